@@ -1,0 +1,216 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What the data determine: rank, null directions in words, honest errors.
+
+A parameter is *identifiable* if no combination of parameters that leaves all
+data unchanged moves it. An error is given for identifiable parameters only:
+a pseudo-inverse would return a small and wrong number for the others.
+"""
+
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+import scipy.linalg
+
+__all__ = ["Identifiability", "analyse"]
+
+# singular values below this share of the largest count as zero
+_RANK_TOLERANCE = 1e-9
+# a parameter that moves by less than this share along a null direction stands still
+_STILL = 1e-5
+# what is worth a word in a null direction, as a share of its largest component
+_WORTH_A_WORD = 0.02
+
+
+@dataclass
+class Identifiability:
+    """
+    Rank of a calibration and what it leaves undetermined.
+
+    Parameters
+    ----------
+    names : list of str
+        Names of the free parameters, one an element of the flat vector.
+    rank : int
+        Rank of the Jacobian.
+    singular_values : `~numpy.ndarray`
+        With columns scaled to a degree, a micrometre or a percent.
+    null_vectors : `~numpy.ndarray`
+        Shape (n_free - rank, n_free), in degree, micrometre or percent.
+    identifiable : `~numpy.ndarray`
+        Whether each parameter is determined, shape (n_free,).
+    directions : list of dict
+        For each null direction its ``words`` and the ``parameters`` that move.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.calibration import Identifiability
+    >>> Identifiability(["a.theta"], 1, np.ones(1), np.zeros((0, 1)), np.ones(1, bool)).n_free
+    1
+    """
+
+    names: list
+    rank: int
+    singular_values: np.ndarray
+    null_vectors: np.ndarray
+    identifiable: np.ndarray
+    directions: list = field(default_factory=list)
+
+    @property
+    def n_free(self):
+        """Number of free parameters."""
+        return len(self.names)
+
+    def __str__(self):
+        lines = [f"The data determine {self.rank} combinations of {self.n_free} free parameters."]
+        lines += [f"  - {direction['words']}" for direction in self.directions]
+        return "\n".join(lines)
+
+
+def analyse(free, jacobian, held=None):
+    """
+    Find the rank, the null directions and the unscaled covariance.
+
+    Parameters
+    ----------
+    free : FreeParameters
+        The free parameters.
+    jacobian : `~numpy.ndarray`
+        Whitened derivative of the data, shape (n_free, n_data).
+    held : `~numpy.ndarray`, optional
+        True for parameters that sit at a bound; they count as fixed.
+
+    Returns
+    -------
+    identifiability : Identifiability
+        The finding.
+    covariance : `~numpy.ndarray`
+        Shape (n_free, n_free), canonical units, for unit noise; NaN in the
+        rows and columns of parameters that are held or not identifiable.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.calibration import analyse
+    >>> from astropolcal.measurement import FreeParameters
+    >>> import numpy as np
+    >>> free = FreeParameters([optics.WollastonPrism(name="wollaston")], 1)
+    >>> analyse(free, np.ones((1, 4)))[0].rank
+    1
+    """
+    held = np.zeros(free.size, dtype=bool) if held is None else held
+    scale = physical_scale(free)
+    scaled = (jacobian * scale[:, None]).T
+    singular, right, rank = _decompose(scaled)
+    null = right[rank:]
+    identifiable = (np.abs(null) < _STILL).all(axis=0) & ~held
+    covariance = _covariance(scaled, held, scale)
+    unknown = ~identifiable
+    covariance[unknown] = covariance[:, unknown] = np.nan
+    finding = Identifiability(
+        names=free.names,
+        rank=rank,
+        singular_values=singular,
+        null_vectors=null,
+        identifiable=identifiable,
+        directions=_directions(free, null),
+    )
+    return finding, covariance
+
+
+def _decompose(scaled):
+    """Return all singular values, all right vectors, and the rank."""
+    n_data, n_free = scaled.shape
+    _, singular, right = np.linalg.svd(scaled, full_matrices=n_data < n_free)
+    singular = np.pad(singular, (0, n_free - singular.size))
+    return singular, right, int(np.sum(singular > _RANK_TOLERANCE * max(singular[0], 1e-300)))
+
+
+def _covariance(scaled, held, scale):
+    """Return the covariance for unit noise, with the held parameters taken as known."""
+    live = np.flatnonzero(~held)
+    out = np.full((scale.size, scale.size), np.nan)
+    if live.size:
+        singular, right, rank = _decompose(scaled[:, live])
+        half = right[:rank] / singular[:rank, None] * scale[live]
+        out[np.ix_(live, live)] = half.T @ half
+    return out
+
+
+def physical_scale(free):
+    """Return one degree, one micrometre or one percent of each parameter, canonical."""
+    kinds = [_step(slot.unit)[0] for slot in free.slots]
+    return np.repeat(kinds, [slot.size for slot in free.slots])
+
+
+def _step(unit):
+    """Return the step of a parameter in canonical units, its size and its unit in words."""
+    if unit is None:
+        return 0.01, 0.01, ""
+    if u.Unit(unit).is_equivalent(u.rad):
+        return np.deg2rad(1.0), 1.0, " deg"
+    return 1.0, 1.0, " um"
+
+
+def _directions(free, null):
+    """Rewrite the null directions so that each is led by one parameter; say them in words."""
+    directions = []
+    for vector, lead in _reduced(free, null):
+        moved = {}
+        for slot in free.slots:
+            part = vector[slot.slice] * _step(slot.unit)[1]
+            if np.abs(vector[slot.slice]).max() > _WORTH_A_WORD:
+                moved[slot.name] = part[0] if slot.size == 1 else part
+        directions.append({"words": _words(free, moved, lead), "parameters": _plain(moved)})
+    return directions
+
+
+def _reduced(free, null):
+    """Yield each null vector, led by a parameter that the others do not move."""
+    if not len(null):
+        return
+    # parameters common to all wavelengths lead, if there are enough of them
+    single = np.array([slot.start for slot in free.slots if slot.size == 1], dtype=int)
+    everything = np.arange(free.size)
+    candidates = single if _spans(null[:, single]) else everything
+    _, _, order = scipy.linalg.qr(null[:, candidates], pivoting=True, mode="economic")
+    leads = candidates[order[: len(null)]]
+    for vector, lead in zip(
+        np.linalg.solve(null[:, leads].T, np.eye(len(null))) @ null, leads, strict=True
+    ):
+        yield vector, free.names[lead]
+
+
+def _spans(columns):
+    if columns.shape[1] < columns.shape[0]:
+        return False
+    return bool(np.linalg.svd(columns, compute_uv=False)[-1] > 1e-3)
+
+
+def _words(free, moved, lead):
+    others = [
+        _change(free, name, value) for name, value in moved.items() if name != lead.split("[")[0]
+    ]
+    stem = lead.split("[")[0]
+    step = _step(free.by_name[stem].unit)
+    size = f"{step[1]:g}{step[2]}"
+    if not others:
+        return f"{lead} changes no datum: it cannot be determined"
+    return f"{lead} by +{size} cannot be told from {', '.join(others)}"
+
+
+def _change(free, name, value):
+    unit = _step(free.by_name[name].unit)[2]
+    if np.ndim(value) == 0:
+        return f"{name} by {value:+.3g}{unit}"
+    low, high = np.min(value), np.max(value)
+    return f"{name} by {low:+.3g} to {high:+.3g}{unit} over the wavelengths"
+
+
+def _plain(moved):
+    return {
+        name: float(value) if np.ndim(value) == 0 else [float(v) for v in value]
+        for name, value in moved.items()
+    }

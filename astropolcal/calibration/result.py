@@ -1,0 +1,361 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The result of a calibration: chains, errors, accuracy, provenance."""
+
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.calibration.accuracy import accuracy_table, cross_validated_residuals
+from astropolcal.chain import leaves
+from astropolcal.exceptions import CalibrationFileError
+
+__all__ = ["Calibration", "DatasetRecord"]
+
+
+@dataclass
+class DatasetRecord:
+    """
+    What a calibration remembers of one dataset.
+
+    Parameters
+    ----------
+    name : str
+        Name of the dataset.
+    source : str or None
+        What sent the light.
+    content_hash : str
+        SHA-256 of the table's content.
+    meta : dict
+        The table's meta: instrument, date, optics in the beam.
+    n_frames, n_masked : int
+        Frames, and cells of frame and wavelength that were masked.
+    accuracy : `~astropy.table.QTable`
+        Accuracy per wavelength, see `accuracy_table`.
+
+    Examples
+    --------
+    >>> from astropolcal.calibration import DatasetRecord
+    >>> DatasetRecord("night1", "polarized", "00", {}, 64, 0).name
+    'night1'
+    """
+
+    name: str
+    source: str | None
+    content_hash: str
+    meta: dict
+    n_frames: int
+    n_masked: int
+    accuracy: QTable | None = None
+
+
+@dataclass
+class Calibration:
+    """
+    A calibrated instrument; `calibrate` makes it, ASDF files keep it.
+
+    Parameters
+    ----------
+    chains : list of `~astropy.modeling.CompoundModel`
+        The calibrated chain of each dataset, sharing their optics' values.
+    wavelength : `~astropy.units.Quantity`
+        Grid of the parameters given per wavelength.
+    covariance : Covariance
+        Of the free parameters, with names and units.
+    identifiability : Identifiability
+        Rank and null directions.
+    at_bound : list of str
+        Free parameters that ended at a bound.
+    datasets : list of DatasetRecord
+        The data behind it.
+    settings : dict
+        ``instrument``, ``observable``, ``fitter``, ``strategy``, ``weights``.
+    fit : dict
+        ``seconds``, ``n_data``, ``converged``, ``message``, ``evaluations``.
+    ties : dict of str to Tie
+        Parameters that follow others.
+    stages : list of dict
+        Parameter values after each step of the two-step strategy.
+    measurement : Measurement or None
+        The fitted model; None after reading from a file.
+    provenance : dict
+        Software versions and time of the fit.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> cal.chain["hwp"].w_sio2.unit, len(cal.accuracy)
+    (Unit("mm"), 22)
+    """
+
+    chains: list
+    wavelength: u.Quantity
+    covariance: object
+    identifiability: object
+    at_bound: list
+    datasets: list
+    settings: dict
+    fit: dict
+    ties: dict = field(default_factory=dict)
+    stages: list = field(default_factory=list)
+    measurement: object = None
+    provenance: dict = field(default_factory=dict)
+
+    @property
+    def chain(self):
+        """The calibrated chain of the first dataset."""
+        return self.chains[0]
+
+    @property
+    def instrument(self):
+        """Name of the instrument, or None."""
+        return self.settings.get("instrument")
+
+    @property
+    def converged(self):
+        """Whether the fitter says that it has arrived."""
+        return bool(self.fit.get("converged"))
+
+    @property
+    def residuals(self):
+        """
+        Residuals of all data, observed minus model, shape (n_data,).
+
+        Raises
+        ------
+        CalibrationFileError
+            If the calibration was read from a file, which holds no data.
+        """
+        return self._live().residuals()
+
+    def _live(self):
+        if self.measurement is None:
+            raise CalibrationFileError(
+                "this calibration was read from a file, which holds no observations; "
+                "fit or predict them again with measurement_of(observations)"
+            )
+        return self.measurement
+
+    def measurement_of(self, observations, dataset=0, positions=None):
+        """
+        Return a measurement of new observations with the calibrated chain.
+
+        Parameters
+        ----------
+        observations : Observations
+            New frames of the same set-up.
+        dataset : int
+            Which of the calibration's chains is meant.
+        positions : dict, optional
+            Position of every stage, see `Measurement`.
+
+        Returns
+        -------
+        Measurement
+            Not fitted: its residuals tell how well the calibration predicts.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal import calibrate, instruments
+        >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+        >>> charis = instruments.get("charis")
+        >>> chain = charis.chain(derotator="linear")
+        >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+        >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+        >>> new = simulate(chain, charis.wavelength, frames, seed=3)
+        >>> bool(abs(cal.measurement_of(new).residuals()).max() < 0.01)
+        True
+        """
+        from astropolcal.measurement import Measurement
+
+        return Measurement(
+            self.chains[dataset],
+            observations,
+            observable=self.settings["observable"],
+            positions=None if positions is None else [positions],
+            ties=self.ties,
+            wavelength=self.wavelength,
+        )
+
+    def cross_validate(self, groups=None):
+        """
+        Fill ``s_cv``: refit without each derotator angle and predict it.
+
+        Parameters
+        ----------
+        groups : `~numpy.ndarray`, optional
+            Group of each datum; by default its derotator angle.
+
+        Returns
+        -------
+        Calibration
+            Itself.
+        """
+        live = self._live()
+        held_out = cross_validated_residuals(live, live.vector(), self._weights(), groups)
+        residuals = live.residuals()
+        for i, record in enumerate(self.datasets):
+            record.accuracy = accuracy_table(live, i, residuals, held_out)
+        return self
+
+    def _weights(self):
+        return 1 / self.measurement.sigma if self.settings.get("weights") == "errors" else None
+
+    @property
+    def accuracy(self):
+        """Accuracy per wavelength of the first dataset, a `~astropy.table.QTable`."""
+        return self.datasets[0].accuracy
+
+    # ---- parameters ----------------------------------------------------------
+
+    def parameter_values(self):
+        """
+        Return every parameter of every optic with all that is known of it.
+
+        Returns
+        -------
+        dict of str to dict
+            ``"optic.parameter"`` to ``value``, ``std`` (NaN where not
+            determined), ``unit``, ``fixed``, ``tied``, ``at_bound`` and
+            ``identifiable``; arrays for parameters given per wavelength.
+        """
+        result = {}
+        for chain in self.chains:
+            for leaf in leaves(chain):
+                for key in leaf.param_names:
+                    name = f"{leaf.name}.{key}"
+                    if name not in result:
+                        result[name] = self._describe(name, getattr(leaf, key))
+        return result
+
+    def _describe(self, name, parameter):
+        size = int(np.size(parameter.value))
+        free = not parameter.fixed and name not in self.ties
+        elements = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
+        shape = np.shape(parameter.value)
+        known = self._known() if free else {}
+        rows = [known.get(element, (np.nan, False, False)) for element in elements]
+        std, identifiable, at_bound = (
+            np.array(column).reshape(shape) for column in zip(*rows, strict=True)
+        )
+        return {
+            "value": np.array(parameter.value),
+            "std": std,
+            "unit": parameter.unit,
+            "fixed": bool(parameter.fixed),
+            "tied": self.ties[name].source if name in self.ties else None,
+            "at_bound": at_bound,
+            "identifiable": identifiable,
+        }
+
+    def _known(self):
+        stds = self.covariance.stds
+        flags = self.identifiability.identifiable
+        bound = set(self.at_bound)
+        return {
+            name: (stds[i], bool(flags[i]), name in bound)
+            for i, name in enumerate(self.covariance.names)
+        }
+
+    @property
+    def parameters(self):
+        """One row a free parameter: name, value, std, unit, flags; a `~astropy.table.QTable`."""
+        rows = []
+        for name, known in self.parameter_values().items():
+            if known["fixed"] or known["tied"]:
+                continue
+            flat = [np.ravel(known[key]) for key in ("value", "std", "at_bound", "identifiable")]
+            labels = [name] if flat[0].size == 1 else [f"{name}[{i}]" for i in range(flat[0].size)]
+            unit = str(known["unit"] or "")
+            rows += [
+                (label, value, std, unit, bound, ok)
+                for label, value, std, bound, ok in zip(labels, *flat, strict=True)
+            ]
+        names = ("name", "value", "std", "unit", "at_bound", "identifiable")
+        types = (str, float, float, str, bool, bool)
+        return QTable(rows=rows or None, names=names, dtype=None if rows else types)
+
+    # ---- in words and files ----------------------------------------------------
+
+    def summary(self):
+        """
+        Return a table for the terminal: how good, what came out, what is undetermined.
+
+        Returns
+        -------
+        str
+        """
+        from astropolcal.calibration.summary import summary
+
+        return summary(self)
+
+    def to_dict(self):
+        """
+        Return the summary for machines, ready for JSON.
+
+        Returns
+        -------
+        dict
+            The keys of ``astropolcal calibrate --json``; not-a-number as None.
+        """
+        from astropolcal.calibration.summary import to_dict
+
+        return to_dict(self)
+
+    def write(self, path, overwrite=False):
+        """
+        Write the calibration to an ASDF file, atomically.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        CalibrationFileError
+            If the file exists or cannot be written.
+        """
+        from astropolcal.calibration.files import write_calibration
+
+        write_calibration(self, path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read a calibration from an ASDF file, validated.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        CalibrationFileError
+            If the file is missing, damaged, of another version, or not ours.
+        """
+        from astropolcal.calibration.files import read_calibration
+
+        return read_calibration(path)
+
+    def __repr__(self):
+        names = ", ".join(record.name for record in self.datasets)
+        return (
+            f"<Calibration of {self.instrument or 'an instrument'} from {names}: "
+            f"{len(self.covariance)} free parameters, rank {self.identifiability.rank}>"
+        )

@@ -1,0 +1,202 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Starts for a fit that has mirror solutions.
+
+With the global parameters held, the bins of a calibration are independent of
+each other. So all bins are searched at once: a coarse scan along the main
+retardance of each optic finds the valleys, and a Levenberg-Marquardt step that
+is batched over the bins polishes the best few. The result is a start for the
+joint fit, and later a check whether a bin sits in the wrong valley.
+"""
+
+import numpy as np
+
+__all__ = ["BinProblem", "search_branches"]
+
+_SCAN_STEP = np.deg2rad(15.0)
+_N_VALLEYS = 3
+_CLEARLY_BETTER = 0.99
+
+
+class BinProblem:
+    """
+    The fit of the parameters given per wavelength, all bins at once.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    weights : `~numpy.ndarray`, optional
+        Weight of each datum, shape (n_data,).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration import BinProblem
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> problem = BinProblem(Measurement(charis.chain(), observations))
+    >>> problem.costs(problem.measurement.vector()).shape
+    (22,)
+    """
+
+    def __init__(self, measurement, weights=None):
+        self.measurement = measurement
+        self.weights = np.ones(measurement.n_data) if weights is None else np.asarray(weights)
+        self.slots = [slot for slot in measurement.free.slots if slot.per_wavelength]
+        self.n_bins = len(measurement.wavelength)
+        self._data, self._present = _data_of_bins(measurement, self.n_bins)
+        starts = np.array([slot.start for slot in self.slots], dtype=int)
+        #: Element of the flat vector of each slot and bin, (n_slots, n_bins).
+        self.elements = starts[:, None] + np.arange(self.n_bins)
+        low, high = measurement.free.bounds()
+        self._low, self._high = low[self.elements], high[self.elements]
+
+    def residuals(self, vector):
+        """Return weighted residuals by bin, zero where a bin has fewer data."""
+        residual = (self.measurement.predict(vector) - self.measurement.observed) * self.weights
+        return residual[self._data] * self._present
+
+    def costs(self, vector):
+        """Return half the sum of squares of each bin, shape (n_bins,)."""
+        return 0.5 * np.sum(self.residuals(vector) ** 2, axis=1)
+
+    def _normal_equations(self, vector):
+        jacobian = self.measurement.jacobian(vector) * self.weights
+        blocks = jacobian[self.elements.T[:, :, None], self._data[:, None, :]]
+        blocks *= self._present[:, None, :]
+        residual = self.residuals(vector)
+        return blocks @ np.swapaxes(blocks, 1, 2), np.einsum("bsd,bd->bs", blocks, residual)
+
+    def polish(self, vector, iterations=10):
+        """
+        Improve the per-wavelength parameters by batched Levenberg-Marquardt.
+
+        Parameters
+        ----------
+        vector : `~numpy.ndarray`
+            Start, shape (n_free,).
+        iterations : int
+            Number of steps.
+
+        Returns
+        -------
+        vector : `~numpy.ndarray`
+            Shape (n_free,); no bin is worse than at the start.
+        costs : `~numpy.ndarray`
+            Cost of each bin there.
+        """
+        vector = vector.copy()
+        costs, damping = self.costs(vector), np.full(self.n_bins, 1e-3)
+        for _ in range(iterations):
+            trial = vector.copy()
+            trial[self.elements] = self._step(vector, damping)
+            new = self.costs(trial)
+            better = new < costs
+            vector[self.elements[:, better]] = trial[self.elements[:, better]]
+            costs = np.where(better, new, costs)
+            damping = np.where(better, damping / 5, damping * 8)
+        return vector, costs
+
+    def _step(self, vector, damping):
+        normal, gradient = self._normal_equations(vector)
+        size = normal.shape[-1]
+        diagonal = np.einsum("bss->bs", normal)
+        ridge = damping[:, None] * diagonal + 1e-12 * (1 + diagonal.max(axis=1, keepdims=True))
+        step = np.linalg.solve(normal + ridge[:, :, None] * np.eye(size), gradient[..., None])
+        return np.clip(vector[self.elements] - step[..., 0].T, self._low, self._high)
+
+    def main_retardances(self):
+        """Return the first slot of each optic that can make half a turn or more."""
+        seen, found = set(), []
+        for row, slot in enumerate(self.slots):
+            optic = slot.name.split(".")[0]
+            low, high = slot.canonical_bounds()
+            if slot.unit is not None and high - low > np.pi and optic not in seen:
+                seen.add(optic)
+                found.append((row, max(low, -2 * np.pi), min(high, 2 * np.pi)))
+        return found
+
+    def valleys(self, vector, row, low, high):
+        """
+        Return the best few values of one slot, from a scan over its bounds.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (n_valleys, n_bins), best first.
+        """
+        grid = np.arange(low, high + _SCAN_STEP / 2, _SCAN_STEP).clip(low, high)
+        trial = vector.copy()
+        costs = np.empty((grid.size, self.n_bins))
+        for i, value in enumerate(grid):
+            trial[self.elements[row]] = value
+            costs[i] = self.costs(trial)
+        padded = np.pad(costs, ((1, 1), (0, 0)), constant_values=np.inf)
+        valley = (costs <= padded[:-2]) & (costs <= padded[2:])
+        order = np.argsort(np.where(valley, costs, np.inf), axis=0)[:_N_VALLEYS]
+        return grid[order]
+
+
+def search_branches(problem, vector):
+    """
+    Return a start in which every bin sits in its best valley.
+
+    Parameters
+    ----------
+    problem : BinProblem
+        The bins of the measurement.
+    vector : `~numpy.ndarray`
+        Current values; its own valley is kept unless another is clearly
+        (1 %) better.
+
+    Returns
+    -------
+    vector : `~numpy.ndarray`
+        Shape (n_free,).
+    moved : `~numpy.ndarray`
+        True for the bins that changed their valley.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration import BinProblem, search_branches
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> measurement = Measurement(charis.chain(), observations)
+    >>> search_branches(BinProblem(measurement), measurement.vector())[1].any()
+    np.False_
+    """
+    if not problem.slots:
+        return vector, np.zeros(problem.n_bins, dtype=bool)
+    best, costs = problem.polish(vector)
+    moved = np.zeros(problem.n_bins, dtype=bool)
+    for row, low, high in problem.main_retardances():
+        for values in problem.valleys(best, row, low, high):
+            trial = best.copy()
+            trial[problem.elements[row]] = values
+            trial, new = problem.polish(trial)
+            better = new < _CLEARLY_BETTER * costs
+            best[problem.elements[:, better]] = trial[problem.elements[:, better]]
+            costs = np.where(better, new, costs)
+            moved |= better
+    return best, moved
+
+
+def _data_of_bins(measurement, n_bins):
+    """Return the data of each bin, padded, and which of them are real."""
+    bins = measurement.bins
+    counts = np.bincount(bins, minlength=n_bins)
+    order = np.argsort(bins, kind="stable")
+    present = np.arange(counts.max()) < counts[:, None]
+    data = np.zeros(present.shape, dtype=int)
+    data[present] = order
+    return data, present

@@ -1,0 +1,248 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""A calibration in words for the terminal, and in numbers for machines."""
+
+import astropy.units as u
+import numpy as np
+
+__all__ = ["summary", "to_dict"]
+
+
+def summary(calibration):
+    """
+    Return a calibration as text of at most 80 columns.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+
+    Returns
+    -------
+    str
+        Accuracy per wavelength with the parameters given per wavelength, the
+        global parameters, and what the data do not determine.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import summary
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> print(summary(cal).splitlines()[0])
+    Calibration of an instrument from simulated
+    """
+    known = calibration.parameter_values()
+    parts = [
+        _heading(calibration),
+        _global_lines(known),
+        *(_accuracy_lines(record) for record in calibration.datasets),
+        _wavelength_lines(calibration, known),
+        [str(calibration.identifiability)],
+        _bound_lines(calibration),
+    ]
+    return "\n\n".join("\n".join(_wrap(part)) for part in parts if part)
+
+
+def _wrap(lines, width=80):
+    import textwrap
+
+    for line in lines:
+        for row in line.split("\n"):
+            indent = "    " if row.startswith("  - ") else ""
+            yield from (
+                textwrap.wrap(
+                    row,
+                    width,
+                    subsequent_indent=indent,
+                    drop_whitespace=False,
+                    replace_whitespace=False,
+                )
+                if len(row) > width
+                else [row]
+            )
+
+
+def _heading(calibration):
+    fit, settings = calibration.fit, calibration.settings
+    names = ", ".join(record.name for record in calibration.datasets)
+    state = "converged" if calibration.converged else "NOT CONVERGED"
+    return [
+        f"Calibration of {calibration.instrument or 'an instrument'} from {names}",
+        f"{settings['strategy']} fit of {len(calibration.covariance)} parameters to "
+        f"{fit['n_data']} {settings['observable'].replace('_', ' ')}s,",
+        f"{settings['fitter']}, {fit['seconds']:.2f} s, {state}",
+    ]
+
+
+def _number(value, std, unit):
+    digits = 4 if unit else 5
+    error = f"+- {std:.{digits}f}" if np.isfinite(std) else "not determined alone"
+    return f"{value:12.{digits}f} {error:<22}{unit}"
+
+
+def _global_lines(known):
+    lines = []
+    for name, entry in known.items():
+        if entry["fixed"] or entry["value"].ndim:
+            continue
+        note = f"  follows {entry['tied']}" if entry["tied"] else ""
+        note += "  AT BOUND" if entry["at_bound"] else ""
+        number = _number(float(entry["value"]), float(entry["std"]), str(entry["unit"] or ""))
+        lines.append(f"  {name:<30}{number}{note}".rstrip())
+    return ["Parameters for all wavelengths", *lines] if lines else []
+
+
+def _accuracy_lines(record):
+    table = record.accuracy
+    lines = [
+        f"Accuracy on {record.name}, in percent of polarization",
+        f"  {'':<10}{'s_res':>10}{'s_mean':>10}{'s_cv':>10}",
+    ]
+    for label, function in (("median", np.median), ("best", np.min), ("worst", np.max)):
+        values = [_of(table[column].value, function) for column in ("s_res", "s_mean", "s_cv")]
+        lines.append(f"  {label:<10}" + "".join(values))
+    masked = f", {record.n_masked} cells masked" if record.n_masked else ""
+    lines.append(f"  ({record.n_frames} frames x {len(table)} wavelengths{masked})")
+    return lines
+
+
+def _of(values, function):
+    known = values[np.isfinite(values)]
+    return f"{function(known):10.3f}" if known.size else f"{'-':>10}"
+
+
+def _wavelength_lines(calibration, known):
+    """Return a table with one row a wavelength, as many columns as fit."""
+    several = {n: e for n, e in known.items() if e["value"].ndim and not e["fixed"]}
+    if not several:
+        return []
+    accuracy = calibration.datasets[0].accuracy
+    shown = list(several)[:5]
+    heads = [name.split(".")[1] for name in shown]
+    units = [str(several[name]["unit"] or "") for name in shown]
+    optics = [name.split(".")[0] for name in shown]
+    lines = [
+        "Parameters for each wavelength (* at a bound)",
+        f"{'':>10}{'':>9}" + "".join(f"{text:>12}" for text in optics),
+        f"{'nm':>10}{'s_mean %':>9}"
+        + "".join(
+            f"{head[:8] + (' ' + unit if unit else ''):>12}"
+            for head, unit in zip(heads, units, strict=True)
+        ),
+    ]
+    s_mean = dict(
+        zip(
+            np.round(accuracy["wavelength"].to_value(u.nm), 2),
+            accuracy["s_mean"].value,
+            strict=True,
+        )
+    )
+    for i, lam in enumerate(calibration.wavelength.to_value(u.nm)):
+        mean = s_mean.get(np.round(lam, 2), np.nan)
+        row = f"{lam:10.1f}" + (f"{mean:9.3f}" if np.isfinite(mean) else f"{'-':>9}")
+        for name, unit in zip(shown, units, strict=True):
+            mark = "*" if several[name]["at_bound"][i] else " "
+            row += f"{several[name]['value'][i]:11.{2 if unit else 4}f}{mark}"
+        lines.append(row.rstrip())
+    return lines
+
+
+def _bound_lines(calibration):
+    if not calibration.at_bound:
+        return []
+    return [f"At a bound, so without an error: {', '.join(calibration.at_bound)}"]
+
+
+# ---- for machines ------------------------------------------------------------------
+
+
+def to_dict(calibration):
+    """
+    Return a calibration as plain numbers, lists and strings, ready for JSON.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+
+    Returns
+    -------
+    dict
+        Keys ``instrument, observable, fitter, strategy, seconds, n_data,
+        n_free, rank, converged, datasets, parameters, null_directions``;
+        what is not a number is None.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import to_dict
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> to_dict(cal)["n_free"]
+    49
+    """
+    settings, fit = calibration.settings, calibration.fit
+    return {
+        "instrument": calibration.instrument,
+        "observable": settings["observable"],
+        "fitter": settings["fitter"],
+        "strategy": settings["strategy"],
+        "weights": settings["weights"],
+        "seconds": fit["seconds"],
+        "converged": calibration.converged,
+        "n_data": fit["n_data"],
+        "n_free": len(calibration.covariance),
+        "rank": calibration.identifiability.rank,
+        "datasets": [_dataset(record) for record in calibration.datasets],
+        "parameters": {
+            name: _parameter(entry) for name, entry in calibration.parameter_values().items()
+        },
+        "null_directions": calibration.identifiability.directions,
+        "at_bound": list(calibration.at_bound),
+        "stages": [_plain(stage) for stage in calibration.stages],
+        "provenance": dict(calibration.provenance),
+    }
+
+
+def _dataset(record):
+    table = record.accuracy
+    return {
+        "name": record.name,
+        "source": record.source,
+        "content_hash": record.content_hash,
+        "n_frames": record.n_frames,
+        "n_masked": record.n_masked,
+        "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
+        "n": _plain(table["n"]),
+        "k": _plain(table["k"]),
+        **{f"{key}_percent": _plain(table[key].value) for key in ("s_res", "s_mean", "s_cv")},
+    }
+
+
+def _parameter(entry):
+    return {key: _plain(value) for key, value in entry.items() if key != "unit"} | {
+        "unit": str(entry["unit"]) if entry["unit"] is not None else ""
+    }
+
+
+def _plain(value):
+    """Turn arrays, quantities and numpy scalars into what JSON knows; NaN into None."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, u.Quantity):
+        return {"value": _plain(value.value), "unit": str(value.unit)}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

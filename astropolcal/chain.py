@@ -1,0 +1,480 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Chains of optics: the compound model, its optics, and its system Mueller matrix.
+
+A chain is what astropy's ``|`` makes of optics, written in the order the
+light travels. Nothing here depends on which optics they are.
+"""
+
+import difflib
+
+import numpy as np
+from astropy.modeling import CompoundModel
+
+from astropolcal.exceptions import ChainError
+from astropolcal.optics import Optic
+from astropolcal.units import angle_to_rad
+
+__all__ = [
+    "at_positions",
+    "find_optic",
+    "insert_optic",
+    "join",
+    "leaves",
+    "remove_optic",
+    "replace_optic",
+    "stages",
+    "system_mueller",
+    "system_mueller_derivatives",
+    "with_beam",
+]
+
+
+def leaves(chain):
+    """
+    Return the optics of a chain in the order the light travels.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        One optic, or optics joined with ``|``.
+
+    Returns
+    -------
+    list of Optic
+        The optics themselves, not copies.
+
+    Raises
+    ------
+    ChainError
+        If something in the chain is not an optic or is joined by another
+        operator, or if two optics share a name.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import leaves
+    >>> chain = optics.LinearPolarizer(name="polarizer") | optics.WollastonPrism(name="wollaston")
+    >>> [optic.name for optic in leaves(chain)]
+    ['polarizer', 'wollaston']
+    """
+    found = list(_walk(chain))
+    names = [optic.name for optic in found if optic.name]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ChainError(f"optics need different names; {', '.join(twice)} occurs more than once")
+    return found
+
+
+def _walk(model):
+    if isinstance(model, CompoundModel):
+        if model.op != "|":
+            raise ChainError(f"optics are joined with |, not with {model.op}")
+        yield from _walk(model.left)
+        yield from _walk(model.right)
+    elif isinstance(model, Optic):
+        yield model
+    else:
+        raise ChainError(
+            f"{type(model).__name__} is not an optic; a chain is made of "
+            "astropolcal.optics joined with |"
+        )
+
+
+def join(optics):
+    """
+    Join optics to a chain.
+
+    Parameters
+    ----------
+    optics : sequence of Optic
+        At least one, in the order the light travels.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    ChainError
+        If there is no optic.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import join
+    >>> join([optics.LinearPolarizer(), optics.WollastonPrism()]).n_submodels
+    2
+    """
+    optics = list(optics)
+    if not optics:
+        raise ChainError("a chain needs at least one optic")
+    chain = optics[0]
+    for optic in optics[1:]:
+        chain = chain | optic
+    return chain
+
+
+def find_optic(chain, name):
+    """
+    Return the optic of that name.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+    name : str
+        Name of the optic.
+
+    Returns
+    -------
+    Optic
+
+    Raises
+    ------
+    ChainError
+        If there is none; the message lists near matches.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import find_optic
+    >>> find_optic(optics.ParityFlip(name="nbs"), "nbs").name
+    'nbs'
+    """
+    found = leaves(chain)
+    for optic in found:
+        if optic.name == name:
+            return optic
+    names = [optic.name for optic in found if optic.name]
+    near = difflib.get_close_matches(str(name), names, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ChainError(f"no optic {name!r} in the chain; it has {', '.join(names)}{hint}")
+
+
+def replace_optic(chain, name, optic):
+    """
+    Return a chain with the named optic replaced; the rest is shared.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+    name : str
+        Name of the optic that goes.
+    optic : Optic
+        The optic that takes its place.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    ChainError
+        If there is no such optic.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import replace_optic
+    >>> chain = optics.ParityFlip(name="nbs") | optics.WollastonPrism(name="wollaston")
+    >>> replace_optic(chain, "nbs", optics.Depolarizer(name="relay"))[0].name
+    'relay'
+    """
+    old = find_optic(chain, name)
+    return join(optic if leaf is old else leaf for leaf in leaves(chain))
+
+
+def insert_optic(chain, optic, *, after=None, before=None):
+    """
+    Return a chain with one more optic.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+    optic : Optic
+        The new optic.
+    after, before : str
+        Name of the neighbour; exactly one of the two.
+
+    Returns
+    -------
+    `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    ChainError
+        If the neighbour is missing or not exactly one is named.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import insert_optic, leaves
+    >>> chain = insert_optic(optics.WollastonPrism(name="wollaston"),
+    ...                      optics.ParityFlip(name="nbs"), before="wollaston")
+    >>> [leaf.name for leaf in leaves(chain)]
+    ['nbs', 'wollaston']
+    """
+    if (after is None) == (before is None):
+        raise ChainError("name exactly one neighbour: after=... or before=...")
+    neighbour = find_optic(chain, after or before)
+    result = []
+    for leaf in leaves(chain):
+        pair = [leaf, optic] if after else [optic, leaf]
+        result.extend(pair if leaf is neighbour else [leaf])
+    return join(result)
+
+
+def remove_optic(chain, name):
+    """
+    Return a chain without the named optic.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+    name : str
+        Name of the optic that goes.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    ChainError
+        If there is no such optic, or nothing would be left.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import remove_optic
+    >>> chain = optics.ParityFlip(name="nbs") | optics.WollastonPrism(name="wollaston")
+    >>> remove_optic(chain, "nbs").name
+    'wollaston'
+    """
+    gone = find_optic(chain, name)
+    return join(leaf for leaf in leaves(chain) if leaf is not gone)
+
+
+def stages(chain):
+    """
+    Return the names of the stages whose positions the chain needs.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import stages
+    >>> stages(optics.LinearRetarder(mount="hwp") | optics.Rotator(mount="-altitude"))
+    ('hwp', 'altitude')
+    """
+    return tuple(dict.fromkeys(leaf.stage for leaf in leaves(chain) if leaf.stage))
+
+
+def with_beam(chain, beam):
+    """
+    Return a copy of the chain that follows one beam of its beam splitter.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+    beam : {"right", "left"}
+        The beam.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    ChainError
+        If the chain has no beam splitter.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import with_beam
+    >>> left = with_beam(optics.LinearPolarizer() | optics.WollastonPrism(), "left")
+    >>> float(left(1.6 * u.um, 1, 0, 0, 0)[1])
+    0.0
+    """
+    copy = chain.copy()
+    splitters = [leaf for leaf in leaves(copy) if hasattr(leaf, "beam")]
+    if not splitters:
+        raise ChainError("the chain has no beam splitter, so it has no beams")
+    for splitter in splitters:
+        splitter.beam = beam
+    return copy
+
+
+def at_positions(chain, **positions):
+    """
+    Return a copy of the chain whose stages stand at the given positions.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+    **positions : `~astropy.units.Quantity`
+        Position of each stage by name.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+        Ready to be called with light.
+
+    Raises
+    ------
+    ChainError
+        If the chain has no such stage.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import at_positions
+    >>> hwp = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp")
+    >>> _, I, Q, U, V = at_positions(hwp, hwp=22.5 * u.deg)(1.6 * u.um, 1, 1, 0, 0)
+    >>> round(float(U), 6)
+    1.0
+    """
+    copy = chain.copy()
+    known = stages(copy)
+    for name in positions:
+        if name not in known:
+            raise ChainError(f"no stage {name!r} in the chain; it has {', '.join(known) or 'none'}")
+    for leaf in leaves(copy):
+        if leaf.stage in positions:
+            leaf.position = positions[leaf.stage]
+    return copy
+
+
+def _stage_angle(leaf, positions):
+    """Return the position (rad) of the leaf's stage, with an axis for the wavelengths."""
+    if leaf.stage is None:
+        return 0.0
+    if leaf.stage not in positions:
+        raise ChainError(
+            f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}, but "
+            f"positions has only {sorted(positions)}"
+        )
+    return positions[leaf.stage]
+
+
+def _oriented_leaves(chain, wavelength, positions):
+    """Yield each leaf with what its matrix needs: dispersion, angle, values."""
+    positions = {name: angle_to_rad(value, name) for name, value in (positions or {}).items()}
+    scalar = wavelength is None or np.ndim(wavelength) == 0
+    for leaf in leaves(chain):
+        dispersion, angle, values = leaf._resolve(wavelength, None)
+        stage = np.asarray(_stage_angle(leaf, positions))
+        stage = stage if scalar else stage[..., None]
+        yield leaf, dispersion, angle + leaf.stage_sign * stage, values
+
+
+def system_mueller(chain, wavelength=None, positions=None):
+    """
+    Return the Mueller matrix of the whole chain.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain; of a beam splitter, its ``beam`` (see `with_beam`).
+    wavelength : `~astropy.units.Quantity`, optional
+        Scalar or shape (n_wavelengths,).
+    positions : dict of str to `~astropy.units.Quantity`, optional
+        Position of every stage, scalar or shape (n_frames,).
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (n_frames, n_wavelengths, 4, 4); an axis is missing where the
+        positions or the wavelength are scalar.
+
+    Raises
+    ------
+    ChainError
+        If the position of a stage is missing.
+    ParameterError, WavelengthRangeError
+        If a wavelength is missing, out of range, or does not match the
+        parameters given per wavelength.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import system_mueller
+    >>> chain = optics.TwoLayerWaveplate(mount="hwp", name="hwp") | optics.WollastonPrism()
+    >>> system_mueller(chain, [1.2, 1.6] * u.um, {"hwp": [0, 22.5, 45] * u.deg}).shape
+    (3, 2, 4, 4)
+    """
+    total = np.eye(4)
+    for leaf, dispersion, angle, values in _oriented_leaves(chain, wavelength, positions):
+        total = leaf._oriented(dispersion, angle, values) @ total
+    return _with_wavelength_axis(total, wavelength)
+
+
+def _with_wavelength_axis(matrix, wavelength):
+    """Broadcast a matrix that no wavelength touched to the wavelengths asked for."""
+    if wavelength is None or np.ndim(wavelength) == 0:
+        return matrix
+    lead = matrix.shape[:-2] or (1,)
+    return np.broadcast_to(matrix, (*lead[:-1], len(wavelength), 4, 4)).copy()
+
+
+def system_mueller_derivatives(chain, wavelength=None, positions=None):
+    """
+    Return the derivative of the system Mueller matrix to every parameter.
+
+    Parameters
+    ----------
+    chain, wavelength, positions
+        As in `system_mueller`.
+
+    Returns
+    -------
+    dict of str to `~astropy.units.Quantity`
+        ``"optic.parameter"`` to derivative, of the shape `system_mueller`
+        gives; for a parameter with one value a wavelength, the derivative to
+        the value at that wavelength.
+
+    Raises
+    ------
+    ChainError, ParameterError, WavelengthRangeError
+        As `system_mueller`; also if an optic has no name.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import system_mueller_derivatives
+    >>> chain = optics.ParityFlip(name="nbs") | optics.WollastonPrism(name="wollaston")
+    >>> float(system_mueller_derivatives(chain)["wollaston.efficiency"][0, 1].value)
+    -0.5
+    """
+    nodes = list(_oriented_leaves(chain, wavelength, positions))
+    matrices = [leaf._oriented(*rest) for leaf, *rest in nodes]
+    before = _running_products(matrices)
+    after = np.eye(4)
+    result = {}
+    for (leaf, *rest), matrix, upstream in zip(
+        nodes[::-1], matrices[::-1], before[::-1], strict=True
+    ):
+        if not leaf.name:
+            raise ChainError(f"{type(leaf).__name__} needs a name before its parameters have one")
+        for key, slope in zip(leaf.param_names, leaf._oriented_derivatives(*rest), strict=True):
+            value = _with_wavelength_axis(after @ slope @ upstream, wavelength)
+            result[f"{leaf.name}.{key}"] = leaf._per_unit(key, value)
+        after = after @ matrix
+    return result
+
+
+def _running_products(matrices):
+    """Return, for every matrix, the product of those before it."""
+    products = [np.eye(4)]
+    for matrix in matrices[:-1]:
+        products.append(matrix @ products[-1])
+    return products

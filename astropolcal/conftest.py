@@ -1,0 +1,15 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Settings for the examples in the docstrings, which run as tests."""
+
+import os
+
+import pytest
+
+# examples that draw need no window system
+os.environ.setdefault("MPLBACKEND", "agg")
+
+
+@pytest.fixture(autouse=True)
+def _in_empty_folder(tmp_path, monkeypatch):
+    """Run each example in a folder of its own, so that none leaves files behind."""
+    monkeypatch.chdir(tmp_path)

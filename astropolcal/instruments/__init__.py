@@ -1,0 +1,105 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Instruments, found by name.
+
+An instrument is one file with a subclass of `Instrument`. Other packages add
+theirs through the entry-point group ``astropolcal.instruments``.
+"""
+
+import difflib
+from importlib.metadata import entry_points
+
+from astropolcal.exceptions import InstrumentError
+from astropolcal.instruments.base import Instrument
+from astropolcal.instruments.charis import CHARIS
+
+__all__ = ["CHARIS", "Instrument", "get", "names", "register"]
+
+_REGISTRY = {}
+
+
+def register(cls):
+    """
+    Add an instrument class to the registry.
+
+    Parameters
+    ----------
+    cls : type
+        Subclass of `Instrument` with a ``name``.
+
+    Returns
+    -------
+    type
+        The class, so that this can be a decorator.
+
+    Raises
+    ------
+    InstrumentError
+        If the name is missing or taken.
+
+    Examples
+    --------
+    >>> from astropolcal.instruments import names
+    >>> "charis" in names()
+    True
+    """
+    if not (isinstance(cls, type) and issubclass(cls, Instrument) and cls.name):
+        raise InstrumentError(f"{cls!r} is not an Instrument with a name")
+    if _REGISTRY.get(cls.name, cls) is not cls:
+        raise InstrumentError(f"an instrument {cls.name!r} is registered already")
+    _REGISTRY[cls.name] = cls
+    return cls
+
+
+def names():
+    """
+    Return the names of all instruments, plug-ins included.
+
+    Examples
+    --------
+    >>> from astropolcal.instruments import names
+    >>> "charis" in names()
+    True
+    """
+    return sorted(
+        {*_REGISTRY, *(point.name for point in entry_points(group="astropolcal.instruments"))}
+    )
+
+
+def get(name):
+    """
+    Return an instrument by its name or an alias.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"charis"`` or ``"SCExAO/CHARIS"``; case does not matter.
+
+    Returns
+    -------
+    Instrument
+
+    Raises
+    ------
+    InstrumentError
+        If it is unknown; the message names near matches.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> instruments.get("SCExAO/CHARIS").name
+    'charis'
+    """
+    for cls in _REGISTRY.values():
+        if cls().answers_to(str(name)):
+            return cls()
+    for point in entry_points(group="astropolcal.instruments"):
+        instrument = register(point.load())()
+        if instrument.answers_to(str(name)):
+            return instrument
+    near = difflib.get_close_matches(str(name).lower(), names(), n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise InstrumentError(f"unknown instrument {name!r}; known are {', '.join(names())}{hint}")
+
+
+register(CHARIS)

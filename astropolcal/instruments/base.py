@@ -1,0 +1,133 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What an instrument is to astropolcal: its chain, its stages, its tables."""
+
+from abc import ABC, abstractmethod
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.chain import stages
+from astropolcal.exceptions import InstrumentError
+
+__all__ = ["Instrument"]
+
+
+class Instrument(ABC):
+    """
+    Base of all instruments; a subclass is one file.
+
+    Attributes
+    ----------
+    name : str
+        Short name, as on the command line.
+    aliases : tuple of str
+        Other spellings, as in the ``instrument`` entry of a table.
+    wavelength : `~astropy.units.Quantity`
+        Usual wavelengths, shape (n_wavelengths,).
+    keywords : dict of str to str
+        Column of the observation table to FITS header keyword.
+    references : tuple of str
+        Where the values come from.
+    """
+
+    name = ""
+    aliases = ()
+    wavelength = None
+    keywords = {}
+    references = ()
+
+    @abstractmethod
+    def chain(self, source="polarized", optics_in=(), *, wavelength=None, **options):
+        """
+        Return the chain for a source, with starting values, bounds and fixed flags.
+
+        Parameters
+        ----------
+        source : str
+            What sends the light.
+        optics_in : sequence of str
+            Optional optics in the beam.
+        wavelength : `~astropy.units.Quantity`, optional
+            Grid of the parameters given per wavelength.
+        **options
+            Particular to the instrument.
+
+        Returns
+        -------
+        `~astropy.modeling.CompoundModel`
+        """
+
+    @abstractmethod
+    def setup(self, observations):
+        """
+        Return ``source`` and ``optics_in`` of a dataset, from its table's meta.
+
+        Raises
+        ------
+        InstrumentError
+            If the table does not say.
+        """
+
+    def chains_for(self, datasets, **options):
+        """
+        Return one chain a dataset, all on the common wavelength grid.
+
+        Parameters
+        ----------
+        datasets : sequence of Observations
+            The datasets.
+        **options
+            Passed to `chain`.
+
+        Returns
+        -------
+        list of `~astropy.modeling.CompoundModel`
+
+        Raises
+        ------
+        InstrumentError
+            If a table belongs to another instrument, or does not say what it is.
+        """
+        datasets = list(datasets)
+        for observations in datasets:
+            self.check(observations)
+        merged = np.concatenate([obs.wavelength.to_value(u.nm) for obs in datasets])
+        grid = np.unique(np.round(merged, 3)) * u.nm
+        setups = [self.setup(observations) for observations in datasets]
+        return [
+            self.chain(source, optics_in, wavelength=grid, **options)
+            for source, optics_in in setups
+        ]
+
+    def check(self, observations):
+        """Raise InstrumentError if the table names another instrument."""
+        stated = observations.instrument
+        if stated is not None and not self.answers_to(stated):
+            raise InstrumentError(
+                f"{observations.name}: the table is of instrument {stated!r}, not {self.name!r}"
+            )
+
+    def answers_to(self, name):
+        """Return whether ``name`` is this instrument, ignoring case."""
+        return name.lower() in {self.name.lower(), *(alias.lower() for alias in self.aliases)}
+
+    def positions(self, observations, chain):
+        """
+        Return the position of every stage of the chain in each frame, in radian.
+
+        Parameters
+        ----------
+        observations : Observations
+            The dataset.
+        chain : Optic or `~astropy.modeling.CompoundModel`
+            The chain.
+
+        Returns
+        -------
+        dict of str to `~numpy.ndarray`
+            Shape (n_frames,) each.
+        """
+        return {stage: observations.position(stage) for stage in stages(chain)}
+
+    def __repr__(self):
+        return f"<{type(self).__name__} {self.name!r}>"

@@ -1,0 +1,242 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Subaru/SCExAO/CHARIS, near-infrared integral-field spectropolarimeter.
+
+The chain, its starting values and the bounds follow the recalibration of
+McIntosh et al. (2026), and 't Hart et al. (2021) for the half-wave plate.
+
+Signs: with positive thicknesses the equation of the two-layer half-wave plate
+gives a *negative* retardance, near -172 deg, and the derotator that belongs to
+it has a negative horizontal and 45 deg retardance. The published values have
+both signs turned, (H, 45, R) to (-H, -45, R): an exact mirror solution, with
+the same double differences.
+"""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import optics
+from astropolcal.chain import join
+from astropolcal.exceptions import InstrumentError
+from astropolcal.instruments.base import Instrument
+
+__all__ = ["CHARIS"]
+
+# 't Hart et al. 2021, thicknesses of the half-wave plate in mm
+_THART_SIO2, _THART_MGF2 = 1.63398, 1.27711
+
+# Horizontal retardance of the derotator, published by McIntosh et al. 2026 for Dataset 3,
+# read at a dozen wavelengths, rounded, with the sign of our convention: where a fit starts
+_START_NM = [1160, 1200, 1240, 1284, 1329, 1375, 1422, 1471, 1522, 1575, 1630, 1686, 1744, 1805,
+             1867, 1932, 1999, 2068, 2139, 2213, 2290, 2369]  # fmt: skip
+_START_DEG = [-251, -236, -224, -210, -190, -154, -140, -124, -111, -98, -87, -78, -71, -66,
+              -61, -58, -56, -55, -55, -55, -56, -57]  # fmt: skip
+
+_BOUNDS = {
+    # every sign and mirror branch of the retardances
+    "physical": {"horizontal": (-360, 360), "diagonal": (-360, 360), "circular": (-360, 360)},
+    # 0 to 360 deg in the published signs, turned to ours
+    "paper": {"horizontal": (-360, 0), "diagonal": (-360, 0), "circular": (0, 360)},
+}
+
+# The Nasmyth beam switcher came between the two calibration runs of 2025
+_NBS_ABSENT_UNTIL, _NBS_PRESENT_FROM = "2025-07-31", "2025-10-01"
+
+
+class CHARIS(Instrument):
+    """
+    Subaru/SCExAO/CHARIS in its broadband spectropolarimetric mode.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(source="polarized", optics_in=["nbs"])
+    >>> [optic.name for optic in chain]
+    ['calibration_polarizer', 'hwp', 'derotator', 'nbs', 'wollaston']
+    """
+
+    name = "charis"
+    aliases = ("SCExAO/CHARIS", "Subaru/SCExAO/CHARIS")
+    wavelength = np.geomspace(1159.5614, 2369.3441, 22) * u.nm
+    keywords = {
+        "hwp": "RET-ANG1",
+        "hwp_true": "RET-POS1",
+        "derotator": "D_IMRANG",
+        "parallactic": "PARANG",
+        "altitude": "ALTITUDE",
+    }
+    references = (
+        "McIntosh et al. 2026, recalibration after the Nasmyth beam switcher",
+        "'t Hart et al. 2021, Proc. SPIE 11833",
+        "van Holstein et al. 2020, Proc. SPIE 11447",
+    )
+    sources = ("polarized", "unpolarized")
+
+    def chain(
+        self,
+        source="polarized",
+        optics_in=(),
+        *,
+        wavelength=None,
+        derotator="elliptical",
+        bounds="physical",
+    ):
+        """
+        Return the chain of the internal source, ready to be calibrated.
+
+        Free are the paper's parameters: two thicknesses and the misalignments
+        of polarizer, half-wave plate and derotator for all wavelengths, and
+        the derotator's retardances and the Wollaston's efficiency for each.
+
+        Parameters
+        ----------
+        source : {"polarized", "unpolarized"}
+            Internal source with or without its polarizer; without it the fold
+            mirror's diattenuation is a free parameter for each wavelength.
+        optics_in : sequence of str
+            Optional optics in the beam: ``"nbs"`` (beam switcher, parity flip)
+            and ``"dichroic"`` (YJH50, as a retarder of zero retardance that
+            is fixed until you free it).
+        wavelength : `~astropy.units.Quantity`, optional
+            Grid, by default the 22 broadband bins.
+        derotator : {"elliptical", "linear"}
+            Elliptical as in the paper, or linear as in the calibrations before.
+        bounds : {"physical", "paper"}
+            Retardances within one turn of either sign, or within the paper's
+            bounds (0 to 360 deg in the published signs). Either way
+            thicknesses are within 0.6 to 1.4 of 't Hart's, misalignments
+            within 5 deg, efficiencies between 0 and 1.
+
+        Returns
+        -------
+        `~astropy.modeling.CompoundModel`
+
+        Raises
+        ------
+        InstrumentError
+            If a choice is unknown; stars are not supported yet.
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> chain = instruments.get("charis").chain(derotator="linear")
+        >>> chain["derotator"].retardance.shape
+        (22,)
+        """
+        _choice("derotator", derotator, ("elliptical", "linear"))
+        _choice("bounds", bounds, tuple(_BOUNDS))
+        _choice("source", source, self.sources)
+        unknown = set(optics_in) - {"nbs", "dichroic"}
+        if unknown:
+            raise InstrumentError(f"optics_in: no {sorted(unknown)}; allowed are 'nbs', 'dichroic'")
+        grid = self.wavelength if wavelength is None else u.Quantity(wavelength)
+        first = _polarizer() if source == "polarized" else _fold_mirror(grid.size)
+        train = [first, _half_wave_plate(), _derotator(grid, derotator, _BOUNDS[bounds])]
+        if "dichroic" in optics_in:
+            train.append(optics.LinearRetarder(name="dichroic", fixed={"retardance": True}))
+        if "nbs" in optics_in:
+            train.append(optics.ParityFlip(name="nbs"))
+        train.append(optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston"))
+        return join(train)
+
+    def setup(self, observations):
+        """
+        Return source and optics in the beam, as the table's meta states them.
+
+        Parameters
+        ----------
+        observations : Observations
+            Its meta holds ``source``, ``nasmyth_beam_switcher`` (``installed``
+            or ``not installed``; else it is taken from ``date``) and
+            ``yjh50_dichroic`` (``in`` or ``out``).
+
+        Returns
+        -------
+        source : str
+        optics_in : tuple of str
+
+        Raises
+        ------
+        InstrumentError
+            If the meta do not say, or name a source that is not supported.
+        """
+        meta, name = observations.meta, observations.name
+        source = observations.source
+        if source not in self.sources:
+            raise InstrumentError(
+                f"{name}: source {source!r} in the table's meta; allowed are "
+                f"{', '.join(self.sources)} (stars are not supported yet)"
+            )
+        present = []
+        if str(meta.get("yjh50_dichroic", "out")).strip().lower() == "in":
+            present.append("dichroic")
+        if _beam_switcher(meta, name):
+            present.append("nbs")
+        return source, tuple(present)
+
+
+def _choice(what, value, allowed):
+    if value not in allowed:
+        raise InstrumentError(f"{what} = {value!r}; allowed are {', '.join(allowed)}")
+
+
+def _beam_switcher(meta, name):
+    stated = meta.get("nasmyth_beam_switcher")
+    if stated is not None:
+        words = {"installed": True, "in": True, "not installed": False, "out": False}
+        try:
+            return words[str(stated).strip().lower()]
+        except KeyError:
+            raise InstrumentError(
+                f"{name}: nasmyth_beam_switcher is {stated!r}; allowed are "
+                "'installed', 'not installed'"
+            ) from None
+    date = str(meta.get("date", ""))
+    if date and date <= _NBS_ABSENT_UNTIL:
+        return False
+    if date >= _NBS_PRESENT_FROM:
+        return True
+    raise InstrumentError(
+        f"{name}: neither nasmyth_beam_switcher nor a conclusive date in the table's meta; "
+        "is the beam switcher 'installed' or 'not installed'?"
+    )
+
+
+def _misaligned(about):
+    return {"fixed": {"theta": False}, "bounds": {"theta": (about - 5, about + 5)}}
+
+
+def _polarizer():
+    return optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer", **_misaligned(90))
+
+
+def _fold_mirror(size):
+    return optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror")
+
+
+def _half_wave_plate():
+    settings = _misaligned(0)
+    settings["bounds"] |= {
+        "w_sio2": (0.6 * _THART_SIO2, 1.4 * _THART_SIO2),
+        "w_mgf2": (0.6 * _THART_MGF2, 1.4 * _THART_MGF2),
+    }
+    return optics.TwoLayerWaveplate(
+        w_sio2=_THART_SIO2 * u.mm, w_mgf2=_THART_MGF2 * u.mm, mount="hwp", name="hwp", **settings
+    )
+
+
+def _derotator(grid, kind, bounds):
+    start = np.interp(grid.to_value(u.nm), _START_NM, _START_DEG) * u.deg
+    settings = _misaligned(0) | {"mount": "derotator", "name": "derotator"}
+    if kind == "linear":
+        settings["bounds"] |= {"retardance": bounds["horizontal"]}
+        return optics.LinearRetarder(retardance=start, **settings)
+    settings["bounds"] |= bounds
+    # a start inside every set of bounds, off the point where the two small ones vanish
+    return optics.EllipticalRetarder(
+        horizontal=start,
+        diagonal=np.full(grid.size, -1.0) * u.deg,
+        circular=np.full(grid.size, 1.0) * u.deg,
+        **settings,
+    )

@@ -1,0 +1,177 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""One dataset of a measurement: a chain, its observations, and its Jacobian."""
+
+import astropy.units as u
+import numpy as np
+from astropy.modeling import Model
+
+from astropolcal.chain import leaves, stages
+from astropolcal.exceptions import ObservationError
+from astropolcal.propagation import Propagator
+
+__all__ = ["Dataset", "as_pairs", "common_wavelengths"]
+
+# wavelengths of two tables are the same when they agree to this share
+_SAME_WAVELENGTH = 1e-5
+
+
+def as_pairs(chain, observations, positions):
+    """Return (chain, observations, positions) a dataset, from one or several of each."""
+    observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
+    chains = [chain] * len(observations) if isinstance(chain, Model) else list(chain)
+    positions = [None] * len(observations) if positions is None else list(positions)
+    if not observations or len(chains) != len(observations) or len(positions) != len(observations):
+        raise ObservationError(
+            f"{len(observations)} datasets, {len(chains)} chains and {len(positions)} sets of "
+            "positions do not go together"
+        )
+    return list(zip(chains, observations, positions, strict=True))
+
+
+def common_wavelengths(observations, wavelength=None):
+    """
+    Return the wavelength grid of the parameters, in micrometre.
+
+    Parameters
+    ----------
+    observations : sequence of Observations
+        The datasets.
+    wavelength : `~astropy.units.Quantity`, optional
+        The grid, if it is not the union of the datasets'.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Ascending, shape (n_wavelengths,).
+    """
+    if wavelength is not None:
+        return np.atleast_1d(u.Quantity(wavelength).to_value(u.um))
+    merged = np.sort(np.concatenate([obs.wavelength.to_value(u.um) for obs in observations]))
+    new = np.concatenate([[True], np.diff(merged) > _SAME_WAVELENGTH * merged[1:]])
+    return merged[new]
+
+
+class Dataset:
+    """A chain with its observations, on the common grid and the flat vector."""
+
+    def __init__(self, chain, observations, observable, free, wavelength, positions=None):
+        self.chain = chain
+        self.observations = observations
+        self.observable = observable
+        self.n_free = free.size
+        self.bins = _bins_on_grid(observations, wavelength)
+        self.frames = self._frames_of_data()
+        columns = self.frames.T.ravel()
+        given = _positions(chain, observations, positions)
+        self.propagator = Propagator(
+            chain,
+            observations.wavelength.to_value(u.um),
+            {stage: angle[columns] for stage, angle in given.items()},
+        )
+        self._plan(free)
+        self._observe(columns)
+
+    # ---- data ----------------------------------------------------------------
+
+    def _frames_of_data(self):
+        """Return the frames of each datum, shape (n_groups, frames_per_datum)."""
+        if self.observable.frames_per_datum == 2:
+            return np.asarray(self.observations.pairs())
+        return np.arange(self.observations.n_frames)[:, None]
+
+    def _observe(self, columns):
+        obs = self.observations
+        right, left = (self._grouped(f[columns].T) for f in (obs.flux_right, obs.flux_left))
+        errors = [
+            self._grouped(v[columns].T)
+            for v in (obs.variance_right, obs.variance_left, obs.covariance)
+        ]
+        bad = self._grouped(obs.mask[columns].T).any(axis=0)
+        #: True where a group of frames gives a datum, (n_wavelengths, n_groups).
+        self.valid = ~bad
+        with np.errstate(invalid="ignore", divide="ignore"):
+            self.observed = self.observable.evaluate(right, left)[self.valid]
+            variance = self.observable.variance(right, left, *errors)
+        self.sigma = np.sqrt(variance[self.valid])
+        self.n_data = int(self.valid.sum())
+        self._all_valid = bool(self.valid.all())
+        every_bin = np.broadcast_to(self.bins[:, None], self.valid.shape)
+        self.bin_of_datum = every_bin[self.valid]
+        every_group = np.broadcast_to(np.arange(self.frames.shape[0]), self.valid.shape)
+        self.group_of_datum = every_group[self.valid]
+
+    def _grouped(self, array):
+        """Turn (n_wavelengths, columns) into (frames_per_datum, n_wavelengths, n_groups)."""
+        shape = (array.shape[0], self.frames.shape[1], self.frames.shape[0])
+        return array.reshape(shape).transpose(1, 0, 2)
+
+    def _flat(self, array):
+        return array.transpose(1, 0, 2).reshape(array.shape[1], -1)
+
+    # ---- parameters ------------------------------------------------------------
+
+    def _plan(self, free):
+        """Note which values of the chain come from which part of the flat vector."""
+        self._constants = self.propagator.values()
+        self._live = []
+        for i, leaf in enumerate(leaves(self.chain)):
+            for j, key in enumerate(leaf.param_names):
+                slot, factor, offset = free.lookup(f"{leaf.name}.{key}")
+                if slot is not None:
+                    where = slot.start + self.bins if slot.per_wavelength else slot.start
+                    self._live.append(((i, j), where, factor, offset))
+                elif np.size(self._constants[i][j]) > 1:
+                    self._constants[i][j] = self._constants[i][j][self.bins]
+
+    @property
+    def n_parameters_per_wavelength(self):
+        """Number of free parameters that act on the data of one wavelength."""
+        starts = {int(np.min(where)) if np.ndim(where) else where for _, where, *_ in self._live}
+        return len(starts)
+
+    def values(self, sweep):
+        """Return the predicted data of a forward sweep, shape (n_data,)."""
+        right, left = (self._grouped(flux) for flux in sweep.fluxes)
+        predicted = self.observable.evaluate(right, left)
+        return predicted.ravel() if self._all_valid else predicted[self.valid]
+
+    def forward(self, vector):
+        """Return the forward sweep at a vector of free parameters."""
+        values = [list(optic) for optic in self._constants]
+        for (i, j), where, factor, offset in self._live:
+            values[i][j] = factor * vector[where] + offset
+        return self.propagator.forward(values)
+
+    def jacobian(self, sweep):
+        """Return the derivative of the data to the flat vector, (n_free, n_data)."""
+        right, left = (self._grouped(flux) for flux in sweep.fluxes)
+        weights = [self._flat(d) for d in self.observable.derivative(right, left)]
+        slopes = sweep.derivatives([key for key, *_ in self._live], weights)
+        n_groups, n_bins = self.frames.shape[0], len(self.bins)
+        out = np.zeros((self.n_free, n_bins, n_groups))
+        each = np.arange(n_bins)
+        for key, where, factor, _ in self._live:
+            slope = factor * self._grouped(slopes[key]).sum(axis=0)
+            if np.ndim(where):
+                out[where, each] += slope
+            else:
+                out[where] += slope
+        return out.reshape(self.n_free, -1) if self._all_valid else out[:, self.valid]
+
+
+def _bins_on_grid(observations, wavelength):
+    own = observations.wavelength.to_value(u.um)
+    nearest = np.abs(own[:, None] - wavelength[None, :]).argmin(axis=1)
+    off = np.abs(wavelength[nearest] - own) > _SAME_WAVELENGTH * own
+    if off.any():
+        raise ObservationError(
+            f"{observations.name}: wavelength {own[off][0] * 1e3:.3f} nm is not on the grid of the "
+            f"parameters (nearest {wavelength[nearest][off][0] * 1e3:.3f} nm)"
+        )
+    return nearest
+
+
+def _positions(chain, observations, positions):
+    if positions is None:
+        return {stage: observations.position(stage) for stage in stages(chain)}
+    return {stage: np.asarray(angle, dtype=float) for stage, angle in positions.items()}

@@ -1,0 +1,233 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+A measurement as one fittable model: index of a datum in, predicted datum out.
+
+Every stock astropy fitter takes it: the parameters are scalars (the free
+parameters of the chains, in radian, micrometre or 1), and ``fit_deriv`` is
+analytic.
+"""
+
+import copy as copy_module
+from itertools import pairwise
+
+import numpy as np
+from astropy.modeling import FittableModel, Parameter
+
+from astropolcal.exceptions import ObservationError
+from astropolcal.measurement.datasets import Dataset, as_pairs, common_wavelengths
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.observations import get_observable
+
+__all__ = ["Measurement"]
+
+
+class Measurement(FittableModel):
+    """
+    Chains and their observations as a 1-input, 1-output fittable model.
+
+    Parameters
+    ----------
+    chain : Optic, `~astropy.modeling.CompoundModel` or sequence of them
+        The chain of each dataset. Optics of the same name are the same optic.
+    observations : Observations or sequence of Observations
+        The datasets.
+    observable : str or Observable
+        What is compared; see `astropolcal.observations.OBSERVABLES`.
+    positions : sequence of dict, optional
+        For each dataset the position of every stage in radian, shape
+        (n_frames,); by default the columns of the observations.
+    ties : dict of str to Tie, optional
+        Parameters that follow others.
+    wavelength : `~astropy.units.Quantity`, optional
+        Common grid for the parameters given per wavelength; by default the
+        union of the observations' wavelengths.
+    copy : bool
+        Whether to work on copies of the chains (default).
+
+    Raises
+    ------
+    ObservationError, ChainError, ParameterError
+        If chains and observations do not fit together.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import optics
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import simulate, half_wave_plate_cycles
+    >>> chain = (optics.LinearPolarizer(name="polarizer")
+    ...          | optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(efficiency=0.98, name="wollaston"))
+    >>> frames = half_wave_plate_cycles(derotator=[45, 90] * u.deg)
+    >>> observations = simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)
+    >>> measurement = Measurement(chain, observations)
+    >>> measurement.param_names
+    ('hwp_retardance', 'wollaston_efficiency')
+    >>> measurement.n_data
+    16
+    """
+
+    n_inputs = 1
+    n_outputs = 1
+    standard_broadcasting = False
+    col_fit_deriv = True
+    _param_names = ()
+
+    def __init__(
+        self,
+        chain,
+        observations,
+        *,
+        observable="normalized_double_difference",
+        positions=None,
+        ties=None,
+        wavelength=None,
+        copy=True,
+        name=None,
+    ):
+        pairs = as_pairs(chain, observations, positions)
+        if copy:
+            pairs = [(item.copy(), obs, position) for item, obs, position in pairs]
+        self.chains = [item for item, _, _ in pairs]
+        self.observable = get_observable(observable)
+        self.wavelength = common_wavelengths([obs for _, obs, _ in pairs], wavelength)
+        self.free = FreeParameters(self.chains, len(self.wavelength), ties)
+        self.datasets = [
+            Dataset(item, obs, self.observable, self.free, self.wavelength, position)
+            for item, obs, position in pairs
+        ]
+        self._finish(name)
+
+    def _finish(self, name):
+        sizes = [dataset.n_data for dataset in self.datasets]
+        edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+        #: Slice of the data vector that belongs to each dataset.
+        self.segments = [slice(a, b) for a, b in pairwise(edges)]
+        self.n_data = int(edges[-1])
+        if not self.n_data:
+            raise ObservationError("no datum is left: every frame is masked or unpaired")
+        self.index = np.arange(self.n_data, dtype=float)
+        self.observed = np.concatenate([d.observed for d in self.datasets])
+        self.sigma = np.concatenate([d.sigma for d in self.datasets])
+        #: Wavelength (index on the common grid) of each datum.
+        self.bins = np.concatenate([d.bin_of_datum for d in self.datasets])
+        self._last = (None, None)
+        self._add_parameters()
+        super().__init__(name=name)
+
+    def _add_parameters(self):
+        """Give this instance its own scalar parameters (astropy has them on the class)."""
+        low, high = self.free.bounds()
+        self._param_names = tuple(self.free.labels)
+        start = self.free.start()
+        for label, value, a, b in zip(self._param_names, start, low, high, strict=True):
+            bounds = (a if np.isfinite(a) else None, b if np.isfinite(b) else None)
+            parameter = Parameter(name=label, default=float(value), bounds=bounds)
+            parameter.model = self
+            parameter.value = float(value)
+            self.__dict__[label] = parameter
+
+    def __setattr__(self, attr, value):
+        # astropy's own way to set a parameter searches all names, for each of the 93
+        parameter = self.__dict__.get(attr)
+        if isinstance(parameter, Parameter) and isinstance(value, Parameter):
+            self.__dict__[attr] = value
+        elif isinstance(parameter, Parameter):
+            parameter.value = float(value)
+        else:
+            super().__setattr__(attr, value)
+
+    @property
+    def param_names(self):
+        """Names of the free scalar parameters, one an element of the flat vector."""
+        return self._param_names
+
+    def __deepcopy__(self, memo):
+        # fitters copy the model: the data do not change, so only chains and values are copied
+        for item in (self.datasets, self.observed, self.sigma, self.index, self.observable):
+            memo[id(item)] = item
+        new = self.__class__.__new__(self.__class__)
+        memo[id(self)] = new
+        new.__dict__.update(copy_module.deepcopy(self.__dict__, memo))
+        return new
+
+    # ---- evaluation ---------------------------------------------------------
+
+    def _sweeps(self, vector):
+        """Return the forward sweep of every dataset; the last one is remembered."""
+        known, sweeps = self._last
+        if known is None or not np.array_equal(known, vector):
+            sweeps = [dataset.forward(vector) for dataset in self.datasets]
+            self._last = (vector.copy(), sweeps)
+        return sweeps
+
+    def predict(self, vector):
+        """
+        Return all predicted data for a vector of free parameters.
+
+        Parameters
+        ----------
+        vector : array_like
+            Canonical values, shape (n_free,).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (n_data,).
+        """
+        sweeps = self._sweeps(np.asarray(vector, dtype=float).ravel())
+        parts = [d.values(s) for d, s in zip(self.datasets, sweeps, strict=True)]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def jacobian(self, vector):
+        """
+        Return the derivative of all data to all free parameters.
+
+        Parameters
+        ----------
+        vector : array_like
+            Canonical values, shape (n_free,).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (n_free, n_data).
+        """
+        sweeps = self._sweeps(np.asarray(vector, dtype=float).ravel())
+        parts = [d.jacobian(s) for d, s in zip(self.datasets, sweeps, strict=True)]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+    def evaluate(self, x, *parameters):
+        """Return the predicted data of index ``x``."""
+        return self._pick(self.predict(_vector(parameters)), x)
+
+    def fit_deriv(self, x, *parameters):
+        """Return the derivative of the data of index ``x``, (n_free, n_data)."""
+        return self._pick(self.jacobian(_vector(parameters)), x)
+
+    def _pick(self, values, x):
+        if np.array_equal(x, self.index):
+            return values
+        index = np.asarray(x)
+        if np.any((index < 0) | (index >= self.n_data) | (index != np.floor(index))):
+            raise ObservationError(f"index of a datum must be a whole number below {self.n_data}")
+        return values[..., index.astype(int)]
+
+    # ---- results --------------------------------------------------------------
+
+    def vector(self):
+        """Return the current values of the scalar parameters, shape (n_free,)."""
+        return np.array([getattr(self, label).value for label in self._param_names], dtype=float)
+
+    def put_back(self, vector=None):
+        """Write values (by default the current ones) into the chains and return these."""
+        self.free.put_back(self.vector() if vector is None else vector)
+        return self.chains
+
+    def residuals(self, vector=None):
+        """Return observed minus predicted data, shape (n_data,)."""
+        return self.observed - self.predict(self.vector() if vector is None else vector)
+
+
+def _vector(parameters):
+    return np.array(parameters, dtype=float).reshape(-1)

@@ -1,0 +1,304 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Free parameters of one or several chains as one flat vector.
+
+Chains name their parameters ``optic.parameter``; equal names in several
+chains are the same parameter. A parameter with one value a wavelength
+becomes one number a wavelength of the common grid. Ties are linear and are
+applied here, so that the Jacobian stays exact.
+"""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.chain import leaves
+from astropolcal.exceptions import ParameterError
+from astropolcal.units import canonical_factor, to_unit
+
+__all__ = ["FreeParameters", "Slot", "Tie", "parameter_table"]
+
+
+@dataclass(frozen=True)
+class Tie:
+    """
+    A parameter that follows another: ``target = factor * source + offset``.
+
+    Parameters
+    ----------
+    source : str
+        Free parameter that leads, ``"optic.parameter"``.
+    factor : float
+        Factor between values in canonical units (radian, micrometre, 1).
+    offset : `~astropy.units.Quantity` or float
+        Constant part, in the target's unit.
+
+    Examples
+    --------
+    >>> from astropolcal.measurement import Tie
+    >>> Tie("hwp.theta", factor=2.0).factor
+    2.0
+    """
+
+    source: str
+    factor: float = 1.0
+    offset: object = 0.0
+
+
+@dataclass(frozen=True)
+class Slot:
+    """
+    Where a named parameter lives in the flat vector.
+
+    Parameters
+    ----------
+    name : str
+        ``"optic.parameter"``.
+    unit : `~astropy.units.Unit` or None
+        The unit it is declared in.
+    start, size : int
+        First element and number of elements; more than one for a parameter
+        with one value a wavelength.
+    bounds : tuple
+        Lower and upper bound in ``unit``, None where open.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.measurement import Slot
+    >>> Slot("hwp.theta", u.deg, 0, 1, (-5, 5)).slice
+    slice(0, 1, None)
+    """
+
+    name: str
+    unit: object
+    start: int
+    size: int
+    bounds: tuple
+
+    @property
+    def slice(self):
+        """The elements of the flat vector."""
+        return slice(self.start, self.start + self.size)
+
+    @property
+    def factor(self):
+        """Factor from ``unit`` to the canonical unit."""
+        return canonical_factor(self.unit)
+
+    @property
+    def per_wavelength(self):
+        """Whether there is one value a wavelength."""
+        return self.size > 1
+
+    @property
+    def labels(self):
+        """Identifiers of the elements, fit for attribute access."""
+        stem = self.name.replace(".", "_")
+        return [stem] if self.size == 1 else [f"{stem}_{i}" for i in range(self.size)]
+
+    def canonical_bounds(self):
+        """Return lower and upper bound as canonical floats, infinite where open."""
+        low, high = self.bounds
+        return (
+            -np.inf if low is None else low * self.factor,
+            np.inf if high is None else high * self.factor,
+        )
+
+
+def parameter_table(chains):
+    """
+    Return every parameter of the chains by name, with the optics that carry it.
+
+    Parameters
+    ----------
+    chains : sequence
+        Chains whose optics have names.
+
+    Returns
+    -------
+    dict of str to list of `~astropy.modeling.Parameter`
+        ``"optic.parameter"`` to its parameter objects, one a chain that has it.
+
+    Raises
+    ------
+    ParameterError
+        If an optic with parameters has no name, or optics of one name differ.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.measurement import parameter_table
+    >>> list(parameter_table([optics.WollastonPrism(name="wollaston")]))
+    ['wollaston.theta', 'wollaston.efficiency']
+    """
+    table = {}
+    kinds = {}
+    for chain in chains:
+        for leaf in leaves(chain):
+            if not leaf.name:
+                raise ParameterError(f"{type(leaf).__name__} needs a name to be calibrated")
+            if kinds.setdefault(leaf.name, type(leaf)) is not type(leaf):
+                raise ParameterError(
+                    f"optic {leaf.name!r} is a {kinds[leaf.name].__name__} in one dataset and a "
+                    f"{type(leaf).__name__} in another; give them different names"
+                )
+            for key in leaf.param_names:
+                table.setdefault(f"{leaf.name}.{key}", []).append(getattr(leaf, key))
+    return table
+
+
+class FreeParameters:
+    """
+    The free parameters of chains that share optics by name.
+
+    Parameters
+    ----------
+    chains : sequence
+        The chains, one a dataset.
+    n_wavelengths : int
+        Size of the common wavelength grid.
+    ties : dict of str to Tie, optional
+        Parameters that follow others.
+
+    Raises
+    ------
+    ParameterError
+        If shapes do not fit the grid, a parameter is free in one chain and
+        fixed in another, a tie is circular or unknown, or astropy's callable
+        ``tied`` is used (it spoils analytic Jacobians).
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.measurement import FreeParameters
+    >>> free = FreeParameters([optics.WollastonPrism(name="wollaston")], 22)
+    >>> [slot.name for slot in free.slots], free.size
+    (['wollaston.efficiency'], 1)
+    """
+
+    def __init__(self, chains, n_wavelengths, ties=None):
+        self.ties = dict(ties or {})
+        self._table = parameter_table(chains)
+        self._check_ties()
+        self.slots = []
+        self.size = 0
+        for name, parameters in self._table.items():
+            self._check(name, parameters, n_wavelengths)
+            if not parameters[0].fixed and name not in self.ties:
+                self._append(name, parameters[0])
+        self.by_name = {slot.name: slot for slot in self.slots}
+        self._followers = {name: self._follower(name, tie) for name, tie in self.ties.items()}
+
+    def _append(self, name, parameter):
+        size = int(np.size(parameter.value))
+        slot = Slot(name, parameter.unit, self.size, size, tuple(parameter.bounds))
+        self.slots.append(slot)
+        self.size += size
+
+    def _check_ties(self):
+        for name, tie in self.ties.items():
+            for wanted in (name, tie.source):
+                if wanted not in self._table:
+                    raise ParameterError(f"tie {name} -> {tie.source}: no parameter {wanted!r}")
+            if tie.source in self.ties or tie.source == name:
+                raise ParameterError(f"tie {name} -> {tie.source}: the source is itself tied")
+
+    @staticmethod
+    def _check(name, parameters, n_wavelengths):
+        first = parameters[0]
+        if first.tied:
+            raise ParameterError(
+                f"{name} has a callable tie, which makes analytic Jacobians silently wrong; "
+                "pass ties={...: Tie(...)} instead"
+            )
+        size = np.size(first.value)
+        if size not in (1, n_wavelengths):
+            raise ParameterError(
+                f"{name} has {size} values; allowed are 1 or {n_wavelengths}, one a wavelength"
+            )
+        if any(np.size(p.value) != size or p.fixed != first.fixed for p in parameters[1:]):
+            raise ParameterError(f"{name} differs between datasets in shape or in being fixed")
+
+    def _follower(self, name, tie):
+        if tie.source not in self.by_name:
+            raise ParameterError(f"tie {name} -> {tie.source}: {tie.source} is not free")
+        target, slot = self._table[name][0], self.by_name[tie.source]
+        if np.size(target.value) not in (1, slot.size) or (
+            slot.size > 1 and np.size(target.value) == 1
+        ):
+            raise ParameterError(f"tie {name} -> {tie.source}: the shapes differ")
+        unit = target.unit
+        offset = tie.offset
+        if not isinstance(offset, u.Quantity) and offset == 0 and unit is not None:
+            offset = 0.0 * unit
+        return (
+            slot,
+            float(tie.factor),
+            to_unit(offset, unit, f"offset of {name}") * canonical_factor(unit),
+        )
+
+    @property
+    def labels(self):
+        """Identifiers of the elements of the flat vector, fit for attribute access."""
+        return [label for slot in self.slots for label in slot.labels]
+
+    @property
+    def names(self):
+        """Readable names of the elements, such as ``derotator.horizontal[3]``."""
+        return [
+            slot.name if slot.size == 1 else f"{slot.name}[{i}]"
+            for slot in self.slots
+            for i in range(slot.size)
+        ]
+
+    def start(self):
+        """Return the current values of the chains as one vector."""
+        vector = np.empty(self.size)
+        for slot in self.slots:
+            vector[slot.slice] = np.ravel(self._table[slot.name][0].value) * slot.factor
+        return vector
+
+    def bounds(self):
+        """Return lower and upper bounds, shape (n_free,) each."""
+        pairs = [slot.canonical_bounds() for slot in self.slots for _ in range(slot.size)]
+        low, high = np.array(pairs, dtype=float).reshape(-1, 2).T
+        return low, high
+
+    def factors(self):
+        """Return the factor from declared to canonical unit of every element."""
+        return np.repeat([slot.factor for slot in self.slots], [slot.size for slot in self.slots])
+
+    def lookup(self, name):
+        """
+        Return where the value of a parameter comes from.
+
+        Returns
+        -------
+        slot : Slot or None
+            None for a parameter that is fixed.
+        factor, offset : float
+            ``value = factor * vector[slot] + offset``.
+        """
+        if name in self.by_name:
+            return self.by_name[name], 1.0, 0.0
+        return self._followers.get(name, (None, 0.0, 0.0))
+
+    def values_of(self, name):
+        """Return the current value of a parameter, a Quantity where it has a unit."""
+        parameter = self._table[name][0]
+        value = np.array(parameter.value)
+        return value if parameter.unit is None else value * parameter.unit
+
+    def put_back(self, vector):
+        """Write the values of the flat vector into the chains' parameters."""
+        for name, parameters in self._table.items():
+            slot, factor, offset = self.lookup(name)
+            if slot is None:
+                continue
+            canonical = factor * np.asarray(vector)[slot.slice] + offset
+            for parameter in parameters:
+                shape = np.shape(parameter.value)
+                value = canonical / canonical_factor(parameter.unit)
+                parameter.value = value.reshape(shape)

@@ -1,0 +1,43 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+The observation layer: tables of beam fluxes, pairs of frames, observables.
+
+A calibration starts from `Observations`, a validated table of the two beam
+fluxes of every frame and wavelength. `pair_frames` finds the frames taken 45
+degrees of half-wave plate apart, and an `Observable` turns their fluxes into
+the quantity that is fitted, with its derivative and its error.
+"""
+
+from astropolcal.observations.example import example_table
+from astropolcal.observations.observables import (
+    OBSERVABLES,
+    NormalizedDoubleDifference,
+    NormalizedSingleDifference,
+    Observable,
+    PerFrameDoubleDifference,
+    RatioMethod,
+    double_difference,
+    double_sum,
+    get_observable,
+    single_difference,
+    single_sum,
+)
+from astropolcal.observations.pairing import pair_frames
+from astropolcal.observations.table import Observations
+
+__all__ = [
+    "OBSERVABLES",
+    "NormalizedDoubleDifference",
+    "NormalizedSingleDifference",
+    "Observable",
+    "Observations",
+    "PerFrameDoubleDifference",
+    "RatioMethod",
+    "double_difference",
+    "double_sum",
+    "example_table",
+    "get_observable",
+    "pair_frames",
+    "single_difference",
+    "single_sum",
+]

@@ -1,0 +1,294 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+From rows of a table to arrays of frame and wavelength.
+
+Rows may come in any order and some may be absent. Here they are checked
+against each other, sorted into a grid of shape (F, W), and cells that cannot be
+used are masked with a reason.
+"""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.exceptions import ObservationError
+from astropolcal.observations.masking import mask_missing, mask_rows
+from astropolcal.observations.reading import check_table, first_bad_row, numeric_column
+from astropolcal.observations.variances import BEAM_ERRORS, SINGLE_ERRORS
+
+__all__ = ["CELL_COLUMNS", "REQUIRED", "Grid", "build_grid"]
+
+REQUIRED = ("frame", "bin", "wavelength", "hwp", "derotator", "flux_right", "flux_left")
+CELL_COLUMNS = (
+    "bin",
+    "wavelength",
+    "flux_right",
+    "flux_left",
+    *BEAM_ERRORS,
+    *SINGLE_ERRORS,
+    "mask_reason",
+)
+_ANGLES = ("hwp", "derotator", "parallactic", "altitude")
+_SAME_WAVELENGTH = 1e-6
+_WAVELENGTHS = (1e-6, 1e6)
+_MAX_EMPTY = 10**6
+# in degree; beyond this the fraction of a turn loses its digits
+_MAX_ANGLE = 1e6
+
+
+@dataclass(frozen=True)
+class Grid:
+    """
+    The arrays of a table of observations.
+
+    Attributes
+    ----------
+    frames : `~astropy.table.QTable`
+        One row a frame, ordered by ``frame``.
+    rows : `~numpy.ndarray` of int
+        First data row (from 1) of every frame.
+    bin, wavelength : `~numpy.ndarray`, `~astropy.units.Quantity`
+        Shape (W,).
+    flux_unit : `~astropy.units.UnitBase`
+        Unit of the fluxes and their errors.
+    flux_right, flux_left : `~numpy.ndarray`
+        Shape (F, W), NaN where masked.
+    errors : dict of `~numpy.ndarray`
+        Error columns as given, each (F, W); empty if there are none.
+    reason : `~numpy.ndarray` of int
+        Shape (F, W): 0 usable, otherwise 1 + index in ``reasons``.
+    reasons : tuple of str
+        Why cells are masked.
+
+    Examples
+    --------
+    >>> from astropolcal.observations.grid import Grid
+    >>> sorted(Grid.__dataclass_fields__)[:3]
+    ['bin', 'errors', 'flux_left']
+    """
+
+    frames: QTable
+    rows: np.ndarray
+    bin: np.ndarray
+    wavelength: u.Quantity
+    flux_unit: u.UnitBase
+    flux_right: np.ndarray
+    flux_left: np.ndarray
+    errors: dict
+    reason: np.ndarray
+    reasons: tuple
+
+
+def build_grid(table, label):
+    """
+    Check a table of observations and sort it into a `Grid`.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        One row a frame and wavelength; see `~astropolcal.observations.Observations`.
+    label : str
+        What to call it in messages: the file or a name.
+
+    Returns
+    -------
+    Grid
+
+    Raises
+    ------
+    ObservationError
+        If the table is inconsistent; the message names the row or column.
+
+    Warns
+    -----
+    AstropolcalWarning
+        Once for every reason for which cells are masked.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal.observations.grid import build_grid
+    >>> grid = build_grid(QTable({
+    ...     "frame": [1, 0], "bin": [0, 0], "wavelength": [1.2, 1.2] * u.um,
+    ...     "hwp": [45, 0] * u.deg, "derotator": [90, 90] * u.deg,
+    ...     "flux_right": [1, 2] * u.adu, "flux_left": [3, 4] * u.adu}), "night")
+    >>> grid.flux_right.tolist(), grid.rows.tolist()
+    ([[2.0], [1.0]], [2, 1])
+    """
+    table = check_table(table, label, REQUIRED)
+    frame = _integers(table, "frame", label)
+    bins = _integers(table, "bin", label)
+    wavelength = _wavelengths(table, label)
+    angles = {name: _angle(table, name, label) for name in _ANGLES if name in table.colnames}
+
+    frame_numbers, first, frame_index = np.unique(frame, return_index=True, return_inverse=True)
+    bin_numbers, bin_index = np.unique(bins, return_inverse=True)
+    shape = (len(frame_numbers), len(bin_numbers))
+    _check_cells(frame_index * shape[1] + bin_index, frame, bins, shape, label)
+    unit = table["wavelength"].unit
+    by_bin = _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label)
+    frames = _frame_table(table, frame_numbers, first, frame_index, angles, label)
+
+    flux_unit, values = _measured(table, label)
+    code, reasons = mask_rows(table, values, label)
+    reason = np.full(shape, -1)
+    reason[frame_index, bin_index] = code
+    mask_missing(reason, reasons, frame_numbers, bin_numbers, label)
+    if reason.all():
+        raise ObservationError(
+            f"{label}: all {reason.size} cells are masked ({', '.join(reasons)}), "
+            "at least one usable cell is needed"
+        )
+    arrays = {}
+    for name, column in values.items():
+        arrays[name] = np.full(shape, np.nan)
+        arrays[name][frame_index, bin_index] = np.where(code > 0, np.nan, column)
+    return Grid(
+        frames=frames,
+        rows=first + 1,
+        bin=bin_numbers,
+        wavelength=by_bin,
+        flux_unit=flux_unit,
+        flux_right=arrays.pop("flux_right"),
+        flux_left=arrays.pop("flux_left"),
+        errors=arrays,
+        reason=reason,
+        reasons=tuple(reasons),
+    )
+
+
+def _integers(table, name, label):
+    values = numeric_column(table, name, label)
+    whole = np.isfinite(values) & (np.abs(values) < 2.0**53) & (values == np.rint(values))
+    first_bad_row(~whole, name, values, label, "whole numbers")
+    return values.astype(np.int64)
+
+
+def _angle(table, name, label):
+    values = numeric_column(table, name, label, u.deg)
+    allowed = f"finite angles up to {_MAX_ANGLE:g} deg"
+    first_bad_row(~(np.abs(values) <= _MAX_ANGLE), name, values, label, allowed)
+    return numeric_column(table, name, label) * table[name].unit
+
+
+def _wavelengths(table, label):
+    values = numeric_column(table, "wavelength", label, u.um)
+    shown = np.char.mod("%.9g um", values)
+    low, high = _WAVELENGTHS
+    allowed = f"lengths above zero ({low:g} to {high:g} um)"
+    first_bad_row(~((values >= low) & (values <= high)), "wavelength", shown, label, allowed)
+    return numeric_column(table, "wavelength", label)
+
+
+def _check_cells(cell, frame, bins, shape, label):
+    """Refuse a cell given twice, and a grid that is nearly all holes."""
+    order = np.argsort(cell, kind="stable")
+    again = order[1:][cell[order[1:]] == cell[order[:-1]]]
+    if again.size:
+        row = int(again.min())
+        before = int(np.argmax(cell == cell[row]))
+        raise ObservationError(
+            f"{label}, row {row + 1}: frame = {frame[row]}, bin = {bins[row]} is given already in "
+            f"row {before + 1}; one row a frame and bin is allowed"
+        )
+    if shape[0] * shape[1] > max(_MAX_EMPTY, 20 * len(cell)):
+        raise ObservationError(
+            f"{label}: {len(cell)} rows for {shape[0]} frames and {shape[1]} bins; "
+            "at least one in 20 of their combinations is needed"
+        )
+
+
+def _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label):
+    by_bin = np.full(len(bin_numbers), np.inf)
+    np.minimum.at(by_bin, bin_index, wavelength)
+    differs = np.abs(wavelength / by_bin[bin_index] - 1.0) > _SAME_WAVELENGTH
+    if differs.any():
+        row = int(np.argmax(differs))
+        raise ObservationError(
+            f"{label}, row {row + 1}: wavelength = {wavelength[row]:.9g} {unit} in bin "
+            f"{bins[row]}, other rows of this bin have {by_bin[bin_index[row]]:.9g} {unit}; "
+            "one a bin is allowed"
+        )
+    order = np.argsort(by_bin)
+    same = np.diff(by_bin[order]) <= _SAME_WAVELENGTH * by_bin[order[1:]]
+    if same.any():
+        one, two = sorted(order[np.argmax(same) : np.argmax(same) + 2])
+        row = int(np.argmax(bin_index == two))
+        raise ObservationError(
+            f"{label}, row {row + 1}: wavelength = {wavelength[row]:.9g} {unit} of bin "
+            f"{bin_numbers[two]} is also that of bin {bin_numbers[one]}; one bin each is allowed"
+        )
+    return by_bin * unit
+
+
+def _frame_table(table, frame_numbers, first, frame_index, angles, label):
+    """Return the columns that belong to frames, after checking that they do."""
+    frames = QTable()
+    frames["frame"] = frame_numbers
+    for name in table.colnames:
+        if name == "frame" or name in CELL_COLUMNS:
+            continue
+        column = angles.get(name, table[name])
+        _check_constant(column, name, first[frame_index], frame_numbers[frame_index], label)
+        frames[name] = column[first]
+        frames[name].info.format = None
+    return frames
+
+
+def _check_constant(column, name, reference, frame, label):
+    try:
+        equal = _filled(column == column[reference])
+        # NaN stands for "unknown" and agrees with itself
+        equal |= _filled(column != column) & _filled(column[reference] != column[reference])
+        mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), equal.shape)
+        equal = np.where(mask | mask[reference], mask & mask[reference], equal)
+    except (TypeError, ValueError, AttributeError, NotImplementedError):
+        raise ObservationError(
+            f"{label}: column {name} of type {type(column).__name__} cannot be compared between "
+            "rows; allowed are numbers, strings and times"
+        ) from None
+    if not equal.all():
+        row = int(np.argmin(equal))
+        value, other = (" ".join(str(column[i]).split()) for i in (row, reference[row]))
+        raise ObservationError(
+            f"{label}, row {row + 1}: {name} = {value} in frame {frame[row]}, but {other} in row "
+            f"{reference[row] + 1}; one value a frame is allowed"
+        )
+
+
+def _filled(comparison):
+    """Return a comparison as plain booleans, False where it is masked."""
+    plain = getattr(comparison, "unmasked", comparison)
+    mask = np.asarray(getattr(comparison, "mask", False))
+    return np.array(np.ma.getdata(plain), dtype=bool) & ~mask
+
+
+def _measured(table, label):
+    """Return the unit of the fluxes, and fluxes and errors in it, by name."""
+    flux_unit = table["flux_right"].unit if hasattr(table["flux_right"], "unit") else None
+    flux_unit = u.dimensionless_unscaled if flux_unit is None else flux_unit
+    if not isinstance(flux_unit, u.UnitBase) or isinstance(flux_unit, u.UnrecognizedUnit):
+        raise ObservationError(
+            f"{label}: column flux_right has unit {flux_unit}, a linear unit such as adu is needed"
+        )
+    names = ["flux_right", "flux_left", *_error_columns(table, label)]
+    values = {name: numeric_column(table, name, label, flux_unit) for name in names}
+    for name in names[2:]:
+        first_bad_row(values[name] < 0, name, values[name], label, "errors above zero")
+    return flux_unit, values
+
+
+def _error_columns(table, label):
+    """Return the pair of error columns to use: of the beams, of the single differences, or none."""
+    found = ()
+    for pair in (BEAM_ERRORS, SINGLE_ERRORS):
+        there = [name for name in pair if name in table.colnames]
+        if len(there) == 1:
+            other = pair[1 - pair.index(there[0])]
+            raise ObservationError(f"{label}: missing column {other}; it has {there[0]}")
+        if there and not found:
+            found = pair
+    return found

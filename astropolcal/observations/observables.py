@@ -1,0 +1,477 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What is compared with the model: differences of the two beams, with derivatives.
+
+Every observable is a small strategy object. Fluxes come as two arrays of shape
+``(k, W, P)``: ``k`` frames a datum (index 0 the plus frame, index 1 the minus
+frame, whose half-wave plate is 45 degrees further), ``W`` wavelengths and
+``P`` data. The derivatives are analytic, because a fit evaluates them at every
+step. The names X and I follow Sec. 2.2 of the CHARIS recalibration paper.
+"""
+
+import difflib
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from astropolcal.exceptions import ObservationError
+
+__all__ = [
+    "OBSERVABLES",
+    "NormalizedDoubleDifference",
+    "NormalizedSingleDifference",
+    "Observable",
+    "PerFrameDoubleDifference",
+    "RatioMethod",
+    "double_difference",
+    "double_sum",
+    "get_observable",
+    "single_difference",
+    "single_sum",
+]
+
+
+def single_difference(right, left):
+    """
+    Return the single difference, X = R - L.
+
+    Parameters
+    ----------
+    right, left : `~numpy.ndarray`
+        Fluxes of the ordinary (right) and extraordinary (left) beam, any shape.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Of the common shape, in the unit of the fluxes.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import single_difference
+    >>> single_difference(3.0, 1.0)
+    2.0
+    """
+    return right - left
+
+
+def single_sum(right, left):
+    """
+    Return the single sum, I = R + L.
+
+    Parameters
+    ----------
+    right, left : `~numpy.ndarray`
+        Fluxes of the ordinary (right) and extraordinary (left) beam, any shape.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Of the common shape, in the unit of the fluxes.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import single_sum
+    >>> single_sum(3.0, 1.0)
+    4.0
+    """
+    return right + left
+
+
+def double_difference(right, left):
+    """
+    Return the double difference, (X+ - X-) / 2.
+
+    Parameters
+    ----------
+    right, left : `~numpy.ndarray`
+        Fluxes of shape (2, ...): the plus frame, then the minus frame.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Of shape (...), in the unit of the fluxes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.observations import double_difference
+    >>> float(double_difference(np.array([3.0, 1.0]), np.array([1.0, 3.0])))
+    2.0
+    """
+    difference = right - left
+    return 0.5 * (difference[0] - difference[1])
+
+
+def double_sum(right, left):
+    """
+    Return the double sum, (I+ + I-) / 2.
+
+    Parameters
+    ----------
+    right, left : `~numpy.ndarray`
+        Fluxes of shape (2, ...): the plus frame, then the minus frame.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Of shape (...), in the unit of the fluxes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.observations import double_sum
+    >>> float(double_sum(np.array([3.0, 1.0]), np.array([1.0, 3.0])))
+    4.0
+    """
+    total = right + left
+    return 0.5 * (total[0] + total[1])
+
+
+class Observable(ABC):
+    """
+    A quantity formed from the beam fluxes of one frame or one pair of frames.
+
+    A subclass gives ``name``, ``description``, ``frames_per_datum``, `evaluate`
+    and `derivative`; errors follow from the derivative.
+
+    Attributes
+    ----------
+    name : str
+        The name by which `get_observable` finds it.
+    description : str
+        One line for reports.
+    frames_per_datum : int
+        1 for a quantity of single frames, 2 for one of pairs.
+
+    Examples
+    --------
+    A new observable needs its formula and the derivative, nothing else:
+
+    >>> import numpy as np
+    >>> from astropolcal.observations import Observable
+    >>> class RightBeam(Observable):
+    ...     name = "right_beam"
+    ...     description = "flux of the right beam"
+    ...     frames_per_datum = 1
+    ...     def evaluate(self, right, left):
+    ...         return right[0]
+    ...     def derivative(self, right, left):
+    ...         return np.ones_like(right), np.zeros_like(left)
+    >>> flux = np.full((1, 1, 1), 100.0)
+    >>> float(RightBeam().variance(flux, flux, var_right=flux, var_left=flux)[0, 0])
+    100.0
+    """
+
+    name = None
+    description = None
+    frames_per_datum = 2
+
+    @abstractmethod
+    def evaluate(self, right, left):
+        """
+        Return the observable.
+
+        Parameters
+        ----------
+        right, left : `~numpy.ndarray`
+            Beam fluxes, shape (k, W, P).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (W, P), dimensionless.
+        """
+
+    @abstractmethod
+    def derivative(self, right, left):
+        """
+        Return the derivative with respect to each flux.
+
+        Parameters
+        ----------
+        right, left : `~numpy.ndarray`
+            Beam fluxes, shape (k, W, P).
+
+        Returns
+        -------
+        d_right, d_left : `~numpy.ndarray`
+            Each (k, W, P), per unit of flux. They may share memory: read only.
+        """
+
+    def variance(self, right, left, var_right, var_left, cov=0.0):
+        """
+        Return the variance to first order in the errors of the fluxes.
+
+        Parameters
+        ----------
+        right, left : `~numpy.ndarray`
+            Beam fluxes, shape (k, W, P).
+        var_right, var_left : `~numpy.ndarray`
+            Their variances, same shape; NaN gives NaN.
+        cov : `~numpy.ndarray` or float
+            Covariance of the two beams of a frame.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (W, P).
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from astropolcal.observations import get_observable
+        >>> flux = np.full((2, 1, 1), 100.0)
+        >>> x = get_observable("normalized_double_difference")
+        >>> round(float(x.variance(flux, flux, flux, flux)[0, 0]), 6)
+        0.0025
+        """
+        d_right, d_left = self.derivative(right, left)
+        terms = d_right**2 * var_right + d_left**2 * var_left + 2.0 * cov * d_right * d_left
+        return terms.sum(axis=0)
+
+    def frame_covariance(self, right, left, var_right, var_left, cov, frames):
+        """
+        Return the covariance between data, which is not zero where they share a frame.
+
+        Parameters
+        ----------
+        right, left, var_right, var_left, cov : `~numpy.ndarray`
+            As in `variance`.
+        frames : `~numpy.ndarray` of int
+            Frame indices of every datum, shape (P, k).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (W, P, P); its diagonal is `variance`.
+
+        Raises
+        ------
+        ObservationError
+            If ``frames`` has another shape.
+
+        Examples
+        --------
+        Two data that share their minus frame have half of their noise in common:
+
+        >>> import numpy as np
+        >>> from astropolcal.observations import get_observable
+        >>> flux = np.full((2, 1, 2), 100.0)
+        >>> x = get_observable("normalized_double_difference")
+        >>> c = x.frame_covariance(flux, flux, flux, flux, 0.0, np.array([[0, 1], [2, 1]]))
+        >>> round(float(c[0, 0, 1] / c[0, 0, 0]), 6)
+        0.5
+        """
+        frames = np.asarray(frames)
+        expected = (right.shape[2], right.shape[0])
+        if frames.shape != expected:
+            raise ObservationError(
+                f"frames has shape {frames.shape}, allowed is (P, k) = {expected}"
+            )
+        d_right, d_left = self.derivative(right, left)
+        # the flux covariance matrix of a frame times the derivative vector
+        to_right = d_right * var_right + d_left * cov
+        to_left = d_left * var_left + d_right * cov
+        total = np.zeros((right.shape[1], len(frames), len(frames)))
+        for i, j in np.ndindex(len(right), len(right)):
+            p, q = np.nonzero(frames[:, i, None] == frames[None, :, j])
+            total[:, p, q] += to_right[i][:, p] * d_right[j][:, q]
+            total[:, p, q] += to_left[i][:, p] * d_left[j][:, q]
+        return total
+
+    def __repr__(self):
+        return f"<{type(self).__name__}: {self.description}>"
+
+
+class NormalizedDoubleDifference(Observable):
+    """
+    Normalized double difference, x = (X+ - X-) / (I+ + I-).
+
+    Notes
+    -----
+    Equation "normalized double difference" of the CHARIS recalibration paper.
+    It removes what the optics behind the half-wave plate polarize, as long as
+    the flux does not change between the two frames.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.observations import NormalizedDoubleDifference
+    >>> right, left = np.array([3.0, 1.0]), np.array([1.0, 3.0])
+    >>> float(NormalizedDoubleDifference().evaluate(right, left))
+    0.5
+    """
+
+    name = "normalized_double_difference"
+    description = "normalized double difference, (X+ - X-) / (I+ + I-)"
+
+    def evaluate(self, right, left):
+        """Return x, shape (W, P); see `Observable.evaluate`."""
+        difference = right - left
+        total = right + left
+        return (difference[0] - difference[1]) / (total[0] + total[1])
+
+    def derivative(self, right, left):
+        """Return dx/dR and dx/dL; see `Observable.derivative`."""
+        difference = right - left
+        total = right + left
+        inverse = 1.0 / (total[0] + total[1])
+        x_inverse = (difference[0] - difference[1]) * (inverse * inverse)
+        d_right = np.stack([inverse - x_inverse, -inverse - x_inverse])
+        # exchanging beams and exchanging frames are the same thing here
+        return d_right, d_right[::-1]
+
+
+class PerFrameDoubleDifference(Observable):
+    """
+    Half the difference of the frames' normalized differences, x = (x+ - x-) / 2.
+
+    Notes
+    -----
+    Each frame is normalized by its own sum, x = (R - L) / (R + L), so a change
+    of flux between the frames (a warming lamp, a cloud) drops out.
+
+    Examples
+    --------
+    A source that doubles its brightness between the two frames:
+
+    >>> import numpy as np
+    >>> from astropolcal.observations import PerFrameDoubleDifference
+    >>> right, left = np.array([3.0, 2.0]), np.array([1.0, 6.0])
+    >>> float(PerFrameDoubleDifference().evaluate(right, left))
+    0.5
+    """
+
+    name = "per_frame_double_difference"
+    description = "difference of the frames' normalized differences, (x+ - x-) / 2"
+
+    def evaluate(self, right, left):
+        """Return x, shape (W, P); see `Observable.evaluate`."""
+        normalized = (right - left) / (right + left)
+        return 0.5 * (normalized[0] - normalized[1])
+
+    def derivative(self, right, left):
+        """Return dx/dR and dx/dL; see `Observable.derivative`."""
+        total = right + left
+        scale = 1.0 / (total * total)
+        scale[1] *= -1.0
+        return left * scale, -right * scale
+
+
+class RatioMethod(Observable):
+    """
+    The ratio method, x = (rho - 1) / (rho + 1), rho^2 = (R+ / L+) / (R- / L-).
+
+    Notes
+    -----
+    Both the gains of the two beams and the flux of each frame drop out exactly,
+    at any degree of polarization; see Bagnulo et al. 2009, PASP 121, 993
+    (doi:10.1086/605654). Fluxes must be positive; the derivative diverges where
+    one of them vanishes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.observations import RatioMethod
+    >>> right, left = np.array([3.0, 1.0]), np.array([1.0, 3.0])
+    >>> float(RatioMethod().evaluate(right, 7.0 * left).round(12))
+    0.5
+    """
+
+    name = "ratio"
+    description = "ratio method, (rho - 1) / (rho + 1) with rho^2 = (R+/L+) / (R-/L-)"
+
+    def evaluate(self, right, left):
+        """Return x, shape (W, P); see `Observable.evaluate`."""
+        # rho = above / below, without a division by a faint beam
+        above = np.sqrt(right[0] * left[1])
+        below = np.sqrt(right[1] * left[0])
+        return (above - below) / (above + below)
+
+    def derivative(self, right, left):
+        """Return dx/dR and dx/dL; see `Observable.derivative`."""
+        x = self.evaluate(right, left)
+        slope = 0.25 * (1.0 - x * x)
+        signed = np.stack([slope, -slope])
+        return signed / right, -signed / left
+
+
+class NormalizedSingleDifference(Observable):
+    """
+    Normalized single difference of every frame, x = (R - L) / (R + L).
+
+    Notes
+    -----
+    It keeps what a double difference cancels (the diattenuation behind the
+    half-wave plate, unequal gains of the beams), so the model must describe it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.observations import NormalizedSingleDifference
+    >>> float(NormalizedSingleDifference().evaluate(np.array([3.0]), np.array([1.0])))
+    0.5
+    """
+
+    name = "normalized_single_difference"
+    description = "normalized single difference of each frame, (R - L) / (R + L)"
+    frames_per_datum = 1
+
+    def evaluate(self, right, left):
+        """Return x, shape (W, P); see `Observable.evaluate`."""
+        return (right[0] - left[0]) / (right[0] + left[0])
+
+    def derivative(self, right, left):
+        """Return dx/dR and dx/dL; see `Observable.derivative`."""
+        total = right + left
+        scale = 2.0 / (total * total)
+        return left * scale, -right * scale
+
+
+OBSERVABLES = {
+    observable.name: observable
+    for observable in (
+        NormalizedDoubleDifference(),
+        PerFrameDoubleDifference(),
+        RatioMethod(),
+        NormalizedSingleDifference(),
+    )
+}
+"""Every registered `Observable`, by name; the first one is the default."""
+
+
+def get_observable(name):
+    """
+    Return the observable of that name.
+
+    Parameters
+    ----------
+    name : str or Observable
+        Case, blanks, hyphens and underscores do not matter. An `Observable` is
+        returned as it is.
+
+    Returns
+    -------
+    Observable
+
+    Raises
+    ------
+    ObservationError
+        If there is none of that name; the message suggests the nearest.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import get_observable
+    >>> get_observable("Normalized-Double-Difference").frames_per_datum
+    2
+    """
+    if isinstance(name, Observable):
+        return name
+    key = "_".join(str(name).lower().replace("-", " ").replace("_", " ").split())
+    if key in OBSERVABLES:
+        return OBSERVABLES[key]
+    near = difflib.get_close_matches(key, OBSERVABLES, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ObservationError(
+        f"unknown observable {name!r}; allowed are {', '.join(OBSERVABLES)}{hint}"
+    )

@@ -1,0 +1,255 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Safe reading and checked columns of an observation table.
+
+Files come from anywhere, so whatever is wrong with one ends in a single-line
+`~astropolcal.exceptions.ObservationError` that names the file and the place.
+Nothing in a file is executed: the text goes through the safe loader of astropy,
+and columns of Python objects are refused.
+"""
+
+import io
+import re
+import warnings
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable, Table
+
+from astropolcal.exceptions import ObservationError
+
+__all__ = ["check_table", "first_bad_row", "numeric_column", "read_ecsv"]
+
+# real headers have 1 to 3 kB; the YAML loader needs seconds for a quarter of a megabyte
+_MAX_HEADER = 2**18
+# merge keys let a header of one kilobyte grow exponentially while it is loaded
+_MERGE_KEY = re.compile(r"<<|!!merge|2002:merge")
+
+
+def read_ecsv(path):
+    """
+    Read an ECSV file into a table without trusting it.
+
+    Parameters
+    ----------
+    path : str or `~pathlib.Path`
+        The file.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+
+    Raises
+    ------
+    ObservationError
+        If there is no such file or it is not a readable ECSV table.
+
+    Examples
+    --------
+    >>> from astropolcal.observations.reading import read_ecsv
+    >>> read_ecsv("nowhere.ecsv")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: nowhere.ecsv: no such file
+    """
+    text = _read_text(path)
+    if not text.startswith("# %ECSV"):
+        raise ObservationError(
+            f"{path}: not an ECSV table; its first line must start with '# %ECSV'"
+        )
+    _check_header(path, text)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # doubtful units and types are errors below
+            return QTable.read(io.BytesIO(text.encode()), format="ascii.ecsv")
+    except Exception as error:  # the parsers below raise errors of every kind
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        raise ObservationError(f"{path}: not a readable ECSV table: {reason}") from error
+
+
+def _read_text(path):
+    try:
+        return Path(path).read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        raise ObservationError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise ObservationError(f"{path}: is a folder, an ECSV file is needed") from None
+    except UnicodeDecodeError:
+        raise ObservationError(f"{path}: not a text file, an ECSV table is needed") from None
+    except (OSError, TypeError, ValueError) as error:
+        raise ObservationError(f"{path}: cannot be read: {error}") from None
+
+
+def _check_header(path, text):
+    size = 0
+    for line in io.StringIO(text):
+        if not line.startswith("#"):
+            break
+        size += len(line)
+        if size > _MAX_HEADER:
+            raise ObservationError(
+                f"{path}: the header is longer than the {_MAX_HEADER} characters allowed"
+            )
+        if _MERGE_KEY.search(line):
+            raise ObservationError(f"{path}: YAML merge keys ('<<') are not allowed in the header")
+
+
+def check_table(table, label, required):
+    """
+    Refuse what is not a table with rows, the required columns and plain values.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The table.
+    label : str
+        What to call it in messages: the file or a name.
+    required : sequence of str
+        Columns that must exist.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        The same columns.
+
+    Raises
+    ------
+    ObservationError
+        If something is wrong; all missing columns are named at once.
+
+    Examples
+    --------
+    >>> from astropy.table import Table
+    >>> from astropolcal.observations.reading import check_table
+    >>> check_table(Table({"frame": [1]}), "night.ecsv", ["frame", "bin"])
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: night.ecsv: missing column bin; it has frame
+    """
+    if not isinstance(table, Table):
+        raise ObservationError(f"{label}: a {type(table).__name__}, an astropy Table is needed")
+    missing = [name for name in required if name not in table.colnames]
+    if missing:
+        raise ObservationError(
+            f"{label}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
+            f"it has {', '.join(table.colnames) or 'none'}"
+        )
+    if len(table) == 0:
+        raise ObservationError(f"{label}: the table is empty, at least one row is needed")
+    for name in table.colnames:
+        _check_plain(table[name], name, label)
+    return table if isinstance(table, QTable) else QTable(table, copy=False)
+
+
+def _check_plain(column, name, label):
+    dtype = getattr(column, "dtype", None)
+    if dtype is not None and dtype.kind in "OV":
+        raise ObservationError(
+            f"{label}: column {name} has type {dtype}; allowed are numbers, strings and times"
+        )
+    if getattr(column, "shape", (0,))[1:]:
+        raise ObservationError(
+            f"{label}: column {name} has shape {column.shape}, one value a row is allowed"
+        )
+
+
+def numeric_column(table, name, label, unit=None):
+    """
+    Return a column as floats in ``unit``, NaN where it is masked.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        A table that passed `check_table`.
+    name : str
+        The column.
+    label : str
+        What to call the table in messages.
+    unit : `~astropy.units.UnitBase`, optional
+        The unit wanted; by default the column may have any unit or none.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (N,), a copy.
+
+    Raises
+    ------
+    ObservationError
+        If the column is not numeric or its unit is missing or of another kind.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal.observations.reading import numeric_column
+    >>> numeric_column(QTable({"hwp": [0, 45] * u.deg}), "hwp", "night", u.arcmin).tolist()
+    [0.0, 2700.0]
+    """
+    column = table[name]
+    dtype = getattr(column, "dtype", None)
+    if dtype is None or dtype.kind not in "iuf":
+        kind = type(column).__name__ if dtype is None else dtype
+        raise ObservationError(f"{label}: column {name} has type {kind}, numbers are needed")
+    mask = np.asarray(getattr(column, "mask", False))
+    plain = getattr(column, "unmasked", column)
+    data = plain.value if isinstance(plain, u.Quantity) else np.ma.getdata(plain)
+    values = np.array(data, dtype=float)
+    if unit is not None:
+        values = _convert(values, getattr(plain, "unit", None), unit, name, label)
+    values[np.broadcast_to(mask, values.shape)] = np.nan
+    return values
+
+
+def _convert(values, own, unit, name, label):
+    example = f"such as {unit}" if unit.to_string() else "that is dimensionless"
+    if own is None:
+        if unit == u.dimensionless_unscaled:
+            return values
+        raise ObservationError(f"{label}: column {name} has no unit, a unit {example} is needed")
+    try:
+        # a factor keeps the numbers untouched where the units agree
+        factor = u.Unit(own).to(unit)
+    except (u.UnitsError, TypeError, ValueError, AttributeError):
+        raise ObservationError(
+            f"{label}: column {name} has unit {own}, a unit {example} is needed"
+        ) from None
+    with np.errstate(over="ignore", under="ignore"):
+        return values if factor == 1.0 else values * factor
+
+
+def first_bad_row(bad, name, values, label, allowed):
+    """
+    Raise for the first row that is bad, if there is one.
+
+    Parameters
+    ----------
+    bad : `~numpy.ndarray` of bool
+        Shape (N,).
+    name : str
+        The column.
+    values : sequence
+        What to show of the row.
+    label, allowed : str
+        What to call the table, and what would have been allowed.
+
+    Raises
+    ------
+    ObservationError
+        Naming the row, counted from 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.observations.reading import first_bad_row
+    >>> first_bad_row(np.array([False, True]), "hwp", [0, np.inf], "night", "finite angles")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: night, row 2: hwp = inf, allowed are finite angles
+    """
+    if np.any(bad):
+        row = int(np.argmax(bad))
+        raise ObservationError(
+            f"{label}, row {row + 1}: {name} = {values[row]}, allowed are {allowed}"
+        )

@@ -1,0 +1,626 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+`Observations`, the table of beam fluxes from which everything is calibrated.
+"""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import Table
+from astropy.time import Time
+
+from astropolcal.exceptions import ObservationError
+from astropolcal.observations.grid import build_grid
+from astropolcal.observations.hashing import hash_columns
+from astropolcal.observations.pairing import pair_frames
+from astropolcal.observations.reading import numeric_column, read_ecsv
+from astropolcal.observations.variances import beam_variances
+from astropolcal.units import angle_to_rad
+
+__all__ = ["Observations"]
+
+
+class Observations:
+    """
+    Beam fluxes of a series of frames, validated.
+
+    Make one with `read` or `from_table`; an instance does not change, and
+    `with_mask` and `select` return new ones. The table has one row a frame and
+    wavelength, in any order:
+
+    ============================== ========= =========================================
+    column                         unit      meaning
+    ============================== ========= =========================================
+    frame, bin                               whole numbers
+    wavelength                     length    one value a bin
+    hwp, derotator                 angle     positions of the stages
+    parallactic, altitude          angle     optional, on sky
+    flux_right, flux_left          any, one  ordinary and extraordinary beam
+    flux_right_err, flux_left_err  of flux   optional errors of the beams, or
+    single_difference_err,         of flux   errors of R - L and R + L (used where
+    single_sum_err                           the former are absent)
+    mask_reason                              optional, not empty where unusable
+    any other                      any       belongs to the frame (file, time,
+                                             flc_state), the same in all its rows
+    ============================== ========= =========================================
+
+    A cell whose flux or error is not a positive number, or that has no row, is
+    masked with a reason and a warning. Everything worse is an
+    `~astropolcal.exceptions.ObservationError`.
+
+    Attributes
+    ----------
+    name : str
+        For messages, reports and plots.
+    path : `~pathlib.Path` or None
+        The file it was read from.
+    meta : dict
+        As in the table.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import Observations, example_table
+    >>> obs = Observations.from_table(example_table(), name="night1")
+    >>> obs
+    <Observations 'night1': example polarimeter, polarized, 4 frames x 3 bins, 0 cells masked>
+    >>> obs.pairs().tolist()
+    [[0, 2], [1, 3]]
+    """
+
+    def __init__(self, grid, meta, name, path):
+        self._grid = grid
+        self.meta = dict(meta)
+        self.name = str(name)
+        self.path = None if path is None else Path(path)
+        self._variances = beam_variances(grid.flux_right, grid.flux_left, grid.errors)
+        self._pairs = {}
+        self._hash = None
+        self._mask = grid.reason > 0
+        self._freeze()
+
+    def _freeze(self):
+        grid = self._grid
+        arrays = (grid.bin, grid.rows, grid.reason, self._mask)
+        for array in (*arrays, *self._variances, *self._measured().values()):
+            array.flags.writeable = False
+
+    @classmethod
+    def read(cls, path, *, name=None):
+        """
+        Read an ECSV file.
+
+        Parameters
+        ----------
+        path : str or `~pathlib.Path`
+            The file.
+        name : str, optional
+            By default the name of the file without its extension.
+
+        Returns
+        -------
+        Observations
+
+        Raises
+        ------
+        ObservationError
+            If the file is absent, unreadable or inconsistent; the message is one
+            line that names the file and the row or column.
+
+        Examples
+        --------
+        >>> from astropolcal.observations import Observations
+        >>> Observations.read("nowhere.ecsv")
+        Traceback (most recent call last):
+        ...
+        astropolcal.exceptions.ObservationError: nowhere.ecsv: no such file
+        """
+        table = read_ecsv(path)
+        name = Path(path).stem if name is None else name
+        return cls.from_table(table, name=name, path=path)
+
+    @classmethod
+    def from_table(cls, table, *, name="table", path=None):
+        """
+        Validate a table that is in memory.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            Columns as described in the class; it is not changed.
+        name : str
+            For messages and reports.
+        path : str or `~pathlib.Path`, optional
+            The file it came from.
+
+        Returns
+        -------
+        Observations
+
+        Raises
+        ------
+        ObservationError
+            If the table is inconsistent.
+
+        Examples
+        --------
+        >>> from astropy.table import QTable
+        >>> from astropolcal.observations import Observations
+        >>> Observations.from_table(QTable({"frame": [0], "bin": [0], "hwp": [0]}), name="x")
+        Traceback (most recent call last):
+        ...
+        astropolcal.exceptions.ObservationError: x: missing columns wavelength, derotator, flux_right, flux_left; it has frame, bin, hwp
+        """  # noqa: E501
+        label = str(name if path is None else path)
+        return cls(build_grid(table, label), table.meta, name, path)
+
+    @property
+    def instrument(self):
+        """Name of the instrument (str), or None if the table does not say."""
+        return self._text("instrument")
+
+    @property
+    def source(self):
+        """What was observed (str), or None if the table does not say."""
+        return self._text("source")
+
+    def _text(self, key):
+        value = self.meta.get(key)
+        return value if isinstance(value, str) else None
+
+    @property
+    def frames(self):
+        """One row a frame with every column that belongs to frames (a copy)."""
+        return self._grid.frames.copy()
+
+    @property
+    def n_frames(self):
+        """Number of frames, F."""
+        return len(self._grid.frames)
+
+    @property
+    def n_bins(self):
+        """Number of wavelength bins, W."""
+        return len(self._grid.bin)
+
+    @property
+    def bin(self):
+        """Numbers of the wavelength bins, shape (W,)."""
+        return self._grid.bin
+
+    @property
+    def wavelength(self):
+        """Wavelength of every bin (`~astropy.units.Quantity`), shape (W,)."""
+        return self._grid.wavelength.copy()
+
+    @property
+    def flux_unit(self):
+        """Unit of the fluxes and the square root of that of the variances."""
+        return self._grid.flux_unit
+
+    @property
+    def flux_right(self):
+        """Flux of the ordinary beam, shape (F, W), NaN where masked."""
+        return self._grid.flux_right
+
+    @property
+    def flux_left(self):
+        """Flux of the extraordinary beam, shape (F, W), NaN where masked."""
+        return self._grid.flux_left
+
+    @property
+    def variance_right(self):
+        """Variance of `flux_right`, shape (F, W), NaN where masked or unknown."""
+        return self._variances[0]
+
+    @property
+    def variance_left(self):
+        """Variance of `flux_left`, shape (F, W), NaN where masked or unknown."""
+        return self._variances[1]
+
+    @property
+    def covariance(self):
+        """Covariance of the two beams, shape (F, W), NaN where masked or unknown."""
+        return self._variances[2]
+
+    @property
+    def has_errors(self):
+        """Whether the table gives errors of the fluxes."""
+        return bool(self._grid.errors)
+
+    @property
+    def mask(self):
+        """True where a cell is unusable, shape (F, W)."""
+        return self._mask
+
+    @property
+    def mask_reasons(self):
+        """Number of masked cells by reason (dict)."""
+        counts = np.bincount(self._grid.reason.ravel(), minlength=len(self._grid.reasons) + 1)
+        pairs = zip(self._grid.reasons, counts[1:].tolist(), strict=True)
+        return {reason: count for reason, count in pairs if count}
+
+    @property
+    def content_hash(self):
+        """
+        SHA-256 of the content (str), the same for any order of rows and format of numbers.
+
+        Numbers count to 12 significant digits in canonical units; of `meta`, only
+        the instrument and the source belong to the content.
+        """
+        if self._hash is None:
+            grid = self._grid
+            columns = {name: grid.frames[name] for name in grid.frames.colnames}
+            columns |= {"bin": grid.bin, "wavelength": grid.wavelength, "mask": self.mask}
+            columns |= {name: array * grid.flux_unit for name, array in self._measured().items()}
+            self._hash = hash_columns(columns, f"{self.instrument}|{self.source}")
+        return self._hash
+
+    def _measured(self):
+        grid = self._grid
+        return {"flux_right": grid.flux_right, "flux_left": grid.flux_left, **grid.errors}
+
+    def __len__(self):
+        return self.n_frames
+
+    def __repr__(self):
+        return f"<Observations {self.name!r}: {self._headline()}>"
+
+    def _headline(self):
+        counts = [f"{_count(self.n_frames, 'frame')} x {_count(self.n_bins, 'bin')}"]
+        counts.append(f"{_count(int(self.mask.sum()), 'cell')} masked")
+        return ", ".join([text for text in (self.instrument, self.source) if text] + counts)
+
+    def summary(self):
+        """
+        Return what the table holds, in a few lines of text.
+
+        Returns
+        -------
+        str
+
+        Examples
+        --------
+        >>> from astropolcal.observations import Observations, example_table
+        >>> print(Observations.from_table(example_table(), name="x").summary())
+        x: example polarimeter, polarized, 4 frames x 3 bins, 0 cells masked
+        wavelength: 1.2 to 2.2 um
+        hwp: 0, 22.5, 45, 67.5 deg
+        derotator: 90 deg
+        errors: flux_right_err and flux_left_err
+        """
+        low, high = self.wavelength.min(), self.wavelength.max()
+        lines = [f"{self.name}: {self._headline()}"]
+        lines.append(f"wavelength: {low.value:g} to {high.value:g} {high.unit}")
+        for column in ("hwp", "derotator", "parallactic", "altitude"):
+            if column in self._grid.frames.colnames:
+                lines.append(f"{column}: {_span(np.rad2deg(self.position(column)))} deg")
+        lines.append(f"errors: {' and '.join(self._grid.errors) or 'none'}")
+        lines += [f"masked, {why}: {_count(n, 'cell')}" for why, n in self.mask_reasons.items()]
+        return "\n".join(lines)
+
+    def position(self, column):
+        """
+        Return an angle of every frame.
+
+        Parameters
+        ----------
+        column : str
+            A column with the unit of an angle, such as ``"hwp"``.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Radian, shape (F,).
+
+        Raises
+        ------
+        ObservationError
+            If there is no such column, or it is not an angle.
+
+        Examples
+        --------
+        >>> from astropolcal.observations import Observations, example_table
+        >>> obs = Observations.from_table(example_table())
+        >>> obs.position("hwp")[:3].round(4).tolist()
+        [0.0, 0.3927, 0.7854]
+        """
+        frames = self._grid.frames
+        if column not in frames.colnames:
+            angles = [name for name in frames.colnames if _is_angle(frames[name])]
+            raise ObservationError(
+                f"{self._label}: no column {column!r}; its angles are {', '.join(angles)}"
+            )
+        if not _is_angle(frames[column]):
+            raise ObservationError(
+                f"{self._label}: column {column} is not an angle; a unit such as deg is needed"
+            )
+        return numeric_column(frames, column, self._label, u.rad)
+
+    @property
+    def _label(self):
+        return self.name if self.path is None else str(self.path)
+
+    def pairs(self, tolerance=0.3 * u.deg, *, derotator_tolerance=0.5 * u.deg, share=False):
+        """
+        Pair the frames 45 degrees of (commanded) half-wave-plate angle apart.
+
+        Parameters
+        ----------
+        tolerance, derotator_tolerance : `~astropy.units.Quantity`
+            Largest differences that still count as the same angle.
+        share : bool
+            Whether a frame left over may be paired with one that is already used.
+
+        Returns
+        -------
+        `~numpy.ndarray` of int
+            Frame indices (plus, minus), shape (P, 2); read only, found once and
+            kept. See `~astropolcal.observations.pair_frames` for the rules.
+
+        Raises
+        ------
+        ObservationError
+            If an angle of the table has no partner in it, or nothing can be paired.
+
+        Warns
+        -----
+        AstropolcalWarning
+            If frames are left over.
+
+        Examples
+        --------
+        >>> from astropolcal.observations import Observations, example_table
+        >>> obs = Observations.from_table(example_table())
+        >>> obs.pairs().tolist()
+        [[0, 2], [1, 3]]
+        """
+        tolerances = (tolerance, derotator_tolerance)
+        key = (*(float(angle_to_rad(angle, "tolerance")) for angle in tolerances), bool(share))
+        if key not in self._pairs:
+            found = self._find_pairs(*(angle * u.rad for angle in key[:2]), key[2])
+            found.flags.writeable = False
+            self._pairs[key] = found
+        return self._pairs[key]
+
+    def _find_pairs(self, tolerance, derotator_tolerance, share):
+        frames = self._grid.frames
+        pairs = pair_frames(
+            self.position("hwp") * u.rad,
+            self.position("derotator") * u.rad,
+            np.asarray(frames["flc_state"]) if "flc_state" in frames.colnames else None,
+            _clock(frames),
+            tolerance=tolerance,
+            derotator_tolerance=derotator_tolerance,
+            share=share,
+            labels=np.asarray(frames["frame"]).tolist(),
+            rows=self._grid.rows.tolist(),
+            name=self._label,
+        )
+        if not len(pairs):
+            raise ObservationError(
+                f"{self._label}: none of its {_count(self.n_frames, 'frame')} can be paired; two "
+                "frames 45 deg of half-wave plate apart at the same derotator angle are needed"
+            )
+        return pairs
+
+    def with_mask(self, mask, reason):
+        """
+        Return observations with more cells masked.
+
+        Parameters
+        ----------
+        mask : array_like of bool
+            True where a cell is to be masked: shape (F, W), or (F,) for whole frames.
+        reason : str
+            Why; it appears in `mask_reasons`. Cells masked before keep their reason.
+
+        Returns
+        -------
+        Observations
+
+        Raises
+        ------
+        ObservationError
+            If the shape, type or reason is wrong, or no usable cell would remain.
+
+        Examples
+        --------
+        >>> from astropolcal.observations import Observations, example_table
+        >>> obs = Observations.from_table(example_table())
+        >>> obs.with_mask(obs.flux_right < 400, "faint").mask_reasons
+        {'faint': 3}
+        """
+        mask = np.asarray(mask)
+        shapes = (self.mask.shape, self.mask.shape[:1])
+        if mask.dtype != bool or mask.shape not in shapes:
+            raise ObservationError(
+                f"{self._label}: mask of type {mask.dtype} and shape {mask.shape}; allowed are "
+                f"booleans of shape {shapes[0]} or {shapes[1]}"
+            )
+        if not isinstance(reason, str) or not reason.strip():
+            raise ObservationError(f"{self._label}: reason = {reason!r}, some words are needed")
+        new = (mask if mask.ndim == 2 else mask[:, None]) & ~self.mask
+        if (new | self.mask).all():
+            raise ObservationError(
+                f"{self._label}: masking {reason!r} would leave no usable cell of {new.size}"
+            )
+        return self._masked(new, reason.strip())
+
+    def _masked(self, new, reason):
+        grid = self._grid
+        reasons = grid.reasons if reason in grid.reasons else (*grid.reasons, reason)
+        changed = dataclasses.replace(
+            grid,
+            flux_right=np.where(new, np.nan, grid.flux_right),
+            flux_left=np.where(new, np.nan, grid.flux_left),
+            errors={name: np.where(new, np.nan, err) for name, err in grid.errors.items()},
+            reason=np.where(new, reasons.index(reason) + 1, grid.reason),
+            reasons=reasons,
+        )
+        return Observations(changed, self.meta, self.name, self.path)
+
+    def select(self, frames):
+        """
+        Return the observations of some frames, in the order of the table.
+
+        Parameters
+        ----------
+        frames : array_like of bool or int
+            One boolean a frame, or indices of frames, each at most once.
+
+        Returns
+        -------
+        Observations
+
+        Raises
+        ------
+        ObservationError
+            If an index is out of range or given twice, or no usable cell remains.
+
+        Examples
+        --------
+        >>> from astropolcal.observations import Observations, example_table
+        >>> obs = Observations.from_table(example_table())
+        >>> obs.select(obs.pairs()[0]).frames["hwp"].value.tolist()
+        [0.0, 45.0]
+        """
+        index = self._frame_index(np.asarray(frames))
+        grid = self._grid
+        if grid.reason[index].all():
+            raise ObservationError(
+                f"{self._label}: the {_count(len(index), 'frame')} selected have no usable cell"
+            )
+        chosen = dataclasses.replace(
+            grid,
+            frames=grid.frames[index],
+            rows=grid.rows[index],
+            flux_right=grid.flux_right[index],
+            flux_left=grid.flux_left[index],
+            errors={name: error[index] for name, error in grid.errors.items()},
+            reason=grid.reason[index],
+        )
+        return Observations(chosen, self.meta, self.name, self.path)
+
+    def _frame_index(self, frames):
+        if frames.dtype == bool and frames.shape == (self.n_frames,):
+            return np.flatnonzero(frames)
+        if frames.dtype.kind not in "iu" or frames.ndim != 1:
+            raise ObservationError(
+                f"{self._label}: frames of type {frames.dtype} and shape {frames.shape}; allowed "
+                f"are {self.n_frames} booleans or a list of indices"
+            )
+        outside = frames[(frames < -self.n_frames) | (frames >= self.n_frames)]
+        if outside.size:
+            raise ObservationError(
+                f"{self._label}: frame index {outside[0]}, allowed are 0 to {self.n_frames - 1}"
+            )
+        index, counts = np.unique(frames % self.n_frames, return_counts=True)
+        if (counts > 1).any():
+            raise ObservationError(
+                f"{self._label}: frame index {index[counts > 1][0]} is given twice, "
+                "each frame is allowed once"
+            )
+        return index
+
+    def to_table(self):
+        """
+        Return a table from which `from_table` makes the same observations.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            One row a frame and bin, masked cells with NaN and a ``mask_reason``.
+
+        Examples
+        --------
+        >>> from astropolcal.observations import Observations, example_table
+        >>> obs = Observations.from_table(example_table())
+        >>> len(obs.to_table())
+        12
+        """
+        grid = self._grid
+        table = grid.frames[np.repeat(np.arange(self.n_frames), self.n_bins)]
+        table["bin"] = np.tile(grid.bin, self.n_frames)
+        table["wavelength"] = np.tile(grid.wavelength, self.n_frames)
+        for name, array in self._measured().items():
+            table[name] = array.ravel() * grid.flux_unit
+        if self.mask.any():
+            table["mask_reason"] = np.array(["", *grid.reasons])[grid.reason.ravel()]
+        table.meta.update(self.meta)
+        return table
+
+    def write(self, path, overwrite=False):
+        """
+        Write an ECSV file that `read` turns into the same observations.
+
+        The file appears complete or not at all.
+
+        Parameters
+        ----------
+        path : str or `~pathlib.Path`
+            The file.
+        overwrite : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        ObservationError
+            If the file exists, or cannot be written.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from astropolcal.observations import Observations, example_table
+        >>> obs = Observations.from_table(example_table())
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     obs.write(Path(folder) / "copy.ecsv")
+        ...     again = Observations.read(Path(folder) / "copy.ecsv")
+        >>> again.content_hash == obs.content_hash
+        True
+        """
+        path = Path(path)
+        if path.exists() and not overwrite:
+            raise ObservationError(f"{path}: exists already; overwrite=True replaces it")
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            with open(temporary, "x", encoding="utf-8") as stream:
+                # a plain Table gives a header that people can read, unlike a QTable
+                Table(self.to_table()).write(stream, format="ascii.ecsv")
+            os.replace(temporary, path)
+        except Exception as error:  # meta may hold what YAML cannot represent
+            raise ObservationError(
+                f"{path}: cannot be written: {' '.join(str(error).split())}"
+            ) from error
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def _count(number, noun):
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _span(angles):
+    """Return few distinct angles one by one, many as a range."""
+    distinct = np.unique(angles.round(4))
+    if len(distinct) <= 8:
+        return ", ".join(f"{angle:g}" for angle in distinct)
+    return f"{distinct[0]:g} to {distinct[-1]:g}"
+
+
+def _is_angle(column):
+    return isinstance(column, u.Quantity) and column.unit.is_equivalent(u.rad)
+
+
+def _clock(frames):
+    """Return the times of the frames as numbers, or None where there are none."""
+    column = frames["time"] if "time" in frames.colnames else None
+    if isinstance(column, Time):
+        column = column.mjd
+    if getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
+        return None
+    times = np.asarray(getattr(column, "value", column), dtype=float)
+    return times if np.isfinite(times).all() else None

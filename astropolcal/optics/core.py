@@ -1,0 +1,407 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What every optic is: an astropy model that takes light and gives light.
+
+An optic's inputs and outputs are the light, ``wavelength, I, Q, U, V``. What
+belongs to the optic is a parameter with unit, bounds and description. Its
+orientation is ``theta``, the installed angle that a calibration finds, plus
+the position of the stage named by ``mount``, which comes from each frame's
+header and is never a parameter.
+"""
+
+import inspect
+from abc import abstractmethod
+
+import astropy.units as u
+import numpy as np
+from astropy.modeling import FittableModel, Parameter
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.mueller.elements import _rotate, _rotation_matrix
+from astropolcal.units import angle_to_rad, canonical_factor, length_to_um, to_unit
+
+__all__ = ["Optic", "rotation_generator"]
+
+LIGHT = ("wavelength", "I", "Q", "U", "V")
+
+
+def rotation_generator(matrix):
+    """
+    Return the derivative of ``T(-theta) M T(theta)`` to theta, at theta = 0.
+
+    With ``T(theta)`` the rotation of Sec. 2 of the CHARIS paper, the
+    derivative is the commutator ``2 (M G - G M)``, where G turns Q into U.
+
+    Parameters
+    ----------
+    matrix : `~numpy.ndarray`
+        Mueller matrices, shape (..., 4, 4).
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Derivative per radian, shape (..., 4, 4).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.optics import rotation_generator
+    >>> bool(np.all(rotation_generator(np.eye(4)) == 0))
+    True
+    """
+    out = np.zeros_like(matrix)
+    out[..., :, 1] -= 2 * matrix[..., :, 2]
+    out[..., :, 2] += 2 * matrix[..., :, 1]
+    out[..., 1, :] -= 2 * matrix[..., 2, :]
+    out[..., 2, :] += 2 * matrix[..., 1, :]
+    return out
+
+
+class Optic(FittableModel):
+    """
+    Base of all optics: light in, light out, with a Mueller matrix.
+
+    A subclass declares its parameters and gives `_matrix` and `_derivatives`
+    on canonical floats (radian, micrometre, 1), in the optic's own frame;
+    everything else (units, orientation, light, derivatives) is done here.
+
+    Parameters
+    ----------
+    theta : `~astropy.units.Quantity`
+        Installed orientation, counter-clockwise from vertical looking into
+        the beam. Fixed by default.
+    mount : str, optional
+        Name of the stage that carries the optic (``"hwp"``), whose position in
+        each frame is added to ``theta``; with a leading minus it is subtracted.
+    name : str, optional
+        Name of the optic in its chain.
+    **parameters : `~astropy.units.Quantity` or float
+        Values of the optic's parameters: a scalar, or one value a wavelength.
+
+    Raises
+    ------
+    ParameterError
+        If a value has no unit, a wrong one, or is not finite.
+    """
+
+    n_inputs = 5
+    n_outputs = 5
+    standard_broadcasting = False
+    #: True for an optic that turns the frame of all that follows.
+    rotates_frame = False
+
+    theta = Parameter(
+        default=0.0,
+        unit=u.deg,
+        bounds=(-180, 180),
+        fixed=True,
+        description="installed orientation, added to the position of the mount",
+    )
+
+    def __init__(self, *args, mount=None, name=None, **kwargs):
+        if args:
+            raise ParameterError(
+                f"{type(self).__name__} takes its parameters by keyword: {self.param_names}"
+            )
+        values = {key: kwargs.pop(key) for key in self.param_names if key in kwargs}
+        values = {key: self._at_the_door(key, value) for key, value in values.items()}
+        try:
+            super().__init__(name=name, **values, **kwargs)
+        except TypeError as error:
+            raise ParameterError(f"{type(self).__name__}: {error}") from None
+        self._inputs = self._outputs = LIGHT
+        self.mount = mount
+        self._position = 0.0
+
+    @classmethod
+    def _at_the_door(cls, key, value):
+        """Return ``value`` as a Quantity in the declared unit of parameter ``key``."""
+        unit = cls._declared(key).unit
+        number = to_unit(value, unit, f"{cls.__name__}.{key}")
+        if not np.all(np.isfinite(number)):
+            raise ParameterError(f"{cls.__name__}.{key} = {value} must be finite")
+        if number.ndim > 1:
+            raise ParameterError(
+                f"{cls.__name__}.{key} has shape {number.shape}; allowed are a "
+                "scalar or one value a wavelength"
+            )
+        return number if unit is None else number * unit
+
+    @classmethod
+    def _declared(cls, key):
+        return inspect.getattr_static(cls, key)
+
+    def __setattr__(self, attr, value):
+        # astropy would adopt the unit of the value and leave the bounds behind
+        if attr in self.param_names and attr in self.__dict__:
+            value = self._at_the_door(attr, value)
+        super().__setattr__(attr, value)
+
+    def __repr__(self):
+        values = ", ".join(
+            f"{key}={np.array2string(getattr(self, key).value, precision=6, threshold=4)}"
+            + (f" {getattr(self, key).unit}" if getattr(self, key).unit else "")
+            for key in self.param_names
+        )
+        label = f", name={self.name!r}" if self.name else ""
+        mount = f", mount={self.mount!r}" if self.mount else ""
+        return f"<{type(self).__name__}({values}{mount}{label})>"
+
+    # ---- where the optic stands ------------------------------------------
+
+    @property
+    def mount(self):
+        """Name of the stage that carries the optic, or None."""
+        return self._mount
+
+    @mount.setter
+    def mount(self, value):
+        if value is not None and not (isinstance(value, str) and value.lstrip("-")):
+            raise ParameterError(f"mount = {value!r} must be the name of a stage or None")
+        self._mount = value
+
+    @property
+    def stage(self):
+        """Name of the stage without its sign, or None."""
+        return self._mount.removeprefix("-") if self._mount else None
+
+    @property
+    def stage_sign(self):
+        """Plus one, or minus one where ``mount`` starts with a minus."""
+        return -1.0 if self._mount and self._mount.startswith("-") else 1.0
+
+    @property
+    def position(self):
+        """Position of the stage at which this copy of the optic stands."""
+        return self._position * u.rad
+
+    @position.setter
+    def position(self, value):
+        self._position = angle_to_rad(value, "position")
+
+    # ---- values on canonical floats ---------------------------------------
+
+    def canonical_values(self):
+        """
+        Return the parameter values as canonical floats, ``theta`` first.
+
+        Returns
+        -------
+        list of `~numpy.ndarray`
+            Radian, micrometre or 1; shape () or (n_wavelengths,).
+
+        Raises
+        ------
+        ParameterError
+            If a parameter was given another unit behind the optic's back.
+        """
+        values = []
+        for key in self.param_names:
+            parameter = getattr(self, key)
+            if parameter.unit != self._declared(key).unit:
+                raise ParameterError(
+                    f"{self.name or type(self).__name__}.{key} is in {parameter.unit}, but its "
+                    f"bounds are in {self._declared(key).unit}; set optic.{key} = value * unit"
+                )
+            values.append(np.asarray(parameter.value) * canonical_factor(parameter.unit))
+        return values
+
+    @property
+    def own_names(self):
+        """Names of the parameters without ``theta``."""
+        return tuple(key for key in self.param_names if key != "theta")
+
+    def _dispersion(self, wavelength):
+        """Return what `_matrix` needs of the wavelength (um); computed once in a fit."""
+        return wavelength
+
+    @abstractmethod
+    def _matrix(self, dispersion, *values):
+        """Return the Mueller matrix in the optic's own frame, (..., 4, 4)."""
+
+    @abstractmethod
+    def _derivatives(self, dispersion, *values):
+        """Return the derivatives of `_matrix`, one array (..., 4, 4) a value."""
+
+    # ---- what the user sees ------------------------------------------------
+
+    def mueller(self, wavelength=None, position=None):
+        """
+        Return the Mueller matrix of the optic where it stands.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`, optional
+            Scalar or shape (n_wavelengths,); may be left out where no
+            parameter and no law depends on it.
+        position : `~astropy.units.Quantity`, optional
+            Position of the stage, broadcastable against the wavelengths;
+            by default the optic's own ``position``.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (..., 4, 4), ``T(-theta) M T(theta)``.
+
+        Raises
+        ------
+        ParameterError, WavelengthRangeError
+            If a wavelength is needed and missing, or out of a law's range.
+        """
+        dispersion, angle, values = self._resolve(wavelength, position)
+        return self._oriented(dispersion, angle, values)
+
+    def mueller_derivatives(self, wavelength=None, position=None):
+        """
+        Return the derivative of the Mueller matrix to every parameter.
+
+        Parameters
+        ----------
+        wavelength, position : `~astropy.units.Quantity`, optional
+            As in `mueller`.
+
+        Returns
+        -------
+        dict of str to `~astropy.units.Quantity`
+            Parameter name to derivative, shape (..., 4, 4), in one over the
+            parameter's unit.
+
+        Raises
+        ------
+        ParameterError, WavelengthRangeError
+            As `mueller`.
+        """
+        dispersion, angle, values = self._resolve(wavelength, position)
+        derivatives = self._oriented_derivatives(dispersion, angle, values)
+        return {
+            key: self._per_unit(key, value)
+            for key, value in zip(self.param_names, derivatives, strict=True)
+        }
+
+    def _per_unit(self, key, derivative):
+        """Turn a derivative per canonical unit into one per the parameter's unit."""
+        unit = self._declared(key).unit
+        inverse = u.dimensionless_unscaled if unit is None else unit**-1
+        return derivative * canonical_factor(unit) * inverse
+
+    def _resolve(self, wavelength, position, parameters=None):
+        """Bring wavelength, orientation and values to canonical floats."""
+        values = self.canonical_values() if parameters is None else parameters
+        lam = None if wavelength is None else length_to_um(wavelength)
+        if lam is not None and not np.all(lam > 0):
+            raise ParameterError(f"wavelength = {wavelength} must be positive")
+        self._check_grid(lam, values)
+        turned = self._position if position is None else angle_to_rad(position, "position")
+        dispersion = None if lam is None else self._dispersion(lam)
+        if lam is None and type(self)._dispersion is not Optic._dispersion:
+            raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
+        return dispersion, values[0] + self.stage_sign * turned, values[1:]
+
+    def _check_grid(self, lam, values):
+        for key, value in zip(self.param_names, values, strict=True):
+            if value.size > 1 and (lam is None or np.shape(lam)[-1:] != value.shape[-1:]):
+                count = 0 if lam is None else np.size(lam)
+                raise ParameterError(
+                    f"{self.name or type(self).__name__}.{key} has {value.size} values, one a "
+                    f"wavelength, but {count} wavelengths were given"
+                )
+
+    def _oriented(self, dispersion, angle, values):
+        matrix = self._matrix(dispersion, *values)
+        return _rotation_matrix(angle) if self.rotates_frame else _rotate(matrix, angle)
+
+    def _oriented_derivatives(self, dispersion, angle, values):
+        """Yield the derivative to theta, then to each other parameter."""
+        matrix = self._oriented(dispersion, angle, values)
+        yield turn(matrix) if self.rotates_frame else rotation_generator(matrix)
+        for derivative in self._derivatives(dispersion, *values):
+            yield _rotate(derivative, angle)
+
+    def evaluate(self, wavelength, I, Q, U, V, *parameters):  # noqa: E741
+        """Return ``wavelength`` and the Stokes parameters behind the optic."""
+        values = [self._strip(key, p) for key, p in zip(self.param_names, parameters, strict=True)]
+        matrix = np.moveaxis(
+            self._oriented(*self._resolve(wavelength, None, values)), (-2, -1), (0, 1)
+        )
+        light = (I, Q, U, V)
+        return (
+            wavelength,
+            *(sum(m * s for m, s in zip(row, light, strict=True)) for row in matrix),
+        )
+
+    def _strip(self, key, value):
+        """Undo the model-set axis and the unit that astropy adds in a call."""
+        unit = self._declared(key).unit
+        number = value.to_value(unit) if isinstance(value, u.Quantity) else np.asarray(value)
+        number = number[0] if number.ndim and number.shape[0] == 1 else number
+        return np.asarray(number) * canonical_factor(unit)
+
+    def with_parameters(self, **values):
+        """
+        Return a copy with other values; shapes may change (scalar to per wavelength).
+
+        Parameters
+        ----------
+        **values : `~astropy.units.Quantity` or float
+            New values by parameter name.
+
+        Returns
+        -------
+        Optic
+            Of the same class, name, mount, position, bounds and fixed flags.
+
+        Raises
+        ------
+        ParameterError
+            If a name or a value does not fit.
+        """
+        unknown = set(values) - set(self.param_names)
+        if unknown:
+            raise ParameterError(
+                f"{type(self).__name__} has no parameter {sorted(unknown)}; "
+                f"it has {self.param_names}"
+            )
+        current = {
+            key: getattr(self, key).value * (self._declared(key).unit or 1)
+            for key in self.param_names
+        }
+        new = type(self)(**(current | values), **self._settings())
+        for key in self.param_names:
+            old, fresh = getattr(self, key), getattr(new, key)
+            fresh.fixed, fresh.bounds = old.fixed, old.bounds
+            fresh.tied, fresh.prior = old.tied, old.prior
+        new._position = self._position
+        return new
+
+    def loosened(self, wavelength):
+        """
+        Return the optic with its law in wavelength replaced by one value a wavelength.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Shape (n_wavelengths,).
+
+        Returns
+        -------
+        Optic
+            Itself where it has no such law.
+        """
+        return self
+
+    def _settings(self):
+        """Return the keyword arguments, other than parameters, that rebuild the optic."""
+        return {"name": self.name, "mount": self.mount}
+
+
+def turn(matrix):
+    """Return 2 G M, the derivative of T(theta) M to theta at theta = 0."""
+    out = np.zeros_like(matrix)
+    out[..., 1, :] = 2 * matrix[..., 2, :]
+    out[..., 2, :] = -2 * matrix[..., 1, :]
+    return out
+
+
+def blank(*values, size=4):
+    """Return zeros of the values' broadcast shape + (size, size)."""
+    return np.zeros((*np.broadcast_shapes(*(np.shape(v) for v in values)), size, size))

@@ -1,0 +1,260 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Optics that retard: linear and elliptical retarders, and a waveplate of two layers."""
+
+import astropy.units as u
+import numpy as np
+from astropy.modeling import Parameter
+
+from astropolcal.materials import MGF2, QUARTZ
+from astropolcal.mueller.elements import _elliptical_retarder, _linear_retarder
+from astropolcal.optics.core import Optic, blank
+
+__all__ = ["EllipticalRetarder", "LinearRetarder", "TwoLayerWaveplate"]
+
+
+class LinearRetarder(Optic):
+    r"""
+    Linear retarder (paper, :math:`M_\mathrm{R}`).
+
+    Parameters
+    ----------
+    retardance : `~astropy.units.Quantity`
+        :math:`\Delta`: scalar, or one value a wavelength.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axis.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import LinearRetarder
+    >>> hwp = LinearRetarder(retardance=180 * u.deg, theta=22.5 * u.deg, name="hwp")
+    >>> _, I, Q, U, V = hwp(1.6 * u.um, 1, 1, 0, 0)
+    >>> round(float(U), 6)
+    1.0
+    """
+
+    retardance = Parameter(
+        default=0.0, unit=u.deg, bounds=(-360, 360), description="phase between the two axes"
+    )
+
+    def _matrix(self, dispersion, retardance):
+        return _linear_retarder(retardance)
+
+    def _derivatives(self, dispersion, retardance):
+        return (_linear_slope(retardance),)
+
+
+class TwoLayerWaveplate(Optic):
+    r"""
+    Achromatic waveplate of crossed crystal quartz and MgF2 layers.
+
+    .. math:: \Delta = \frac{2\pi}{\lambda}\left[w_\mathrm{SiO_2}
+              (n_e - n_o)_\mathrm{SiO_2} - w_\mathrm{MgF_2}(n_e - n_o)_\mathrm{MgF_2}\right]
+
+    (paper, Eq. for the physical half-wave plate, after 't Hart et al. 2021);
+    indices from Ghosh (1999) and Dodge (1984), see `astropolcal.materials`.
+    The sign follows the equation: the CHARIS plate comes out near -172 deg.
+
+    Parameters
+    ----------
+    w_sio2, w_mgf2 : `~astropy.units.Quantity`
+        Thicknesses of the two layers.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axis.
+
+    Raises
+    ------
+    WavelengthRangeError
+        If a wavelength lies outside the range of either material.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import TwoLayerWaveplate
+    >>> hwp = TwoLayerWaveplate(w_sio2=1.653 * u.mm, w_mgf2=1.291 * u.mm, mount="hwp", name="hwp")
+    >>> hwp.retardance([1.6, 2.0] * u.um).round(0)
+    <Quantity [-171., -176.] deg>
+    """
+
+    w_sio2 = Parameter(
+        default=1.63398, unit=u.mm, bounds=(0, None), description="thickness of the quartz layer"
+    )
+    w_mgf2 = Parameter(
+        default=1.27711, unit=u.mm, bounds=(0, None), description="thickness of the MgF2 layer"
+    )
+
+    def _dispersion(self, wavelength):
+        phase = 2 * np.pi / np.asarray(wavelength)
+        return np.stack(
+            [
+                phase * QUARTZ._birefringence_um(wavelength),
+                -phase * MGF2._birefringence_um(wavelength),
+            ]
+        )
+
+    def _matrix(self, dispersion, w_sio2, w_mgf2):
+        return _linear_retarder(w_sio2 * dispersion[0] + w_mgf2 * dispersion[1])
+
+    def _derivatives(self, dispersion, w_sio2, w_mgf2):
+        slope = _linear_slope(w_sio2 * dispersion[0] + w_mgf2 * dispersion[1])
+        return tuple(per_um[..., None, None] * slope for per_um in dispersion)
+
+    def retardance(self, wavelength):
+        """
+        Return the retardance at a wavelength.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Any shape.
+
+        Returns
+        -------
+        `~astropy.units.Quantity`
+            Retardance in degree, of the same shape, not wrapped.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.optics import TwoLayerWaveplate
+        >>> TwoLayerWaveplate().retardance(1.6 * u.um).round(0)
+        <Quantity -174. deg>
+        """
+        dispersion, _, (w_sio2, w_mgf2) = self._resolve(wavelength, None)
+        return (w_sio2 * dispersion[0] + w_mgf2 * dispersion[1]) * u.rad.to(u.deg) * u.deg
+
+    def loosened(self, wavelength):
+        """
+        Return the linear retarder that starts with the same retardances.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Shape (n_wavelengths,).
+
+        Returns
+        -------
+        LinearRetarder
+            One free retardance a wavelength.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.optics import TwoLayerWaveplate
+        >>> TwoLayerWaveplate().loosened([1.2, 1.6] * u.um).retardance.shape
+        (2,)
+        """
+        free = LinearRetarder(
+            retardance=self.retardance(wavelength),
+            theta=self.theta.value * u.deg,
+            **self._settings(),
+        )
+        free.theta.fixed, free.theta.bounds = self.theta.fixed, self.theta.bounds
+        return free
+
+
+class EllipticalRetarder(Optic):
+    r"""
+    Elliptical retarder (paper, :math:`M_\mathrm{ER}`; Chipman et al. 2018).
+
+    The retardance vector :math:`d = (\Delta_H, \Delta_{45}, \Delta_R)` turns
+    (Q, U, V) by :math:`|d|` about its own direction. Written with
+    :math:`\sin\Delta/\Delta` and :math:`(1-\cos\Delta)/\Delta^2` it is exact
+    and smooth through zero retardance.
+
+    Parameters
+    ----------
+    horizontal, diagonal, circular : `~astropy.units.Quantity`
+        :math:`\Delta_H`, :math:`\Delta_{45}`, :math:`\Delta_R`; scalars, or
+        one value a wavelength.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import EllipticalRetarder
+    >>> derotator = EllipticalRetarder(horizontal=99 * u.deg, diagonal=4 * u.deg,
+    ...                                circular=4.5 * u.deg, mount="derotator", name="derotator")
+    >>> derotator.mueller()[0]
+    array([1., 0., 0., 0.])
+    """
+
+    horizontal = Parameter(
+        default=0.0, unit=u.deg, bounds=(-360, 360), description="horizontal linear retardance"
+    )
+    diagonal = Parameter(
+        default=0.0, unit=u.deg, bounds=(-360, 360), description="45 deg linear retardance"
+    )
+    circular = Parameter(
+        default=0.0, unit=u.deg, bounds=(-360, 360), description="right circular retardance"
+    )
+
+    def _matrix(self, dispersion, horizontal, diagonal, circular):
+        return _elliptical_retarder(horizontal, diagonal, circular)
+
+    def _derivatives(self, dispersion, horizontal, diagonal, circular):
+        vector = _vector(horizontal, diagonal, circular)
+        total = np.sqrt(np.sum(vector**2, axis=-1))
+        sinc, versine, sinc_slope, versine_slope = (f[..., None, None] for f in _functions(total))
+        outer = vector[..., :, None] * vector[..., None, :]
+        cross = (vector @ _CROSS).reshape(*total.shape, 3, 3)
+        common = sinc_slope * cross + versine_slope * outer - sinc * np.eye(3)
+        return tuple(self._slope(i, vector, sinc, versine, common) for i in range(3))
+
+    @staticmethod
+    def _slope(i, vector, sinc, versine, common):
+        """Derivative to component i; ``common`` is that through the length, over d_i."""
+        out = blank(vector[..., 0])
+        block = out[..., 1:, 1:]
+        block += vector[..., i, None, None] * common + sinc * _CROSS[i].reshape(3, 3)
+        block[..., i, :] += versine[..., 0] * vector
+        block[..., :, i] += versine[..., 0] * vector
+        return out
+
+
+# d @ _CROSS is the antisymmetric part of the rotation of (Q, U, V), row by row
+_CROSS = np.array(
+    [
+        [[0, 0, 0], [0, 0, 1], [0, -1, 0]],
+        [[0, 0, -1], [0, 0, 0], [1, 0, 0]],
+        [[0, 1, 0], [-1, 0, 0], [0, 0, 0]],
+    ],
+    dtype=float,
+).reshape(3, 9)
+
+
+def _vector(horizontal, diagonal, circular):
+    return np.stack(np.broadcast_arrays(horizontal, diagonal, circular), axis=-1)
+
+
+def _functions(x):
+    """Return sin(x)/x, (1 - cos x)/x^2 and their derivatives over x, for any x >= 0."""
+    small = x < 0.3
+    safe = np.where(small, 1.0, x)
+    x2, safe2 = x * x, safe * safe
+    sine, cosine = np.sin(safe), np.cos(safe)
+    sinc = np.where(small, _series(x2, 1, 6, 20, 42, 72), sine / safe)
+    versine = np.where(small, _series(x2, 2, 12, 30, 56, 90), 2 * np.sin(safe / 2) ** 2 / safe2)
+    sinc_slope = np.where(small, -_series(x2, 3, 10, 28, 54, 88), (cosine - sine / safe) / safe2)
+    versine_slope = np.where(
+        small, -_series(x2, 12, 15, 112 / 3, 67.5, 105.6), (sine / safe - 2 * versine) / safe2
+    )
+    return sinc, versine, sinc_slope, versine_slope
+
+
+def _series(x2, first, *ratios):
+    """Sum (1/first)(1 - x2/r1 (1 - x2/r2 (1 - ...))), the nested power series."""
+    total = 1.0
+    for ratio in reversed(ratios):
+        total = 1.0 - x2 / ratio * total
+    return total / first
+
+
+def _linear_slope(retardance):
+    out = blank(retardance)
+    out[..., 2, 2] = out[..., 3, 3] = -np.sin(retardance)
+    cosine = np.cos(retardance)
+    out[..., 2, 3] = cosine
+    out[..., 3, 2] = -cosine
+    return out

@@ -1,0 +1,284 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Fluxes of both beams and their derivatives, for many frames and wavelengths.
+
+One forward sweep carries the Stokes vectors of all frames and wavelengths
+through the chain; one backward sweep carries the analyser rows (the adjoint)
+towards the source. The derivative to any parameter is then a product of the
+two at its optic, so that all derivatives together cost about as much as a
+few evaluations. Everything is on canonical floats.
+
+Arrays of light have shape (n_wavelengths, 4, n_columns); a column is a frame,
+and an axis has length 1 as long as nothing has depended on it.
+"""
+
+import numpy as np
+
+from astropolcal.chain import leaves, with_beam
+from astropolcal.exceptions import ChainError
+
+__all__ = ["Propagator"]
+
+
+class _Node:
+    """An optic of the chain, with what does not change in a fit."""
+
+    __slots__ = ("dispersion", "index", "leaf", "stage_angle")
+
+    def __init__(self, index, leaf, wavelength, positions):
+        self.index = index
+        self.leaf = leaf
+        self.dispersion = leaf._dispersion(wavelength)
+        self.stage_angle = leaf.stage_sign * positions[leaf.stage] if leaf.stage else 0.0
+
+    def matrix(self, values):
+        return _three_axes(self.leaf._matrix(self.dispersion, *values))
+
+    def derivatives(self, values):
+        return [_three_axes(d) for d in self.leaf._derivatives(self.dispersion, *values)]
+
+
+class _Step:
+    """What the forward sweep leaves at one optic for the backward sweep."""
+
+    __slots__ = ("light", "matrix", "node", "out", "turn", "values")
+
+    def __init__(self, node, values, turn, light, matrix, out):
+        self.node, self.values, self.turn = node, values, turn
+        self.light, self.matrix, self.out = light, matrix, out
+
+
+class Propagator:
+    """
+    The fluxes that a chain predicts, and their derivatives.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        A chain with one beam splitter.
+    wavelength : `~numpy.ndarray`
+        Wavelengths in micrometre, shape (n_wavelengths,).
+    positions : dict of str to `~numpy.ndarray`
+        Position of each stage in radian, shape (n_columns,).
+    source : sequence of float
+        Stokes vector of the light that enters.
+
+    Raises
+    ------
+    ChainError
+        If the chain has no beam splitter or a stage has no position.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal import optics
+    >>> from astropolcal.propagation import Propagator
+    >>> chain = optics.LinearPolarizer() | optics.WollastonPrism(efficiency=0.9)
+    >>> right, left = Propagator(chain, np.array([1.6]), {}).fluxes()
+    >>> float(right[0, 0].round(4)), float(left[0, 0].round(4))
+    (0.475, 0.025)
+    """
+
+    def __init__(self, chain, wavelength, positions, source=(1.0, 0.0, 0.0, 0.0)):
+        wavelength = np.atleast_1d(np.asarray(wavelength, dtype=float))
+        self.leaves = leaves(chain)
+        self._check(self.leaves, positions)
+        columns = {np.size(angle) for angle in positions.values()} or {1}
+        self.shape = (len(wavelength), max(columns))
+        self.source = np.asarray(source, dtype=float).reshape(1, 4, 1)
+        split = next(i for i, leaf in enumerate(self.leaves) if hasattr(leaf, "beam"))
+        make = [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(self.leaves)]
+        self._common = make[:split]
+        self._arms = [
+            [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(leaves(arm))][split:]
+            for arm in (with_beam(chain, "right"), with_beam(chain, "left"))
+        ]
+
+    @staticmethod
+    def _check(found, positions):
+        if not any(hasattr(leaf, "beam") for leaf in found):
+            raise ChainError("the chain has no beam splitter, so it predicts no beam fluxes")
+        for leaf in found:
+            if leaf.stage and leaf.stage not in positions:
+                raise ChainError(
+                    f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}; "
+                    f"the observations give positions of {sorted(positions)}"
+                )
+
+    def values(self):
+        """
+        Return the current parameter values, one list an optic.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from astropolcal import optics
+        >>> from astropolcal.propagation import Propagator
+        >>> Propagator(optics.WollastonPrism(), np.array([1.6]), {}).values()
+        [[array(0.), array(1.)]]
+        """
+        return [leaf.canonical_values() for leaf in self.leaves]
+
+    def fluxes(self, values=None):
+        """
+        Return the fluxes of the right and the left beam.
+
+        Parameters
+        ----------
+        values : list of list, optional
+            Values as `values` gives them; by default the current ones.
+
+        Returns
+        -------
+        right, left : `~numpy.ndarray`
+            Shape (n_wavelengths, n_columns), for unit source intensity.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from astropolcal import optics
+        >>> from astropolcal.propagation import Propagator
+        >>> [float(flux[0, 0]) for flux in Propagator(optics.WollastonPrism(), [1.6], {}).fluxes()]
+        [0.5, 0.5]
+        """
+        return self.forward(values).fluxes
+
+    def forward(self, values=None):
+        """
+        Carry the light through the chain and keep what derivatives need.
+
+        Parameters
+        ----------
+        values : list of list, optional
+            As for `fluxes`.
+
+        Returns
+        -------
+        Sweep
+            With ``fluxes`` and the method ``derivatives``.
+        """
+        return Sweep(self, self.values() if values is None else values)
+
+
+class Sweep:
+    """A forward sweep: the fluxes of both beams, ready to be differentiated."""
+
+    def __init__(self, propagator, values):
+        self._propagator = propagator
+        self._common, state = _run(propagator._common, values, (propagator.source, 0.0))
+        self._arms, fluxes = [], []
+        for nodes in propagator._arms:
+            steps, (light, _) = _run(nodes, values, state)
+            self._arms.append(steps)
+            fluxes.append(np.broadcast_to(light[:, 0, :], propagator.shape))
+        #: Fluxes of the right and the left beam, (n_wavelengths, n_columns) each.
+        self.fluxes = tuple(fluxes)
+
+    def derivatives(self, wanted, weights):
+        """
+        Return derivatives of a weighted sum of the two fluxes of each column.
+
+        Parameters
+        ----------
+        wanted : sequence of (int, int)
+            Index of the optic in the chain and of its parameter.
+        weights : pair of `~numpy.ndarray`
+            Weights of the right and the left flux, (n_wavelengths, n_columns).
+
+        Returns
+        -------
+        dict of (int, int) to `~numpy.ndarray`
+            Derivative per canonical unit, (n_wavelengths, n_columns).
+        """
+        result = {}
+        by_optic = {}
+        for optic, parameter in wanted:
+            by_optic.setdefault(optic, []).append(parameter)
+        adjoint = 0.0
+        for steps, weight in zip(self._arms, weights, strict=True):
+            row = np.zeros((weight.shape[0], 4, weight.shape[1]))
+            row[:, 0, :] = weight
+            adjoint = adjoint + _back(steps, row, by_optic, result)
+        _back(self._common, adjoint, by_optic, result)
+        shape = self._propagator.shape
+        return {key: np.broadcast_to(value, shape) for key, value in result.items()}
+
+
+def _run(nodes, values, state):
+    """Carry light through ``nodes``; return the steps and the state behind them."""
+    light, frame = state
+    steps = []
+    for node in nodes:
+        theta, *own = values[node.index]
+        angle = node.stage_angle + theta
+        if node.leaf.rotates_frame:
+            frame = frame - angle
+            steps.append(_Step(node, own, None, light, None, light))
+            continue
+        turn = angle - frame
+        light = _rotate(light, turn)
+        matrix = node.matrix(own)
+        out = matrix @ light
+        steps.append(_Step(node, own, turn, light, matrix, out))
+        light, frame = out, angle
+    return steps, (light, frame)
+
+
+def _back(steps, adjoint, by_optic, result):
+    """Carry the adjoint back through ``steps``, adding derivatives to ``result``."""
+    for step in reversed(steps):
+        wanted = by_optic.get(step.node.index, ())
+        if step.matrix is None:
+            if 0 in wanted:
+                _add(result, (step.node.index, 0), 2 * _cross(adjoint, step.light))
+            continue
+        inward = np.swapaxes(step.matrix, -1, -2) @ adjoint
+        if wanted:
+            _at_optic(step, wanted, adjoint, inward, result)
+        adjoint = _rotate(inward, -step.turn)
+    return adjoint
+
+
+def _at_optic(step, wanted, adjoint, inward, result):
+    """Add the derivatives to the wanted parameters of one optic."""
+    index = step.node.index
+    if 0 in wanted:
+        slope = 2 * (_cross(inward, step.light) - _cross(adjoint, step.out))
+        _add(result, (index, 0), slope)
+    if max(wanted) > 0:
+        derivatives = step.node.derivatives(step.values)
+        for parameter in wanted:
+            if parameter:
+                changed = derivatives[parameter - 1] @ step.light
+                _add(result, (index, parameter), np.einsum("wsc,wsc->wc", *_same(adjoint, changed)))
+
+
+def _same(a, b):
+    return np.broadcast_arrays(a, b) if a.shape != b.shape else (a, b)
+
+
+def _add(result, key, value):
+    result[key] = result[key] + value if key in result else value
+
+
+def _cross(a, s):
+    """Return a . G s, the product with the generator of rotations."""
+    return a[..., 1, :] * s[..., 2, :] - a[..., 2, :] * s[..., 1, :]
+
+
+def _rotate(light, angle):
+    """Return T(angle) applied to the light; ``angle`` scalar or one a column."""
+    if np.ndim(angle) == 0 and angle == 0:
+        return light
+    cosine, sine = np.cos(2 * angle), np.sin(2 * angle)
+    columns = max(light.shape[-1], np.size(angle))
+    out = np.empty((*light.shape[:-1], columns))
+    q, u = light[..., 1, :], light[..., 2, :]
+    out[..., 0, :], out[..., 3, :] = light[..., 0, :], light[..., 3, :]
+    out[..., 1, :] = cosine * q + sine * u
+    out[..., 2, :] = cosine * u - sine * q
+    return out
+
+
+def _three_axes(matrix):
+    return matrix if matrix.ndim == 3 else matrix.reshape(-1, 4, 4)

@@ -1,0 +1,183 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Simulated observations: beam fluxes of any chain, with photon and read noise.
+"""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.chain import stages
+from astropolcal.exceptions import ParameterError
+from astropolcal.observations import Observations
+from astropolcal.propagation import Propagator
+from astropolcal.units import angle_to_rad, length_to_um
+
+__all__ = ["half_wave_plate_cycles", "simulate"]
+
+#: The angles of a calibration run of CHARIS (paper, Sec. 5.1).
+_CYCLE = np.array([0, 45, 11.25, 56.25, 22.5, 67.5, 33.75, 78.75])
+
+
+def half_wave_plate_cycles(hwp=_CYCLE * u.deg, derotator=45 * u.deg):
+    """
+    Return the frames of half-wave-plate cycles at several derotator angles.
+
+    Parameters
+    ----------
+    hwp : `~astropy.units.Quantity`
+        Angles of one cycle, in the order taken; by default the eight of the
+        CHARIS calibrations.
+    derotator : `~astropy.units.Quantity`
+        Derotator angles, one cycle at each.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Columns ``hwp`` and ``derotator``, one row a frame.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.simulation import half_wave_plate_cycles
+    >>> len(half_wave_plate_cycles(derotator=[45, 57.5] * u.deg))
+    16
+    """
+    hwp, derotator = np.atleast_1d(u.Quantity(hwp)), np.atleast_1d(u.Quantity(derotator))
+    return QTable(
+        {"hwp": np.tile(hwp, derotator.size), "derotator": np.repeat(derotator, hwp.size)}
+    )
+
+
+def simulate(
+    chain,
+    wavelength,
+    frames,
+    *,
+    flux=1e7,
+    lamp=None,
+    gain=1.0,
+    read_noise=0.0,
+    noise=True,
+    source=(1.0, 0.0, 0.0, 0.0),
+    seed=None,
+    meta=None,
+    name="simulated",
+):
+    """
+    Simulate the beam fluxes that a chain gives in a list of frames.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        The true chain, with a beam splitter.
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_wavelengths,).
+    frames : `~astropy.table.QTable`
+        One row a frame: the position of every stage (``hwp``, ``derotator``,
+        ...) and whatever else is to stand in the table.
+    flux : float or array_like
+        Flux that enters the chain, in adu; scalar or one value a wavelength.
+    lamp : array_like, optional
+        Relative brightness of the source in each frame.
+    gain : float
+        Electrons per adu.
+    read_noise : float
+        Standard deviation per beam and frame, in electrons.
+    noise : bool
+        Whether to draw noise; the errors are given either way.
+    source : sequence of float
+        Stokes vector of the source.
+    seed : int or `~numpy.random.Generator`, optional
+        Seed of the noise.
+    meta : dict, optional
+        Meta of the table.
+    name : str
+        Name of the dataset.
+
+    Returns
+    -------
+    Observations
+        With errors, on all frames and wavelengths.
+
+    Raises
+    ------
+    ParameterError
+        If flux, gain, lamp or noise are not positive or of the wrong shape, or
+        the chain lets no light through in some frame.
+    ChainError
+        If the position of a stage is missing in ``frames``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 90] * u.deg)
+    >>> simulate(charis.chain(), charis.wavelength, frames, seed=1).n_frames
+    16
+    """
+    wavelength = np.atleast_1d(u.Quantity(wavelength))
+    right, left = _expected(chain, wavelength, frames, source)
+    scale = _scale(flux, lamp, len(frames), len(wavelength))
+    electrons = np.stack([right.T * scale, left.T * scale]) * _positive("gain", gain)
+    variance = electrons + _positive("read_noise", read_noise, zero=True) ** 2
+    if noise:
+        rng = np.random.default_rng(seed)
+        drawn = rng.poisson(electrons) + rng.normal(0.0, 1.0, electrons.shape) * read_noise
+        electrons = drawn.astype(float)
+    table = _table(wavelength, frames, electrons / gain, np.sqrt(variance) / gain)
+    table.meta = {"simulated": True, **(meta or {})}
+    return Observations.from_table(table, name=name)
+
+
+def _expected(chain, wavelength, frames, source):
+    """Return the noiseless fluxes of both beams for unit source, (n_wavelengths, n_frames)."""
+    positions = {
+        stage: angle_to_rad(frames[stage], stage)
+        for stage in stages(chain)
+        if stage in frames.colnames
+    }
+    propagator = Propagator(chain, length_to_um(wavelength), positions, source)
+    shape = (len(wavelength), len(frames))
+    right, left = (np.broadcast_to(flux, shape) for flux in propagator.fluxes())
+    if min(right.min(), left.min()) < 0:
+        raise ParameterError("the chain gives negative flux: it is not physical")
+    return right, left
+
+
+def _positive(name, value, zero=False):
+    value = np.asarray(value, dtype=float)
+    if not np.all(np.isfinite(value)) or np.any(value < 0) or (not zero and np.any(value == 0)):
+        raise ParameterError(
+            f"{name} = {value} must be finite and {'not negative' if zero else 'positive'}"
+        )
+    return value
+
+
+def _scale(flux, lamp, n_frames, n_wavelengths):
+    """Return the flux that enters, (n_frames, n_wavelengths)."""
+    flux = _positive("flux", flux)
+    lamp = _positive("lamp", np.ones(n_frames) if lamp is None else lamp)
+    if flux.shape not in ((), (n_wavelengths,)) or lamp.shape != (n_frames,):
+        raise ParameterError(
+            f"flux has shape {flux.shape} and lamp {lamp.shape}; allowed are a scalar or "
+            f"({n_wavelengths},), and ({n_frames},)"
+        )
+    return lamp[:, None] * np.broadcast_to(flux, (n_wavelengths,))
+
+
+def _table(wavelength, frames, fluxes, errors):
+    n_frames, n_wavelengths = fluxes.shape[1:]
+    table = QTable()
+    table["frame"] = np.repeat(np.arange(n_frames), n_wavelengths)
+    table["bin"] = np.tile(np.arange(n_wavelengths), n_frames)
+    table["wavelength"] = np.tile(wavelength, n_frames)
+    for column in frames.colnames:
+        if column != "frame":
+            table[column] = np.repeat(frames[column], n_wavelengths)
+    for beam, flux, error in zip(("right", "left"), fluxes, errors, strict=True):
+        table[f"flux_{beam}"] = flux.ravel() * u.adu
+        table[f"flux_{beam}_err"] = error.ravel() * u.adu
+    return table

@@ -1,0 +1,87 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Sphinx configuration, on the shared settings of Astropy.
+
+The build needs no network. Links to the documentation of other packages are
+resolved only where ``READTHEDOCS`` or ``ASTROPOLCAL_DOCS_ONLINE`` is set.
+"""
+
+import os
+from datetime import UTC, datetime
+
+from sphinx_astropy.conf.v3 import *  # noqa: F403
+from sphinx_astropy.conf.v3 import (
+    exclude_patterns,
+    extensions,
+    intersphinx_mapping,
+    numpydoc_xref_ignore,
+)
+
+from astropolcal.version import version as release
+
+# -- Project --------------------------------------------------------------------
+
+project = "astropolcal"
+author = "astropolcal developers"
+copyright = f"{datetime.now(tz=UTC).year}, {author}"
+version = release.split("+")[0]
+
+# -- Sources --------------------------------------------------------------------
+
+exclude_patterns += ["changes/*", "_templates", "**/conftest.py"]
+numpydoc_xref_ignore |= {"shape", "array"}
+
+# -- Links to other packages ------------------------------------------------------
+
+ONLINE = bool(os.environ.get("READTHEDOCS") or os.environ.get("ASTROPOLCAL_DOCS_ONLINE"))
+
+EXTERNAL = (
+    "asdf",
+    "asdf_astropy",
+    "astropy",
+    "dask",
+    "emcee",
+    "matplotlib",
+    "numpy",
+    "photutils",
+    "scipy",
+    "specutils",
+)
+
+if ONLINE:
+    for unused in ("astropy.org", "h5py", "pythonloc"):
+        intersphinx_mapping.pop(unused, None)
+    intersphinx_mapping["asdf"] = ("https://www.asdf-format.org/projects/asdf/en/stable/", None)
+    intersphinx_mapping["photutils"] = ("https://photutils.readthedocs.io/en/stable/", None)
+    intersphinx_mapping["specutils"] = ("https://specutils.readthedocs.io/en/stable/", None)
+else:
+    intersphinx_mapping = {}
+    # it looks for its inventories on the network
+    extensions = [name for name in extensions if not name.endswith("intersphinx_toggle")]
+
+nitpicky = True
+nitpick_ignore_regex = [
+    # private bases, and packages whose inventory lists too little
+    (r"py:.*", r"astropolcal\.(.*\.)?_.*"),
+    (r"py:.*", r"(astropy\.modeling|numpy\.typing)\..*"),
+]
+if not ONLINE:
+    builtin = (
+        r"(bool|bytes|dict|float|int|list|object|str|tuple|type|property|None|True|False"
+        r"|[A-Z]\w*(Error|Warning|Exception)|Exception"
+        r"|(abc|collections|contextlib|dataclasses|enum|functools|pathlib|typing)\..*)"
+    )
+    nitpick_ignore_regex += [
+        (r"py:.*", rf"({'|'.join(EXTERNAL)})(\..*)?"),
+        (r"py:.*", builtin),
+    ]
+
+# -- Pages ------------------------------------------------------------------------
+
+html_title = f"astropolcal {version}"
+html_static_path = []
+modindex_common_prefix = ["astropolcal."]
+
+# the class page lists attributes and methods already
+numpydoc_show_class_members = False
+autoclass_content = "class"

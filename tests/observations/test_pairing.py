@@ -1,0 +1,171 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Pairs by half-wave-plate angle: preference, left-over frames, laws."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.observations import pair_frames
+
+CYCLE = [0.0, 45.0, 22.5, 67.5]
+
+
+def pair(hwp, derotator=None, **kwargs):
+    derotator = None if derotator is None else derotator * u.deg
+    return pair_frames(np.array(hwp, dtype=float) * u.deg, derotator, **kwargs).tolist()
+
+
+def test_one_cycle():
+    assert pair(CYCLE) == [[0, 1], [2, 3]]
+
+
+@pytest.mark.parametrize("order", [[3, 1, 0, 2], [2, 3, 1, 0]])
+def test_the_order_of_frames_does_not_matter(order):
+    hwp = np.array(CYCLE)[order]
+    found = {(hwp[p], hwp[m]) for p, m in pair(hwp)}
+    assert found == {(0.0, 45.0), (22.5, 67.5)}
+
+
+def test_the_plus_frame_has_an_angle_below_45_degrees():
+    # 45 deg comes first, yet 0 deg is the plus frame
+    assert pair([45.0, 0.0]) == [[1, 0]]
+
+
+def test_angles_up_to_180_degrees():
+    hwp = np.arange(0.0, 180.0, 11.25)  # the 16 angles of the VAMPIRES calibration
+    found = {(hwp[p], hwp[m]) for p, m in pair(hwp)}
+    assert found == {(a, a + 45) for a in (0, 11.25, 22.5, 33.75, 90, 101.25, 112.5, 123.75)}
+
+
+def test_angles_are_the_same_modulo_180_degrees():
+    assert pair([180.0, 45.0]) == [[0, 1]]
+    assert pair([0.0, 225.0]) == [[0, 1]]
+    assert pair([-180.0, -135.0]) == [[0, 1]]
+
+
+def test_an_unused_partner_45_degrees_behind_will_do():
+    assert pair([90.0, 45.0]) == [[0, 1]]
+
+
+def test_a_partner_ahead_is_preferred_to_a_nearer_one_behind():
+    assert pair([45.0, 90.0, 0.0, 135.0]) == [[1, 3], [2, 0]]
+
+
+@pytest.mark.parametrize("offset", [-0.2, 0.0, 0.2])
+def test_tolerance_at_the_edge_of_the_range(offset):
+    # 0 deg read back as 359.8 deg is still the plus frame
+    assert pair([np.mod(offset, 360.0), 45.0]) == [[0, 1]]
+
+
+def test_beyond_the_tolerance_there_is_no_partner():
+    with pytest.raises(ObservationError, match="hwp = 0 deg has no partner"):
+        pair([0.0, 45.4])
+    assert pair([0.0, 45.4], tolerance=0.5 * u.deg) == [[0, 1]]
+
+
+def test_the_nearest_in_the_sequence_wins():
+    # the cycle starts in the middle: frame 0 is nearer to nothing than frame 4 is to frame 3
+    hwp = [45.0, 22.5, 67.5, 0.0, 45.0, 22.5, 67.5]
+    with pytest.warns(AstropolcalWarning, match=r"1 of 7 frames left out.*frame 0 \(hwp 45 deg\)"):
+        assert pair(hwp) == [[1, 2], [3, 4], [5, 6]]
+
+
+def test_time_replaces_the_sequence():
+    hwp = [0.0, 45.0, 45.0, 0.0]
+    assert pair(hwp) == [[0, 1], [3, 2]]
+    assert pair(hwp, time=[0.0, 9.0, 1.0, 8.0]) == [[0, 2], [3, 1]]
+
+
+def test_the_derotator_must_stand_still():
+    hwp, derotator = [0.0, 45.0, 0.0, 45.0], [45.0, 60.0, 60.0, 45.0]
+    assert pair(hwp, derotator) == [[0, 3], [2, 1]]
+
+
+def test_a_drifting_derotator_pairs_neighbours():
+    hwp = CYCLE * 10
+    derotator = 97.0 - 0.02 * np.arange(40)
+    assert pair(hwp, derotator) == [[i, i + 1] for i in range(0, 40, 2)]
+
+
+def test_derotator_tolerance():
+    with pytest.warns(AstropolcalWarning, match="2 of 2 frames left out"):
+        assert pair([0.0, 45.0], [90.0, 90.6]) == []
+    assert pair([0.0, 45.0], [90.0, 90.6], derotator_tolerance=1 * u.deg) == [[0, 1]]
+
+
+def test_the_modulator_must_be_in_the_same_state():
+    assert pair([0.0, 0.0, 45.0, 45.0], flc_state=["A", "B", "B", "A"]) == [[0, 3], [1, 2]]
+
+
+def test_left_over_frames_are_named():
+    with pytest.warns(
+        AstropolcalWarning, match=r"night: 1 of 3 frames left out.* frame 17 \(hwp 90 deg\)"
+    ):
+        assert pair([0.0, 45.0, 90.0], labels=[5, 6, 17], name="night") == [[0, 1]]
+
+
+def test_many_left_over_frames_are_counted():
+    with pytest.warns(AstropolcalWarning, match="19 of 21 frames left out.* and 9 more"):
+        pair([0.0] * 20 + [45.0])
+
+
+def test_sharing_gives_every_frame_a_partner():
+    assert pair([0.0, 45.0, 90.0], share=True) == [[0, 1], [2, 1]]
+
+
+def test_sharing_leaves_complete_cycles_alone():
+    assert pair(CYCLE * 3, share=True) == pair(CYCLE * 3)
+
+
+def test_sharing_does_not_bridge_derotator_angles():
+    with pytest.warns(AstropolcalWarning, match=r"1 of 3.*frame 2 \(hwp 0 deg\)"):
+        assert pair([0.0, 45.0, 0.0], [45.0, 45.0, 60.0], share=True) == [[0, 1]]
+
+
+def test_an_angle_without_partner_is_an_error_that_names_the_row():
+    with pytest.raises(ObservationError, match=r"night.ecsv, row 13: hwp = 10 deg has no partner"):
+        pair([*CYCLE, 10.0], rows=[1, 4, 7, 10, 13], name="night.ecsv")
+
+
+def test_an_angle_without_partner_is_an_error_without_rows():
+    with pytest.raises(ObservationError, match="table, frame index 0: hwp = 10 deg"):
+        pair([10.0])
+
+
+def test_angles_need_a_unit():
+    with pytest.raises(ValueError, match="needs a unit such as rad"):
+        pair_frames([0.0, 45.0])
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(np.arange(0, 180, 22.5)), st.sampled_from([45.0, 70.0])),
+        min_size=1,
+        max_size=24,
+    ),
+    st.booleans(),
+)
+def test_laws_of_pairing(frames, share):
+    hwp, derotator = np.array([*frames, *((a + 45.0, d) for a, d in frames)]).T
+    pairs = np.array(pair(hwp, derotator, share=share))
+    plus, minus = pairs.T
+    np.testing.assert_array_equal(np.mod(hwp[plus] - hwp[minus], 90.0), 45.0)
+    np.testing.assert_array_equal(derotator[plus], derotator[minus])
+    assert np.all(np.mod(hwp[plus], 90.0) < 45.0)
+    if not share:
+        # every angle was added with its partner, so everything can be paired once
+        assert len(set(pairs.ravel())) == pairs.size
+    assert set(pairs.ravel()) == set(range(len(hwp)))
+
+
+@given(st.permutations(range(12)))
+def test_pairs_follow_the_times_whatever_the_order(order):
+    time = np.arange(12.0)
+    hwp = np.array(CYCLE * 3)
+    order = np.array(order)
+    found = pair_frames(hwp[order] * u.deg, time=time[order])
+    back = {tuple(order[p] for p in pair) for pair in found.tolist()}
+    assert back == {(i, i + 1) for i in range(0, 12, 2)}

@@ -1,0 +1,569 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Bad tables: one line that names the file, the place and what is allowed."""
+
+import re
+import time
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import EarthLocation, SkyCoord
+from astropy.table import QTable, Table
+from astropy.utils.masked import Masked
+
+from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.observations import Observations, example_table
+from astropolcal.observations.reading import numeric_column
+
+
+@pytest.fixture
+def table():
+    return example_table()
+
+
+def from_file(table, folder):
+    """Write a table as it is and read it as observations."""
+    path = folder / "night.ecsv"
+    table.write(path, format="ascii.ecsv")
+    return Observations.read(path)
+
+
+def refuse(table, match):
+    with pytest.raises(ObservationError, match=match) as info:
+        Observations.from_table(table, path="night.ecsv")
+    message = str(info.value)
+    assert message.startswith("night.ecsv")
+    assert "\n" not in message
+    return message
+
+
+def set_row(table, name, row, value):
+    """Return a table of which one value is replaced, whatever its type."""
+    column = np.array(getattr(table[name], "value", table[name]), dtype=float)
+    column[row] = value
+    unit = getattr(table[name], "unit", None)
+    table[name] = column if unit is None else column * unit
+    return table
+
+
+# ---- files -----------------------------------------------------------------------------------
+
+
+def test_no_such_file(tmp_path):
+    with pytest.raises(ObservationError, match=r"nowhere.ecsv: no such file"):
+        Observations.read(tmp_path / "nowhere.ecsv")
+
+
+def test_a_folder(tmp_path):
+    with pytest.raises(ObservationError, match="is a folder, an ECSV file is needed"):
+        Observations.read(tmp_path)
+
+
+@pytest.mark.parametrize("path", [None, 7, "a\0b"])
+def test_not_a_path(path):
+    with pytest.raises(ObservationError, match="cannot be read"):
+        Observations.read(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (b"", "not an ECSV table; its first line must start with '# %ECSV'"),
+        (b"frame,bin\n0,0\n", "not an ECSV table"),
+        (b"\x80\x04\x95\x10pickle", "not a text file"),
+        (b"\x89PNG\r\n\x1a\n\0\0\xff", "not a text file"),
+        (b"# %ECSV 1.0\n", "not a readable ECSV table"),
+        (b"# %ECSV 1.0\n# ---\n# datatype: [\n", "not a readable ECSV table"),
+        (b"# %ECSV 1.0\n# ---\n# {a: *b}\nframe\n", "not a readable ECSV table"),
+        (b"# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\na\nx\n", "readable"),
+        (b"# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\na\n1\n", "missing col"),
+    ],
+)
+def test_not_a_table(tmp_path, content, match):
+    path = tmp_path / "night.ecsv"
+    path.write_bytes(content)
+    with pytest.raises(ObservationError, match=match) as info:
+        Observations.read(path)
+    assert str(info.value).startswith(str(path))
+    assert "\n" not in str(info.value)
+
+
+def test_a_row_with_too_few_values_is_named(tmp_path, table):
+    path = tmp_path / "night.ecsv"
+    table.write(path, format="ascii.ecsv")
+    lines = path.read_text().splitlines()
+    lines[-2] = lines[-2].rsplit(" ", 1)[0]
+    path.write_text("\n".join(lines))
+    with pytest.raises(ObservationError, match=r"inconsistent with data columns .* at data line"):
+        Observations.read(path)
+
+
+def test_a_table_cut_off_in_the_header(tmp_path, table):
+    path = tmp_path / "night.ecsv"
+    table.write(path, format="ascii.ecsv")
+    text = path.read_text()
+    path.write_text(text[: text.index("meta")])
+    with pytest.raises(ObservationError, match="not a readable ECSV table"):
+        Observations.read(path)
+
+
+def test_a_huge_header_is_refused_at_once(tmp_path):
+    path = tmp_path / "night.ecsv"
+    column = "# - {name: c, datatype: float64}\n"
+    path.write_text("# %ECSV 1.0\n# ---\n# datatype:\n" + column * 10**5 + "c\n1\n")
+    start = time.perf_counter()
+    with pytest.raises(ObservationError, match="the header is longer than the 262144 characters"):
+        Observations.read(path)
+    assert time.perf_counter() - start < 2
+
+
+def test_a_header_that_would_explode_is_refused(tmp_path):
+    levels = ["# a0: &a0 {x: 1, y: 2}"]
+    levels += [f"# a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}, *a{i - 1}]}}" for i in range(1, 40)]
+    path = tmp_path / "night.ecsv"
+    path.write_text("\n".join(["# %ECSV 1.0", "# ---", *levels, "c", "1"]))
+    with pytest.raises(ObservationError, match="merge keys"):
+        Observations.read(path)
+
+
+def test_a_header_that_promises_giant_arrays_is_refused(tmp_path):
+    path = tmp_path / "night.ecsv"
+    column = "{name: c, datatype: string, subtype: 'float64[1000000000,1000]'}"
+    path.write_text(f"# %ECSV 1.0\n# ---\n# datatype:\n# - {column}\nc\n[1]\n")
+    start = time.perf_counter()
+    with pytest.raises(ObservationError, match=r"night.ecsv"):
+        Observations.read(path)
+    assert time.perf_counter() - start < 2
+
+
+def test_a_header_that_calls_python_is_refused(tmp_path):
+    path, trace = tmp_path / "night.ecsv", tmp_path / "trace"
+    call = (
+        f"!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path [{trace}]]"
+    )
+    column = "{name: c, datatype: int64}"
+    path.write_text(f"# %ECSV 1.0\n# ---\n# datatype:\n# - {column}\n# meta: {call}\nc\n1\n")
+    with pytest.raises(ObservationError, match="not a readable ECSV table"):
+        Observations.read(path)
+    assert not trace.exists()
+
+
+def test_columns_of_objects_are_refused(tmp_path, table):
+    table["extra"] = np.array([{"a": 1}] * len(table), dtype=object)
+    with pytest.raises(ObservationError, match="column extra has type object; allowed are numbers"):
+        from_file(table, tmp_path)
+
+
+# ---- columns ---------------------------------------------------------------------------------
+
+
+def test_not_a_table_in_memory():
+    with pytest.raises(ObservationError, match="x: a dict, an astropy Table is needed"):
+        Observations.from_table({}, name="x")
+
+
+def test_all_missing_columns_are_named(table):
+    table.remove_columns(["hwp", "bin", "flux_left"])
+    message = refuse(table, "missing columns bin, hwp, flux_left; it has frame, wavelength")
+    assert "derotator" in message
+
+
+def test_a_single_missing_column(table):
+    table.remove_column("derotator")
+    refuse(table, "missing column derotator; it has ")
+
+
+def test_a_table_without_rows(table):
+    refuse(table[:0], "the table is empty, at least one row")
+
+
+def test_a_table_without_columns():
+    refuse(QTable(), "missing columns frame, .*; it has none")
+
+
+@pytest.mark.parametrize("name", ["wavelength", "hwp", "derotator", "flux_left", "flux_right_err"])
+def test_columns_without_unit(table, name):
+    table[name] = table[name].value
+    refuse(table, f"column {name} has no unit, a unit such as ")
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "match"),
+    [
+        ("wavelength", u.deg, "column wavelength has unit deg, a unit such as um is needed"),
+        ("wavelength", u.Hz, "column wavelength has unit Hz"),
+        ("hwp", u.um, "column hwp has unit um, a unit such as deg is needed"),
+        ("derotator", u.s, "column derotator has unit s"),
+        ("flux_left", u.Jy, "column flux_left has unit Jy, a unit such as adu is needed"),
+        ("flux_left_err", u.deg, "column flux_left_err has unit deg"),
+        ("flux_right", u.mag, "column flux_(right|left)"),
+    ],
+)
+def test_columns_with_a_wrong_unit(table, name, unit, match):
+    table[name] = table[name].value * unit
+    refuse(table, match)
+
+
+def test_fluxes_are_linear(table):
+    table["flux_right"] = u.Magnitude(np.ones(len(table)) * u.adu)
+    refuse(table, r"column flux_right has unit mag\(adu\), a linear unit such as adu is needed")
+
+
+def test_an_unknown_unit_in_a_file(tmp_path, table):
+    path = tmp_path / "night.ecsv"
+    table.write(path, format="ascii.ecsv")
+    path.write_text(path.read_text().replace("unit: um", "unit: furlongs"))
+    with pytest.raises(ObservationError, match="column wavelength has unit furlongs"):
+        Observations.read(path)
+
+
+def test_fluxes_may_lack_a_unit_together(table):
+    for name in table.colnames[-4:]:
+        table[name] = table[name].value
+    obs = Observations.from_table(table)
+    assert obs.flux_unit == u.dimensionless_unscaled
+    assert np.isfinite(obs.variance_right).all()
+
+
+def test_the_left_flux_is_converted_to_the_unit_of_the_right(table):
+    table["flux_left"] = (table["flux_left"].value / 1000) * (1000 * u.adu)
+    obs = Observations.from_table(table)
+    np.testing.assert_allclose(obs.flux_left, Observations.from_table(example_table()).flux_left)
+
+
+@pytest.mark.parametrize("name", ["frame", "bin", "wavelength", "hwp", "flux_right"])
+def test_columns_that_are_not_numbers(table, name):
+    table[name] = [f"x{i}" for i in range(len(table))]
+    refuse(table, f"column {name} has type <U3, numbers are needed")
+
+
+def test_complex_and_boolean_columns(table):
+    table["flux_right"] = table["flux_right"] * (1 + 0j)
+    refuse(table, "column flux_right has type complex128")
+    table["flux_right"] = np.ones(len(table), bool)
+    refuse(table, "column flux_right has type bool")
+
+
+def test_coordinates_are_not_numbers(table):
+    table["hwp"] = SkyCoord([0] * len(table) * u.deg, [0] * len(table) * u.deg)
+    refuse(table, "column hwp has type SkyCoord, numbers are needed")
+
+
+def test_columns_with_more_than_one_value_a_row(table):
+    table["flux_right"] = np.ones((len(table), 2)) * u.adu
+    refuse(table, r"column flux_right has shape \(12, 2\), one value a row is allowed")
+
+
+@pytest.mark.parametrize(("one", "other"), [("flux_right_err", "flux_left_err")])
+def test_half_of_the_errors(table, one, other):
+    table.remove_column(other)
+    refuse(table, f"missing column {other}; it has {one}")
+
+
+def test_half_of_the_single_errors(table):
+    table["single_sum_err"] = table["flux_right_err"]
+    table.remove_columns(["flux_right_err", "flux_left_err"])
+    refuse(table, "missing column single_difference_err; it has single_sum_err")
+
+
+def test_no_errors_at_all(table):
+    table.remove_columns(["flux_right_err", "flux_left_err"])
+    obs = Observations.from_table(table)
+    assert not obs.has_errors
+    assert np.isnan(obs.variance_right).all()
+    assert not obs.mask.any()
+
+
+def test_errors_of_the_beams_win(table):
+    table["single_sum_err"] = table["single_difference_err"] = 9 * table["flux_right_err"]
+    obs = Observations.from_table(table)
+    np.testing.assert_allclose(obs.variance_right, obs.flux_right)
+
+
+# ---- rows ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["frame", "bin", "wavelength", "hwp", "derotator"])
+def test_values_that_must_be_finite(table, name, value):
+    refuse(set_row(table, name, 4, value), rf"row 5: {name} = {value}( um)?, allowed are ")
+
+
+def test_angles_keep_their_digits(table):
+    refuse(set_row(table, "hwp", 0, 1e9), r"row 1: hwp = 1000000000.0, allowed are .* 1e\+06 deg")
+
+
+@pytest.mark.parametrize("name", ["parallactic", "altitude"])
+def test_angles_on_sky_must_be_finite_angles(table, name):
+    table[name] = np.ones(len(table)) * u.deg
+    refuse(set_row(table, name, 1, np.nan), f"row 2: {name} = nan, allowed are finite angles")
+    table[name] = np.ones(len(table)) * u.m
+    refuse(table, f"column {name} has unit m, a unit such as deg")
+
+
+@pytest.mark.parametrize("name", ["frame", "hwp", "wavelength"])
+def test_masked_values_that_must_be_finite(tmp_path, table, name):
+    mask = np.arange(len(table)) == 2
+    column = table[name]
+    table[name] = np.ma.MaskedArray(column, mask) if name == "frame" else Masked(column, mask)
+    with pytest.raises(ObservationError, match=rf"night.ecsv, row 3: {name} = nan"):
+        from_file(table, tmp_path)
+
+
+def test_frames_are_whole_numbers(table):
+    refuse(set_row(table, "frame", 3, 0.5), "row 4: frame = 0.5, allowed are whole numbers")
+
+
+def test_whole_numbers_may_be_floats(table):
+    table["frame"] = table["frame"].astype(float)
+    assert Observations.from_table(table).frames["frame"].dtype == np.int64
+
+
+@pytest.mark.parametrize("value", [0.0, -1.6, 1e-300, 1e300])
+def test_wavelengths_are_positive(table, value):
+    match = re.escape(f"row 1: wavelength = {value:g} um, allowed are lengths above zero")
+    refuse(set_row(table, "wavelength", 0, value), match)
+
+
+def test_a_cell_given_twice(table):
+    table["frame"][7] = 1
+    table["hwp"][7] = 22.5 * u.deg
+    refuse(table, "row 8: frame = 1, bin = 1 is given already in row 5; one row a frame and bin")
+
+
+def test_a_bin_with_two_wavelengths(table):
+    table["wavelength"][5] += 1e-4 * u.um
+    refuse(table, r"row 6: wavelength = 2.2001 um in bin 2, other rows of this bin have 2.2 um")
+
+
+def test_rounded_wavelengths_are_the_same(table):
+    table["wavelength"][5] *= 1 + 5e-7
+    assert Observations.from_table(table).wavelength[2].value == 2.2
+
+
+def test_two_bins_with_one_wavelength(table):
+    table["wavelength"][table["bin"] == 2] = 1.2 * u.um
+    refuse(table, r"row 3: wavelength = 1.2 um of bin 2 is also that of bin 0; one bin each")
+
+
+@pytest.mark.parametrize("name", ["hwp", "derotator"])
+def test_columns_of_frames_are_constant(table, name):
+    table[name][4] += 1 * u.deg
+    refuse(table, rf"row 5: {name} = .* deg in frame 1, but .* deg in row 4; one value a frame")
+
+
+def test_other_columns_of_frames_are_constant(table):
+    table["file"] = [f"cube{i}" for i in range(len(table))]
+    refuse(table, "row 2: file = cube1 in frame 0, but cube0 in row 1; one value a frame")
+
+
+def test_coordinates_of_frames(tmp_path, table):
+    right_ascension = np.where(table["frame"] == 0, 10.0, 20.0) * u.deg
+    table["target"] = SkyCoord(right_ascension, np.zeros(len(table)) * u.deg)
+    obs = from_file(table, tmp_path)
+    assert obs.frames["target"].ra.to_value(u.deg).tolist() == [10.0, 20.0, 20.0, 20.0]
+    assert len(obs.content_hash) == 64
+    table["target"] = SkyCoord(np.arange(len(table)) * u.deg, np.zeros(len(table)) * u.deg)
+    refuse(table, "row 2: target = .* in frame 0, but ")
+
+
+def test_structured_columns_are_refused(table):
+    table["site"] = EarthLocation.from_geodetic(*np.zeros((2, len(table))) * u.deg)
+    refuse(table, "column site has type .*'x', '<f8'.*; allowed are numbers, strings and times")
+
+
+def test_unknown_values_of_frames_agree(table):
+    table["seeing"] = np.where(table["frame"] == 1, np.nan, 0.5) * u.arcsec
+    table["comment"] = np.ma.MaskedArray(["clear"] * len(table), table["frame"] == 0)
+    frames = Observations.from_table(table).frames
+    assert np.isnan(frames["seeing"][1])
+    assert frames["comment"].mask.tolist() == [True, False, False, False]
+    table["comment"].mask[0] = False
+    refuse(table, "row 2: comment = ")
+
+
+def test_negative_errors(table):
+    table["flux_left_err"][8] *= -1
+    refuse(table, r"row 9: flux_left_err = -.*, allowed are errors above zero")
+
+
+def test_a_grid_that_is_nearly_all_holes():
+    n = 5000
+    table = QTable(
+        {
+            "frame": np.arange(n),
+            "bin": np.arange(n),
+            "wavelength": np.linspace(1, 2, n) * u.um,
+            "hwp": np.zeros(n) * u.deg,
+            "derotator": np.zeros(n) * u.deg,
+            "flux_right": np.ones(n) * u.adu,
+            "flux_left": np.ones(n) * u.adu,
+        }
+    )
+    refuse(table, "5000 rows for 5000 frames and 5000 bins; at least one in 20")
+
+
+# ---- masked cells ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("flux_right", np.nan, "flux not finite"),
+        ("flux_left", np.inf, "flux not finite"),
+        ("flux_left", 1e300, "flux not finite"),
+        ("flux_left_err", 1e-320, "error not positive"),
+        ("flux_right", 0.0, "flux not positive"),
+        ("flux_left", -3.0, "flux not positive"),
+        ("flux_right_err", np.nan, "error not finite"),
+        ("flux_left_err", np.inf, "error not finite"),
+        ("flux_left_err", 0.0, "error not positive"),
+    ],
+)
+def test_bad_cells_are_masked_with_a_reason(table, name, value, reason):
+    # rows 5 and 8: frames 1 and 2, bin 1
+    for row in (4, 7):
+        table = set_row(table, name, row, value)
+    match = rf"night: 2 cells masked, {reason} \(first: row 5: .*{re.escape(f'{name} = {value:g}')}"
+    with pytest.warns(AstropolcalWarning, match=match) as record:
+        obs = Observations.from_table(table, name="night")
+    assert len(record) == 1
+    assert np.argwhere(obs.mask).tolist() == [[1, 1], [2, 1]]
+    assert obs.mask_reasons == {reason: 2}
+    assert np.isnan(obs.flux_right[1, 1])
+    assert np.isnan(obs.flux_left[1, 1])
+    assert np.isnan(obs.variance_left[1, 1])
+    assert np.isfinite(obs.variance_left[~obs.mask]).all()
+
+
+def test_masked_values_of_a_file_are_masked(tmp_path, table):
+    table["flux_left"] = Masked(table["flux_left"], np.arange(len(table)) == 1)
+    with pytest.warns(AstropolcalWarning, match="1 cell masked, flux not finite"):
+        obs = from_file(table, tmp_path)
+    assert np.argwhere(obs.mask).tolist() == [[0, 1]]
+
+
+def test_one_warning_for_each_reason(table):
+    table["flux_left"][0] = np.nan
+    table["flux_left"][1] = 0 * u.adu
+    with pytest.warns(AstropolcalWarning) as record:
+        obs = Observations.from_table(table)
+    assert [re.search("masked, ([a-z ]+)", str(w.message))[1].strip() for w in record] == [
+        "flux not finite",
+        "flux not positive",
+    ]
+    assert obs.mask_reasons == {"flux not finite": 1, "flux not positive": 1}
+
+
+def test_missing_rows_are_masked(table):
+    table.remove_rows([5, 6])
+    with pytest.warns(
+        AstropolcalWarning, match=r"2 cells masked, missing \(first: frame 1, bin 2 has no row"
+    ):
+        obs = Observations.from_table(table)
+    assert obs.mask_reasons == {"missing": 2}
+    assert np.argwhere(obs.mask).tolist() == [[1, 2], [2, 0]]
+
+
+def test_all_cells_masked(table):
+    table["flux_left"][:] = np.nan
+    with pytest.warns(AstropolcalWarning, match="12 cells masked"):
+        refuse(table, r"all 12 cells are masked \(flux not finite\), at least one usable cell")
+
+
+def test_a_column_of_reasons_must_be_text(table):
+    table["mask_reason"] = 1
+    refuse(table, "column mask_reason has type int64, strings are needed")
+
+
+def test_numeric_column_copies(table):
+    values = numeric_column(table, "hwp", "x", u.deg)
+    values[:] = 1
+    assert table["hwp"][0] == 0
+
+
+# ---- damaged files ---------------------------------------------------------------------------
+
+
+VALUES = "nan inf -inf 0 -1 1e308 1e-320 0.1 45 180 -0.0 2 x True 99999999999999999999".split()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wrong_values_end_in_an_error_or_a_sound_table(tmp_path, table, seed):
+    path, copy = tmp_path / "night.ecsv", tmp_path / "copy.ecsv"
+    Table(table).write(path, format="ascii.ecsv")
+    head, body = path.read_text().split("\nframe")
+    rows = [line.split(" ") for line in body.splitlines()]
+    rng = np.random.default_rng(seed)
+    sound = 0
+    for _ in range(100):
+        wrong = [list(row) for row in rows]
+        row, column = rng.integers(1, len(rows)), rng.integers(len(rows[0]))
+        for index in range(1, len(rows)) if rng.random() < 0.4 else [row]:
+            wrong[index][column] = VALUES[rng.integers(len(VALUES))]
+        path.write_text(head + "\nframe" + "\n".join(" ".join(row) for row in wrong))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AstropolcalWarning)
+            try:
+                obs = Observations.read(path)
+            except ObservationError as error:
+                assert str(error).startswith(str(path)), str(error)  # noqa: PT017
+                continue
+        obs.write(copy, overwrite=True)
+        assert Observations.read(copy).content_hash == obs.content_hash
+        assert (obs.variance_right[~obs.mask] > 0).all()
+        sound += 1
+    assert 5 < sound < 60
+
+
+PRINTABLE = list(b" \n\t#:{}[]-.,eE0123456789\"'&*!|%")
+
+
+def damaged(content, rng, start=0):
+    """Return the bytes of a file after a few random accidents behind ``start``."""
+    data = bytearray(content)
+    for _ in range(rng.integers(1, 4)):
+        if len(data) <= start:
+            break
+        at = int(rng.integers(start, len(data)))
+        match rng.integers(8):
+            case 0:
+                data[at] = int(rng.integers(256))
+            case 1:
+                del data[at : at + int(rng.integers(1, 30))]
+            case 2:
+                data[at:at] = data[at : at + int(rng.integers(1, 60))]
+            case 3 if rng.random() < 0.3:
+                del data[at:]
+            case _:
+                data[at] = int(rng.choice(PRINTABLE))
+    return bytes(data)
+
+
+@pytest.mark.parametrize("part", ["anywhere", "rows"])
+@pytest.mark.parametrize("seed", range(3))
+def test_damaged_files_end_in_one_kind_of_error(tmp_path, table, seed, part):
+    table["file"] = [f"cube{frame}.fits" for frame in table["frame"]]
+    path = tmp_path / "night.ecsv"
+    Table(table).write(path, format="ascii.ecsv")
+    content = path.read_bytes()
+    start = content.index(b"\nframe") if part == "rows" else 0
+    rng = np.random.default_rng(seed)
+    messages = []
+    for _ in range(100):
+        path.write_bytes(damaged(content, rng, start))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            warnings.simplefilter("ignore", AstropolcalWarning)
+            try:
+                obs = Observations.read(path)
+                assert len(obs.content_hash) == 64
+                assert obs.summary().startswith("night: ")
+                assert np.isfinite(obs.flux_right[~obs.mask]).all()
+                obs.pairs()
+            except ObservationError as error:
+                messages.append(str(error))
+    # damage in a value may go unseen, damage of the structure may not
+    assert 20 < len(messages) < 100
+    assert all(message.startswith(f"{path}") and "\n" not in message for message in messages)
