@@ -196,9 +196,10 @@ def _joint(measurement, weight, fitter, search):
     problem = BinProblem(measurement, weight)
     if search:
         measurement.parameters = search_branches(problem, measurement.vector())[0]
-    for _ in range(_MAX_ROUNDS):
+    for left in reversed(range(_MAX_ROUNDS)):
         outcome = _run(measurement, weight, fitter)
-        if not search:
+        # the last word belongs to the fit of all parameters, not to a search by bin
+        if not search or not left:
             break
         better, moved = search_branches(problem, measurement.vector())
         if not moved.any():
@@ -219,23 +220,32 @@ def _two_step(measurement, weight, fitter, search, options):
     parts = [dataset.observations for dataset in measurement.datasets]
     single = {slot.name for slot in measurement.free.slots if not slot.per_wavelength}
     several = {slot.name for slot in measurement.free.slots if slot.per_wavelength}
-    options = options | {"ties": measurement.free.ties, "wavelength": measurement.wavelength * u.um}
+    ties = measurement.free.ties
+    measurement.put_back()
+    options = options | {"wavelength": measurement.wavelength * u.um}
     stages = []
 
     loose = [_loosened(chain, measurement.wavelength * u.um) for chain in measurement.chains]
-    first = Measurement(_held(loose, single), parts, **options)
+    first = _step_of(loose, single, parts, ties, options)
     outcome = _joint(first, weight, fitter, search)
     stages.append(_stage("per wavelength, misalignments held", first))
     _copy_values(first.put_back(), measurement.chains)
 
     for title, held in (("global", several), ("per wavelength, global parameters held", single)):
-        step = Measurement(_held(measurement.chains, held), parts, **options)
+        step = _step_of(measurement.chains, held, parts, ties, options)
         if step.free.size:
             outcome = _run(step, weight, fitter)
         stages.append(_stage(title, step))
         _copy_values(step.put_back(), measurement.chains)
     measurement.parameters = measurement.free.start()
     return outcome, stages
+
+
+def _step_of(chains, held, parts, ties, options):
+    """Return the measurement of one step; what follows a held parameter is held too."""
+    known = set(parameter_table(chains))
+    live = {n: tie for n, tie in ties.items() if n in known and tie.source in known - held}
+    return Measurement(_held(chains, held | (set(ties) - set(live))), parts, ties=live, **options)
 
 
 def _loosened(chain, wavelength):

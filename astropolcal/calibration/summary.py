@@ -1,10 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """A calibration in words for the terminal, and in numbers for machines."""
 
+import textwrap
+
 import astropy.units as u
 import numpy as np
 
 __all__ = ["summary", "to_dict"]
+
+_WIDTH = 80
+_N_COLUMNS = 5
 
 
 def summary(calibration):
@@ -41,29 +46,17 @@ def summary(calibration):
         _global_lines(known),
         *(_accuracy_lines(record) for record in calibration.datasets),
         _wavelength_lines(calibration, known),
-        [str(calibration.identifiability)],
+        list(_wrap([str(calibration.identifiability)])),
         _bound_lines(calibration),
     ]
-    return "\n\n".join("\n".join(_wrap(part)) for part in parts if part)
+    return "\n\n".join("\n".join(part) for part in parts if part)
 
 
-def _wrap(lines, width=80):
-    import textwrap
-
-    for line in lines:
-        for row in line.split("\n"):
-            indent = "    " if row.startswith("  - ") else ""
-            yield from (
-                textwrap.wrap(
-                    row,
-                    width,
-                    subsequent_indent=indent,
-                    drop_whitespace=False,
-                    replace_whitespace=False,
-                )
-                if len(row) > width
-                else [row]
-            )
+def _wrap(lines):
+    """Break long lines at 80 columns, keeping the indentation of list items."""
+    for line in "\n".join(lines).split("\n"):
+        indent = " " * (len(line) - len(line.lstrip(" -")))
+        yield from textwrap.wrap(line, _WIDTH, subsequent_indent=indent) or [""]
 
 
 def _heading(calibration):
@@ -78,21 +71,23 @@ def _heading(calibration):
     ]
 
 
-def _number(value, std, unit):
-    digits = 4 if unit else 5
-    error = f"+- {std:.{digits}f}" if np.isfinite(std) else "not determined alone"
-    return f"{value:12.{digits}f} {error:<22}{unit}"
+def _number(entry):
+    """Return value, error and unit of a parameter common to all wavelengths."""
+    value, std, unit = float(entry["value"]), float(entry["std"]), str(entry["unit"] or "")
+    if entry["tied"]:
+        note = f"follows {entry['tied']}"
+    elif entry["at_bound"]:
+        note = "at a bound"
+    elif not np.isfinite(std):
+        note = "not determined alone, see below"
+    else:
+        return f"{value:12.5f} +- {std:.5f} {unit}"
+    return f"{value:12.5f} {unit} ({note})"
 
 
 def _global_lines(known):
-    lines = []
-    for name, entry in known.items():
-        if entry["fixed"] or entry["value"].ndim:
-            continue
-        note = f"  follows {entry['tied']}" if entry["tied"] else ""
-        note += "  AT BOUND" if entry["at_bound"] else ""
-        number = _number(float(entry["value"]), float(entry["std"]), str(entry["unit"] or ""))
-        lines.append(f"  {name:<30}{number}{note}".rstrip())
+    shown = {n: e for n, e in known.items() if not e["fixed"] and not e["value"].ndim}
+    lines = [f"  {name:<28}{_number(entry)}".rstrip() for name, entry in shown.items()]
     return ["Parameters for all wavelengths", *lines] if lines else []
 
 
@@ -120,41 +115,40 @@ def _wavelength_lines(calibration, known):
     several = {n: e for n, e in known.items() if e["value"].ndim and not e["fixed"]}
     if not several:
         return []
-    accuracy = calibration.datasets[0].accuracy
-    shown = list(several)[:5]
-    heads = [name.split(".")[1] for name in shown]
-    units = [str(several[name]["unit"] or "") for name in shown]
-    optics = [name.split(".")[0] for name in shown]
-    lines = [
-        "Parameters for each wavelength (* at a bound)",
-        f"{'':>10}{'':>9}" + "".join(f"{text:>12}" for text in optics),
-        f"{'nm':>10}{'s_mean %':>9}"
-        + "".join(
-            f"{head[:8] + (' ' + unit if unit else ''):>12}"
-            for head, unit in zip(heads, units, strict=True)
-        ),
-    ]
-    s_mean = dict(
-        zip(
-            np.round(accuracy["wavelength"].to_value(u.nm), 2),
-            accuracy["s_mean"].value,
-            strict=True,
-        )
+    shown = dict(list(several.items())[:_N_COLUMNS])
+    left_out = (
+        f"; not shown: {', '.join(list(several)[_N_COLUMNS:])}" if len(several) > len(shown) else ""
     )
-    for i, lam in enumerate(calibration.wavelength.to_value(u.nm)):
-        mean = s_mean.get(np.round(lam, 2), np.nan)
-        row = f"{lam:10.1f}" + (f"{mean:9.3f}" if np.isfinite(mean) else f"{'-':>9}")
-        for name, unit in zip(shown, units, strict=True):
-            mark = "*" if several[name]["at_bound"][i] else " "
-            row += f"{several[name]['value'][i]:11.{2 if unit else 4}f}{mark}"
-        lines.append(row.rstrip())
-    return lines
+    rows = [f"Parameters for each wavelength (* at a bound{left_out})", *_table_head(shown)]
+    s_mean = _by_wavelength(calibration.datasets[0].accuracy)
+    for i, wavelength in enumerate(calibration.wavelength.to_value(u.nm)):
+        mean = s_mean.get(round(wavelength, 2), np.nan)
+        row = f"{wavelength:9.1f}" + (f"{mean:9.3f}" if np.isfinite(mean) else f"{'-':>9}")
+        for entry in shown.values():
+            digits = 2 if entry["unit"] else 4
+            row += f"{entry['value'][i]:11.{digits}f}" + ("*" if entry["at_bound"][i] else " ")
+        rows.append(row.rstrip())
+    return rows
+
+
+def _table_head(shown):
+    optics, keys = zip(*(name.split(".") for name in shown), strict=True)
+    units = [str(entry["unit"] or "") for entry in shown.values()]
+    return [
+        f"{first:>9}{second:>9}" + "".join(f"{text[:11]:>11} " for text in texts).rstrip()
+        for first, second, texts in (("", "", optics), ("", "s_mean", keys), ("nm", "%", units))
+    ]
+
+
+def _by_wavelength(accuracy):
+    nm = accuracy["wavelength"].to_value(u.nm)
+    return {round(w, 2): s for w, s in zip(nm, accuracy["s_mean"].value, strict=True)}
 
 
 def _bound_lines(calibration):
     if not calibration.at_bound:
         return []
-    return [f"At a bound, so without an error: {', '.join(calibration.at_bound)}"]
+    return list(_wrap([f"At a bound, so without an error: {', '.join(calibration.at_bound)}"]))
 
 
 # ---- for machines ------------------------------------------------------------------

@@ -11,6 +11,8 @@ from astropolcal.exceptions import InstrumentError
 
 __all__ = ["Instrument"]
 
+_SAME_WAVELENGTH = 1e-5
+
 
 class Instrument(ABC):
     """
@@ -28,6 +30,23 @@ class Instrument(ABC):
         Column of the observation table to FITS header keyword.
     references : tuple of str
         Where the values come from.
+
+    Examples
+    --------
+    A polarimeter with a half-wave plate and nothing else to choose:
+
+    >>> from astropolcal import optics
+    >>> from astropolcal.instruments import Instrument
+    >>> class Simple(Instrument):
+    ...     name = "simple"
+    ...     def chain(self, source="polarized", optics_in=(), *, wavelength=None):
+    ...         return (optics.LinearPolarizer(name="polarizer")
+    ...                 | optics.LinearRetarder(mount="hwp", name="hwp")
+    ...                 | optics.WollastonPrism(name="wollaston"))
+    ...     def setup(self, observations):
+    ...         return "polarized", ()
+    >>> Simple().chain().submodel_names
+    ('polarizer', 'hwp', 'wollaston')
     """
 
     name = ""
@@ -68,6 +87,21 @@ class Instrument(ABC):
             If the table does not say.
         """
 
+    def published(self):
+        """
+        Return the chain with published values, for simulations and examples.
+
+        Raises
+        ------
+        InstrumentError
+            If the instrument has none.
+        """
+        raise InstrumentError(f"{self.name}: no published values; give a calibration file")
+
+    def published_meta(self):
+        """Return the meta of a table taken with the chain of `published`."""
+        return {"instrument": self.name}
+
     def chains_for(self, datasets, **options):
         """
         Return one chain a dataset, all on the common wavelength grid.
@@ -91,8 +125,10 @@ class Instrument(ABC):
         datasets = list(datasets)
         for observations in datasets:
             self.check(observations)
-        merged = np.concatenate([obs.wavelength.to_value(u.nm) for obs in datasets])
-        grid = np.unique(np.round(merged, 3)) * u.nm
+        merged = np.sort(np.concatenate([obs.wavelength.to_value(u.nm) for obs in datasets]))
+        # as Measurement merges them: tables round the same wavelength differently
+        new = np.diff(merged, prepend=-np.inf) > _SAME_WAVELENGTH * merged
+        grid = merged[new] * u.nm
         setups = [self.setup(observations) for observations in datasets]
         return [
             self.chain(source, optics_in, wavelength=grid, **options)

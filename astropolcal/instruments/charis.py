@@ -12,6 +12,8 @@ both signs turned, (H, 45, R) to (-H, -45, R): an exact mirror solution, with
 the same double differences.
 """
 
+import re
+
 import astropy.units as u
 import numpy as np
 
@@ -25,12 +27,19 @@ __all__ = ["CHARIS"]
 # 't Hart et al. 2021, thicknesses of the half-wave plate in mm
 _THART_SIO2, _THART_MGF2 = 1.63398, 1.27711
 
-# Horizontal retardance of the derotator, published by McIntosh et al. 2026 for Dataset 3,
-# read at a dozen wavelengths, rounded, with the sign of our convention: where a fit starts
-_START_NM = [1160, 1200, 1240, 1284, 1329, 1375, 1422, 1471, 1522, 1575, 1630, 1686, 1744, 1805,
-             1867, 1932, 1999, 2068, 2139, 2213, 2290, 2369]  # fmt: skip
-_START_DEG = [-251, -236, -224, -210, -190, -154, -140, -124, -111, -98, -87, -78, -71, -66,
-              -61, -58, -56, -55, -55, -55, -56, -57]  # fmt: skip
+# McIntosh et al. 2026, Dataset 3, final fit for each of the 22 bins (in the signs they publish)
+_DEROTATOR_HORIZONTAL = [251.47, 235.97, 223.97, 209.45, 166.71, 153.47, 140.0, 124.37, 110.61,
+                         98.49, 86.98, 77.67, 71.03, 65.73, 60.99, 58.05, 56.51, 55.28, 54.92,
+                         55.18, 56.02, 57.04]  # fmt: skip
+_DEROTATOR_DIAGONAL = [5.08, 5.68, 6.16, 6.8, 5.0, 4.88, 5.01, 4.56, 4.05, 3.78, 3.57, 3.2, 2.9,
+                       2.88, 2.36, 2.08, 2.27, 2.51, 2.81, 3.16, 3.76, 4.07]  # fmt: skip
+_DEROTATOR_CIRCULAR = [0, 0, 0, 0, 0, 0, 1.69, 3.1, 3.74, 4.5, 4.73, 4.8, 5.01, 5.27, 5.25, 5.07,
+                       5.14, 5.11, 5.05, 4.88, 5.18, 4.83]  # fmt: skip
+_EFFICIENCY = [1.0, 0.992, 0.9953, 0.9816, 0.97, 0.9905, 0.9892, 0.9903, 0.9908, 0.9911, 0.9896,
+               0.9889, 0.9904, 0.9888, 0.9887, 0.9878, 0.9902, 0.9868, 0.9875, 0.9818, 0.9746,
+               0.9523]  # fmt: skip
+_PUBLISHED_SIO2, _PUBLISHED_MGF2 = 1.653, 1.291
+_PUBLISHED_MISALIGNMENT = {"calibration_polarizer": 90.03, "derotator": -0.02, "hwp": -0.04}
 
 _BOUNDS = {
     # every sign and mirror branch of the retardances
@@ -140,6 +149,44 @@ class CHARIS(Instrument):
         train.append(optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston"))
         return join(train)
 
+    def published(self):
+        """
+        Return the chain with the values published for Dataset 3.
+
+        The final fit of McIntosh et al. (2026), rounded, in our signs: October
+        2025, polarized internal source, dichroic and beam switcher in.
+
+        Returns
+        -------
+        `~astropy.modeling.CompoundModel`
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> instruments.get("charis").published()["hwp"].w_sio2.quantity
+        <Quantity 1.653 mm>
+        """
+        chain = self.chain("polarized", ["dichroic", "nbs"])
+        hwp, derotator = chain["hwp"], chain["derotator"]
+        hwp.w_sio2, hwp.w_mgf2 = _PUBLISHED_SIO2 * u.mm, _PUBLISHED_MGF2 * u.mm
+        derotator.horizontal = -np.array(_DEROTATOR_HORIZONTAL) * u.deg
+        derotator.diagonal = -np.array(_DEROTATOR_DIAGONAL) * u.deg
+        derotator.circular = np.array(_DEROTATOR_CIRCULAR) * u.deg
+        chain["wollaston"].efficiency = _EFFICIENCY
+        for name, angle in _PUBLISHED_MISALIGNMENT.items():
+            chain[name].theta = angle * u.deg
+        return chain
+
+    def published_meta(self):
+        """Return the meta of a table taken with the chain of `published`."""
+        return {
+            "instrument": "SCExAO/CHARIS",
+            "mode": "broadband JHK",
+            "source": "polarized",
+            "yjh50_dichroic": "in",
+            "nasmyth_beam_switcher": "installed",
+        }
+
     def setup(self, observations):
         """
         Return source and optics in the beam, as the table's meta states them.
@@ -169,7 +216,7 @@ class CHARIS(Instrument):
                 f"{', '.join(self.sources)} (stars are not supported yet)"
             )
         present = []
-        if str(meta.get("yjh50_dichroic", "out")).strip().lower() == "in":
+        if _stated(meta, name, "yjh50_dichroic", {"in": True, "out": False}):
             present.append("dichroic")
         if _beam_switcher(meta, name):
             present.append("nbs")
@@ -181,22 +228,30 @@ def _choice(what, value, allowed):
         raise InstrumentError(f"{what} = {value!r}; allowed are {', '.join(allowed)}")
 
 
+def _stated(meta, name, key, words):
+    """Return what the meta say of an optional optic, None where they say nothing."""
+    if meta.get(key) is None:
+        return None
+    word = str(meta[key]).strip().lower()
+    if word not in words:
+        raise InstrumentError(
+            f"{name}: {key} is {meta[key]!r}; allowed are {', '.join(map(repr, words))}"
+        )
+    return words[word]
+
+
 def _beam_switcher(meta, name):
-    stated = meta.get("nasmyth_beam_switcher")
+    words = {"installed": True, "not installed": False, "in": True, "out": False}
+    stated = _stated(meta, name, "nasmyth_beam_switcher", words)
     if stated is not None:
-        words = {"installed": True, "in": True, "not installed": False, "out": False}
-        try:
-            return words[str(stated).strip().lower()]
-        except KeyError:
-            raise InstrumentError(
-                f"{name}: nasmyth_beam_switcher is {stated!r}; allowed are "
-                "'installed', 'not installed'"
-            ) from None
-    date = str(meta.get("date", ""))
-    if date and date <= _NBS_ABSENT_UNTIL:
-        return False
-    if date >= _NBS_PRESENT_FROM:
-        return True
+        return stated
+    day = str(meta.get("date", ""))[:10]
+    # ISO dates compare as strings
+    if re.fullmatch(r"\d{4}-\d\d-\d\d", day):
+        if day <= _NBS_ABSENT_UNTIL:
+            return False
+        if day >= _NBS_PRESENT_FROM:
+            return True
     raise InstrumentError(
         f"{name}: neither nasmyth_beam_switcher nor a conclusive date in the table's meta; "
         "is the beam switcher 'installed' or 'not installed'?"
@@ -227,7 +282,9 @@ def _half_wave_plate():
 
 
 def _derotator(grid, kind, bounds):
-    start = np.interp(grid.to_value(u.nm), _START_NM, _START_DEG) * u.deg
+    # the published retardances, in our sign, are where a fit starts
+    nm = CHARIS.wavelength.to_value(u.nm)
+    start = -np.interp(grid.to_value(u.nm), nm, _DEROTATOR_HORIZONTAL) * u.deg
     settings = _misaligned(0) | {"mount": "derotator", "name": "derotator"}
     if kind == "linear":
         settings["bounds"] |= {"retardance": bounds["horizontal"]}

@@ -16,7 +16,37 @@ _SAME_WAVELENGTH = 1e-5
 
 
 def as_pairs(chain, observations, positions):
-    """Return (chain, observations, positions) a dataset, from one or several of each."""
+    """
+    Return chain, observations and positions of every dataset, from one or several of each.
+
+    Parameters
+    ----------
+    chain : Optic, `~astropy.modeling.CompoundModel` or sequence of them
+        One for all datasets, or one each.
+    observations : Observations or sequence of Observations
+        The datasets.
+    positions : sequence of dict or None
+        Position of every stage for each dataset.
+
+    Returns
+    -------
+    list of tuple
+        ``(chain, observations, positions)``, one a dataset.
+
+    Raises
+    ------
+    ObservationError
+        If there is no dataset, or the numbers differ.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.measurement.datasets import as_pairs
+    >>> from astropolcal.observations import Observations, example_table
+    >>> night = Observations.from_table(example_table())
+    >>> len(as_pairs(optics.WollastonPrism(), [night, night], None))
+    2
+    """
     observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
     chains = [chain] * len(observations) if isinstance(chain, Model) else list(chain)
     positions = [None] * len(observations) if positions is None else list(positions)
@@ -43,6 +73,14 @@ def common_wavelengths(observations, wavelength=None):
     -------
     `~numpy.ndarray`
         Ascending, shape (n_wavelengths,).
+
+    Examples
+    --------
+    >>> from astropolcal.measurement.datasets import common_wavelengths
+    >>> from astropolcal.observations import Observations, example_table
+    >>> night = Observations.from_table(example_table())
+    >>> common_wavelengths([night, night]).tolist()
+    [1.2, 1.6, 2.2]
     """
     if wavelength is not None:
         return np.atleast_1d(u.Quantity(wavelength).to_value(u.um))
@@ -52,7 +90,42 @@ def common_wavelengths(observations, wavelength=None):
 
 
 class Dataset:
-    """A chain with its observations, on the common grid and the flat vector."""
+    """
+    A chain with its observations, on the common grid and the flat vector.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+    observations : Observations
+        The data.
+    observable : Observable
+        What is compared.
+    free : FreeParameters
+        The flat vector of free parameters.
+    wavelength : `~numpy.ndarray`
+        Common grid in micrometre.
+    positions : dict of str to `~numpy.ndarray`, optional
+        Position of every stage in radian, shape (n_frames,).
+
+    Raises
+    ------
+    ObservationError
+        If a wavelength of the data is not on the grid.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.observations import Observations, example_table
+    >>> chain = (optics.LinearPolarizer(name="polarizer")
+    ...          | optics.LinearRetarder(mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(name="wollaston"))
+    >>> night = Observations.from_table(example_table())
+    >>> dataset = Measurement(chain, night).datasets[0]
+    >>> dataset.n_data, dataset.n_parameters_per_wavelength
+    (6, 2)
+    """
 
     def __init__(self, chain, observations, observable, free, wavelength, positions=None):
         self.chain = chain

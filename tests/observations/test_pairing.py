@@ -90,6 +90,20 @@ def test_a_drifting_derotator_pairs_neighbours():
     assert pair(hwp, derotator) == [[i, i + 1] for i in range(0, 40, 2)]
 
 
+def test_the_same_derotator_angle_comes_before_the_same_time():
+    # frames 1 and 2 are neighbours, but 0.4 deg of derotator apart
+    hwp, derotator = [45.0, 0.0, 45.0, 0.0], [90.0, 90.0, 90.4, 90.4]
+    assert pair(hwp, derotator, time=[0.0, 5.0, 6.0, 11.0]) == [[1, 0], [3, 2]]
+    # a smaller drift does not count
+    assert pair(hwp, 90.0 + 0.02 * np.arange(4), time=[0.0, 5.0, 6.0, 11.0]) == [[1, 2], [3, 0]]
+
+
+def test_equal_times_leave_the_choice_to_the_sequence():
+    assert pair([0.0, 45.0, 0.0, 45.0], time=[1.0] * 4) == [[0, 1], [2, 3]]
+    hwp = [0.0, 0.0, 45.0, 45.0, 0.0, 45.0]
+    assert pair(hwp, time=[1.0] * 6) == [[0, 5], [1, 2], [4, 3]]
+
+
 def test_derotator_tolerance():
     with pytest.warns(AstropolcalWarning, match="2 of 2 frames left out"):
         assert pair([0.0, 45.0], [90.0, 90.6]) == []

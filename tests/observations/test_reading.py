@@ -347,6 +347,17 @@ def test_two_bins_with_one_wavelength(table):
     refuse(table, r"row 3: wavelength = 1.2 um of bin 2 is also that of bin 0; one bin each")
 
 
+@pytest.mark.parametrize(("ratio", "distinct"), [(1 + 5e-7, False), (1 + 5e-6, True)])
+@pytest.mark.parametrize("unit", [u.nm, u.um, u.m])
+def test_how_near_two_bins_may_be(table, unit, ratio, distinct):
+    table["wavelength"] = np.array([1.2, 1.6, 1.6 * ratio])[table["bin"]] * u.um
+    table["wavelength"] = table["wavelength"].to(unit)
+    if distinct:
+        assert Observations.from_table(table).n_bins == 3
+    else:
+        refuse(table, r"row 3: wavelength = .* of bin 2 is also that of bin 1")
+
+
 @pytest.mark.parametrize("name", ["hwp", "derotator"])
 def test_columns_of_frames_are_constant(table, name):
     table[name][4] += 1 * u.deg

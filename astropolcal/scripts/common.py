@@ -1,0 +1,137 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What the subcommands share: outputs, datasets, edits of the chains."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.chain import find_optic, leaves, remove_optic
+from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.files import atomic_path
+
+__all__ = ["check_outputs", "edit_chains", "read_datasets", "write_json"]
+
+
+def check_outputs(*paths):
+    """Raise before any work is done if an output's folder is missing or is a file."""
+    for path in paths:
+        if path is None or str(path) == "-":
+            continue
+        path = Path(path)
+        if not path.parent.is_dir():
+            raise AstropolcalError(f"{path}: there is no folder {path.parent}")
+        if path.is_dir():
+            raise AstropolcalError(f"{path}: is a folder, not a file")
+
+
+def write_json(content, path):
+    """Write a dictionary as JSON, atomically; ``-`` is the standard output."""
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    if str(path) == "-":
+        sys.stdout.write(text)
+        return
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_datasets(paths):
+    """Read observation tables; refuse one that is given twice."""
+    from astropolcal.observations import Observations
+
+    datasets = []
+    for path in paths:
+        dataset = Observations.read(path)
+        for other, known in zip(paths, datasets, strict=False):
+            if known.content_hash == dataset.content_hash:
+                raise AstropolcalError(f"{path}: holds the same frames as {other}")
+        datasets.append(dataset)
+    return datasets
+
+
+def edit_chains(chains, *, without=(), free=(), fix=()):
+    """
+    Return the chains with optics taken out and parameters freed or fixed.
+
+    Parameters
+    ----------
+    chains : list
+        The chains of all datasets.
+    without : sequence of str
+        Names of optics to take out.
+    free : sequence of str
+        ``optic.parameter``, or ``optic`` for all of its parameters.
+    fix : sequence of str
+        The same, with ``=VALUE`` to set it; a number without unit is in the
+        parameter's own.
+
+    Returns
+    -------
+    list
+
+    Raises
+    ------
+    ChainError, ParameterError
+        If a name or a value does not fit.
+    """
+    for name in without:
+        present = [name in {leaf.name for leaf in leaves(chain)} for chain in chains]
+        if not any(present):
+            find_optic(chains[0], name)
+        chains = [
+            remove_optic(chain, name) if here else chain
+            for chain, here in zip(chains, present, strict=True)
+        ]
+    for name in free:
+        for parameter in _parameters(chains, name):
+            parameter.fixed = False
+    for text in fix:
+        name, _, value = text.partition("=")
+        for parameter in _parameters(chains, name):
+            if value:
+                _set(name, parameter, value)
+            parameter.fixed = True
+    return chains
+
+
+def _parameters(chains, name):
+    """Return the parameters that ``optic.parameter`` or ``optic`` names, in all chains."""
+    optic, _, key = name.partition(".")
+    carriers = [leaf for chain in chains for leaf in leaves(chain) if leaf.name == optic]
+    if not carriers:
+        find_optic(chains[0], optic)
+    found = []
+    for leaf in carriers:
+        if key and key not in leaf.param_names:
+            raise ParameterError(f"{optic} has no parameter {key!r}; it has {leaf.param_names}")
+        found += [getattr(leaf, each) for each in ([key] if key else leaf.param_names)]
+    return found
+
+
+def _set(name, parameter, text):
+    match = re.fullmatch(r"\s*([-+.\d]+(?:[eE][-+]?\d+)?)\s*([A-Za-z%].*)?", text)
+    number, unit = match.groups() if match else ("", None)
+    try:
+        value = float(number)
+    except ValueError:
+        raise ParameterError(f"{name}={text}: not a number") from None
+    if unit:
+        try:
+            value = (value * u.Unit(unit)).to_value(parameter.unit or u.dimensionless_unscaled)
+        except (ValueError, TypeError, u.UnitConversionError):
+            raise ParameterError(
+                f"{name}={text}: the unit must be convertible to {parameter.unit or 'a number'}"
+            ) from None
+    low, high = parameter.bounds
+    if (
+        not np.isfinite(value)
+        or (low is not None and value < low)
+        or (high is not None and value > high)
+    ):
+        raise ParameterError(
+            f"{name}={text}: allowed is {low} to {high} {parameter.unit or ''}".rstrip()
+        )
+    parameter.value = np.full(np.shape(parameter.value), value)

@@ -1,0 +1,101 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Entry point of the ``astropolcal`` command.
+
+Exit status 0, or 2 with one clear line on bad input.
+"""
+
+import argparse
+import os
+import sys
+import warnings
+
+from astropolcal.exceptions import AstropolcalError
+from astropolcal.version import version
+
+__all__ = ["build_parser", "main"]
+
+_DESCRIPTION = "Calibrate polarimeters, and say how well their model fits."
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    """A parser whose complaint is one line, like every other error here."""
+
+    def error(self, message):
+        self.exit(2, f"astropolcal: error: {message} (see {self.prog} --help)\n")
+
+
+def build_parser():
+    """
+    Return the parser of the command and its subcommands.
+
+    Returns
+    -------
+    `argparse.ArgumentParser`
+
+    Examples
+    --------
+    >>> from astropolcal.scripts.main import build_parser
+    >>> build_parser().parse_args(["info"]).command
+    'info'
+    """
+    from astropolcal.scripts import calibrate, info, simulate
+
+    parser = _OneLineParser(prog="astropolcal", description=_DESCRIPTION)
+    parser.add_argument("--version", action="version", version=f"astropolcal {version}")
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="{calibrate,simulate,info}"
+    )
+    for module in (calibrate, simulate, info):
+        module.add_parser(commands)
+    return parser
+
+
+def main(argv=None):
+    """
+    Run the command.
+
+    Parameters
+    ----------
+    argv : list of str, optional
+        Arguments, by default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0, or 2 on bad input.
+
+    Examples
+    --------
+    >>> from astropolcal.scripts.main import main
+    >>> main(["info", "--instruments"])
+    charis
+    0
+    """
+    arguments = build_parser().parse_args(argv)
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            arguments.run(arguments)
+        except AstropolcalError as error:
+            print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print("astropolcal: interrupted", file=sys.stderr)
+            return 130
+        except BrokenPipeError:
+            # whoever read our output has gone; do not complain again at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def _one_line(message):
+    return " ".join(str(message).split())
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None):
+    print(f"astropolcal: warning: {_one_line(message)}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
