@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import astropy.units as u
 import numpy as np
-import scipy.linalg
 
 __all__ = ["Identifiability", "analyse"]
 
@@ -171,22 +170,32 @@ def _reduced(free, null):
     """Yield each null vector, led by a parameter that the others do not move."""
     if not len(null):
         return
-    # parameters common to all wavelengths lead, if there are enough of them
-    single = np.array([slot.start for slot in free.slots if slot.size == 1], dtype=int)
-    everything = np.arange(free.size)
-    candidates = single if _spans(null[:, single]) else everything
-    _, _, order = scipy.linalg.qr(null[:, candidates], pivoting=True, mode="economic")
-    leads = candidates[order[: len(null)]]
-    for vector, lead in zip(
-        np.linalg.solve(null[:, leads].T, np.eye(len(null))) @ null, leads, strict=True
-    ):
+    leads = _leads(free, null)
+    solved = np.linalg.solve(null[:, leads].T, np.eye(len(null)))
+    for vector, lead in zip(solved @ null, leads, strict=True):
         yield vector, free.names[lead]
 
 
-def _spans(columns):
-    if columns.shape[1] < columns.shape[0]:
-        return False
-    return bool(np.linalg.svd(columns, compute_uv=False)[-1] > 1e-3)
+def _leads(free, null):
+    """Choose a leading parameter for each null direction, those for all wavelengths first."""
+    order = np.argsort(
+        [slot.per_wavelength for slot in free.slots for _ in range(slot.size)], kind="stable"
+    )
+    columns, leads = null.copy(), []
+    while len(leads) < len(null):
+        size = np.linalg.norm(columns, axis=0)
+        single = size[order[: _n_single(free)]]
+        # the first that moves about as much as any: small changes of the data do not reorder
+        pool = order[: _n_single(free)] if single.size and single.max() > 1e-3 else order
+        lead = next(i for i in pool if size[i] > 0.3 * size[pool].max())
+        direction = columns[:, lead] / size[lead]
+        columns -= np.outer(direction, direction @ columns)
+        leads.append(int(lead))
+    return leads
+
+
+def _n_single(free):
+    return sum(not slot.per_wavelength for slot in free.slots)
 
 
 def _words(free, moved, lead):

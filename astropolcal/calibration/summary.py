@@ -100,6 +100,10 @@ def _accuracy_lines(record):
     for label, function in (("median", np.median), ("best", np.min), ("worst", np.max)):
         values = [_of(table[column].value, function) for column in ("s_res", "s_mean", "s_cv")]
         lines.append(f"  {label:<10}" + "".join(values))
+    lines += [
+        "  s_res: residuals, corrected for the parameters fitted; s_mean: s_res/sqrt(n),",
+        "  the paper's s_rel; s_cv: rms error on derotator angles left out of the fit",
+    ]
     masked = f", {record.n_masked} cells masked" if record.n_masked else ""
     lines.append(f"  ({record.n_frames} frames x {len(table)} wavelengths{masked})")
     return lines
