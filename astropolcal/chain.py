@@ -11,9 +11,9 @@ import difflib
 import numpy as np
 from astropy.modeling import CompoundModel
 
-from astropolcal.exceptions import ChainError
+from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.optics import Optic
-from astropolcal.units import angle_to_rad
+from astropolcal.optics.core import finite_angle
 
 __all__ = [
     "at_positions",
@@ -97,7 +97,8 @@ def join(optics):
     Raises
     ------
     ChainError
-        If there is no optic.
+        If there is no optic, something else than an optic, or two optics
+        share a name.
 
     Examples
     --------
@@ -109,9 +110,12 @@ def join(optics):
     optics = list(optics)
     if not optics:
         raise ChainError("a chain needs at least one optic")
+    for optic in optics:
+        leaves(optic)
     chain = optics[0]
     for optic in optics[1:]:
         chain = chain | optic
+    leaves(chain)
     return chain
 
 
@@ -149,7 +153,8 @@ def find_optic(chain, name):
     names = [optic.name for optic in found if optic.name]
     near = difflib.get_close_matches(str(name), names, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise ChainError(f"no optic {name!r} in the chain; it has {', '.join(names)}{hint}")
+    known = ", ".join(names) or "no optic with a name"
+    raise ChainError(f"no optic {name!r} in the chain; it has {known}{hint}")
 
 
 def replace_optic(chain, name, optic):
@@ -263,6 +268,16 @@ def stages(chain):
     """
     Return the names of the stages whose positions the chain needs.
 
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+
+    Returns
+    -------
+    tuple of str
+        Each name once, without sign, in the order the light meets them.
+
     Examples
     --------
     >>> from astropolcal import optics
@@ -320,7 +335,8 @@ def at_positions(chain, **positions):
     chain : Optic or `~astropy.modeling.CompoundModel`
         The chain.
     **positions : `~astropy.units.Quantity`
-        Position of each stage by name.
+        Position of each stage by name; for many frames and wavelengths in one
+        call, of shape (n_frames, 1).
 
     Returns
     -------
@@ -331,6 +347,8 @@ def at_positions(chain, **positions):
     ------
     ChainError
         If the chain has no such stage.
+    ParameterError
+        If a position is not an angle or not finite.
 
     Examples
     --------
@@ -367,7 +385,6 @@ def _stage_angle(leaf, positions):
 
 def _oriented_leaves(chain, wavelength, positions):
     """Yield each leaf with what its matrix needs: dispersion, angle, values."""
-    positions = {name: angle_to_rad(value, name) for name, value in (positions or {}).items()}
     scalar = wavelength is None or np.ndim(wavelength) == 0
     for leaf in leaves(chain):
         dispersion, angle, values = leaf._resolve(wavelength, None)
@@ -392,13 +409,14 @@ def system_mueller(chain, wavelength=None, positions=None):
     Returns
     -------
     `~numpy.ndarray`
-        Shape (n_frames, n_wavelengths, 4, 4); an axis is missing where the
+        Shape (n_frames, n_wavelengths, 4, 4); an axis is missing where all
         positions or the wavelength are scalar.
 
     Raises
     ------
     ChainError
-        If the position of a stage is missing.
+        If the position of a stage is missing, or two stages have different
+        numbers of positions.
     ParameterError, WavelengthRangeError
         If a wavelength is missing, out of range, or does not match the
         parameters given per wavelength.
@@ -412,18 +430,26 @@ def system_mueller(chain, wavelength=None, positions=None):
     >>> system_mueller(chain, [1.2, 1.6] * u.um, {"hwp": [0, 22.5, 45] * u.deg}).shape
     (3, 2, 4, 4)
     """
+    positions, shape = _check_axes(wavelength, positions)
     total = np.eye(4)
     for leaf, dispersion, angle, values in _oriented_leaves(chain, wavelength, positions):
         total = leaf._oriented(dispersion, angle, values) @ total
-    return _with_wavelength_axis(total, wavelength)
+    return np.broadcast_to(total, (*shape, 4, 4)).copy()
 
 
-def _with_wavelength_axis(matrix, wavelength):
-    """Broadcast a matrix that no wavelength touched to the wavelengths asked for."""
-    if wavelength is None or np.ndim(wavelength) == 0:
-        return matrix
-    lead = matrix.shape[:-2] or (1,)
-    return np.broadcast_to(matrix, (*lead[:-1], len(wavelength), 4, 4)).copy()
+def _check_axes(wavelength, positions):
+    """Return the positions in radian, and the shape of positions and wavelengths."""
+    if np.ndim(wavelength) > 1:
+        raise ParameterError(
+            f"wavelength has shape {np.shape(wavelength)}; allowed are a scalar or one axis"
+        )
+    positions = {name: finite_angle(value, name) for name, value in (positions or {}).items()}
+    shapes = {name: value.shape for name, value in positions.items()}
+    try:
+        frames = np.broadcast_shapes(*shapes.values())
+    except ValueError:
+        raise ChainError(f"the positions have different shapes: {shapes}") from None
+    return positions, frames + (() if wavelength is None else np.shape(wavelength))
 
 
 def system_mueller_derivatives(chain, wavelength=None, positions=None):
@@ -455,6 +481,7 @@ def system_mueller_derivatives(chain, wavelength=None, positions=None):
     >>> float(system_mueller_derivatives(chain)["wollaston.efficiency"][0, 1].value)
     -0.5
     """
+    positions, shape = _check_axes(wavelength, positions)
     nodes = list(_oriented_leaves(chain, wavelength, positions))
     matrices = [leaf._oriented(*rest) for leaf, *rest in nodes]
     before = _running_products(matrices)
@@ -466,7 +493,7 @@ def system_mueller_derivatives(chain, wavelength=None, positions=None):
         if not leaf.name:
             raise ChainError(f"{type(leaf).__name__} needs a name before its parameters have one")
         for key, slope in zip(leaf.param_names, leaf._oriented_derivatives(*rest), strict=True):
-            value = _with_wavelength_axis(after @ slope @ upstream, wavelength)
+            value = np.broadcast_to(after @ slope @ upstream, (*shape, 4, 4)).copy()
             result[f"{leaf.name}.{key}"] = leaf._per_unit(key, value)
         after = after @ matrix
     return result

@@ -66,7 +66,10 @@ class Propagator:
     Raises
     ------
     ChainError
-        If the chain has no beam splitter or a stage has no position.
+        If the chain has no beam splitter, a stage has no position, or the
+        stages have different numbers of positions.
+    ParameterError
+        If a parameter has neither one value nor one a wavelength.
 
     Examples
     --------
@@ -83,8 +86,9 @@ class Propagator:
         wavelength = np.atleast_1d(np.asarray(wavelength, dtype=float))
         self.leaves = leaves(chain)
         self._check(self.leaves, positions)
-        columns = {np.size(angle) for angle in positions.values()} or {1}
-        self.shape = (len(wavelength), max(columns))
+        for leaf in self.leaves:
+            leaf._check_grid(wavelength, leaf.canonical_values())
+        self.shape = (len(wavelength), _column_count(positions))
         self.source = np.asarray(source, dtype=float).reshape(1, 4, 1)
         split = next(i for i, leaf in enumerate(self.leaves) if hasattr(leaf, "beam"))
         make = [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(self.leaves)]
@@ -109,13 +113,19 @@ class Propagator:
         """
         Return the current parameter values, one list an optic.
 
+        Returns
+        -------
+        list of list of `~numpy.ndarray`
+            Canonical floats, ``theta`` first; shape () or (n_wavelengths,).
+
         Examples
         --------
         >>> import numpy as np
         >>> from astropolcal import optics
         >>> from astropolcal.propagation import Propagator
-        >>> Propagator(optics.WollastonPrism(), np.array([1.6]), {}).values()
-        [[array(0.), array(1.)]]
+        >>> values = Propagator(optics.WollastonPrism(), np.array([1.6]), {}).values()
+        >>> [[float(value) for value in optic] for optic in values]
+        [[0.0, 1.0]]
         """
         return [leaf.canonical_values() for leaf in self.leaves]
 
@@ -156,8 +166,29 @@ class Propagator:
         -------
         Sweep
             With ``fluxes`` and the method ``derivatives``.
+
+        Examples
+        --------
+        The derivative of the right flux to the efficiency of the Wollaston prism:
+
+        >>> import numpy as np
+        >>> from astropolcal import optics
+        >>> from astropolcal.propagation import Propagator
+        >>> chain = optics.LinearPolarizer() | optics.WollastonPrism(efficiency=0.9)
+        >>> sweep = Propagator(chain, np.array([1.6]), {}).forward()
+        >>> weights = np.ones((1, 1)), np.zeros((1, 1))
+        >>> float(sweep.derivatives([(1, 1)], weights)[1, 1][0, 0])
+        0.25
         """
         return Sweep(self, self.values() if values is None else values)
+
+
+def _column_count(positions):
+    counts = {name: np.size(angle) for name, angle in positions.items()}
+    several = {count for count in counts.values() if count != 1}
+    if len(several) > 1:
+        raise ChainError(f"the stages have different numbers of positions: {counts}")
+    return several.pop() if several else 1
 
 
 class Sweep:
@@ -210,7 +241,8 @@ def _run(nodes, values, state):
     steps = []
     for node in nodes:
         theta, *own = values[node.index]
-        angle = node.stage_angle + theta
+        # one value a wavelength goes along the first axis, positions along the last
+        angle = node.stage_angle + (theta[:, None] if np.ndim(theta) else theta)
         if node.leaf.rotates_frame:
             frame = frame - angle
             steps.append(_Step(node, own, None, light, None, light))
@@ -267,13 +299,13 @@ def _cross(a, s):
 
 
 def _rotate(light, angle):
-    """Return T(angle) applied to the light; ``angle`` scalar or one a column."""
+    """Return T(angle) applied to the light; ``angle`` broadcasts against (wavelength, column)."""
     if np.ndim(angle) == 0 and angle == 0:
         return light
     cosine, sine = np.cos(2 * angle), np.sin(2 * angle)
-    columns = max(light.shape[-1], np.size(angle))
-    out = np.empty((*light.shape[:-1], columns))
     q, u = light[..., 1, :], light[..., 2, :]
+    rows, columns = np.broadcast_shapes(q.shape, cosine.shape)
+    out = np.empty((rows, 4, columns))
     out[..., 0, :], out[..., 3, :] = light[..., 0, :], light[..., 3, :]
     out[..., 1, :] = cosine * q + sine * u
     out[..., 2, :] = cosine * u - sine * q

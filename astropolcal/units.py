@@ -57,6 +57,21 @@ def canonical_factor(unit):
     """
     Return the number by which a value in ``unit`` becomes canonical.
 
+    Parameters
+    ----------
+    unit : unit-like or None
+        Any unit of angle or length, a dimensionless one, or None.
+
+    Returns
+    -------
+    float
+        Radian, micrometre or 1 a unit.
+
+    Raises
+    ------
+    ParameterError
+        If the unit is of another kind.
+
     Examples
     --------
     >>> import astropy.units as u
@@ -100,6 +115,8 @@ def to_unit(value, unit, name="value"):
     1200.0
     """
     unit = u.dimensionless_unscaled if unit is None else u.Unit(unit)
+    if np.iscomplexobj(value):
+        raise ParameterError(f"{name} = {value!r} is complex; allowed are real numbers")
     if isinstance(value, u.Quantity) or hasattr(value, "unit"):
         try:
             return np.asarray(u.Quantity(value).to_value(unit), dtype=float)
@@ -120,6 +137,23 @@ def angle_to_rad(value, name="angle"):
     """
     Return an angle with unit as floats in radian.
 
+    Parameters
+    ----------
+    value : `~astropy.units.Quantity`
+        Any angle, of any shape.
+    name : str
+        What the angle is called in the error message.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Floats in radian, of the shape of ``value``.
+
+    Raises
+    ------
+    ParameterError
+        If the unit is missing or is not one of angle.
+
     Examples
     --------
     >>> import astropy.units as u
@@ -133,6 +167,23 @@ def angle_to_rad(value, name="angle"):
 def length_to_um(value, name="wavelength"):
     """
     Return a length with unit as floats in micrometre.
+
+    Parameters
+    ----------
+    value : `~astropy.units.Quantity`
+        Any length, of any shape.
+    name : str
+        What the length is called in the error message.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Floats in micrometre, of the shape of ``value``.
+
+    Raises
+    ------
+    ParameterError
+        If the unit is missing or is not one of length.
 
     Examples
     --------

@@ -171,8 +171,7 @@ def _reduced(free, null):
     if not len(null):
         return
     leads = _leads(free, null)
-    solved = np.linalg.solve(null[:, leads].T, np.eye(len(null)))
-    for vector, lead in zip(solved @ null, leads, strict=True):
+    for vector, lead in zip(np.linalg.solve(null[:, leads], null), leads, strict=True):
         yield vector, free.names[lead]
 
 

@@ -14,7 +14,7 @@ from abc import abstractmethod
 
 import astropy.units as u
 import numpy as np
-from astropy.modeling import FittableModel, Parameter
+from astropy.modeling import FittableModel, InputParameterError, Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller.elements import _rotate, _rotation_matrix
@@ -81,7 +81,30 @@ class Optic(FittableModel):
     Raises
     ------
     ParameterError
-        If a value has no unit, a wrong one, or is not finite.
+        If a value has no unit, a wrong one, or is not finite; if a parameter is
+        unknown or given by position.
+
+    Notes
+    -----
+    The derivative and the frame convention are those of Sec. 2 of the CHARIS
+    paper: an optic turned by ``theta`` is ``T(-theta) M T(theta)``.
+
+    Examples
+    --------
+    A new optic is a short class; its matrix is given in its own frame:
+
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import Optic
+    >>> class HalfWavePlate(Optic):
+    ...     def _matrix(self, dispersion):
+    ...         return np.diag([1.0, 1.0, -1.0, -1.0])
+    ...     def _derivatives(self, dispersion):
+    ...         return ()
+    >>> plate = HalfWavePlate(theta=22.5 * u.deg, name="plate")
+    >>> _, I, Q, U, V = plate(1.6 * u.um, 1, 1, 0, 0)
+    >>> round(float(U), 6)
+    1.0
     """
 
     n_inputs = 5
@@ -107,7 +130,7 @@ class Optic(FittableModel):
         values = {key: self._at_the_door(key, value) for key, value in values.items()}
         try:
             super().__init__(name=name, **values, **kwargs)
-        except TypeError as error:
+        except (TypeError, InputParameterError) as error:
             raise ParameterError(f"{type(self).__name__}: {error}") from None
         self._inputs = self._outputs = LIGHT
         self.mount = mount
@@ -120,7 +143,7 @@ class Optic(FittableModel):
         number = to_unit(value, unit, f"{cls.__name__}.{key}")
         if not np.all(np.isfinite(number)):
             raise ParameterError(f"{cls.__name__}.{key} = {value} must be finite")
-        if number.ndim > 1:
+        if number.ndim > 1 or number.size == 0:
             raise ParameterError(
                 f"{cls.__name__}.{key} has shape {number.shape}; allowed are a "
                 "scalar or one value a wavelength"
@@ -135,6 +158,12 @@ class Optic(FittableModel):
         # astropy would adopt the unit of the value and leave the bounds behind
         if attr in self.param_names and attr in self.__dict__:
             value = self._at_the_door(attr, value)
+            if np.shape(value) != self.__dict__[attr].shape:
+                raise ParameterError(
+                    f"{type(self).__name__}.{attr} holds values of shape "
+                    f"{self.__dict__[attr].shape}, not {np.shape(value)}; "
+                    f"optic.with_parameters({attr}=...) returns a copy of another shape"
+                )
         super().__setattr__(attr, value)
 
     def __repr__(self):
@@ -156,8 +185,12 @@ class Optic(FittableModel):
 
     @mount.setter
     def mount(self, value):
-        if value is not None and not (isinstance(value, str) and value.lstrip("-")):
-            raise ParameterError(f"mount = {value!r} must be the name of a stage or None")
+        stage = value.removeprefix("-") if isinstance(value, str) else ""
+        if value is not None and (not stage.strip() or stage.startswith("-")):
+            raise ParameterError(
+                f"mount = {value!r} must be None or the name of a stage, with or without "
+                "one leading minus"
+            )
         self._mount = value
 
     @property
@@ -177,7 +210,7 @@ class Optic(FittableModel):
 
     @position.setter
     def position(self, value):
-        self._position = angle_to_rad(value, "position")
+        self._position = finite_angle(value, "position")
 
     # ---- values on canonical floats ---------------------------------------
 
@@ -198,13 +231,16 @@ class Optic(FittableModel):
         values = []
         for key in self.param_names:
             parameter = getattr(self, key)
-            if parameter.unit != self._declared(key).unit:
-                raise ParameterError(
-                    f"{self.name or type(self).__name__}.{key} is in {parameter.unit}, but its "
-                    f"bounds are in {self._declared(key).unit}; set optic.{key} = value * unit"
-                )
+            self._check_unit(key, parameter.unit)
             values.append(np.asarray(parameter.value) * canonical_factor(parameter.unit))
         return values
+
+    def _check_unit(self, key, unit):
+        if unit != self._declared(key).unit:
+            raise ParameterError(
+                f"{self.name or type(self).__name__}.{key} is in {unit}, but its "
+                f"bounds are in {self._declared(key).unit}; set optic.{key} = value * unit"
+            )
 
     @property
     def own_names(self):
@@ -291,7 +327,8 @@ class Optic(FittableModel):
         if lam is not None and not np.all(lam > 0):
             raise ParameterError(f"wavelength = {wavelength} must be positive")
         self._check_grid(lam, values)
-        turned = self._position if position is None else angle_to_rad(position, "position")
+        turned = self._position if position is None else finite_angle(position, "position")
+        check_broadcast(lam, turned)
         dispersion = None if lam is None else self._dispersion(lam)
         if lam is None and type(self)._dispersion is not Optic._dispersion:
             raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
@@ -324,6 +361,12 @@ class Optic(FittableModel):
             self._oriented(*self._resolve(wavelength, None, values)), (-2, -1), (0, 1)
         )
         light = (I, Q, U, V)
+        # astropy gives the outputs of scalar inputs back as scalars
+        if matrix[0, 0].size > 1 and all(np.size(x) == 1 for x in (wavelength, *light)):
+            raise ParameterError(
+                f"{self.name or type(self).__name__} stands at {matrix[0, 0].size} positions: "
+                f"give light of shape {matrix[0, 0].shape}"
+            )
         return (
             wavelength,
             *(sum(m * s for m, s in zip(row, light, strict=True)) for row in matrix),
@@ -332,7 +375,9 @@ class Optic(FittableModel):
     def _strip(self, key, value):
         """Undo the model-set axis and the unit that astropy adds in a call."""
         unit = self._declared(key).unit
-        number = value.to_value(unit) if isinstance(value, u.Quantity) else np.asarray(value)
+        if isinstance(value, u.Quantity):
+            self._check_unit(key, value.unit)
+        number = np.asarray(getattr(value, "value", value))
         number = number[0] if number.ndim and number.shape[0] == 1 else number
         return np.asarray(number) * canonical_factor(unit)
 
@@ -361,10 +406,10 @@ class Optic(FittableModel):
                 f"{type(self).__name__} has no parameter {sorted(unknown)}; "
                 f"it has {self.param_names}"
             )
-        current = {
-            key: getattr(self, key).value * (self._declared(key).unit or 1)
-            for key in self.param_names
-        }
+        current = {}
+        for key in set(self.param_names) - set(values):
+            self._check_unit(key, getattr(self, key).unit)
+            current[key] = getattr(self, key).value * (self._declared(key).unit or 1)
         new = type(self)(**(current | values), **self._settings())
         for key in self.param_names:
             old, fresh = getattr(self, key), getattr(new, key)
@@ -392,6 +437,25 @@ class Optic(FittableModel):
     def _settings(self):
         """Return the keyword arguments, other than parameters, that rebuild the optic."""
         return {"name": self.name, "mount": self.mount}
+
+
+def finite_angle(value, name):
+    """Return an angle with unit in radian; refuse what is not finite."""
+    angle = angle_to_rad(value, name)
+    if not np.all(np.isfinite(angle)):
+        raise ParameterError(f"{name} = {value} must be finite")
+    return angle
+
+
+def check_broadcast(wavelength, position):
+    """Refuse positions and wavelengths that do not broadcast."""
+    try:
+        np.broadcast_shapes(np.shape(wavelength), np.shape(position))
+    except ValueError:
+        raise ParameterError(
+            f"positions of shape {np.shape(position)} do not broadcast against wavelengths of "
+            f"shape {np.shape(wavelength)}; give the positions the shape (n_frames, 1)"
+        ) from None
 
 
 def turn(matrix):

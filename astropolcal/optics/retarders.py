@@ -118,7 +118,7 @@ class TwoLayerWaveplate(Optic):
         >>> import astropy.units as u
         >>> from astropolcal.optics import TwoLayerWaveplate
         >>> TwoLayerWaveplate().retardance(1.6 * u.um).round(0)
-        <Quantity -174. deg>
+        <Quantity -171. deg>
         """
         dispersion, _, (w_sio2, w_mgf2) = self._resolve(wavelength, None)
         return (w_sio2 * dispersion[0] + w_mgf2 * dispersion[1]) * u.rad.to(u.deg) * u.deg

@@ -1,0 +1,224 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+One converter for all optics.
+
+An optic is stored as its parameters, each with value, unit, fixed flag and
+both bounds written out, and the settings that rebuild it (name, mount, beam).
+The position of its stage belongs to a frame and is not stored.
+"""
+
+import re
+
+import numpy as np
+from asdf.extension import Converter
+
+from astropolcal.exceptions import CalibrationFileError
+
+__all__ = ["OPTIC_MODULES", "OpticConverter", "node_from_optic", "optic_from_node", "optic_tag"]
+
+#: Module of `astropolcal.optics` in which each optic is defined. It repeats the
+#: registry, so that ASDF can find a converter without importing the optics.
+OPTIC_MODULES = {
+    "Depolarizer": "depolarizers",
+    "Diattenuator": "polarizers",
+    "DiattenuatorRetarder": "polarizers",
+    "EllipticalRetarder": "retarders",
+    "LinearPolarizer": "polarizers",
+    "LinearRetarder": "retarders",
+    "MuellerElement": "general",
+    "ParityFlip": "mirrors",
+    "Rotator": "rotators",
+    "TwoLayerWaveplate": "retarders",
+    "WollastonPrism": "beamsplitters",
+}
+
+
+def optic_tag(name):
+    """
+    Return the ASDF tag of an optic's class.
+
+    Parameters
+    ----------
+    name : str
+        Name of the class.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> from astropolcal.converters.optics import optic_tag
+    >>> optic_tag("TwoLayerWaveplate")
+    'tag:astropolcal.org:astropolcal/optics/two_layer_waveplate-1.0.0'
+    """
+    stem = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+    return f"tag:astropolcal.org:astropolcal/optics/{stem}-1.0.0"
+
+
+class OpticConverter(Converter):
+    """
+    Convert one class of optics.
+
+    Parameters
+    ----------
+    name : str
+        Name of the class, a key of `OPTIC_MODULES`.
+
+    Examples
+    --------
+    >>> from astropolcal.converters.optics import OpticConverter
+    >>> OpticConverter("Rotator").types
+    ['astropolcal.optics.rotators.Rotator']
+    """
+
+    def __init__(self, name):
+        self.name = name
+
+    @property
+    def tags(self):
+        """Tags of the class."""
+        return [optic_tag(self.name)]
+
+    @property
+    def types(self):
+        """Full name of the class, which is imported only when it is needed."""
+        return [f"astropolcal.optics.{OPTIC_MODULES[self.name]}.{self.name}"]
+
+    def to_yaml_tree(self, obj, tag, ctx):
+        """Return the node of an optic, see `node_from_optic`."""
+        return node_from_optic(obj)
+
+    def from_yaml_tree(self, node, tag, ctx):
+        """Return the optic of a node, see `optic_from_node`."""
+        return optic_from_node(self.name, node)
+
+
+# ---- writing ---------------------------------------------------------------------
+
+
+def node_from_optic(optic):
+    """
+    Return the node that stores an optic.
+
+    Parameters
+    ----------
+    optic : Optic
+        Of a class in `astropolcal.optics.OPTICS`.
+
+    Returns
+    -------
+    dict
+        ``parameters``, and ``name``, ``mount``, ``beam`` where the optic has them.
+
+    Raises
+    ------
+    CalibrationFileError
+        If a file cannot hold the optic: its class is not registered, or a
+        parameter has a callable tie, a prior, or a value that is not finite.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.converters.optics import node_from_optic
+    >>> node = node_from_optic(optics.WollastonPrism(name="wollaston"))
+    >>> node["beam"], node["parameters"]["efficiency"]
+    ('right', {'value': 1.0, 'fixed': False, 'bounds': [0.0, 1.0]})
+    """
+    _check_class(optic)
+    settings = {key: value for key, value in optic._settings().items() if value is not None}
+    return settings | {
+        "parameters": {key: _parameter_node(optic, key) for key in optic.param_names}
+    }
+
+
+def _check_class(optic):
+    from astropolcal.optics import OPTICS
+
+    cls = type(optic)
+    if OPTICS.get(cls.__name__) is not cls:
+        raise CalibrationFileError(
+            f"optic {optic.name or 'without a name'!r} is a {cls.__module__}.{cls.__qualname__}, "
+            f"which files cannot hold; allowed are {', '.join(OPTICS)}"
+        )
+
+
+def _parameter_node(optic, key):
+    parameter = getattr(optic, key)
+    label = f"{optic.name or type(optic).__name__}.{key}"
+    for kind in ("tied", "prior"):
+        if getattr(parameter, kind):
+            raise CalibrationFileError(
+                f"{label} has a callable {kind!r}, which files cannot hold"
+                + ("; use ties={...: Tie(...)} of calibrate" if kind == "tied" else "")
+            )
+    declared = optic._declared(key).unit
+    if parameter.unit != declared:
+        raise CalibrationFileError(f"{label} is in {parameter.unit}, allowed is {declared}")
+    node = {"value": _stored(parameter.value, label)}
+    if declared is not None:
+        node["unit"] = declared.to_string()
+    return node | {"fixed": bool(parameter.fixed), "bounds": _bounds(parameter)}
+
+
+def _stored(value, label):
+    value = np.array(value, dtype=float)
+    if value.ndim > 1 or not np.isfinite(value).all():
+        raise CalibrationFileError(
+            f"{label} = {value} must be a finite number, or one a wavelength"
+        )
+    return value if value.ndim else float(value)
+
+
+def _bounds(parameter):
+    return [None if bound is None else float(bound) for bound in parameter.bounds]
+
+
+# ---- reading ---------------------------------------------------------------------
+
+
+def optic_from_node(name, node):
+    """
+    Return the optic that a node stores.
+
+    Parameters
+    ----------
+    name : str
+        Name of its class.
+    node : dict
+        Its node, which obeys the schema.
+
+    Returns
+    -------
+    Optic
+
+    Raises
+    ------
+    ParameterError
+        If the class refuses a value.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.converters.optics import node_from_optic, optic_from_node
+    >>> node = node_from_optic(optics.WollastonPrism(efficiency=0.98, name="wollaston"))
+    >>> optic_from_node("WollastonPrism", node)
+    <WollastonPrism(theta=0. deg, efficiency=0.98, name='wollaston')>
+    """
+    from astropolcal.optics import OPTICS
+
+    settings = {key: value for key, value in node.items() if key != "parameters"}
+    values = {key: _value(entry) for key, entry in node["parameters"].items()}
+    optic = OPTICS[name](**values, **settings)
+    for key, entry in node["parameters"].items():
+        parameter = getattr(optic, key)
+        parameter.fixed = entry["fixed"]
+        parameter.bounds = tuple(entry["bounds"])
+    return optic
+
+
+def _value(entry):
+    import astropy.units as u
+
+    value = np.array(entry["value"], dtype=float)
+    return value * u.Unit(entry["unit"]) if "unit" in entry else value

@@ -1,0 +1,28 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Figures of a calibration: differences, residuals, accuracy, and parameters.
+
+Every function returns a `~matplotlib.figure.Figure` and leaves pyplot alone,
+so that figures can be made in a pipeline without a window system. Matplotlib
+is imported when the first figure is drawn.
+"""
+
+from astropolcal.plotting.accuracy import plot_accuracy
+from astropolcal.plotting.differences import plot_double_differences
+from astropolcal.plotting.parameters import (
+    plot_efficiency,
+    plot_parameters,
+    plot_retardances,
+)
+from astropolcal.plotting.residuals import plot_residuals
+from astropolcal.plotting.saving import save_all
+
+__all__ = [
+    "plot_accuracy",
+    "plot_double_differences",
+    "plot_efficiency",
+    "plot_parameters",
+    "plot_residuals",
+    "plot_retardances",
+    "save_all",
+]

@@ -1,0 +1,153 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Observed and modelled data of one dataset, laid out for figures."""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.exceptions import ParameterError, WavelengthRangeError
+from astropolcal.plotting._style import clusters, degrees, nanometres
+from astropolcal.propagation import Propagator
+
+# angles (deg) that differ by less are the same setting of a stage
+SAME_ANGLE = 0.5
+
+
+@dataclass
+class Series:
+    """Data taken with the same setting of the half-wave plate."""
+
+    label: str
+    #: Which data belong to it, indices on the second axis of the grids.
+    data: np.ndarray
+    #: Mean position (rad) of every stage in each frame of a datum, or None if one moves.
+    positions: dict | None
+
+
+class DataGrid:
+    """
+    One dataset as arrays of shape (n_wavelengths, n_groups), NaN where masked.
+
+    A group is the frame, or the pair of frames, that gives one datum.
+    """
+
+    def __init__(self, calibration, dataset):
+        residuals = calibration.residuals  # first: says clearly if there are no data
+        measurement = calibration.measurement
+        dataset = check_dataset(calibration, dataset)
+        self.part = measurement.datasets[dataset]
+        self.observable = measurement.observable
+        self.wavelength = nanometres(self.part.observations.wavelength)
+        self.observed = self._grid(self.part.observed)
+        self.residual = self._grid(residuals[measurement.segments[dataset]])
+        self.sigma = self._grid(self.part.sigma)
+        self.derotator = np.rad2deg(self.position("derotator")[0])
+
+    def _grid(self, flat):
+        grid = np.full(self.part.valid.shape, np.nan)
+        grid[self.part.valid] = flat
+        return grid
+
+    @property
+    def quantity(self):
+        """Name of the observable in words."""
+        return self.observable.name.replace("_", " ")
+
+    # ---- where the stages stand -------------------------------------------------
+
+    def position(self, stage):
+        """Return the position (rad) of a stage, shape (frames_per_datum, n_groups)."""
+        stages = self._stages()
+        if stage in stages:
+            return stages[stage]
+        return self.part.observations.position(stage)[self.part.frames.T]
+
+    def _stages(self):
+        """Positions as the model has them, which need not be the table's columns."""
+        propagator, shape = self.part.propagator, self.part.frames.T.shape
+        nodes = [*propagator._common, *propagator._arms[0]]
+        return {
+            node.leaf.stage: (node.leaf.stage_sign * node.stage_angle).reshape(shape)
+            for node in nodes
+            if node.leaf.stage
+        }
+
+    def series(self):
+        """Return the data by setting of the half-wave plate, ordered by its angle."""
+        # half a turn does not matter; a value just below it belongs to zero
+        angle = np.mod(np.rad2deg(self.position("hwp")) + SAME_ANGLE, 180) - SAME_ANGLE
+        number = clusters(angle[0], SAME_ANGLE)
+        return [self._one_series(angle, number == n) for n in range(number.max() + 1)]
+
+    def _one_series(self, angle, member):
+        middle = np.median(angle[:, member], axis=1)
+        return Series(
+            label=" − ".join(degrees(value) for value in middle),
+            data=np.flatnonzero(member),
+            positions=self._steady(member),
+        )
+
+    def _steady(self, member):
+        others = {s: a[:, member] for s, a in self._stages().items() if s != "derotator"}
+        if any(np.ptp(angle, axis=1).max() > np.deg2rad(SAME_ANGLE) for angle in others.values()):
+            return None
+        return {stage: angle.mean(axis=1) for stage, angle in others.items()}
+
+    # ---- the model ---------------------------------------------------------------
+
+    def curve(self, series, bins, derotator):
+        """
+        Return the model between the data, shape (n_bins, n_angles).
+
+        The derotator turns (``derotator`` in degree); every other stage stays
+        where it stands in the series.
+        """
+        angle = np.deg2rad(derotator)
+        per_datum, n = self.part.frames.shape[1], len(angle)
+        positions = {stage: np.repeat(p, n) for stage, p in series.positions.items()}
+        positions["derotator"] = np.tile(angle, per_datum)
+        lam = self.part.observations.wavelength.to_value(u.um)[bins]
+        propagator = Propagator(self.part.chain, lam, positions)
+        on_grid = self.part.bins[bins]
+        values = [
+            [value[on_grid] if np.size(value) > 1 else value for value in optic]
+            for optic in propagator.values()
+        ]
+        right, left = (
+            flux.reshape(len(lam), per_datum, n).transpose(1, 0, 2)
+            for flux in propagator.fluxes(values)
+        )
+        return self.observable.evaluate(right, left)
+
+    # ---- wavelengths ---------------------------------------------------------------
+
+    def spread_bins(self, count):
+        """Return bins with data, spread over the range without its very ends."""
+        usable = np.flatnonzero(np.isfinite(self.observed).any(axis=1))
+        usable = usable[np.argsort(self.wavelength[usable])]
+        if len(usable) <= count:
+            return usable
+        inner = np.linspace(0, len(usable) - 1, count + 2)[1:-1]
+        return usable[np.unique(np.round(inner).astype(int))]
+
+    def nearest_bins(self, wavelengths):
+        """Return the bins nearest to wavelengths, each once."""
+        wanted = nanometres(wavelengths)
+        low, high = self.wavelength.min(), self.wavelength.max()
+        for value in wanted:
+            if not 0.99 * low <= value <= 1.01 * high:
+                raise WavelengthRangeError(
+                    f"wavelength {value:g} nm; {self.part.observations.name} has "
+                    f"{low:.1f} to {high:.1f} nm"
+                )
+        nearest = np.abs(self.wavelength[None, :] - wanted[:, None]).argmin(axis=1)
+        return np.array(list(dict.fromkeys(nearest.tolist())))
+
+
+def check_dataset(calibration, dataset):
+    """Return the index of a dataset, or say which there are."""
+    count = len(calibration.datasets)
+    if isinstance(dataset, bool) or dataset not in range(count):
+        raise ParameterError(f"dataset = {dataset!r}; allowed are whole numbers 0 to {count - 1}")
+    return int(dataset)

@@ -1,0 +1,97 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Colours, markers, sizes, and what else all figures have in common."""
+
+from itertools import cycle, islice
+
+import astropy.units as u
+import numpy as np
+
+# Okabe & Ito (2008), distinct for all kinds of colour vision; yellow is too pale for lines
+BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
+COLORS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)
+# one more than colours: the pairs repeat only after 56 series
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+GREY = "0.45"
+
+_SETTINGS = {
+    "font.size": 11,
+    "axes.titlesize": 11.5,
+    "axes.labelsize": 11.5,
+    "figure.titlesize": 13,
+    "legend.fontsize": 10.5,
+    "legend.title_fontsize": 10.5,
+    "legend.frameon": False,
+    "axes.grid": True,
+    "grid.color": "0.88",
+    "grid.linewidth": 0.7,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "text.usetex": False,
+    "lines.linewidth": 1.5,
+    "lines.markersize": 5.5,
+    "errorbar.capsize": 2.5,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+}
+
+
+def style():
+    """Return the context in which figures are drawn; the user's settings come back after it."""
+    import matplotlib as mpl
+
+    return mpl.rc_context(_SETTINGS)
+
+
+def canvas(figure, width, height):
+    """Return the figure to draw into: the one given, or a new one of this size (inch)."""
+    from matplotlib.figure import Figure
+
+    if figure is None:
+        return Figure(figsize=(width, height), layout="constrained")
+    if isinstance(figure, Figure) and figure.get_layout_engine() is None:
+        # without it a legend cannot be kept outside the axes
+        figure.set_layout_engine("constrained")
+    return figure
+
+
+def looks(count):
+    """Return ``count`` pairs of colour and marker."""
+    return list(islice(zip(cycle(COLORS), cycle(MARKERS), strict=False), count))
+
+
+def heading(figure, calibration, what, names):
+    """Title a figure with what it shows, of what, and whether the fit is to be trusted."""
+    state = "" if calibration.converged else "  (FIT NOT CONVERGED)"
+    of = ", ".join(names)
+    instrument = f"{calibration.instrument}: " if calibration.instrument else ""
+    figure.suptitle(f"{what}{state}\n{instrument}{of}")
+
+
+def legend_outside(figure, handles, *, place="outside lower center", title=None, columns=1):
+    """Put a legend where it hides no data."""
+    return figure.legend(handles=handles, loc=place, title=title, ncols=columns)
+
+
+def nanometres(wavelength):
+    """Return wavelengths in nm as floats."""
+    return np.atleast_1d(u.Quantity(wavelength).to_value(u.nm))
+
+
+def wavelength_label(axes):
+    """Label the wavelength axis."""
+    axes.set_xlabel("wavelength (nm)")
+
+
+def clusters(values, gap):
+    """Return the number of each value's cluster; clusters are more than ``gap`` apart."""
+    order = np.argsort(values, kind="stable")
+    number = np.empty(len(values), dtype=int)
+    number[order] = np.concatenate([[0], np.cumsum(np.diff(values[order]) > gap)])
+    return number
+
+
+def degrees(angle):
+    """Return an angle in degree as short text: ``11.25°``."""
+    text = f"{angle:.2f}".rstrip("0").rstrip(".")
+    return f"{'0' if text == '-0' else text}°"

@@ -1,0 +1,172 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Observed and modelled differences against the derotator angle."""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.plotting._data import DataGrid
+from astropolcal.plotting._style import GREY, canvas, heading, legend_outside, looks, style
+
+__all__ = ["plot_double_differences"]
+
+_PANELS = 4
+_CURVE_POINTS = 241
+
+
+def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=None):
+    """
+    Draw observed and modelled differences against the derotator angle.
+
+    One pair of panels a wavelength: above the observed data and the model,
+    evaluated between the data too; below their difference in percent. Where
+    another stage than the derotator moves within a series, the model is drawn
+    at the data only.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        A calibration that still has its data.
+    wavelengths : `~astropy.units.Quantity`, optional
+        The nearest wavelengths of the data are shown; by default four.
+    dataset : int
+        Which of the calibration's datasets.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    CalibrationFileError
+        If the calibration was read from a file, which holds no data.
+    ParameterError, WavelengthRangeError
+        If there is no such dataset or wavelength, or a wavelength has no unit.
+
+    Notes
+    -----
+    The figure of double differences of McIntosh et al. (2026), with residuals.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.plotting import plot_double_differences
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> len(plot_double_differences(cal, [1330, 1575] * u.nm).axes)
+    4
+    """
+    grid = DataGrid(calibration, dataset)
+    bins = grid.spread_bins(_PANELS) if wavelengths is None else grid.nearest_bins(wavelengths)
+    series = grid.series()
+    with style():
+        columns = min(2, len(bins))
+        rows = -(-len(bins) // columns)
+        figure = canvas(figure, 3.0 + 4.4 * columns, 1.2 + 4.1 * rows)
+        pairs = _panels(figure, len(bins), rows, columns)
+        for pair, row, s_res in zip(pairs, bins, _s_res(calibration, dataset)[bins], strict=True):
+            _draw_wavelength(pair, grid, row, series, s_res)
+        _label(pairs, grid, columns)
+        heading(figure, calibration, grid.quantity.capitalize(), [grid.part.observations.name])
+        _legend(figure, grid, series, bins)
+    return figure
+
+
+def _panels(figure, count, rows, columns):
+    """Return (data, residual) axes for each wavelength, all with the same scales."""
+    outer = figure.add_gridspec(rows, columns)
+    pairs = []
+    for i in range(count):
+        inner = outer[divmod(i, columns)].subgridspec(2, 1, height_ratios=(3, 1.2), hspace=0.0)
+        shared = {"sharex": pairs[0][0]} if pairs else {}
+        top = figure.add_subplot(inner[0], sharey=pairs[0][0] if pairs else None, **shared)
+        bottom = figure.add_subplot(inner[1], sharex=top, sharey=pairs[0][1] if pairs else None)
+        pairs.append((top, bottom))
+    return pairs
+
+
+def _s_res(calibration, dataset):
+    return calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
+
+
+def _draw_wavelength(pair, grid, row, series, s_res):
+    top, bottom = pair
+    bottom.axhline(0, color=GREY, linewidth=1)
+    spread = f",  s_res = {s_res:.2f} %" if np.isfinite(s_res) else ""
+    top.set_title(f"{grid.wavelength[row]:.1f} nm{spread}")
+    if spread:
+        bottom.axhspan(-s_res, s_res, color="0.92", zorder=0)
+    fine = _fine(grid.derotator)
+    for one, (color, marker) in zip(series, looks(len(series)), strict=True):
+        angle = grid.derotator[one.data]
+        value, residual, sigma = (
+            array[row, one.data] for array in (grid.observed, grid.residual, grid.sigma)
+        )
+        if one.positions is None:
+            top.plot(angle, value - residual, "x", color=color, markersize=8)
+        else:
+            top.plot(fine, grid.curve(one, [row], fine)[0], color=color)
+        look = {"color": color, "marker": marker, "linestyle": "none", "label": one.label}
+        top.errorbar(angle, value, yerr=_bars(sigma), **look)
+        bottom.errorbar(angle, 100 * residual, yerr=_bars(100 * sigma), **look)
+
+
+def _bars(sigma):
+    return np.nan_to_num(sigma) if np.isfinite(sigma).any() else None
+
+
+def _fine(angle):
+    """Return angles for the curve: a little beyond the data, ten degrees around a single one."""
+    low, high = angle.min(), angle.max()
+    margin = 0.04 * (high - low) if high - low > 1 else 10
+    return np.linspace(low - margin, high + margin, _CURVE_POINTS)
+
+
+def _label(pairs, grid, columns):
+    for i, (top, bottom) in enumerate(pairs):
+        top.tick_params(labelbottom=False)
+        last = i + columns >= len(pairs)
+        bottom.tick_params(labelbottom=last)
+        if last:
+            bottom.set_xlabel("derotator angle (°)")
+        if i % columns == 0:
+            top.set_ylabel(_two_lines(grid.quantity))
+            bottom.set_ylabel("obs. − model\n(%)")
+    fine = _fine(grid.derotator)
+    pairs[0][0].set_xlim(fine[0], fine[-1])
+
+
+def _two_lines(words):
+    first, _, rest = words.partition(" ")
+    return f"{first}\n{rest}" if rest else words
+
+
+def _legend(figure, grid, series, bins):
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    curves = any(one.positions is not None for one in series)
+    handles = [
+        Line2D([], [], color=color, marker=marker, linestyle="-" if curves else "", label=one.label)
+        for one, (color, marker) in zip(series, looks(len(series)), strict=True)
+    ]
+    bars = np.isfinite(grid.sigma[bins]).any()
+    seen = "observed, with 1σ errors" if bars else "observed (no errors given)"
+    handles.append(Line2D([], [], color=GREY, marker="o", linestyle="", label=seen))
+    if curves:
+        handles.append(Line2D([], [], color=GREY, label="model"))
+    if any(one.positions is None for one in series):
+        handles.append(Line2D([], [], color=GREY, marker="x", linestyle="", label="model"))
+    handles.append(Patch(color="0.92", label="± s_res"))
+    frames = "plus − minus frame" if grid.part.frames.shape[1] == 2 else "of the frame"
+    legend_outside(
+        figure,
+        handles,
+        place="outside right upper",
+        title=f"half-wave plate,\n{frames}",
+    )

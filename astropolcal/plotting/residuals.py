@@ -1,0 +1,157 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""A map of the residuals: where the model fails."""
+
+import numpy as np
+
+from astropolcal.plotting._data import SAME_ANGLE, DataGrid
+from astropolcal.plotting._style import BLUE, canvas, clusters, degrees, heading, style
+
+__all__ = ["plot_residuals"]
+
+# share of the residuals that the colour scale covers, so that one outlier does not blank the map
+_COVERED = 99
+_MAX_TICKS = 12
+
+
+def plot_residuals(calibration, *, figure=None):
+    """
+    Draw a map of the residuals: wavelength against datum, by derotator angle.
+
+    Above the map is the rms of each datum over the wavelengths, at its right
+    the rms of each wavelength over the data; one map a dataset, all with the
+    same colours. Masked data are grey.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        A calibration that still has its data.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    CalibrationFileError
+        If the calibration was read from a file, which holds no data.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.plotting import plot_residuals
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> plot_residuals(cal).axes[0].get_ylabel()
+    'wavelength (nm)'
+    """
+    grids = [DataGrid(calibration, i) for i in range(len(calibration.datasets))]
+    limit, clipped = _limit(grids)
+    with style():
+        figure = canvas(figure, 10.5, 0.8 + 5.4 * len(grids))
+        spec = figure.add_gridspec(
+            2 * len(grids), 2, width_ratios=(5, 1), height_ratios=(1, 3.6) * len(grids)
+        )
+        maps = []
+        for i, grid in enumerate(grids):
+            main = figure.add_subplot(spec[2 * i + 1, 0])
+            above = figure.add_subplot(spec[2 * i, 0], sharex=main)
+            right = figure.add_subplot(spec[2 * i + 1, 1], sharey=main)
+            maps.append(main)
+            drawn = _draw_dataset(main, above, right, grid, limit)
+        bar = figure.colorbar(
+            drawn, ax=figure.axes, extend="both" if clipped else "neither", shrink=0.8, aspect=35
+        )
+        bar.set_label("observed − model (%); grey: masked")
+        heading(
+            figure,
+            calibration,
+            f"Residuals of the {grids[0].quantity}",
+            [grid.part.observations.name for grid in grids],
+        )
+    return figure
+
+
+def _limit(grids):
+    """Return the end of the colour scale in percent, and whether data lie beyond it."""
+    size = np.concatenate([np.abs(g.residual[np.isfinite(g.residual)]) for g in grids]) * 100
+    limit = max(np.percentile(size, _COVERED), 1e-12)
+    return limit, bool(size.max() > limit)
+
+
+def _draw_dataset(main, above, right, grid, limit):
+    order, group, ends = _layout(grid)
+    lam = np.argsort(grid.wavelength)
+    edges = _edges(grid.wavelength[lam])
+    percent = 100 * grid.residual[np.ix_(lam, order)]
+    columns = np.arange(len(order) + 1)
+    main.grid(False)
+    main.set_facecolor("0.75")
+    drawn = main.pcolormesh(
+        columns, edges, np.ma.masked_invalid(percent), cmap="RdBu_r", vmin=-limit, vmax=limit
+    )
+    main.vlines(ends[:-1], edges[0], edges[-1], color="black", linewidth=0.8)
+    main.set_ylabel("wavelength (nm)")
+    _name_groups(main, grid, order, group, ends)
+    above.stairs(_rms(percent, axis=0), columns, color=BLUE, fill=True)
+    above.tick_params(labelbottom=False)
+    above.set_ylabel("rms (%)")
+    above.set_title(grid.part.observations.name, loc="left")
+    _wavelength_rms(right, _rms(percent, axis=1), grid.wavelength[lam])
+    for axes in (above, right):
+        axes.margins(0)
+    above.set_ylim(bottom=0)
+    return drawn
+
+
+def _layout(grid):
+    """Return the data by derotator then half-wave plate angle, groups, and where these end."""
+    derotator = clusters(grid.derotator, SAME_ANGLE)
+    plate = np.empty(len(derotator), dtype=int)
+    for i, series in enumerate(grid.series()):
+        plate[series.data] = i
+    order = np.lexsort((plate, derotator))
+    group = derotator[order]
+    ends = np.flatnonzero(np.diff(group, append=group[-1] + 1)) + 1
+    return order, group, ends
+
+
+def _name_groups(main, grid, order, group, ends):
+    starts = np.concatenate([[0], ends[:-1]])
+    angles = [np.median(grid.derotator[order][group == g]) for g in range(len(ends))]
+    step = -(-len(ends) // _MAX_TICKS)
+    main.set_xticks(
+        ((starts + ends) / 2)[::step], labels=[degrees(angle) for angle in angles[::step]]
+    )
+    main.tick_params(axis="x", length=0)
+    labels = [series.label for series in grid.series()]
+    within = ", ".join(labels) if len(labels) <= 8 else f"{labels[0]} to {labels[-1]}"
+    main.set_xlabel(f"derotator angle; within one, by half-wave plate angle:\n{within}")
+
+
+def _edges(centres):
+    """Return edges half way between wavelengths."""
+    if len(centres) == 1:
+        return centres[0] * np.array([0.98, 1.02])
+    middle = (centres[1:] + centres[:-1]) / 2
+    first, last = 2 * centres[0] - middle[0], 2 * centres[-1] - middle[-1]
+    return np.concatenate([[first], middle, [last]])
+
+
+def _rms(percent, axis):
+    known = np.isfinite(percent)
+    count = known.sum(axis=axis)
+    total = np.where(known, percent, 0.0) ** 2
+    return np.sqrt(np.where(count, total.sum(axis=axis) / np.maximum(count, 1), np.nan))
+
+
+def _wavelength_rms(axes, rms, wavelength):
+    axes.plot(rms, wavelength, "o-", color=BLUE)
+    axes.set_xlabel("rms (%)")
+    axes.tick_params(labelleft=False)
+    axes.set_xlim(0, 1.1 * np.nanmax(rms) or 1)

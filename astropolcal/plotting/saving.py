@@ -1,0 +1,99 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""All figures of a calibration as files."""
+
+from pathlib import Path
+
+from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ChainError
+from astropolcal.files import atomic_path
+from astropolcal.plotting.accuracy import plot_accuracy
+from astropolcal.plotting.differences import plot_double_differences
+from astropolcal.plotting.parameters import (
+    other_parameters,
+    plot_efficiency,
+    plot_parameters,
+    plot_retardances,
+)
+from astropolcal.plotting.residuals import plot_residuals
+
+__all__ = ["save_all"]
+
+_DPI = 150
+
+
+def save_all(calibration, folder):
+    """
+    Write every figure that a calibration allows as PNG files.
+
+    Figures for which the chain has no such optic, or the calibration no data
+    (when it was read from a file), are left out. Each file appears complete
+    or not at all; existing ones are replaced.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    folder : path-like
+        Where to write; it is created if it does not exist.
+
+    Returns
+    -------
+    list of `~pathlib.Path`
+        The files: of ``double_differences.png`` (``double_differences_2.png``
+        for the second dataset, and so on), ``residuals.png``,
+        ``accuracy.png``, ``retardances.png``, ``efficiency.png`` and
+        ``other_parameters.png`` those that could be drawn.
+
+    Raises
+    ------
+    AstropolcalError
+        If the folder or a file cannot be written.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, optics
+    >>> from astropolcal.plotting import save_all
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> chain = (optics.LinearPolarizer(name="polarizer")
+    ...          | optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(efficiency=0.98, name="wollaston"))
+    >>> frames = half_wave_plate_cycles(derotator=[45, 90] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, [1.2, 1.6] * u.um, frames, seed=1))
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in save_all(cal, folder)][:3]
+    ['double_differences.png', 'residuals.png', 'accuracy.png']
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AstropolcalError(
+            f"{folder}: cannot be created: {error.strerror or error}"
+        ) from error
+    paths = []
+    for name, draw in _figures(calibration):
+        try:
+            figure = draw()
+        except (ChainError, CalibrationFileError):
+            continue
+        paths.append(_save(figure, folder / f"{name}.png"))
+    return paths
+
+
+def _figures(calibration):
+    """Yield the name of each figure and what draws it."""
+    for i in range(len(calibration.datasets)):
+        name = "double_differences" + (f"_{i + 1}" if i else "")
+        yield name, lambda i=i: plot_double_differences(calibration, dataset=i)
+    yield "residuals", lambda: plot_residuals(calibration)
+    yield "accuracy", lambda: plot_accuracy(calibration)
+    yield "retardances", lambda: plot_retardances(calibration)
+    yield "efficiency", lambda: plot_efficiency(calibration)
+    yield "other_parameters", lambda: plot_parameters(calibration, other_parameters(calibration))
+
+
+def _save(figure, path):
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=_DPI)
+    return path

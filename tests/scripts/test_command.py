@@ -1,0 +1,298 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The astropolcal command, as a person or a pipeline calls it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+import astropolcal
+from astropolcal import Calibration, Observations, instruments
+from astropolcal.scripts.main import build_parser, main
+from astropolcal.scripts.simulate import EXAMPLE
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+EXAMPLE_FILE = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A table of three bins and three derotator angles, quick to calibrate."""
+    charis = instruments.get("charis")
+    wavelength = charis.wavelength[[9, 12, 16]]
+    chain = charis.chain("polarized", ["nbs"], wavelength=wavelength)
+    frames = half_wave_plate_cycles(derotator=[50, 62.5, 80, 100] * u.deg)
+    meta = charis.published_meta()
+    path = tmp_path_factory.mktemp("tables") / "small.ecsv"
+    simulate(chain, wavelength, frames, seed=5, meta=meta).write(path)
+    return path
+
+
+def _fails(capsys, *argv):
+    """Run the command on bad input; return its one line of complaint."""
+    try:
+        status = main([str(a) for a in argv])
+    except SystemExit as stop:
+        status = stop.code
+    captured = capsys.readouterr()
+    assert status == 2
+    complaint = [line for line in captured.err.splitlines() if "error" in line]
+    assert len(complaint) == 1
+    assert "Traceback" not in captured.err
+    return complaint[0]
+
+
+# ---- calibrate ----------------------------------------------------------------------
+
+
+def test_without_files_the_packaged_example_is_calibrated_and_it_says_so(capsys, tmp_path):
+    assert main(["calibrate", "--json", str(tmp_path / "out.json")]) == 0
+    text = capsys.readouterr().out
+    assert "packaged example" in text
+    assert max(len(line) for line in text.splitlines() if str(tmp_path) not in line) <= 80
+    summary = json.loads((tmp_path / "out.json").read_text())
+    assert summary["n_free"] == 93
+    assert summary["rank"] == 91
+    assert summary["parameters"]["hwp.w_sio2"]["value"] == pytest.approx(1.653, abs=1e-3)
+    assert len(summary["null_directions"]) == 2
+
+
+def test_json_holds_the_keys_of_the_contract(small, tmp_path):
+    out = tmp_path / "out.json"
+    assert main(["calibrate", str(small), "-q", "--json", str(out)]) == 0
+    summary = json.loads(out.read_text())
+    wanted = {"instrument", "observable", "fitter", "seconds", "n_data", "n_free", "rank",
+              "datasets", "parameters", "null_directions"}  # fmt: skip
+    assert wanted <= set(summary)
+    dataset = summary["datasets"][0]
+    for key in ("wavelength_nm", "n", "s_res_percent", "s_mean_percent", "s_cv_percent"):
+        assert len(dataset[key]) == 3
+    for key in ("value", "unit", "std", "fixed", "at_bound", "identifiable"):
+        assert key in summary["parameters"]["derotator.horizontal"]
+    assert len(summary["parameters"]["derotator.horizontal"]["value"]) == 3
+
+
+def test_json_on_the_standard_output_is_nothing_but_json(small, capsys):
+    assert main(["calibrate", str(small), "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["instrument"] == "charis"
+
+
+def test_quiet_prints_nothing(small, capsys):
+    assert main(["calibrate", str(small), "-q"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_fix_free_and_without_edit_the_model(small, tmp_path):
+    out = tmp_path / "out.json"
+    arguments = ["--fix", "hwp.theta=0.1deg", "--fix", "derotator.circular", "--free",
+                 "wollaston.theta", "--without", "nbs"]  # fmt: skip
+    assert main(["calibrate", str(small), "-q", "--json", str(out), *arguments]) == 0
+    parameters = json.loads(out.read_text())["parameters"]
+    assert parameters["hwp.theta"]["value"] == pytest.approx(0.1)
+    assert parameters["hwp.theta"]["fixed"]
+    assert parameters["derotator.circular"]["fixed"]
+    assert not parameters["wollaston.theta"]["fixed"]
+    assert "nbs.theta" not in parameters
+
+
+@pytest.mark.parametrize(
+    ("option", "free"), [(("--derotator", "linear"), 3 * 2 + 5), (("--strategy", "two-step"), 17)]
+)
+def test_models_and_strategies(small, tmp_path, option, free):
+    out = tmp_path / "out.json"
+    assert main(["calibrate", str(small), "-q", "--json", str(out), *option]) == 0
+    assert json.loads(out.read_text())["n_free"] == free
+
+
+def test_output_and_info_tell_the_same(small, tmp_path, capsys):
+    path = tmp_path / "cal.asdf"
+    assert main(["calibrate", str(small), "-o", str(path), "--json", str(tmp_path / "a.json")]) == 0
+    capsys.readouterr()
+    assert main(["info", str(path), "--json", str(tmp_path / "b.json")]) == 0
+    assert "Calibration of charis from small" in capsys.readouterr().out
+    first, second = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
+    assert first == second
+    assert Calibration.read(path).chain["hwp"].w_sio2.unit == u.mm
+
+
+def test_plots_are_saved(small, tmp_path, capsys):
+    assert main(["calibrate", str(small), "--plots", str(tmp_path / "figures")]) == 0
+    assert "Written: " in capsys.readouterr().out
+    assert len(list((tmp_path / "figures").glob("*.png"))) >= 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["missing.ecsv"], "missing.ecsv: no such file"),
+        (["--instrument", "charix"], "unknown instrument 'charix'.*did you mean 'charis'"),
+        (["--observable", "ratios"], "unknown observable"),
+        (["--strategy", "three-step"], "three-step.*joint, two-step"),
+        (["--derotator", "circular"], "elliptical, linear"),
+        (["--bounds", "none"], "physical, paper"),
+        (["--fix", "hwp.theta=9"], r"hwp.theta=9.*-5.0 to 5.0 deg"),
+        (["--fix", "hwp.theta=1mm"], "convertible to deg"),
+        (["--fix", "hwp.theta=abc"], "not a number"),
+        (["--fix", "hwp.tilt"], "no parameter 'tilt'"),
+        (["--free", "hpw"], "did you mean 'hwp'"),
+        (["--without", "m3"], "no optic 'm3'"),
+        (["-o", "nowhere/cal.asdf"], "no folder"),
+        (["--json", "nowhere/out.json"], "no folder"),
+        (["--no-such-option"], "unrecognized"),
+    ],
+)
+def test_bad_arguments_get_one_line_and_status_two(
+    capsys, tmp_path, monkeypatch, arguments, complaint
+):
+    import re
+
+    monkeypatch.chdir(tmp_path)
+    assert re.search(complaint, _fails(capsys, "calibrate", *arguments))
+    assert list(tmp_path.iterdir()) == []
+
+
+def _spoil(table, how):
+    if how == "empty":
+        return table[:0]
+    if how == "unpaired":
+        return table[table["hwp"] < 40 * u.deg]
+    if how == "masked":
+        table["flux_right"] = np.nan * u.adu
+    if how == "infrared":
+        table["wavelength"] = table["wavelength"] * 3
+    if how == "other instrument":
+        table.meta["instrument"] = "VLT/SPHERE"
+    if how == "star":
+        table.meta["source"] = "unpolarized standard star"
+    return table
+
+
+@pytest.mark.parametrize(
+    ("how", "complaint"),
+    [
+        ("empty", "empty"),
+        ("unpaired", "45"),
+        ("masked", "mask"),
+        ("infrared", "range"),
+        ("other instrument", "SPHERE"),
+        ("star", "not supported"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_bad_tables_get_one_line_and_leave_nothing_behind(small, capsys, tmp_path, how, complaint):
+    table = _spoil(QTable.read(small), how)
+    path = tmp_path / "bad.ecsv"
+    table.write(path, format="ascii.ecsv")
+    argv = [path, "-o", tmp_path / "cal.asdf", "--json", tmp_path / "out.json"]
+    if how == "other instrument":
+        argv += ["--instrument", "charis"]
+    assert complaint in _fails(capsys, "calibrate", *argv)
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.ecsv"]
+
+
+def test_the_same_table_twice_is_refused(small, capsys):
+    assert "same frames" in _fails(capsys, "calibrate", small, small)
+
+
+def test_a_table_without_instrument_asks_for_it(small, capsys, tmp_path):
+    table = QTable.read(small)
+    del table.meta["instrument"]
+    table.write(tmp_path / "anonymous.ecsv", format="ascii.ecsv")
+    assert "--instrument" in _fails(capsys, "calibrate", tmp_path / "anonymous.ecsv")
+    assert (
+        main(["calibrate", str(tmp_path / "anonymous.ecsv"), "--instrument", "charis", "-q"]) == 0
+    )
+
+
+# ---- simulate -------------------------------------------------------------------------
+
+
+def test_the_packaged_example_is_what_simulate_makes(tmp_path):
+    assert main(["simulate", "-o", str(tmp_path / "again.ecsv")]) == 0
+    again, packaged = Observations.read(tmp_path / "again.ecsv"), Observations.read(EXAMPLE_FILE)
+    assert (packaged.n_frames, packaged.n_bins) == (64, 22)
+    np.testing.assert_allclose(again.flux_right, packaged.flux_right, rtol=1e-9)
+    np.testing.assert_allclose(again.flux_left, packaged.flux_left, rtol=1e-9)
+    assert packaged.meta == again.meta
+
+
+def test_simulate_takes_angles_and_parameters(tmp_path, capsys):
+    path = tmp_path / "table.ecsv"
+    argv = ["-o", path, "--hwp", "0,45", "--derotator", "60", "--without", "nbs", "--no-noise",
+            "--fix", "wollaston.efficiency=0.5", "--json", "-"]  # fmt: skip
+    assert main(["simulate", *map(str, argv)]) == 0
+    assert json.loads(capsys.readouterr().out)["n_frames"] == 2
+    table = Observations.read(path)
+    assert table.meta["nasmyth_beam_switcher"] == "not installed"
+    contrast = (table.flux_right - table.flux_left) / (table.flux_right + table.flux_left)
+    assert np.abs(contrast).max() <= 0.5
+
+
+def test_simulate_from_a_calibration(small, tmp_path):
+    assert main(["calibrate", str(small), "-q", "-o", str(tmp_path / "cal.asdf")]) == 0
+    argv = ["simulate", "-o", tmp_path / "new.ecsv", "--calibration", tmp_path / "cal.asdf"]
+    assert main([str(a) for a in argv]) == 0
+    assert Observations.read(tmp_path / "new.ecsv").n_bins == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--flux", "-1"], "flux"),
+        (["--gain", "0"], "gain"),
+        (["--read-noise", "nan"], "read_noise"),
+        (["--hwp", "0,x"], "not a list of angles"),
+        (["--calibration", "missing.asdf"], "missing.asdf"),
+    ],
+)
+def test_simulate_refuses_nonsense(capsys, tmp_path, arguments, complaint):
+    assert complaint in _fails(capsys, "simulate", "-o", tmp_path / "x.ecsv", *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_example_settings_are_the_defaults():
+    defaults = build_parser().parse_args(["simulate", "-o", "x"])
+    assert {key: getattr(defaults, key) for key in EXAMPLE} == EXAMPLE
+
+
+# ---- info and the process -----------------------------------------------------------------
+
+
+def test_info_of_a_table_and_of_the_installation(small, capsys):
+    assert main(["info", str(small)]) == 0
+    assert "SCExAO/CHARIS" in capsys.readouterr().out
+    assert main(["info"]) == 0
+    assert "EllipticalRetarder" in capsys.readouterr().out
+
+
+def _damage(path, how):
+    content = path.read_bytes()
+    if how == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    elif how == "not ours":
+        import asdf
+
+        asdf.AsdfFile({"a": 1}).write_to(path)
+    elif how == "other version":
+        path.write_bytes(content.replace(b"calibration-1.0.0", b"calibration-9.0.0"))
+    elif how == "text":
+        path.write_text("hello")
+
+
+@pytest.mark.parametrize("how", ["truncated", "not ours", "other version", "text"])
+def test_info_of_a_damaged_calibration(small, capsys, tmp_path, how):
+    path = tmp_path / "cal.asdf"
+    assert main(["calibrate", str(small), "-q", "-o", str(path)]) == 0
+    _damage(path, how)
+    assert "cal.asdf" in _fails(capsys, "info", path)
+
+
+def test_a_reader_that_goes_away_is_no_error(small):
+    command = f"{sys.executable} -m astropolcal.scripts.main info {small} | true"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr

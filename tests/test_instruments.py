@@ -1,0 +1,375 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Instruments: the registry, the chain of CHARIS, and its published values."""
+
+from datetime import date
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from astropolcal import instruments, optics
+from astropolcal.chain import join, leaves, stages
+from astropolcal.exceptions import AstropolcalError, InstrumentError
+from astropolcal.instruments import CHARIS, Instrument
+from astropolcal.measurement import FreeParameters, Measurement
+from astropolcal.observations import Observations
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+N_BINS = 22
+
+
+class Plugin(Instrument):
+    name = "plug-in polarimeter"
+    aliases = ("PIP",)
+
+    def chain(self, source="polarized", optics_in=(), *, wavelength=None):
+        return optics.LinearPolarizer(name="polarizer") | optics.WollastonPrism(name="wollaston")
+
+    def setup(self, observations):
+        return "polarized", ()
+
+
+@pytest.fixture
+def registry(monkeypatch):
+    """The registry, restored afterwards."""
+    monkeypatch.setattr(instruments, "_REGISTRY", dict(instruments._REGISTRY))
+
+
+@pytest.fixture
+def entry_point(registry, monkeypatch):
+    """An installed package that brings an instrument."""
+    point = SimpleNamespace(name=Plugin.name, load=lambda: Plugin)
+    monkeypatch.setattr(
+        instruments,
+        "entry_points",
+        lambda group: [point] if group == "astropolcal.instruments" else [],
+    )
+
+
+def _observations(wavelength=(1200, 1600) * u.nm, name="night", **meta):
+    frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
+    chain = CHARIS().chain(wavelength=wavelength)
+    return simulate(chain, wavelength, frames, noise=False, meta=meta, name=name)
+
+
+def _setup(**meta):
+    return CHARIS().setup(_observations(**meta))
+
+
+# --- registry -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["charis", "CHARIS", "SCExAO/CHARIS", "scexao/charis", "Subaru/SCExAO/CHARIS"]
+)
+def test_get_knows_name_and_aliases_in_any_case(name):
+    assert isinstance(instruments.get(name), CHARIS)
+
+
+def test_get_suggests_a_near_match():
+    with pytest.raises(InstrumentError, match=r"unknown instrument 'chari'.*did you mean 'charis'"):
+        instruments.get("chari")
+
+
+def test_get_lists_what_is_known_when_nothing_is_near():
+    with pytest.raises(InstrumentError, match="known are .*charis") as caught:
+        instruments.get("zzzzzz")
+    assert "did you mean" not in str(caught.value)
+    assert isinstance(caught.value, AstropolcalError)
+
+
+def test_registered_class_is_found_and_returned(registry):
+    assert instruments.register(Plugin) is Plugin
+    assert isinstance(instruments.get("pip"), Plugin)
+    assert Plugin.name in instruments.names()
+
+
+def test_registering_the_same_class_twice_is_harmless(registry):
+    assert instruments.register(CHARIS) is CHARIS
+
+
+def test_name_that_is_taken_is_refused(registry):
+    other = type("Other", (Plugin,), {"name": "charis"})
+    with pytest.raises(InstrumentError, match="'charis' is registered already"):
+        instruments.register(other)
+
+
+@pytest.mark.parametrize("thing", [CHARIS(), int, "charis", type("Nameless", (Plugin,), {"name": ""})])
+def test_only_named_instrument_classes_are_registered(registry, thing):
+    with pytest.raises(InstrumentError, match="not an Instrument with a name"):
+        instruments.register(thing)
+
+
+def test_entry_point_is_listed_without_being_loaded(entry_point):
+    assert instruments.names() == sorted(["charis", Plugin.name])
+    assert Plugin.name not in instruments._REGISTRY
+
+
+def test_entry_point_is_loaded_when_asked_for(entry_point):
+    assert isinstance(instruments.get("PIP"), Plugin)
+    assert Plugin.name in instruments._REGISTRY
+
+
+def test_entry_point_with_something_else_is_refused(registry, monkeypatch):
+    point = SimpleNamespace(name="broken", load=lambda: object)
+    monkeypatch.setattr(instruments, "entry_points", lambda group: [point])
+    with pytest.raises(InstrumentError, match="not an Instrument with a name"):
+        instruments.get("broken")
+
+
+def test_base_class_cannot_be_used_itself():
+    with pytest.raises(TypeError, match="abstract"):
+        Instrument()
+
+
+@pytest.mark.parametrize("name", instruments.names())
+def test_every_instrument_gives_a_chain_that_predicts(name):
+    instrument = instruments.get(name)
+    chain = instrument.chain()
+    assert all(leaf.name for leaf in leaves(chain))
+    assert instrument.references
+    assert instrument.name in repr(instrument)
+    for leaf in leaves(chain):
+        for key in leaf.param_names:
+            low, high = getattr(leaf, key).bounds
+            value = getattr(leaf, key).value
+            assert np.all(value >= (-np.inf if low is None else low)), f"{leaf.name}.{key}"
+            assert np.all(value <= (np.inf if high is None else high)), f"{leaf.name}.{key}"
+
+
+# --- the chain of CHARIS ----------------------------------------------------------
+
+
+def test_polarized_chain_has_the_contracts_names_in_order():
+    chain = CHARIS().chain("polarized", ["dichroic", "nbs"])
+    assert [leaf.name for leaf in leaves(chain)] == [
+        "calibration_polarizer", "hwp", "derotator", "dichroic", "nbs", "wollaston",
+    ]  # fmt: skip
+    assert sorted(stages(chain)) == ["derotator", "hwp"]
+
+
+def test_unpolarized_chain_begins_with_the_fold_mirror():
+    chain = CHARIS().chain("unpolarized")
+    assert [leaf.name for leaf in leaves(chain)] == ["fold_mirror", "hwp", "derotator", "wollaston"]
+    assert not chain["fold_mirror"].diattenuation.fixed
+
+
+@pytest.mark.parametrize(
+    ("derotator", "count"),
+    [("elliptical", 5 + 4 * N_BINS), ("linear", 5 + 2 * N_BINS)],  # 93 as in the paper, and 49
+)
+def test_number_of_free_parameters(derotator, count):
+    chain = CHARIS().chain(derotator=derotator)
+    assert FreeParameters([chain], N_BINS).size == count
+
+
+def test_dichroic_adds_no_free_parameter_and_no_change():
+    with_it, without = (CHARIS().chain(optics_in=o) for o in (["dichroic"], []))
+    assert FreeParameters([with_it], N_BINS).size == FreeParameters([without], N_BINS).size
+    light = (1.0, 0.3, 0.4, 0.1)
+    wavelength = CHARIS.wavelength
+    np.testing.assert_allclose(with_it(wavelength, *light)[1], without(wavelength, *light)[1])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "expected"),
+    [
+        ("physical", {"horizontal": (-360, 360), "diagonal": (-360, 360), "circular": (-360, 360)}),
+        ("paper", {"horizontal": (-360, 0), "diagonal": (-360, 0), "circular": (0, 360)}),
+    ],
+)
+def test_bounds_of_the_derotator(bounds, expected):
+    derotator = CHARIS().chain(bounds=bounds)["derotator"]
+    assert {key: getattr(derotator, key).bounds for key in expected} == expected
+
+
+def test_bounds_of_the_paper():
+    """Table "initial guesses and bounds": thicknesses 0.6 to 1.4 of 't Hart's, angles 5 deg."""
+    chain = CHARIS().chain()
+    assert chain["calibration_polarizer"].theta.bounds == (85, 95)
+    assert chain["hwp"].theta.bounds == chain["derotator"].theta.bounds == (-5, 5)
+    np.testing.assert_allclose(chain["hwp"].w_sio2.bounds, np.array([0.6, 1.4]) * 1.63398)
+    np.testing.assert_allclose(chain["hwp"].w_mgf2.bounds, np.array([0.6, 1.4]) * 1.27711)
+    assert chain["wollaston"].efficiency.bounds == (0, 1)
+    assert chain["wollaston"].theta.fixed
+
+
+def test_linear_derotator_takes_its_bounds_from_the_same_choice():
+    chain = CHARIS().chain(derotator="linear", bounds="paper")
+    assert chain["derotator"].retardance.bounds == (-360, 0)
+
+
+def test_chain_follows_the_wavelength_grid():
+    chain = CHARIS().chain(wavelength=[1.2, 1.6, 2.2] * u.um)
+    assert chain["derotator"].horizontal.shape == (3,)
+    assert chain["wollaston"].efficiency.shape == (3,)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"source": "star"}, r"source = 'star'; allowed are polarized, unpolarized"),
+        ({"derotator": "round"}, r"derotator = 'round'; allowed are elliptical, linear"),
+        ({"bounds": "none"}, r"bounds = 'none'; allowed are physical, paper"),
+        ({"optics_in": ["lens"]}, r"no \['lens'\]; allowed are 'nbs', 'dichroic'"),
+    ],
+)
+def test_unknown_choice_is_refused(options, words):
+    with pytest.raises(InstrumentError, match=words):
+        CHARIS().chain(**options)
+
+
+# --- setup from a table -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("meta", "expected"),
+    [
+        ({"nasmyth_beam_switcher": "installed"}, ("nbs",)),
+        ({"nasmyth_beam_switcher": " Not Installed "}, ()),
+        ({"nasmyth_beam_switcher": "not installed", "date": "2025-11-01"}, ()),
+        ({"date": "2025-07-15"}, ()),
+        ({"date": "2025-10-05"}, ("nbs",)),
+        ({"date": "2025-10-05T03:04:05"}, ("nbs",)),
+        ({"date": date(2025, 7, 31)}, ()),
+        ({"date": "2025-10-05", "yjh50_dichroic": "in"}, ("dichroic", "nbs")),
+        ({"date": "2025-07-15", "yjh50_dichroic": "out"}, ()),
+    ],
+)
+def test_setup_reads_what_is_in_the_beam(meta, expected):
+    assert _setup(source="polarized", **meta) == ("polarized", expected)
+
+
+@pytest.mark.parametrize("day", [None, "2025-09-01", "unknown", "05.10.2025", "yesterday"])
+def test_inconclusive_date_is_an_error(day):
+    meta = {} if day is None else {"date": day}
+    with pytest.raises(InstrumentError, match="neither nasmyth_beam_switcher nor a conclusive"):
+        _setup(source="polarized", **meta)
+
+
+@pytest.mark.parametrize("key", ["nasmyth_beam_switcher", "yjh50_dichroic"])
+def test_word_that_is_not_understood_is_an_error(key):
+    meta = {"date": "2025-10-05", key: "perhaps"}
+    with pytest.raises(InstrumentError, match=f"night: {key} is 'perhaps'; allowed are"):
+        _setup(source="polarized", **meta)
+
+
+@pytest.mark.parametrize("source", ["star", "unpolarized_standard", None])
+def test_source_that_is_not_supported_is_an_error(source):
+    meta = {"date": "2025-10-05"} | ({} if source is None else {"source": source})
+    with pytest.raises(InstrumentError, match=r"night: source .*allowed are polarized"):
+        _setup(**meta)
+
+
+# --- chains for several datasets ------------------------------------------------------
+
+
+def test_chains_share_one_grid():
+    meta = {"source": "polarized", "instrument": "CHARIS"}
+    first = _observations([1200, 1600] * u.nm, date="2025-07-15", **meta)
+    second = _observations([1.6, 2.0] * u.um, date="2025-10-05", **meta)
+    chains = CHARIS().chains_for([first, second])
+    assert [c["derotator"].horizontal.size for c in chains] == [3, 3]
+    assert ["nbs" in c.submodel_names for c in chains] == [False, True]
+
+
+def test_tables_that_round_wavelengths_differently_share_their_bins():
+    """One table writes 1159.5614 nm and another 1159.56 nm: the same bin to both layers."""
+    meta = {"source": "polarized", "date": "2025-07-15"}
+    first = _observations([1159.5614, 1600.0012] * u.nm, **meta)
+    second = _observations([1159.56, 1600.0] * u.nm, **meta)
+    chains = CHARIS().chains_for([first, second])
+    assert chains[0]["wollaston"].efficiency.size == 2
+    assert Measurement(chains, [first, second]).wavelength.size == 2
+
+
+def test_table_of_another_instrument_is_refused():
+    table = _observations(instrument="VAMPIRES", source="polarized", date="2025-10-05")
+    with pytest.raises(InstrumentError, match="night: the table is of instrument 'VAMPIRES'"):
+        CHARIS().chains_for([table])
+
+
+def test_table_that_names_no_instrument_is_taken():
+    assert CHARIS().check(_observations()) is None
+
+
+def test_options_reach_the_chain():
+    table = _observations(source="polarized", date="2025-10-05")
+    (chain,) = CHARIS().chains_for([table], derotator="linear")
+    assert isinstance(chain["derotator"], optics.LinearRetarder)
+
+
+def test_positions_are_those_of_the_stages():
+    table = _observations()
+    positions = CHARIS().positions(table, CHARIS().chain())
+    assert sorted(positions) == ["derotator", "hwp"]
+    np.testing.assert_array_equal(positions["hwp"], table.position("hwp"))
+
+
+# --- published values -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def published(shared_data):
+    return Table.read(shared_data / "reference" / "charis_published_fits.ecsv")
+
+
+def _published_chain(table):
+    """Their per-wavelength fit in our signs: see the docstring of the CHARIS module."""
+
+    def angle(name, sign=-1):
+        return sign * np.asarray(table[name]) * u.deg
+
+    return join(
+        [
+            optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer"),
+            optics.LinearRetarder(retardance=angle("hwp_retardance"), mount="hwp", name="hwp"),
+            optics.EllipticalRetarder(
+                horizontal=angle("derotator_horizontal"),
+                diagonal=angle("derotator_45"),
+                circular=angle("derotator_circular", +1),
+                mount="derotator",
+                name="derotator",
+            ),
+            optics.ParityFlip(name="nbs"),
+            optics.WollastonPrism(efficiency=table["wollaston_efficiency"], name="wollaston"),
+        ]
+    )
+
+
+def test_wavelengths_are_the_published_bins(published):
+    expected = np.asarray(published["wavelength"])
+    np.testing.assert_allclose(CHARIS.wavelength.to_value(u.nm), expected, rtol=0, atol=1e-3)
+
+
+def test_published_parameters_reproduce_the_published_accuracy(published, shared_data):
+    """
+    All 22 values of s_rel of the CHARIS authors' own software, to 1e-5 percent.
+
+    Their n = 32 double differences and k = 5 parameters (HWP retardance, three
+    of the derotator, efficiency), s_rel = sqrt(sum r^2 / (n - k) / n).
+    """
+    folder = shared_data / "data" / "charis"
+    observations = Observations.read(folder / "dataset3_polarized_2025-10-05.ecsv")
+    measurement = Measurement(_published_chain(published), observations)
+    squares = np.bincount(measurement.bins, measurement.residuals() ** 2)
+    s_rel = 100 * np.sqrt(squares / (32 - 5) / 32)
+    np.testing.assert_allclose(s_rel, published["s_rel_elliptical_dataset3"], rtol=0, atol=1e-5)
+
+
+def test_published_chain_of_the_instrument_agrees_with_the_table(published):
+    chain = CHARIS().published()
+    derotator = chain["derotator"]
+    for name, key, sign in (
+        ("horizontal", "final_derotator_horizontal", -1),
+        ("diagonal", "final_derotator_45", -1),
+        ("circular", "final_derotator_circular", 1),
+    ):
+        values = sign * getattr(derotator, name).value
+        np.testing.assert_allclose(values, published[key], rtol=0, atol=0.0051, err_msg=name)
+    given = published.meta["paper_table_global"]
+    assert chain["hwp"].w_sio2.value == pytest.approx(given["w_sio2_mm"])
+    assert chain["hwp"].w_mgf2.value == pytest.approx(given["w_mgf2_mm"])
+    assert chain["calibration_polarizer"].theta.value == pytest.approx(90 + given["offset_cal_deg"])
