@@ -68,8 +68,6 @@ class Propagator:
     ChainError
         If the chain has no beam splitter, a stage has no position, or the
         stages have different numbers of positions.
-    ParameterError
-        If a parameter has neither one value nor one a wavelength.
 
     Examples
     --------
@@ -86,8 +84,7 @@ class Propagator:
         wavelength = np.atleast_1d(np.asarray(wavelength, dtype=float))
         self.leaves = leaves(chain)
         self._check(self.leaves, positions)
-        for leaf in self.leaves:
-            leaf._check_grid(wavelength, leaf.canonical_values())
+        self.wavelength = wavelength
         self.shape = (len(wavelength), _column_count(positions))
         self.source = np.asarray(source, dtype=float).reshape(1, 4, 1)
         split = next(i for i, leaf in enumerate(self.leaves) if hasattr(leaf, "beam"))
@@ -167,6 +164,12 @@ class Propagator:
         Sweep
             With ``fluxes`` and the method ``derivatives``.
 
+        Raises
+        ------
+        ParameterError
+            If the chain's own values are used and one has neither one value
+            nor one a wavelength.
+
         Examples
         --------
         The derivative of the right flux to the efficiency of the Wollaston prism:
@@ -180,7 +183,14 @@ class Propagator:
         >>> float(sweep.derivatives([(1, 1)], weights)[1, 1][0, 0])
         0.25
         """
-        return Sweep(self, self.values() if values is None else values)
+        return Sweep(self, self._own_values() if values is None else values)
+
+    def _own_values(self):
+        """Return the chain's values; refuse those that are on another wavelength grid."""
+        values = self.values()
+        for leaf, own in zip(self.leaves, values, strict=True):
+            leaf._check_grid(self.wavelength, own)
+        return values
 
 
 def _column_count(positions):

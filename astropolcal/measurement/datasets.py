@@ -6,7 +6,7 @@ import numpy as np
 from astropy.modeling import Model
 
 from astropolcal.chain import leaves, stages
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import ObservationError, WavelengthRangeError
 from astropolcal.propagation import Propagator
 
 __all__ = ["Dataset", "as_pairs", "common_wavelengths"]
@@ -136,11 +136,11 @@ class Dataset:
         self.frames = self._frames_of_data()
         columns = self.frames.T.ravel()
         given = _positions(chain, observations, positions)
-        self.propagator = Propagator(
-            chain,
-            observations.wavelength.to_value(u.um),
-            {stage: angle[columns] for stage, angle in given.items()},
-        )
+        placed = {stage: angle[columns] for stage, angle in given.items()}
+        try:
+            self.propagator = Propagator(chain, observations.wavelength.to_value(u.um), placed)
+        except WavelengthRangeError as error:
+            raise WavelengthRangeError(f"{observations.name}: {error}") from None
         self._plan(free)
         self._observe(columns)
 

@@ -2,6 +2,7 @@
 """The astropolcal command, as a person or a pipeline calls it."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -149,8 +150,6 @@ def test_plots_are_saved(small, tmp_path, capsys):
 def test_bad_arguments_get_one_line_and_status_two(
     capsys, tmp_path, monkeypatch, arguments, complaint
 ):
-    import re
-
     monkeypatch.chdir(tmp_path)
     assert re.search(complaint, _fails(capsys, "calibrate", *arguments))
     assert list(tmp_path.iterdir()) == []
@@ -178,7 +177,7 @@ def _spoil(table, how):
         ("empty", "empty"),
         ("unpaired", "45"),
         ("masked", "mask"),
-        ("infrared", "range"),
+        ("infrared", "bad: the refractive index of quartz is known from"),
         ("other instrument", "SPHERE"),
         ("star", "not supported"),
     ],

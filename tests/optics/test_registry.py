@@ -1,0 +1,613 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+The laws that every optic obeys, for every class of the registry.
+
+A new optic needs one entry in ``CASES``; the message of
+`test_every_optic_has_a_case` says what it holds.
+"""
+
+import importlib
+import pkgutil
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from astropolcal import mueller, optics
+from astropolcal.exceptions import ParameterError
+from astropolcal.optics import OPTICS, Optic
+from astropolcal.units import canonical_factor, canonical_unit
+
+WAVELENGTH = [1.2, 1.6, 2.1] * u.um
+FRACTION = st.floats(0, 1)
+SIGNED = st.floats(-1, 1)
+# sqrt(1 - eps^2) is too steep for differences nearer to the bound
+SMOOTH = st.floats(-0.95, 0.95)
+DEGREES = st.floats(-360, 360)
+ANGLE = st.floats(-180, 180)
+OTHER_UNITS = {u.rad: (u.deg, u.rad, u.arcmin), u.um: (u.mm, u.um, u.nm)}
+# small enough for the five-point rule, large enough for rounding
+STEP = {u.rad: 1e-3, u.um: 1e-2, u.dimensionless_unscaled: 1e-4}
+
+
+@st.composite
+def depolarization(draw):
+    """Shares of Q, U, V within the bounds whose coherency matrix is positive."""
+    q, u_ = draw(FRACTION), draw(FRACTION)
+    low, high = max(0.0, q + u_ - 1), 1 - abs(q - u_)
+    v = low + (high - low) * draw(FRACTION)
+    return {"retained_q": q, "retained_u": u_, "retained_v": v}
+
+
+@st.composite
+def mueller_elements(draw):
+    """Elements of a random physical Mueller matrix of unit transmission."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    root = rng.normal(size=(4, 4)) + 1j * rng.normal(size=(4, 4))
+    matrix = mueller.mueller_from_coherency(root @ root.conj().T)
+    matrix /= matrix[0, 0]
+    return {f"m{i}{j}": matrix[i, j] for i in range(4) for j in range(4)}
+
+
+def two_layer_retardance(w_sio2, w_mgf2):
+    from astropolcal.materials import MGF2, QUARTZ
+
+    path = w_sio2 * QUARTZ.birefringence(WAVELENGTH) - w_mgf2 * MGF2.birefringence(WAVELENGTH)
+    return (2 * np.pi * path / WAVELENGTH).to_value(u.one) * u.rad
+
+
+def wollaston(beam):
+    sign = {"right": 1, "left": -1}[beam]
+    # a polarizer along or across the axis, and what depolarizes the rest
+    return lambda efficiency: (
+        0.5 * mueller.diattenuator(sign * efficiency) * np.outer([1, 1, 0, 0], [1, 1, 0, 0])
+    )
+
+
+@dataclass(frozen=True)
+class Case:
+    """
+    What the laws need to know of an optic.
+
+    ``values``: strategy of physical parameter values within the bounds, as
+    floats in the declared units; ``expected``: the Mueller matrix of these
+    values (as quantities), by the functions of `astropolcal.mueller`;
+    ``smooth``: strategy where the derivatives are finite; ``settings``: further
+    arguments of the class.
+    """
+
+    optic: type
+    values: st.SearchStrategy
+    expected: object
+    smooth: st.SearchStrategy | None = None
+    settings: dict = field(default_factory=dict)
+
+
+def case(optic, expected, smooth=None, settings=None, **values):
+    strategy = st.fixed_dictionaries(values)
+    steep = None if smooth is None else st.fixed_dictionaries(values | smooth)
+    return Case(optic, strategy, expected, steep, settings or {})
+
+
+CASES = {
+    "Depolarizer": Case(
+        optics.Depolarizer,
+        depolarization(),
+        lambda retained_q, retained_u, retained_v: mueller.depolarizer(
+            retained_q, retained_u, retained_v
+        ),
+    ),
+    "Diattenuator": case(
+        optics.Diattenuator,
+        mueller.diattenuator,
+        smooth={"diattenuation": SMOOTH},
+        diattenuation=SIGNED,
+    ),
+    "DiattenuatorRetarder": case(
+        optics.DiattenuatorRetarder,
+        mueller.diattenuator_retarder,
+        smooth={"diattenuation": SMOOTH},
+        diattenuation=SIGNED,
+        retardance=DEGREES,
+    ),
+    "EllipticalRetarder": case(
+        optics.EllipticalRetarder,
+        mueller.elliptical_retarder,
+        horizontal=DEGREES,
+        diagonal=DEGREES,
+        circular=DEGREES,
+    ),
+    "LinearPolarizer": case(optics.LinearPolarizer, mueller.linear_polarizer),
+    "LinearRetarder": case(
+        optics.LinearRetarder, mueller.linear_retarder, retardance=DEGREES
+    ),
+    "MuellerElement": Case(
+        optics.MuellerElement,
+        mueller_elements(),
+        lambda **m: np.array([[m[f"m{i}{j}"] for j in range(4)] for i in range(4)]),
+    ),
+    "ParityFlip": case(
+        optics.ParityFlip,
+        # a mirror, which keeps +Q and changes the sign of U and V, turned by 45 deg
+        lambda: mueller.rotate(mueller.linear_retarder(180 * u.deg), 45 * u.deg),
+    ),
+    "Rotator": case(optics.Rotator, lambda: mueller.rotation_matrix(0 * u.deg)),
+    "TwoLayerWaveplate": case(
+        optics.TwoLayerWaveplate,
+        lambda w_sio2, w_mgf2: mueller.linear_retarder(two_layer_retardance(w_sio2, w_mgf2)),
+        w_sio2=st.floats(0, 3),
+        w_mgf2=st.floats(0, 3),
+    ),
+    "WollastonPrism": case(optics.WollastonPrism, wollaston("right"), efficiency=FRACTION),
+    "WollastonPrism, left": case(
+        optics.WollastonPrism, wollaston("left"), settings={"beam": "left"}, efficiency=FRACTION
+    ),
+}
+HOW = (
+    "add to CASES in tests/optics/test_registry.py a case with a strategy of values for every "
+    "parameter but theta and the same matrix by the functions of astropolcal.mueller; it is then "
+    "tested for physicality, derivatives, light against matrix, copies, with_parameters and units"
+)
+
+every = pytest.mark.parametrize("label", CASES)
+
+
+def unit_of(optic, key):
+    return getattr(optic, key).unit or u.dimensionless_unscaled
+
+
+def with_units(cls, values):
+    """Attach the declared units to plain values; numbers stay numbers."""
+    default = cls()
+    return {
+        key: value if default._declared(key).unit is None else value * unit_of(default, key)
+        for key, value in values.items()
+    }
+
+
+def build(label, values, **kwargs):
+    cls = CASES[label].optic
+    return cls(**with_units(cls, values), **(CASES[label].settings | kwargs))
+
+
+def draw_per_wavelength(data, strategy):
+    """Values of every parameter, one a wavelength."""
+    several = [data.draw(strategy) for _ in WAVELENGTH]
+    return {key: np.array([one[key] for one in several]) for key in several[0]}
+
+
+def draw_smooth(data, label):
+    strategy = CASES[label].smooth or CASES[label].values
+    if data.draw(st.booleans()):
+        return draw_per_wavelength(data, strategy)
+    return data.draw(strategy)
+
+
+def apply(matrix, light):
+    return np.einsum("...ij,j...->i...", matrix, np.asarray(light))
+
+
+# --- the registry -----------------------------------------------------------------
+
+
+def test_every_optic_has_a_case():
+    missing = set(OPTICS) - {case.optic.__name__ for case in CASES.values()}
+    assert not missing, f"{sorted(missing)}: {HOW}"
+
+
+@every
+def test_case_covers_every_parameter(label):
+    optic = CASES[label].optic()
+    for strategy in filter(None, (CASES[label].values, CASES[label].smooth)):
+        assert set(strategy.example() if False else _keys(strategy)) == set(optic.own_names), (
+            f"{label}: {HOW}"
+        )
+
+
+def _keys(strategy):
+    found = []
+
+    @settings(max_examples=1)
+    @given(strategy)
+    def look(values):
+        found.append(set(values))
+
+    look()
+    return found[0]
+
+
+def _defined_optics():
+    """Every concrete optic that a module of the package defines."""
+    for module in pkgutil.iter_modules(optics.__path__):
+        importlib.import_module(f"astropolcal.optics.{module.name}")
+    pending, found = [Optic], set()
+    while pending:
+        cls = pending.pop()
+        pending.extend(cls.__subclasses__())
+        if cls.__module__.startswith("astropolcal.") and cls is not Optic:
+            found.add(cls)
+    return found
+
+
+def test_every_optic_is_registered():
+    missing = {cls.__name__ for cls in _defined_optics()} - set(OPTICS)
+    assert not missing, f"name {sorted(missing)} in OPTICS of astropolcal/optics/__init__.py"
+
+
+@pytest.mark.parametrize("name", OPTICS)
+def test_registry_name_is_the_public_name(name):
+    assert OPTICS[name].__name__ == name
+    assert getattr(optics, name) is OPTICS[name]
+    assert name in optics.__all__
+
+
+@pytest.mark.parametrize("name", OPTICS)
+def test_parameters_are_declared_in_full(name):
+    optic = OPTICS[name]()
+    assert optic.param_names[0] == "theta", "theta comes first, as the derivatives do"
+    for key in optic.param_names:
+        parameter = getattr(optic, key)
+        assert parameter.description, f"{name}.{key}: give the Parameter a description"
+        assert parameter.bounds != (None, None) or parameter.fixed, (
+            f"{name}.{key}: give the Parameter bounds, or fixed=True where it is known"
+        )
+        assert canonical_unit(parameter.unit) in STEP
+        low, high = parameter.bounds
+        assert low is None or low <= parameter.value
+        assert high is None or parameter.value <= high
+
+
+@pytest.mark.parametrize("name", OPTICS)
+def test_only_theta_is_not_the_optics_own(name):
+    optic = OPTICS[name]()
+    assert ("theta", *optic.own_names) == optic.param_names
+    assert optic.theta.fixed
+    assert optic.inputs == optic.outputs == ("wavelength", "I", "Q", "U", "V")
+
+
+# --- physics ----------------------------------------------------------------------
+
+
+@every
+@given(data=st.data())
+@settings(max_examples=40)
+def test_mueller_matrix_is_physical(label, data):
+    optic = build(label, data.draw(CASES[label].values), theta=data.draw(ANGLE) * u.deg)
+    assert np.all(mueller.is_physical(optic.mueller(WAVELENGTH)))
+
+
+@every
+@given(data=st.data())
+@settings(max_examples=40)
+def test_mueller_matrix_is_that_of_the_mueller_functions(label, data):
+    values = data.draw(CASES[label].values)
+    expected = CASES[label].expected(**with_units(CASES[label].optic, values))
+    found = build(label, values).mueller(WAVELENGTH)
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=0, atol=2e-13)
+
+
+@every
+@given(data=st.data())
+@settings(max_examples=25)
+def test_one_value_a_wavelength_is_the_stack_of_the_scalars(label, data):
+    values = draw_per_wavelength(data, CASES[label].values)
+    together = build(label, values).mueller(WAVELENGTH)
+    for i, wavelength in enumerate(WAVELENGTH):
+        alone = build(label, {key: value[i] for key, value in values.items()}).mueller(wavelength)
+        row = together[i] if together.ndim == 3 else together
+        np.testing.assert_allclose(row, alone, rtol=0, atol=1e-14)
+
+
+@every
+@given(data=st.data(), angle=ANGLE)
+@settings(max_examples=25)
+def test_orientation_turns_the_matrix(label, data, angle):
+    values = data.draw(CASES[label].values)
+    turned = build(label, values, theta=angle * u.deg).mueller(WAVELENGTH)
+    straight = build(label, values).mueller(WAVELENGTH)
+    if CASES[label].optic.rotates_frame:
+        expected = mueller.rotation_matrix(angle * u.deg) @ straight
+    else:
+        expected = mueller.rotate(straight, angle * u.deg)
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-13)
+
+
+@every
+@given(data=st.data(), theta=st.floats(-90, 90), position=st.floats(-90, 90))
+@settings(max_examples=25)
+def test_position_adds_to_theta(label, data, theta, position):
+    values = data.draw(CASES[label].values)
+    theta, position = theta * u.deg, position * u.deg
+    plus = build(label, values, theta=theta, mount="stage")
+    minus = build(label, values, theta=theta, mount="-stage")
+    for optic, sum_ in ((plus, theta + position), (minus, theta - position)):
+        expected = build(label, values, theta=sum_).mueller(WAVELENGTH)
+        given_ = optic.mueller(WAVELENGTH, position=position)
+        optic.position = position
+        np.testing.assert_allclose(given_, expected, rtol=0, atol=1e-13)
+        np.testing.assert_array_equal(optic.mueller(WAVELENGTH), given_)
+
+
+@every
+@given(data=st.data(), angle=ANGLE)
+@settings(max_examples=25)
+def test_light_is_matrix_times_stokes(label, data, angle):
+    values = draw_smooth(data, label)
+    optic = build(label, values, theta=angle * u.deg)
+    light = data.draw(st.lists(st.floats(-3, 3), min_size=4, max_size=4))
+    light = np.repeat(np.array(light)[:, None], WAVELENGTH.size, axis=1)
+    through = optic(WAVELENGTH, *light)
+    assert through[0] is WAVELENGTH or np.all(through[0] == WAVELENGTH)
+    expected = apply(optic.mueller(WAVELENGTH), light)
+    np.testing.assert_allclose(np.array(through[1:]), expected, rtol=0, atol=1e-12)
+
+
+@every
+@given(data=st.data(), seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=10)
+def test_light_of_many_frames(label, data, seed):
+    light = np.random.default_rng(seed).normal(size=(4, 5, WAVELENGTH.size))
+    optic = build(label, draw_smooth(data, label))
+    through = np.array(optic(WAVELENGTH, *light)[1:])
+    np.testing.assert_allclose(through, apply(optic.mueller(WAVELENGTH), light), atol=1e-12)
+
+
+# --- derivatives ------------------------------------------------------------------
+
+
+def differences(optic, key):
+    """Five-point derivative of the Mueller matrix, per canonical unit."""
+    unit = optic._declared(key).unit
+    step = STEP[canonical_unit(unit)]
+    value = np.asarray(getattr(optic, key).value)
+
+    def matrix(shift):
+        moved = (value + shift * step / canonical_factor(unit)) * (unit or 1)
+        return optic.with_parameters(**{key: moved}).mueller(WAVELENGTH)
+
+    return (8 * (matrix(1) - matrix(-1)) - (matrix(2) - matrix(-2))) / (12 * step)
+
+
+@every
+@given(data=st.data(), angle=ANGLE)
+@settings(max_examples=12)
+def test_derivatives_against_differences(label, data, angle):
+    optic = build(label, draw_smooth(data, label), theta=angle * u.deg)
+    derivatives = optic.mueller_derivatives(WAVELENGTH)
+    assert list(derivatives) == list(optic.param_names)
+    for key, derivative in derivatives.items():
+        unit = unit_of(optic, key)
+        assert derivative.unit == unit**-1
+        found = derivative.to_value(canonical_unit(unit) ** -1)
+        expected = differences(optic, key)
+        scale = max(np.abs(expected).max(), 1.0)
+        found = np.broadcast_to(found, expected.shape)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * scale)
+
+
+@every
+@given(data=st.data())
+@settings(max_examples=8)
+def test_derivative_to_theta_may_vary_with_wavelength(label, data):
+    values = data.draw(CASES[label].smooth or CASES[label].values)
+    optic = build(label, values, theta=[-20, 3, 50] * u.deg)
+    found = optic.mueller_derivatives(WAVELENGTH)["theta"].to_value(1 / u.rad)
+    np.testing.assert_allclose(found, differences(optic, "theta"), rtol=0, atol=1e-7)
+
+
+# --- units ------------------------------------------------------------------------
+
+
+@every
+@given(data=st.data(), angle=ANGLE)
+@settings(max_examples=10)
+def test_any_unit_gives_the_same_optic(label, data, angle):
+    values = data.draw(CASES[label].values) | {"theta": angle}
+    optic = build(label, values)
+    quantities = {key: getattr(optic, key).value * unit_of(optic, key) for key in values}
+    for i, wavelength in enumerate((WAVELENGTH.to(u.nm), WAVELENGTH.to(u.mm), WAVELENGTH)):
+        others = {
+            key: value.to(OTHER_UNITS.get(canonical_unit(value.unit), [u.percent] * 3)[i])
+            for key, value in quantities.items()
+        }
+        other = CASES[label].optic(**others, **CASES[label].settings)
+        assert [getattr(other, k).unit for k in values] == [getattr(optic, k).unit for k in values]
+        np.testing.assert_allclose(
+            other.mueller(wavelength), optic.mueller(WAVELENGTH), rtol=0, atol=1e-12
+        )
+
+
+@every
+def test_plain_number_is_refused_where_a_unit_is_due(label):
+    cls = CASES[label].optic
+    for key in cls().param_names:
+        if cls._declared(key).unit is not None:
+            with pytest.raises(ParameterError, match=f"{cls.__name__}.{key} = 1.0 needs a unit"):
+                cls(**{key: 1.0})
+            with pytest.raises(ParameterError, match="needs a unit"):
+                setattr(cls(), key, 1.0)
+
+
+@every
+def test_wrong_unit_is_refused(label):
+    cls = CASES[label].optic
+    for key in cls().param_names:
+        with pytest.raises(ParameterError, match=f"{cls.__name__}.{key} has unit Jy"):
+            cls(**{key: 1 * u.Jy})
+        with pytest.raises(ParameterError, match=f"{cls.__name__}.{key} has unit Jy"):
+            setattr(cls(), key, 1 * u.Jy)
+
+
+@every
+@pytest.mark.parametrize("bad", [np.nan, np.inf, [0.1, np.nan]])
+def test_value_that_is_not_finite_is_refused(label, bad):
+    cls = CASES[label].optic
+    for key in cls().param_names:
+        value = np.asarray(bad) * unit_of(cls(), key)
+        with pytest.raises(ParameterError, match=f"{cls.__name__}.{key} = .* must be finite"):
+            cls(**{key: value})
+
+
+@every
+@pytest.mark.parametrize("shape", [(0,), (2, 2), (1, 3)])
+def test_value_of_other_shape_is_refused(label, shape):
+    cls = CASES[label].optic
+    for key in cls().param_names:
+        with pytest.raises(ParameterError, match="scalar or one value a wavelength"):
+            cls(**{key: np.zeros(shape) * unit_of(cls(), key)})
+
+
+@every
+def test_value_of_other_number_of_wavelengths_is_refused(label):
+    cls = CASES[label].optic
+    for key in cls().param_names:
+        optic = cls(**{key: np.full(2, 0.5) * unit_of(cls(), key)}, name="it")
+        message = rf"it.{key} has 2 values, one a wavelength, but {{}} wavelengths"
+        for wavelength in (WAVELENGTH, 1.6 * u.um, None):
+            count = 0 if wavelength is None else np.size(wavelength)
+            with pytest.raises(ParameterError, match=message.format(count)):
+                optic.mueller(wavelength)
+        with pytest.raises(ParameterError, match=message.format(3)):
+            optic(WAVELENGTH, 1, 0, 0, 0)
+
+
+@every
+def test_unknown_and_positional_arguments_are_refused(label):
+    cls = CASES[label].optic
+    with pytest.raises(ParameterError, match=r"parameter 'retardence'"):
+        cls(retardence=1 * u.deg)
+    with pytest.raises(ParameterError, match=r"by keyword: \('theta'"):
+        cls(1 * u.deg)
+    with pytest.raises(ParameterError, match=r"has no parameter \['retardence'\]"):
+        cls().with_parameters(retardence=1 * u.deg)
+
+
+@every
+def test_unit_changed_behind_the_optics_back_is_refused(label):
+    cls = CASES[label].optic
+    optic = cls(name="it", **CASES[label].settings)
+    optic.theta.quantity = 0.1 * u.rad
+    for use in (
+        lambda: optic.mueller(WAVELENGTH),
+        lambda: optic.mueller_derivatives(WAVELENGTH),
+        lambda: optic.with_parameters(),
+        lambda: optic(WAVELENGTH, 1, 0, 0, 0),
+    ):
+        with pytest.raises(ParameterError, match=r"it.theta is in rad, but its bounds are in deg"):
+            use()
+    optic.theta = 0.1 * u.rad
+    assert optic.theta.unit == u.deg
+    optic.mueller(WAVELENGTH)
+
+
+# --- copies -----------------------------------------------------------------------
+
+
+@every
+@given(data=st.data())
+@settings(max_examples=10)
+def test_assignment_keeps_the_declared_unit(label, data):
+    optic = build(label, data.draw(CASES[label].values))
+    for key, value in data.draw(CASES[label].values).items():
+        unit, bounds = unit_of(optic, key), getattr(optic, key).bounds
+        other = OTHER_UNITS.get(canonical_unit(unit), [u.percent])[-1]
+        setattr(optic, key, (value * unit).to(other))
+        assert getattr(optic, key).value == pytest.approx(value, abs=1e-12)
+        assert getattr(optic, key).unit == optic._declared(key).unit
+        assert getattr(optic, key).bounds == bounds
+    optic.theta = 0.1 * u.rad
+    assert (optic.theta.unit, optic.theta.value) == (u.deg, pytest.approx(np.degrees(0.1)))
+
+
+def marked(label, values):
+    """An optic in which everything that a copy must keep is unlike the default."""
+    optic = build(label, values, name="it", mount="-stage")
+    optic.position = 12 * u.deg
+    optic.theta.fixed, optic.theta.bounds = False, (-5, 5)
+    for key in optic.own_names:
+        getattr(optic, key).fixed = True
+        getattr(optic, key).bounds = (-4, None)
+    return optic
+
+
+def state(optic):
+    return [
+        type(optic),
+        optic.name,
+        optic.mount,
+        optic.position,
+        optic._settings(),
+        {key: (getattr(optic, key).fixed, getattr(optic, key).bounds) for key in optic.param_names},
+    ]
+
+
+@every
+@given(data=st.data())
+@settings(max_examples=5)
+def test_copy_is_equal_and_independent(label, data):
+    optic = marked(label, draw_smooth(data, label))
+    copy = optic.copy()
+    before = optic.mueller(WAVELENGTH)
+    assert state(copy) == state(optic)
+    np.testing.assert_array_equal(copy.mueller(WAVELENGTH), before)
+    copy.position, copy.mount, copy.theta.fixed = 50 * u.deg, None, True
+    copy.theta = 3 * u.deg
+    np.testing.assert_array_equal(optic.mueller(WAVELENGTH), before)
+    assert (optic.mount, optic.theta.fixed, optic.theta.value) == ("-stage", False, 0)
+
+
+@every
+@given(data=st.data())
+@settings(max_examples=5)
+def test_with_parameters_changes_only_the_values(label, data):
+    optic = marked(label, data.draw(CASES[label].values))
+    values = draw_per_wavelength(data, CASES[label].values) | {"theta": np.array([1.0, 2.0, 3.0])}
+    other = optic.with_parameters(**with_units(CASES[label].optic, values))
+    assert state(other) == state(optic)
+    for key, value in values.items():
+        np.testing.assert_array_equal(getattr(other, key).value, value)
+        assert np.shape(getattr(optic, key).value) == ()
+    same = optic.with_parameters()
+    assert state(same) == state(optic)
+    np.testing.assert_array_equal(same.mueller(WAVELENGTH), optic.mueller(WAVELENGTH))
+
+
+@every
+def test_assignment_of_another_shape_points_to_with_parameters(label):
+    optic = CASES[label].optic()
+    with pytest.raises(ParameterError, match=r"shape \(\), not \(2,\); optic.with_parameters\(the"):
+        optic.theta = [1, 2] * u.deg
+
+
+@every
+@given(data=st.data())
+@settings(max_examples=5)
+def test_loosened_optic_is_the_same_at_its_wavelengths(label, data):
+    optic = build(label, data.draw(CASES[label].values), name="it", mount="stage")
+    loose = optic.loosened(WAVELENGTH)
+    assert (loose.name, loose.mount) == ("it", "stage")
+    np.testing.assert_allclose(
+        loose.mueller(WAVELENGTH), optic.mueller(WAVELENGTH), rtol=0, atol=1e-12
+    )
+
+
+@every
+def test_repr_names_class_values_mount_and_name(label):
+    optic = build(label, {}, name="it", mount="-stage")
+    text = repr(optic)
+    assert text.startswith(f"<{type(optic).__name__}(theta=0. deg")
+    assert all(f"{key}=" in text for key in optic.param_names)
+    assert text.endswith("mount='-stage', name='it')>")
+
+
+@every
+def test_only_a_law_in_wavelength_needs_a_wavelength(label):
+    optic = CASES[label].optic()
+    if optic.loosened(WAVELENGTH) is optic:
+        assert optic.mueller().shape == (4, 4)
+    else:
+        with pytest.raises(ParameterError, match="depends on wavelength: give one"):
+            optic.mueller()
