@@ -9,6 +9,7 @@ is batched over the bins polishes the best few. The result is a start for the
 joint fit, and later a check whether a bin sits in the wrong valley.
 """
 
+import astropy.units as u
 import numpy as np
 
 __all__ = ["BinProblem", "search_branches"]
@@ -47,8 +48,9 @@ class BinProblem:
     def __init__(self, measurement, weights=None):
         self.measurement = measurement
         self.weights = np.ones(measurement.n_data) if weights is None else np.asarray(weights)
-        self.slots = [slot for slot in measurement.free.slots if slot.per_wavelength]
         self.n_bins = len(measurement.wavelength)
+        # with a single bin every parameter belongs to it
+        self.slots = [s for s in measurement.free.slots if s.per_wavelength or self.n_bins == 1]
         self._data, self._present = _data_of_bins(measurement, self.n_bins)
         starts = np.array([slot.start for slot in self.slots], dtype=int)
         #: Element of the flat vector of each slot and bin, (n_slots, n_bins).
@@ -114,9 +116,10 @@ class BinProblem:
         """Return the first slot of each optic that can make half a turn or more."""
         seen, found = set(), []
         for row, slot in enumerate(self.slots):
-            optic = slot.name.split(".")[0]
+            optic, key = slot.name.split(".")
             low, high = slot.canonical_bounds()
-            if slot.unit is not None and high - low > np.pi and optic not in seen:
+            is_phase = key != "theta" and slot.unit is not None and slot.unit.is_equivalent(u.rad)
+            if is_phase and high - low > np.pi and optic not in seen:
                 seen.add(optic)
                 found.append((row, max(low, -2 * np.pi), min(high, 2 * np.pi)))
         return found

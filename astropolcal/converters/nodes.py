@@ -6,7 +6,6 @@ What all nodes are made of: plain values, quantities, tables, and a checksum.
 import datetime
 import hashlib
 import json
-import numbers
 
 import astropy.units as u
 import numpy as np
@@ -127,7 +126,7 @@ def plain(value, where="value"):
         return [plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         # a copy: views of one array would share a block
-        return value.copy()
+        return value.copy() if value.ndim or isinstance(value, u.Quantity) else value.item()
     return _plain_scalar(value, where)
 
 
@@ -137,7 +136,7 @@ def _plain_scalar(value, where):
         return value.isoformat()
     if isinstance(value, Time):
         return plain(value.isot, where)
-    if value is None or isinstance(value, (str, numbers.Real)):
+    if value is None or isinstance(value, (str, bool, int, float)):
         return value
     raise CalibrationFileError(
         f"{where} is a {type(value).__name__}, which files cannot hold; allowed are "

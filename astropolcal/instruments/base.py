@@ -4,14 +4,13 @@
 from abc import ABC, abstractmethod
 
 import astropy.units as u
-import numpy as np
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError
+from astropolcal.observations import common_wavelengths
 
 __all__ = ["Instrument"]
 
-_SAME_WAVELENGTH = 1e-5
 
 
 class Instrument(ABC):
@@ -125,10 +124,7 @@ class Instrument(ABC):
         datasets = list(datasets)
         for observations in datasets:
             self.check(observations)
-        merged = np.sort(np.concatenate([obs.wavelength.to_value(u.nm) for obs in datasets]))
-        # as Measurement merges them: tables round the same wavelength differently
-        new = np.diff(merged, prepend=-np.inf) > _SAME_WAVELENGTH * merged
-        grid = merged[new] * u.nm
+        grid = (common_wavelengths(datasets) * u.um).to(u.nm)
         setups = [self.setup(observations) for observations in datasets]
         return [
             self.chain(source, optics_in, wavelength=grid, **options)

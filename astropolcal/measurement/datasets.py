@@ -7,13 +7,10 @@ from astropy.modeling import Model
 
 from astropolcal.chain import leaves, stages
 from astropolcal.exceptions import ObservationError, WavelengthRangeError
+from astropolcal.observations import SAME_WAVELENGTH
 from astropolcal.propagation import Propagator
 
-__all__ = ["Dataset", "as_pairs", "common_wavelengths"]
-
-# wavelengths of two tables are the same when they agree to this share
-_SAME_WAVELENGTH = 1e-5
-
+__all__ = ["Dataset", "as_pairs"]
 
 def as_pairs(chain, observations, positions):
     """
@@ -56,37 +53,6 @@ def as_pairs(chain, observations, positions):
             "positions do not go together"
         )
     return list(zip(chains, observations, positions, strict=True))
-
-
-def common_wavelengths(observations, wavelength=None):
-    """
-    Return the wavelength grid of the parameters, in micrometre.
-
-    Parameters
-    ----------
-    observations : sequence of Observations
-        The datasets.
-    wavelength : `~astropy.units.Quantity`, optional
-        The grid, if it is not the union of the datasets'.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Ascending, shape (n_wavelengths,).
-
-    Examples
-    --------
-    >>> from astropolcal.measurement.datasets import common_wavelengths
-    >>> from astropolcal.observations import Observations, example_table
-    >>> night = Observations.from_table(example_table())
-    >>> common_wavelengths([night, night]).tolist()
-    [1.2, 1.6, 2.2]
-    """
-    if wavelength is not None:
-        return np.atleast_1d(u.Quantity(wavelength).to_value(u.um))
-    merged = np.sort(np.concatenate([obs.wavelength.to_value(u.um) for obs in observations]))
-    new = np.concatenate([[True], np.diff(merged) > _SAME_WAVELENGTH * merged[1:]])
-    return merged[new]
 
 
 class Dataset:
@@ -137,6 +103,8 @@ class Dataset:
         columns = self.frames.T.ravel()
         given = _positions(chain, observations, positions)
         placed = {stage: angle[columns] for stage, angle in given.items()}
+        # where nothing moves all frames are alike, but there are as many
+        placed = placed or {"frame": np.zeros(columns.size)}
         try:
             self.propagator = Propagator(chain, observations.wavelength.to_value(u.um), placed)
         except WavelengthRangeError as error:
@@ -235,7 +203,7 @@ class Dataset:
 def _bins_on_grid(observations, wavelength):
     own = observations.wavelength.to_value(u.um)
     nearest = np.abs(own[:, None] - wavelength[None, :]).argmin(axis=1)
-    off = np.abs(wavelength[nearest] - own) > _SAME_WAVELENGTH * own
+    off = np.abs(wavelength[nearest] - own) > SAME_WAVELENGTH * own
     if off.any():
         raise ObservationError(
             f"{observations.name}: wavelength {own[off][0] * 1e3:.3f} nm is not on the grid of the "

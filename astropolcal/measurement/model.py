@@ -14,9 +14,9 @@ import numpy as np
 from astropy.modeling import FittableModel, Parameter
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.measurement.datasets import Dataset, as_pairs, common_wavelengths
+from astropolcal.measurement.datasets import Dataset, as_pairs
 from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.observations import get_observable
+from astropolcal.observations import common_wavelengths, get_observable
 
 __all__ = ["Measurement"]
 

@@ -24,15 +24,18 @@ from astropolcal.observations.observables import (
 )
 from astropolcal.observations.pairing import pair_frames
 from astropolcal.observations.table import Observations
+from astropolcal.observations.wavelengths import SAME_WAVELENGTH, common_wavelengths
 
 __all__ = [
     "OBSERVABLES",
+    "SAME_WAVELENGTH",
     "NormalizedDoubleDifference",
     "NormalizedSingleDifference",
     "Observable",
     "Observations",
     "PerFrameDoubleDifference",
     "RatioMethod",
+    "common_wavelengths",
     "double_difference",
     "double_sum",
     "example_table",

@@ -3,7 +3,6 @@
 
 from dataclasses import dataclass
 
-import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
@@ -42,6 +41,7 @@ class DataGrid:
         self.observed = self._grid(self.part.observed)
         self.residual = self._grid(residuals[measurement.segments[dataset]])
         self.sigma = self._grid(self.part.sigma)
+        self.calibrated_um = measurement.wavelength
         self.derotator = np.rad2deg(self.position("derotator")[0])
 
     def _grid(self, flat):
@@ -107,16 +107,11 @@ class DataGrid:
         per_datum, n = self.part.frames.shape[1], len(angle)
         positions = {stage: np.repeat(p, n) for stage, p in series.positions.items()}
         positions["derotator"] = np.tile(angle, per_datum)
-        lam = self.part.observations.wavelength.to_value(u.um)[bins]
-        propagator = Propagator(self.part.chain, lam, positions)
-        on_grid = self.part.bins[bins]
-        values = [
-            [value[on_grid] if np.size(value) > 1 else value for value in optic]
-            for optic in propagator.values()
-        ]
+        # the chain's parameters are given on the calibration's own grid of wavelengths
+        propagator = Propagator(self.part.chain, self.calibrated_um, positions)
         right, left = (
-            flux.reshape(len(lam), per_datum, n).transpose(1, 0, 2)
-            for flux in propagator.fluxes(values)
+            flux[self.part.bins[bins]].reshape(len(bins), per_datum, n).transpose(1, 0, 2)
+            for flux in propagator.fluxes()
         )
         return self.observable.evaluate(right, left)
 

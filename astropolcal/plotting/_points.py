@@ -7,12 +7,13 @@ import numpy as np
 from astropolcal.plotting._style import BLACK, GREY, legend_outside, nanometres
 
 _DETERMINED = "fitted, with 1σ error"
-_ALONE = "hollow: not determined alone (trades off with others), so no error"
+_ALONE = "hollow: not determined alone, so no error"
 _BOUND = "boxed: at a bound, so no error"
 _FIXED = "fixed"
 _STAGE = "fitted per wavelength (first step of two)"
 _LAW = "law fitted to all wavelengths, with 1σ band"
 _LAW_ALONE = "law fitted to all wavelengths (no error: not determined alone)"
+_ORDER = (_DETERMINED, _ALONE, _BOUND, _LAW, _LAW_ALONE, _STAGE)
 _FINE = 201
 # how near to half a wave a panel must be to show that line (deg)
 _NEAR_HALF_WAVE = 45
@@ -157,13 +158,19 @@ def mark_half_wave(axes):
 # ---- legend -----------------------------------------------------------------------
 
 
-def legend_of(figure, axes):
+def legend_of(figure, axes, calibration):
     """Put one legend for all panels below them: each label once, in neutral colours."""
     entries = {}
     for one in axes:
         for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    handles = [_neutral(handle, label) for label, handle in entries.items()]
+    labels = [label for label in _ORDER if label in entries]
+    labels += [label for label in entries if label not in labels]
+    handles = [_neutral(entries[label], label) for label in labels]
+    free = len(calibration.identifiability.directions)
+    if _ALONE in labels and free:
+        parameters = "combination of parameters" if free == 1 else "combinations of parameters"
+        handles[labels.index(_ALONE)].set_label(f"{_ALONE} (the data leave {free} {parameters} open)")
     return legend_outside(figure, handles)
 
 

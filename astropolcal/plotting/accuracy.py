@@ -22,7 +22,7 @@ __all__ = ["plot_accuracy"]
 
 _CURVES = {
     "s_res": (VERMILLION, "o", "s_res = √(Σr²/(n − k)): scatter of one datum about the model"),
-    "s_mean": (BLUE, "s", "s_mean = s_res/√n: of the mean of n data (the paper's s_rel)"),
+    "s_mean": (BLUE, "s", "s_mean = s_res/√n: scatter of the mean of n data (elsewhere s_rel)"),
     "s_cv": (GREEN, "^", "s_cv: rms error when predicting derotator angles left out of the fit"),
 }
 _REFERENCE_STYLES = ("--", ":", "-.")
@@ -80,7 +80,8 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
         for axes, record in zip(panels, records, strict=True):
             handles = [_draw(axes, record.accuracy, name) for name in _CURVES]
             handles += _draw_references(axes, curves)
-            axes.set_title(_counts(record))
+            name = f"{record.name}: " if len(records) > 1 else ""
+            axes.set_title(name + _counts(record))
             axes.set_ylabel("accuracy (% of polarization)")
         _scale(panels[0], records, curves)
         wavelength_label(panels[-1])
@@ -135,7 +136,7 @@ def _draw_references(axes, curves):
 def _counts(record):
     n, k = (np.asarray(record.accuracy[key]) for key in ("n", "k"))
     span = f"{n.min()}" if n.min() == n.max() else f"{n.min()} to {n.max()}"
-    return f"{record.name}: n = {span} data a wavelength, k = {k.max()} parameters"
+    return f"n = {span} data a wavelength, k = {k.max()} free parameters"
 
 
 def _scale(axes, records, curves):

@@ -69,8 +69,15 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
         rows = -(-len(bins) // columns)
         figure = canvas(figure, 3.0 + 4.4 * columns, 1.2 + 4.1 * rows)
         pairs = _panels(figure, len(bins), rows, columns)
-        for pair, row, s_res in zip(pairs, bins, _s_res(calibration, dataset)[bins], strict=True):
-            _draw_wavelength(pair, grid, row, series, s_res)
+        fine = _fine(grid.derotator)
+        curves = [_curve(grid, one, bins, fine) for one in series]
+        spread = _s_res(calibration, dataset)
+        for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
+            _draw_heading(pair, grid.wavelength[row], spread[row])
+            for one, curve, look in zip(series, curves, looks(len(series)), strict=True):
+                _draw_series(pair, grid, row, one, look)
+                if curve is not None:
+                    pair[0].plot(fine, curve[i], color=look[0])
         _label(pairs, grid, columns)
         heading(figure, calibration, grid.quantity.capitalize(), [grid.part.observations.name])
         _legend(figure, grid, series, bins)
@@ -79,13 +86,13 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
 
 def _panels(figure, count, rows, columns):
     """Return (data, residual) axes for each wavelength, all with the same scales."""
-    outer = figure.add_gridspec(rows, columns)
+    spec = figure.add_gridspec(2 * rows, columns, height_ratios=(3, 1.5) * rows)
     pairs = []
     for i in range(count):
-        inner = outer[divmod(i, columns)].subgridspec(2, 1, height_ratios=(3, 1.2), hspace=0.0)
-        shared = {"sharex": pairs[0][0]} if pairs else {}
-        top = figure.add_subplot(inner[0], sharey=pairs[0][0] if pairs else None, **shared)
-        bottom = figure.add_subplot(inner[1], sharex=top, sharey=pairs[0][1] if pairs else None)
+        row, column = divmod(i, columns)
+        first = pairs[0] if pairs else (None, None)
+        top = figure.add_subplot(spec[2 * row, column], sharex=first[0], sharey=first[0])
+        bottom = figure.add_subplot(spec[2 * row + 1, column], sharex=top, sharey=first[1])
         pairs.append((top, bottom))
     return pairs
 
@@ -94,26 +101,31 @@ def _s_res(calibration, dataset):
     return calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
 
 
-def _draw_wavelength(pair, grid, row, series, s_res):
+def _draw_heading(pair, wavelength, s_res):
     top, bottom = pair
     bottom.axhline(0, color=GREY, linewidth=1)
-    spread = f",  s_res = {s_res:.2f} %" if np.isfinite(s_res) else ""
-    top.set_title(f"{grid.wavelength[row]:.1f} nm{spread}")
-    if spread:
+    known = np.isfinite(s_res)
+    top.set_title(f"{wavelength:.1f} nm" + (f",  s_res = {s_res:.2f} %" if known else ""))
+    if known:
         bottom.axhspan(-s_res, s_res, color="0.92", zorder=0)
-    fine = _fine(grid.derotator)
-    for one, (color, marker) in zip(series, looks(len(series)), strict=True):
-        angle = grid.derotator[one.data]
-        value, residual, sigma = (
-            array[row, one.data] for array in (grid.observed, grid.residual, grid.sigma)
-        )
-        if one.positions is None:
-            top.plot(angle, value - residual, "x", color=color, markersize=8)
-        else:
-            top.plot(fine, grid.curve(one, [row], fine)[0], color=color)
-        look = {"color": color, "marker": marker, "linestyle": "none", "label": one.label}
-        top.errorbar(angle, value, yerr=_bars(sigma), **look)
-        bottom.errorbar(angle, 100 * residual, yerr=_bars(100 * sigma), **look)
+
+
+def _draw_series(pair, grid, row, one, look):
+    """Draw the data of one setting of the half-wave plate, and their residuals."""
+    color, marker = look
+    angle = grid.derotator[one.data]
+    value, residual, sigma = (
+        array[row, one.data] for array in (grid.observed, grid.residual, grid.sigma)
+    )
+    points = {"color": color, "marker": marker, "linestyle": "none", "label": one.label}
+    pair[0].errorbar(angle, value, yerr=_bars(sigma), **points)
+    pair[1].errorbar(angle, 100 * residual, yerr=_bars(100 * sigma), **points)
+    if one.positions is None:
+        pair[0].plot(angle, value - residual, "x", color=color, markersize=8)
+
+
+def _curve(grid, one, bins, fine):
+    return None if one.positions is None else grid.curve(one, bins, fine)
 
 
 def _bars(sigma):
@@ -137,6 +149,9 @@ def _label(pairs, grid, columns):
         if i % columns == 0:
             top.set_ylabel(_two_lines(grid.quantity))
             bottom.set_ylabel("obs. − model\n(%)")
+        else:
+            top.tick_params(labelleft=False)
+            bottom.tick_params(labelleft=False)
     fine = _fine(grid.derotator)
     pairs[0][0].set_xlim(fine[0], fine[-1])
 

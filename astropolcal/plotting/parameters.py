@@ -220,7 +220,7 @@ def _check_name(name, known):
 
 
 def _describe(parameter):
-    words = parameter.description or parameter.name
+    words = parameter.__doc__ or parameter.name
     if parameter.unit is None or parameter.unit == u.dimensionless_unscaled:
         return words
     return f"{words} ({'°' if parameter.unit == u.deg else parameter.unit})"
@@ -268,4 +268,4 @@ def _grid(figure, count):
 
 def _finish(figure, axes, calibration, what):
     heading(figure, calibration, what, [record.name for record in calibration.datasets])
-    legend_of(figure, axes)
+    legend_of(figure, axes, calibration)

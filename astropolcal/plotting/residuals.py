@@ -64,6 +64,8 @@ def plot_residuals(calibration, *, figure=None):
             right = figure.add_subplot(spec[2 * i + 1, 1], sharey=main)
             maps.append(main)
             drawn = _draw_dataset(main, above, right, grid, limit)
+            if len(grids) > 1:
+                above.set_title(grid.part.observations.name, loc="left")
         bar = figure.colorbar(
             drawn, ax=figure.axes, extend="both" if clipped else "neither", shrink=0.8, aspect=35
         )
@@ -101,7 +103,6 @@ def _draw_dataset(main, above, right, grid, limit):
     above.stairs(_rms(percent, axis=0), columns, color=BLUE, fill=True)
     above.tick_params(labelbottom=False)
     above.set_ylabel("rms (%)")
-    above.set_title(grid.part.observations.name, loc="left")
     _wavelength_rms(right, _rms(percent, axis=1), grid.wavelength[lam])
     for axes in (above, right):
         axes.margins(0)
@@ -131,7 +132,7 @@ def _name_groups(main, grid, order, group, ends):
     main.tick_params(axis="x", length=0)
     labels = [series.label for series in grid.series()]
     within = ", ".join(labels) if len(labels) <= 8 else f"{labels[0]} to {labels[-1]}"
-    main.set_xlabel(f"derotator angle; within one, by half-wave plate angle:\n{within}")
+    main.set_xlabel(f"derotator angle; at each, left to right, half-wave plate at\n{within}")
 
 
 def _edges(centres):

@@ -1,0 +1,229 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Calibration files: ASDF, with schemas of our own, validated on reading.
+
+By default ASDF neither validates what it reads nor stops at what it cannot
+convert, and it follows links out of the file. Here all of that is refused: a
+file gives back exactly what was written, or one line that says why not.
+"""
+
+import io
+import re
+import warnings
+from contextlib import contextmanager
+from pathlib import Path
+
+import asdf
+import asdf.util
+from asdf.exceptions import AsdfConversionWarning, AsdfWarning, ValidationError
+
+from astropolcal._atomic import write_atomically
+from astropolcal.exceptions import CalibrationFileError
+
+__all__ = ["read_calibration", "write_calibration"]
+
+_KEY = "calibration"
+_TAG = "tag:astropolcal.org:astropolcal/calibration-1.0.0"
+_ALLOWED_TAGS = re.compile(
+    r"tag:stsci\.edu:asdf/(core/(asdf|software|extension_metadata|history_entry|ndarray)"
+    r"|unit/(quantity|unit))-[0-9.]+"
+    r"|tag:astropy\.org:astropy/units/unit-[0-9.]+"
+    r"|tag:astropolcal\.org:astropolcal/(calibration|optics/[a-z_0-9]+)-1\.0\.0"
+    r"|tag:yaml\.org,2002:[a-z]+"
+)
+# arrays of more numbers go into binary blocks, the others are readable
+_INLINE = 64
+_BEGIN, _END = b"#ASDF", b"\n...\n"
+_LONGEST_REASON = 240
+
+
+def write_calibration(calibration, path, overwrite=False):
+    """
+    Write a calibration to an ASDF file, which appears complete or not at all.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    path : path-like
+        The file.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    CalibrationFileError
+        If the file exists, its folder is missing or cannot be written, or the
+        calibration holds what a file cannot hold, such as an optic of a class
+        outside `astropolcal.optics`.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise CalibrationFileError(f"{path}: is a folder; name a file in it")
+    if path.exists() and not overwrite:
+        raise CalibrationFileError(f"{path}: exists already; overwrite=True replaces it")
+    if not path.parent.is_dir():
+        raise CalibrationFileError(f"{path}: cannot be written: no folder {path.parent}")
+    with _speaking_of(path, "cannot be written: "):
+        write_atomically(path, _to_bytes(calibration))
+
+
+def read_calibration(path):
+    """
+    Read a calibration from an ASDF file, validated; nothing in it is executed.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    Calibration
+        Equal to what was written, to the last bit; without ``measurement``.
+
+    Raises
+    ------
+    CalibrationFileError
+        If the file is missing, truncated, changed, of another version, not a
+        calibration, or inconsistent.
+    """
+    path = Path(path)
+    if not path.is_file():
+        what = "is a folder, not a file" if path.is_dir() else "no such file"
+        raise CalibrationFileError(f"{path}: {what}")
+    with _speaking_of(path, ""):
+        content = path.read_bytes()
+        _check_ends(content)
+        _check_tree(content)
+        return _from_bytes(content)
+
+
+# ---- to and from bytes -------------------------------------------------------------
+
+
+def _to_bytes(calibration):
+    buffer = io.BytesIO()
+    with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
+        file.write_to(buffer)
+    return buffer.getvalue()
+
+
+def _from_bytes(content):
+    with (
+        _strict_asdf(),
+        asdf.open(
+            io.BytesIO(content), lazy_load=False, memmap=False, validate_checksums=True
+        ) as file,
+    ):
+        return file[_KEY]
+
+
+@contextmanager
+def _strict_asdf():
+    """Switch on what ASDF leaves off: validation, and errors for what cannot be converted."""
+    with asdf.config_context() as config, warnings.catch_warnings():
+        # other versions of asdf and its plugins do not matter, what is in the file does
+        warnings.simplefilter("ignore", AsdfWarning)
+        warnings.simplefilter("error", AsdfConversionWarning)
+        config.validate_on_read = True
+        config.warn_on_failed_conversion = False
+        config.lazy_tree = False
+        config.array_inline_threshold = _INLINE
+        config.all_array_storage = None
+        config.all_array_compression = "input"
+        _register(config)
+        yield
+
+
+def _register(config):
+    """Tell ASDF of our schemas where the package was not installed, only imported."""
+    from astropolcal.extension import MANIFEST_URI, get_extensions, get_resource_mappings
+
+    if MANIFEST_URI in config.resource_manager:
+        return
+    for mapping in get_resource_mappings():
+        config.add_resource_mapping(mapping)
+    for extension in get_extensions():
+        config.add_extension(extension)
+
+
+# ---- what is refused before ASDF opens the file ------------------------------------
+
+
+def _check_ends(content):
+    if not content.startswith(_BEGIN):
+        raise CalibrationFileError("not an ASDF file")
+    if not content.endswith(_END):
+        raise CalibrationFileError("truncated: the end of the file is missing")
+
+
+def _check_tree(content):
+    """Check the tags before any object is made, so that nothing unknown is."""
+    tree = asdf.util.load_yaml(io.BytesIO(content), tagged=True)
+    if not isinstance(tree, dict) or _KEY not in tree:
+        raise CalibrationFileError(f"not an astropolcal calibration: it has no {_KEY!r}")
+    tag = getattr(tree[_KEY], "_tag", None) or "no tag"
+    if tag != _TAG:
+        version = re.fullmatch(_TAG.replace(".", r"\.").replace("1\\.0\\.0", "(.*)"), tag)
+        if not version:
+            raise CalibrationFileError(f"not an astropolcal calibration: {_KEY!r} has {tag}")
+        raise CalibrationFileError(
+            f"calibration of version {version[1]}; this astropolcal reads version 1.0.0"
+        )
+    _check_nodes(tree)
+
+
+def _check_nodes(tree):
+    """Refuse unknown tags and links out of the file."""
+    waiting, seen = [tree], set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen:
+            continue
+        seen.add(id(node))
+        tag = getattr(node, "_tag", None)
+        if tag is not None and not _ALLOWED_TAGS.fullmatch(tag):
+            raise CalibrationFileError(f"holds an object of unknown kind or version, {tag}")
+        if isinstance(node, dict):
+            if "$ref" in node or ("ndarray" in (tag or "") and isinstance(node.get("source"), str)):
+                raise CalibrationFileError("refers to another file")
+            waiting.extend(node.values())
+        elif isinstance(node, list):
+            waiting.extend(node)
+
+
+# ---- errors ------------------------------------------------------------------------
+
+
+@contextmanager
+def _speaking_of(path, prefix):
+    """Turn whatever goes wrong into one line that names the file."""
+    try:
+        yield
+    except CalibrationFileError as error:
+        raise CalibrationFileError(f"{path}: {prefix}{error}") from error
+    except OSError as error:
+        reason = error.strerror or _one_line(error)
+        raise CalibrationFileError(f"{path}: {prefix}{reason}") from error
+    except ValidationError as error:
+        raise CalibrationFileError(f"{path}: {prefix}{_where(error)}") from error
+    # a damaged file can make ASDF, YAML and numpy raise anything
+    except Exception as error:
+        label = prefix or "damaged: "
+        raise CalibrationFileError(f"{path}: {label}{_one_line(error)}") from error
+
+
+def _where(error):
+    """Return what a schema objects to, and at which place of the file."""
+    place = ".".join(str(part) for part in error.absolute_path)
+    return f"invalid at {place}: {_shortened(error.message)}"
+
+
+def _one_line(error):
+    return _shortened(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
+
+
+def _shortened(text):
+    text = " ".join(text.split())
+    return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."

@@ -1,0 +1,323 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+The converter of calibrations.
+
+The node holds everything of a `~astropolcal.calibration.Calibration` but the
+measurement, so the observations themselves stay outside. Its checksum covers
+all numbers and words, so that a file either gives back what was written or is
+refused.
+"""
+
+from asdf.extension import Converter
+
+from astropolcal.exceptions import CalibrationFileError
+
+__all__ = [
+    "CALIBRATION_TAG",
+    "CalibrationConverter",
+    "calibration_from_node",
+    "node_from_calibration",
+]
+
+CALIBRATION_TAG = "tag:astropolcal.org:astropolcal/calibration-1.0.0"
+
+# what is written for those who look into the file, and worked out again on reading
+_DERIVED = ("checksum", "validity", "written_with")
+
+
+class CalibrationConverter(Converter):
+    """
+    Convert a calibration.
+
+    Examples
+    --------
+    >>> from astropolcal.converters.calibration import CalibrationConverter
+    >>> CalibrationConverter().types
+    ['astropolcal.calibration.result.Calibration']
+    """
+
+    @property
+    def tags(self):
+        """Tags of a calibration."""
+        return [CALIBRATION_TAG]
+
+    @property
+    def types(self):
+        """Full name of the class, which is imported only when it is needed."""
+        return ["astropolcal.calibration.result.Calibration"]
+
+    def to_yaml_tree(self, obj, tag, ctx):
+        """Return the node of a calibration, see `node_from_calibration`."""
+        return node_from_calibration(obj)
+
+    def from_yaml_tree(self, node, tag, ctx):
+        """Return the calibration of a node, see `calibration_from_node`."""
+        return calibration_from_node(node)
+
+
+# ---- writing ---------------------------------------------------------------------
+
+
+def node_from_calibration(calibration):
+    """
+    Return the node that stores a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+
+    Returns
+    -------
+    dict
+        As the schema ``calibration-1.0.0`` describes it.
+
+    Raises
+    ------
+    CalibrationFileError
+        If it is inconsistent, or holds what files cannot hold.
+    """
+    from astropolcal.converters.consistency import check_calibration
+    from astropolcal.converters.nodes import node_from_value, plain
+
+    check_calibration(calibration)
+    node = {
+        "chains": [_chain_node(chain) for chain in calibration.chains],
+        "wavelength": node_from_value(calibration.wavelength),
+        "covariance": _covariance_node(calibration.covariance),
+        "identifiability": _identifiability_node(calibration.identifiability),
+        "at_bound": plain(calibration.at_bound, "at_bound"),
+        "datasets": [_dataset_node(record) for record in calibration.datasets],
+        "settings": plain(calibration.settings, "settings"),
+        "fit": plain(calibration.fit, "fit"),
+        "ties": [_tie_node(name, tie) for name, tie in calibration.ties.items()],
+        "stages": [_stage_node(stage) for stage in calibration.stages],
+        "provenance": plain(calibration.provenance, "provenance"),
+    }
+    return node | {
+        "checksum": _checksum(node),
+        "validity": _validity(calibration),
+        "written_with": _versions(),
+    }
+
+
+def _checksum(node):
+    from astropolcal.converters.nodes import checksum
+    from astropolcal.converters.optics import node_from_optic
+
+    content = {key: value for key, value in node.items() if key not in _DERIVED}
+    return checksum(content, expand=node_from_optic)
+
+
+def _versions():
+    from importlib.metadata import version as installed
+
+    from astropolcal.version import version
+
+    names = ("asdf", "asdf-astropy", "astropy")
+    return {"astropolcal": version} | {name: installed(name) for name in names}
+
+
+def _validity(calibration):
+    """Return what tells whether a frame may be reduced with the calibration."""
+    from astropolcal.chain import leaves
+
+    dates = {str(record.meta["date"]) for record in calibration.datasets if "date" in record.meta}
+    return {
+        "instrument": calibration.instrument,
+        "dates": sorted(dates),
+        "optics_in_beam": [[leaf.name for leaf in leaves(chain)] for chain in calibration.chains],
+    }
+
+
+def _chain_node(chain):
+    from astropolcal.chain import leaves
+
+    node = {"optics": leaves(chain)}
+    # a chain of one optic is that optic, which has its own name
+    named = chain.n_submodels > 1 and chain.name
+    return node | {"name": chain.name} if named else node
+
+
+def _covariance_node(covariance):
+    from astropolcal.converters.nodes import unit_text
+
+    return {
+        "names": list(covariance.names),
+        "units": [unit_text(unit) for unit in covariance.units],
+        "matrix": covariance.matrix.copy(),
+    }
+
+
+def _identifiability_node(finding):
+    from astropolcal.converters.nodes import plain
+
+    return {
+        "names": list(finding.names),
+        "rank": int(finding.rank),
+        "singular_values": finding.singular_values.copy(),
+        "null_vectors": finding.null_vectors.copy(),
+        "identifiable": finding.identifiable.copy(),
+        "directions": [
+            {
+                "words": str(direction["words"]),
+                # a list, as a mapping would lose the order
+                "parameters": [
+                    {"name": name, "value": plain(value, name)}
+                    for name, value in direction["parameters"].items()
+                ],
+            }
+            for direction in finding.directions
+        ],
+    }
+
+
+def _dataset_node(record):
+    from astropolcal.converters.nodes import node_from_table, plain
+
+    return {
+        "name": record.name,
+        "source": record.source,
+        "content_hash": record.content_hash,
+        "meta": plain(record.meta, f"meta of {record.name}"),
+        "n_frames": int(record.n_frames),
+        "n_masked": int(record.n_masked),
+        "accuracy": node_from_table(record.accuracy),
+    }
+
+
+def _tie_node(name, tie):
+    from astropolcal.converters.nodes import node_from_value
+
+    return {
+        "target": name,
+        "source": tie.source,
+        "factor": float(tie.factor),
+        "offset": node_from_value(tie.offset),
+    }
+
+
+def _stage_node(stage):
+    from astropolcal.converters.nodes import node_from_value, plain
+
+    values = stage["parameters"].items()
+    return {
+        "title": stage["title"],
+        "parameters": [{"name": name} | node_from_value(value) for name, value in values],
+        "residual_rms": plain(stage["residual_rms"], "residual_rms"),
+    }
+
+
+# ---- reading ---------------------------------------------------------------------
+
+
+def calibration_from_node(node):
+    """
+    Return the calibration that a node stores.
+
+    Parameters
+    ----------
+    node : dict
+        Its node, which obeys the schema, with its optics restored.
+
+    Returns
+    -------
+    Calibration
+        Without ``measurement``.
+
+    Raises
+    ------
+    CalibrationFileError
+        If the content does not match its checksum or is inconsistent.
+    """
+    from astropolcal.calibration import Calibration
+    from astropolcal.converters.consistency import check_calibration
+    from astropolcal.converters.nodes import plain, value_from_node
+
+    if _checksum(node) != node["checksum"]:
+        raise CalibrationFileError(
+            "the content does not match its checksum: it was changed after it was written"
+        )
+    calibration = Calibration(
+        chains=[_chain(entry) for entry in node["chains"]],
+        wavelength=value_from_node(node["wavelength"]),
+        covariance=_covariance(node["covariance"]),
+        identifiability=_identifiability(node["identifiability"]),
+        at_bound=list(node["at_bound"]),
+        datasets=[_dataset(entry) for entry in node["datasets"]],
+        settings=plain(node["settings"]),
+        fit=plain(node["fit"]),
+        ties={entry["target"]: _tie(entry) for entry in node["ties"]},
+        stages=[_stage(entry) for entry in node["stages"]],
+        provenance=plain(node["provenance"]),
+    )
+    check_calibration(calibration)
+    return calibration
+
+
+def _chain(node):
+    from astropolcal.chain import join
+
+    chain = join(node["optics"])
+    if "name" in node:
+        chain.name = node["name"]
+    return chain
+
+
+def _covariance(node):
+    from astropolcal.calibration import Covariance
+    from astropolcal.converters.nodes import unit_from_text
+
+    units = [unit_from_text(text) for text in node["units"]]
+    return Covariance(node["names"], units, node["matrix"])
+
+
+def _identifiability(node):
+    import numpy as np
+
+    from astropolcal.calibration import Identifiability
+
+    return Identifiability(
+        names=list(node["names"]),
+        rank=node["rank"],
+        singular_values=np.array(node["singular_values"]),
+        null_vectors=np.array(node["null_vectors"]),
+        identifiable=np.array(node["identifiable"]),
+        directions=[
+            {
+                "words": direction["words"],
+                "parameters": {entry["name"]: entry["value"] for entry in direction["parameters"]},
+            }
+            for direction in node["directions"]
+        ],
+    )
+
+
+def _dataset(node):
+    from astropolcal.calibration import DatasetRecord
+    from astropolcal.converters.nodes import plain, table_from_node
+
+    accuracy = table_from_node(node["accuracy"])
+    return DatasetRecord(**(node | {"meta": plain(node["meta"]), "accuracy": accuracy}))
+
+
+def _tie(node):
+    import numpy as np
+
+    from astropolcal.converters.nodes import value_from_node
+    from astropolcal.measurement.parameters import Tie
+
+    offset = value_from_node(node["offset"])
+    # a number of its own type, as it was given
+    plain_number = "unit" not in node["offset"] and not np.ndim(offset)
+    return Tie(node["source"], node["factor"], offset.item() if plain_number else offset)
+
+
+def _stage(node):
+    from astropolcal.converters.nodes import value_from_node
+
+    return {
+        "title": node["title"],
+        "parameters": {entry["name"]: value_from_node(entry) for entry in node["parameters"]},
+        "residual_rms": node["residual_rms"],
+    }
