@@ -51,3 +51,40 @@ def shared_data():
     if not folder.is_dir():
         pytest.skip(f"reference data are absent: no folder {folder.name!r} beside the repository")
     return folder
+
+
+@pytest.fixture(scope="session")
+def random_chain():
+    """
+    Function that makes a chain of random optics from all that are registered.
+
+    ``random_chain(rng, n_wavelengths, n_optics=6, split=False)``: values anywhere
+    within the bounds, half of them one a wavelength, on stages "a", "b" and "c"
+    or on none; with ``split`` a Wollaston prism stands among the optics.
+    """
+    return _random_chain
+
+
+def _random_chain(rng, n_wavelengths, n_optics=6, split=False):
+    from astropolcal.chain import join
+    from astropolcal.optics import OPTICS
+
+    names = sorted(set(OPTICS) - {"WollastonPrism"})
+    kinds = list(rng.choice(names, n_optics))
+    if split:
+        kinds.insert(rng.integers(n_optics + 1), "WollastonPrism")
+    mounts = rng.choice(["a", "b", "-b", "-c", ""], len(kinds))
+    chain = []
+    for i, (kind, mount) in enumerate(zip(kinds, mounts, strict=True)):
+        values = _random_values(OPTICS[kind], rng, n_wavelengths)
+        chain.append(OPTICS[kind](name=f"{kind}_{i}", mount=str(mount) or None, **values))
+    return join(chain)
+
+
+def _random_values(optic, rng, n_wavelengths):
+    values = {}
+    for key, parameter in ((k, getattr(optic(), k)) for k in optic().param_names):
+        low, high = (0.5 if bound is None else 0.9 * bound for bound in parameter.bounds)
+        size = n_wavelengths if n_wavelengths and rng.random() < 0.5 else None
+        values[key] = rng.uniform(low, high, size) * (parameter.unit or 1)
+    return values

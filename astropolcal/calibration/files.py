@@ -17,13 +17,13 @@ import asdf
 import asdf.util
 from asdf.exceptions import AsdfConversionWarning, AsdfWarning, ValidationError
 
-from astropolcal._atomic import write_atomically
+from astropolcal.converters.calibration import CALIBRATION_TAG
 from astropolcal.exceptions import CalibrationFileError
+from astropolcal.files import atomic_path
 
 __all__ = ["read_calibration", "write_calibration"]
 
 _KEY = "calibration"
-_TAG = "tag:astropolcal.org:astropolcal/calibration-1.0.0"
 _ALLOWED_TAGS = re.compile(
     r"tag:stsci\.edu:asdf/(core/(asdf|software|extension_metadata|history_entry|ndarray)"
     r"|unit/(quantity|unit))-[0-9.]+"
@@ -56,6 +56,20 @@ def write_calibration(calibration, path, overwrite=False):
         If the file exists, its folder is missing or cannot be written, or the
         calibration holds what a file cannot hold, such as an optic of a class
         outside `astropolcal.optics`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration.files import read_calibration, write_calibration
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> write_calibration(cal, "charis.asdf")
+    >>> read_calibration("charis.asdf").covariance == cal.covariance
+    True
     """
     path = Path(path)
     if path.is_dir():
@@ -65,7 +79,9 @@ def write_calibration(calibration, path, overwrite=False):
     if not path.parent.is_dir():
         raise CalibrationFileError(f"{path}: cannot be written: no folder {path.parent}")
     with _speaking_of(path, "cannot be written: "):
-        write_atomically(path, _to_bytes(calibration))
+        content = _to_bytes(calibration)
+    with atomic_path(path, error=CalibrationFileError) as temporary:
+        temporary.write_bytes(content)
 
 
 def read_calibration(path):
@@ -87,6 +103,20 @@ def read_calibration(path):
     CalibrationFileError
         If the file is missing, truncated, changed, of another version, not a
         calibration, or inconsistent.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration.files import read_calibration, write_calibration
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> write_calibration(cal, "charis.asdf")
+    >>> len(read_calibration("charis.asdf").parameters)
+    49
     """
     path = Path(path)
     if not path.is_file():
@@ -163,15 +193,20 @@ def _check_tree(content):
     tree = asdf.util.load_yaml(io.BytesIO(content), tagged=True)
     if not isinstance(tree, dict) or _KEY not in tree:
         raise CalibrationFileError(f"not an astropolcal calibration: it has no {_KEY!r}")
-    tag = getattr(tree[_KEY], "_tag", None) or "no tag"
-    if tag != _TAG:
-        version = re.fullmatch(_TAG.replace(".", r"\.").replace("1\\.0\\.0", "(.*)"), tag)
-        if not version:
-            raise CalibrationFileError(f"not an astropolcal calibration: {_KEY!r} has {tag}")
-        raise CalibrationFileError(
-            f"calibration of version {version[1]}; this astropolcal reads version 1.0.0"
-        )
+    _check_version(getattr(tree[_KEY], "_tag", None) or "no tag")
     _check_nodes(tree)
+
+
+def _check_version(tag):
+    if tag == CALIBRATION_TAG:
+        return
+    ours, _, known = CALIBRATION_TAG.rpartition("-")
+    kind, _, version = tag.rpartition("-")
+    if kind != ours:
+        raise CalibrationFileError(f"not an astropolcal calibration: {_KEY!r} has {tag}")
+    raise CalibrationFileError(
+        f"calibration of version {version}; this astropolcal reads version {known}"
+    )
 
 
 def _check_nodes(tree):

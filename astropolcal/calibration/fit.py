@@ -194,14 +194,15 @@ def _run(measurement, weight, fitter):
 def _joint(measurement, weight, fitter, search):
     """Fit everything; go on as long as some bin finds a better mirror branch."""
     problem = BinProblem(measurement, weight)
+    origin = measurement.vector()
     if search:
-        measurement.parameters = search_branches(problem, measurement.vector())[0]
+        measurement.parameters = search_branches(problem, origin)[0]
     for left in reversed(range(_MAX_ROUNDS)):
         outcome = _run(measurement, weight, fitter)
         # the last word belongs to the fit of all parameters, not to a search by bin
         if not search or not left:
             break
-        better, moved = search_branches(problem, measurement.vector())
+        better, moved = search_branches(problem, measurement.vector(), origin)
         if not moved.any():
             break
         measurement.parameters = better

@@ -16,6 +16,8 @@ __all__ = ["Identifiability", "analyse"]
 
 # singular values below this share of the largest count as zero
 _RANK_TOLERANCE = 1e-9
+# and so do those below this: a rounding error, as the error would be 1e12 degrees
+_NOTHING = 1e-12
 # a parameter that moves by less than this share along a null direction stands still
 _STILL = 1e-5
 # what is worth a word in a null direction, as a share of its largest component
@@ -124,7 +126,8 @@ def _decompose(scaled):
     n_data, n_free = scaled.shape
     _, singular, right = np.linalg.svd(scaled, full_matrices=n_data < n_free)
     singular = np.pad(singular, (0, n_free - singular.size))
-    return singular, right, int(np.sum(singular > _RANK_TOLERANCE * max(singular[0], 1e-300)))
+    threshold = max(_RANK_TOLERANCE * singular[0], _NOTHING)
+    return singular, right, int(np.sum(singular > threshold))
 
 
 def _covariance(scaled, held, scale):

@@ -15,7 +15,7 @@ import numpy as np
 __all__ = ["BinProblem", "search_branches"]
 
 _SCAN_STEP = np.deg2rad(15.0)
-_N_VALLEYS = 3
+_N_VALLEYS = 4
 _CLEARLY_BETTER = 0.99
 
 
@@ -74,7 +74,7 @@ class BinProblem:
         residual = self.residuals(vector)
         return blocks @ np.swapaxes(blocks, 1, 2), np.einsum("bsd,bd->bs", blocks, residual)
 
-    def polish(self, vector, iterations=10):
+    def polish(self, vector, iterations=12):
         """
         Improve the per-wavelength parameters by batched Levenberg-Marquardt.
 
@@ -106,11 +106,16 @@ class BinProblem:
 
     def _step(self, vector, damping):
         normal, gradient = self._normal_equations(vector)
+        here = vector[self.elements]
+        held = (((here <= self._low) & (gradient.T > 0)) | ((here >= self._high) & (gradient.T < 0))).T
+        # a parameter that leans against its bound must not slow down the others
+        normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
+        gradient = np.where(held, 0.0, gradient)
         size = normal.shape[-1]
         diagonal = np.einsum("bss->bs", normal)
         ridge = damping[:, None] * diagonal + 1e-12 * (1 + diagonal.max(axis=1, keepdims=True))
         step = np.linalg.solve(normal + ridge[:, :, None] * np.eye(size), gradient[..., None])
-        return np.clip(vector[self.elements] - step[..., 0].T, self._low, self._high)
+        return np.clip(here - step[..., 0].T, self._low, self._high)
 
     def main_retardances(self):
         """Return the first slot of each optic that can make half a turn or more."""
@@ -145,7 +150,7 @@ class BinProblem:
         return grid[order]
 
 
-def search_branches(problem, vector):
+def search_branches(problem, vector, origin=None):
     """
     Return a start in which every bin sits in its best valley.
 
@@ -156,6 +161,9 @@ def search_branches(problem, vector):
     vector : `~numpy.ndarray`
         Current values; its own valley is kept unless another is clearly
         (1 %) better.
+    origin : `~numpy.ndarray`, optional
+        Where the scans begin, by default at ``vector``; shape (n_free,). Only
+        its per-wavelength parameters matter.
 
     Returns
     -------
@@ -180,17 +188,24 @@ def search_branches(problem, vector):
     """
     if not problem.slots:
         return vector, np.zeros(problem.n_bins, dtype=bool)
+    # in the wrong valley a bin drives its other parameters astray: scan from the origin
+    start = vector.copy()
+    if origin is not None:
+        start[problem.elements] = origin[problem.elements]
     best, costs = problem.polish(vector)
     moved = np.zeros(problem.n_bins, dtype=bool)
-    for row, low, high in problem.main_retardances():
-        for values in problem.valleys(best, row, low, high):
-            trial = best.copy()
-            trial[problem.elements[row]] = values
-            trial, new = problem.polish(trial)
-            better = new < _CLEARLY_BETTER * costs
-            best[problem.elements[:, better]] = trial[problem.elements[:, better]]
-            costs = np.where(better, new, costs)
-            moved |= better
+    retardances = problem.main_retardances()
+    for row, low, high in retardances:
+        # one that was scanned before may have moved
+        for base in (start, best.copy()) if len(retardances) > 1 else (start,):
+            for values in problem.valleys(base, row, low, high):
+                trial = base.copy()
+                trial[problem.elements[row]] = values
+                trial, new = problem.polish(trial)
+                better = new < _CLEARLY_BETTER * costs
+                best[problem.elements[:, better]] = trial[problem.elements[:, better]]
+                costs = np.where(better, new, costs)
+                moved |= better
     return best, moved
 
 

@@ -76,6 +76,19 @@ def node_from_calibration(calibration):
     ------
     CalibrationFileError
         If it is inconsistent, or holds what files cannot hold.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.converters.calibration import node_from_calibration
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> node_from_calibration(cal)["covariance"]["names"][:2]
+    ['calibration_polarizer.theta', 'hwp.theta']
     """
     from astropolcal.converters.consistency import check_calibration
     from astropolcal.converters.nodes import node_from_value, plain
@@ -229,6 +242,20 @@ def calibration_from_node(node):
     ------
     CalibrationFileError
         If the content does not match its checksum or is inconsistent.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.converters.calibration import calibration_from_node, node_from_calibration
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> again = calibration_from_node(node_from_calibration(cal))
+    >>> again.to_dict() == cal.to_dict()
+    True
     """
     from astropolcal.calibration import Calibration
     from astropolcal.converters.consistency import check_calibration

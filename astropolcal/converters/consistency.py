@@ -8,6 +8,8 @@ from astropolcal.measurement.parameters import FreeParameters, parameter_table
 
 __all__ = ["check_calibration"]
 
+_ACCURACY = ("wavelength", "n", "k", "s_res", "s_mean", "s_cv")
+
 
 def check_calibration(calibration):
     """
@@ -24,6 +26,22 @@ def check_calibration(calibration):
         If the sizes of the parameters do not fit the wavelengths, covariance
         or identifiability are not those of the free parameters, datasets of
         one optic disagree, or the numbers of chains and datasets differ.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.converters.consistency import check_calibration
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> cal.at_bound = ["hwp.thickness"]
+    >>> check_calibration(cal)
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.CalibrationFileError: at_bound names 'hwp.thickness', which ...
     """
     wavelength = calibration.wavelength
     if np.ndim(wavelength) != 1 or not np.all(wavelength.value > 0):
@@ -89,9 +107,9 @@ def _check_words(calibration, names):
     if unknown:
         raise CalibrationFileError(f"at_bound names {unknown[0]!r}, which is no free parameter")
     for record in calibration.datasets:
-        missing = {"wavelength", "n", "k", "s_res", "s_mean", "s_cv"}
-        missing -= set(record.accuracy.colnames if record.accuracy is not None else missing)
+        known = _ACCURACY if record.accuracy is None else record.accuracy.colnames
+        missing = [name for name in _ACCURACY if name not in known]
         if missing:
             raise CalibrationFileError(
-                f"the accuracy of {record.name} lacks the columns {sorted(missing)}"
+                f"the accuracy of {record.name} has no column {', '.join(missing)}"
             )

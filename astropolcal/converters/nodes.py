@@ -27,12 +27,29 @@ __all__ = [
 
 
 def unit_text(unit):
-    """Return a unit as text that `unit_from_text` understands; None stays None."""
+    """
+    Return a unit as text that `unit_from_text` understands; None stays None.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.converters.nodes import unit_text
+    >>> unit_text(u.deg)
+    'deg'
+    """
     return None if unit is None else u.Unit(unit).to_string()
 
 
 def unit_from_text(text):
-    """Return the unit that `unit_text` wrote."""
+    """
+    Return the unit that `unit_text` wrote.
+
+    Examples
+    --------
+    >>> from astropolcal.converters.nodes import unit_from_text
+    >>> unit_from_text("mm")
+    Unit("mm")
+    """
     return None if text is None else u.Unit(text)
 
 
@@ -78,14 +95,32 @@ def value_from_node(node):
 
 
 def node_from_table(table):
-    """Return the node of a table, a list of its columns in their order; None stays None."""
+    """
+    Return the node of a table, a list of its columns in their order; None stays None.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal.converters.nodes import node_from_table
+    >>> [column["name"] for column in node_from_table(QTable({"s_res": [0.2] * u.percent}))]
+    ['s_res']
+    """
     if table is None:
         return None
     return [{"name": name} | node_from_value(table[name]) for name in table.colnames]
 
 
 def table_from_node(node):
-    """Return the `~astropy.table.QTable` of a node that `node_from_table` made."""
+    """
+    Return the `~astropy.table.QTable` of a node that `node_from_table` made.
+
+    Examples
+    --------
+    >>> from astropolcal.converters.nodes import table_from_node
+    >>> table_from_node([{"name": "s_res", "value": [0.2], "unit": "%"}])["s_res"]
+    <Quantity [0.2] %>
+    """
     if node is None:
         return None
     return QTable({column["name"]: value_from_node(column) for column in node})

@@ -155,7 +155,8 @@ def _parameter_node(optic, key):
     declared = optic._declared(key).unit
     if parameter.unit != declared:
         raise CalibrationFileError(f"{label} is in {parameter.unit}, allowed is {declared}")
-    node = {"value": _stored(parameter.value, label)}
+    # astropy gives the value of an array of one as a number
+    node = {"value": _stored(np.reshape(parameter.value, parameter.shape), label)}
     if declared is not None:
         node["unit"] = declared.to_string()
     return node | {"fixed": bool(parameter.fixed), "bounds": _bounds(parameter)}

@@ -57,7 +57,32 @@ def rotation_generator(matrix):
     return out
 
 
-class Optic(FittableModel):
+class _KeywordOnly(type(FittableModel)):
+    """Keeps astropy from giving each optic an ``__init__`` with positional parameters."""
+
+    def __init__(cls, name, bases, members, **kwargs):
+        super().__init__(name, bases, {"__init__": cls.__init__} | members, **kwargs)
+        cls.__signature__ = inspect.Signature(
+            [
+                inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default)
+                for key, default in cls._keywords().items()
+            ]
+        )
+
+    def _keywords(cls):
+        """Return every keyword that the optic takes, with its default."""
+        found = {}
+        for key in (*cls.param_names[1:], "theta"):
+            parameter = inspect.getattr_static(cls, key)
+            unit = parameter.unit
+            found[key] = parameter.default if unit is None else parameter.default * unit
+        for base in cls.__mro__:
+            if isinstance(base, _KeywordOnly):
+                found |= getattr(base.__init__, "__kwdefaults__", None) or {}
+        return found
+
+
+class Optic(FittableModel, metaclass=_KeywordOnly):
     """
     Base of all optics: light in, light out, with a Mueller matrix.
 

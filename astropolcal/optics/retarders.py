@@ -234,11 +234,17 @@ def _functions(x):
     safe = np.where(small, 1.0, x)
     x2, safe2 = x * x, safe * safe
     sine, cosine = np.sin(safe), np.cos(safe)
-    sinc = np.where(small, _series(x2, 1, 6, 20, 42, 72), sine / safe)
-    versine = np.where(small, _series(x2, 2, 12, 30, 56, 90), 2 * np.sin(safe / 2) ** 2 / safe2)
-    sinc_slope = np.where(small, -_series(x2, 3, 10, 28, 54, 88), (cosine - sine / safe) / safe2)
+    sinc = np.where(small, _series(x2, 1, 6, 20, 42, 72, 110), sine / safe)
+    versine = np.where(
+        small, _series(x2, 2, 12, 30, 56, 90, 132), 2 * np.sin(safe / 2) ** 2 / safe2
+    )
+    sinc_slope = np.where(
+        small, -_series(x2, 3, 10, 28, 54, 88, 130), (cosine - sine / safe) / safe2
+    )
     versine_slope = np.where(
-        small, -_series(x2, 12, 15, 112 / 3, 67.5, 105.6), (sine / safe - 2 * versine) / safe2
+        small,
+        -_series(x2, 12, 15, 112 / 3, 67.5, 105.6, 455 / 3),
+        (sine / safe - 2 * versine) / safe2,
     )
     return sinc, versine, sinc_slope, versine_slope
 

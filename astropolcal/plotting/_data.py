@@ -5,8 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from astropolcal.exceptions import ParameterError, WavelengthRangeError
-from astropolcal.plotting._style import clusters, degrees, nanometres
+from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
+from astropolcal.plotting._style import (
+    MINUS,
+    clusters,
+    degrees,
+    nanometres,
+)
 from astropolcal.propagation import Propagator
 
 # angles (deg) that differ by less are the same setting of a stage
@@ -36,6 +41,8 @@ class DataGrid:
         measurement = calibration.measurement
         dataset = check_dataset(calibration, dataset)
         self.part = measurement.datasets[dataset]
+        if not self.part.n_data:
+            raise ObservationError(f"{self.part.observations.name}: no datum is left to draw")
         self.observable = measurement.observable
         self.wavelength = nanometres(self.part.observations.wavelength)
         self.observed = self._grid(self.part.observed)
@@ -83,7 +90,7 @@ class DataGrid:
     def _one_series(self, angle, member):
         middle = np.median(angle[:, member], axis=1)
         return Series(
-            label=" − ".join(degrees(value) for value in middle),
+            label=f" {MINUS} ".join(degrees(value) for value in middle),
             data=np.flatnonzero(member),
             positions=self._steady(member),
         )
@@ -118,13 +125,15 @@ class DataGrid:
     # ---- wavelengths ---------------------------------------------------------------
 
     def spread_bins(self, count):
-        """Return bins with data, spread over the range without its very ends."""
+        """Return bins with data, spread over the range."""
         usable = np.flatnonzero(np.isfinite(self.observed).any(axis=1))
         usable = usable[np.argsort(self.wavelength[usable])]
         if len(usable) <= count:
             return usable
-        inner = np.linspace(0, len(usable) - 1, count + 2)[1:-1]
-        return usable[np.unique(np.round(inner).astype(int))]
+        # few wavelengths leave nothing between them to be spread over
+        ends = 1 if len(usable) > 2 * count else 0
+        places = np.linspace(0, len(usable) - 1, count + 2 * ends)[ends : ends + count]
+        return usable[np.round(places).astype(int)]
 
     def nearest_bins(self, wavelengths):
         """Return the bins nearest to wavelengths, each once."""

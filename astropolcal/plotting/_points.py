@@ -4,14 +4,20 @@
 import astropy.units as u
 import numpy as np
 
-from astropolcal.plotting._style import BLACK, GREY, legend_outside, nanometres
+from astropolcal.plotting._style import (
+    BLACK,
+    GREY,
+    SIGMA,
+    legend_outside,
+    nanometres,
+)
 
-_DETERMINED = "fitted, with 1σ error"
+_DETERMINED = f"fitted, with 1{SIGMA} error"
 _ALONE = "hollow: not determined alone, so no error"
 _BOUND = "boxed: at a bound, so no error"
 _FIXED = "fixed"
-_STAGE = "fitted per wavelength (first step of two)"
-_LAW = "law fitted to all wavelengths, with 1σ band"
+_STAGE = "fitted per wavelength (first step of two), modulo 360°"
+_LAW = f"law fitted to all wavelengths, with 1{SIGMA} band"
 _LAW_ALONE = "law fitted to all wavelengths (no error: not determined alone)"
 _ORDER = (_DETERMINED, _ALONE, _BOUND, _LAW, _LAW_ALONE, _STAGE)
 _FINE = 201
@@ -135,6 +141,8 @@ def _draw_stage(axes, calibration, leaf):
         value = stage["parameters"].get(f"{leaf.name}.retardance")
         if value is not None and np.size(value) == lam.size:
             value = u.Quantity(value, u.deg).value
+            # a turn more or less is the same retarder: draw the one near the law
+            value = value - 360 * np.round((value - _retardance(leaf, lam)) / 360)
             axes.plot(lam, value, "o", color=GREY, label=_STAGE)
             return
 
@@ -170,7 +178,9 @@ def legend_of(figure, axes, calibration):
     free = len(calibration.identifiability.directions)
     if _ALONE in labels and free:
         parameters = "combination of parameters" if free == 1 else "combinations of parameters"
-        handles[labels.index(_ALONE)].set_label(f"{_ALONE} (the data leave {free} {parameters} open)")
+        handles[labels.index(_ALONE)].set_label(
+            f"{_ALONE} (the data leave {free} {parameters} open)"
+        )
     return legend_outside(figure, handles)
 
 

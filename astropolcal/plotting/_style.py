@@ -6,13 +6,19 @@ from itertools import cycle, islice
 import astropy.units as u
 import numpy as np
 
+from astropolcal.exceptions import ParameterError
+
 # Okabe & Ito (2008), distinct for all kinds of colour vision; yellow is too pale for lines
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
-COLORS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)
-# one more than colours: the pairs repeat only after 56 series
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+WINE = "#882255"  # the eighth, from P. Tol's "muted" scheme
+COLORS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, WINE)
+# one more than colours: the pairs repeat only after 72 series
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "h")
 GREY = "0.45"
+MINUS, SIGMA = "\N{MINUS SIGN}", "\N{GREEK SMALL LETTER SIGMA}"
+# more names than this do not fit into a title
+_MAX_NAMES = 2
 
 _SETTINGS = {
     "font.size": 11,
@@ -63,7 +69,7 @@ def looks(count):
 def heading(figure, calibration, what, names):
     """Title a figure with what it shows, of what, and whether the fit is to be trusted."""
     state = "" if calibration.converged else "  (FIT NOT CONVERGED)"
-    of = ", ".join(names)
+    of = ", ".join(names) if len(names) <= _MAX_NAMES else f"{len(names)} datasets"
     instrument = f"{calibration.instrument}: " if calibration.instrument else ""
     figure.suptitle(f"{what}{state}\n{instrument}{of}")
 
@@ -74,8 +80,11 @@ def legend_outside(figure, handles, *, place="outside lower center", title=None,
 
 
 def nanometres(wavelength):
-    """Return wavelengths in nm as floats."""
-    return np.atleast_1d(u.Quantity(wavelength).to_value(u.nm))
+    """Return wavelengths in nm as floats, shape (n_wavelengths,)."""
+    try:
+        return np.atleast_1d(u.Quantity(wavelength).to_value(u.nm))
+    except (TypeError, u.UnitConversionError):
+        raise ParameterError(f"wavelength = {wavelength!r} needs a unit such as nm") from None
 
 
 def wavelength_label(axes):

@@ -9,6 +9,7 @@ from astropolcal.plotting._style import (
     BLACK,
     BLUE,
     GREEN,
+    MINUS,
     VERMILLION,
     canvas,
     heading,
@@ -21,7 +22,11 @@ from astropolcal.plotting._style import (
 __all__ = ["plot_accuracy"]
 
 _CURVES = {
-    "s_res": (VERMILLION, "o", "s_res = √(Σr²/(n − k)): scatter of one datum about the model"),
+    "s_res": (
+        VERMILLION,
+        "o",
+        f"s_res = √(Σr²/(n {MINUS} k)): scatter of one datum about the model",
+    ),
     "s_mean": (BLUE, "s", "s_mean = s_res/√n: scatter of the mean of n data (elsewhere s_rel)"),
     "s_cv": (GREEN, "^", "s_cv: rms error when predicting derotator angles left out of the fit"),
 }

@@ -5,7 +5,16 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.plotting._data import DataGrid
-from astropolcal.plotting._style import GREY, canvas, heading, legend_outside, looks, style
+from astropolcal.plotting._style import (
+    GREY,
+    MINUS,
+    SIGMA,
+    canvas,
+    heading,
+    legend_outside,
+    looks,
+    style,
+)
 
 __all__ = ["plot_double_differences"]
 
@@ -42,7 +51,9 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
     ParameterError, WavelengthRangeError
-        If there is no such dataset or wavelength, or a wavelength has no unit.
+        If there is no such dataset, or a wavelength outside its range.
+    ObservationError
+        If every datum of the dataset is masked.
 
     Notes
     -----
@@ -80,7 +91,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
                     pair[0].plot(fine, curve[i], color=look[0])
         _label(pairs, grid, columns)
         heading(figure, calibration, grid.quantity.capitalize(), [grid.part.observations.name])
-        _legend(figure, grid, series, bins)
+        _legend(figure, grid, series, bins, spread[bins])
     return figure
 
 
@@ -148,7 +159,7 @@ def _label(pairs, grid, columns):
             bottom.set_xlabel("derotator angle (°)")
         if i % columns == 0:
             top.set_ylabel(_two_lines(grid.quantity))
-            bottom.set_ylabel("obs. − model\n(%)")
+            bottom.set_ylabel(f"obs. {MINUS} model\n(%)")
         else:
             top.tick_params(labelleft=False)
             bottom.tick_params(labelleft=False)
@@ -161,7 +172,7 @@ def _two_lines(words):
     return f"{first}\n{rest}" if rest else words
 
 
-def _legend(figure, grid, series, bins):
+def _legend(figure, grid, series, bins, s_res):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -171,14 +182,15 @@ def _legend(figure, grid, series, bins):
         for one, (color, marker) in zip(series, looks(len(series)), strict=True)
     ]
     bars = np.isfinite(grid.sigma[bins]).any()
-    seen = "observed, with 1σ errors" if bars else "observed (no errors given)"
+    seen = f"observed, with 1{SIGMA} errors" if bars else "observed (no errors given)"
     handles.append(Line2D([], [], color=GREY, marker="o", linestyle="", label=seen))
     if curves:
         handles.append(Line2D([], [], color=GREY, label="model"))
     if any(one.positions is None for one in series):
-        handles.append(Line2D([], [], color=GREY, marker="x", linestyle="", label="model"))
-    handles.append(Patch(color="0.92", label="± s_res"))
-    frames = "plus − minus frame" if grid.part.frames.shape[1] == 2 else "of the frame"
+        handles.append(Line2D([], [], color=GREY, marker="x", linestyle="", label="model at data"))
+    if np.isfinite(s_res).any():
+        handles.append(Patch(color="0.92", label="± s_res"))
+    frames = f"plus {MINUS} minus frame" if grid.part.frames.shape[1] == 2 else "of the frame"
     legend_outside(
         figure,
         handles,

@@ -4,7 +4,15 @@
 import numpy as np
 
 from astropolcal.plotting._data import SAME_ANGLE, DataGrid
-from astropolcal.plotting._style import BLUE, canvas, clusters, degrees, heading, style
+from astropolcal.plotting._style import (
+    BLUE,
+    MINUS,
+    canvas,
+    clusters,
+    degrees,
+    heading,
+    style,
+)
 
 __all__ = ["plot_residuals"]
 
@@ -36,6 +44,8 @@ def plot_residuals(calibration, *, figure=None):
     ------
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
+    ObservationError
+        If every datum of a dataset is masked.
 
     Examples
     --------
@@ -69,7 +79,7 @@ def plot_residuals(calibration, *, figure=None):
         bar = figure.colorbar(
             drawn, ax=figure.axes, extend="both" if clipped else "neither", shrink=0.8, aspect=35
         )
-        bar.set_label("observed − model (%); grey: masked")
+        bar.set_label(f"observed {MINUS} model (%); grey: masked")
         heading(
             figure,
             calibration,

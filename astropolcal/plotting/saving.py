@@ -3,7 +3,12 @@
 
 from pathlib import Path
 
-from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ChainError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    CalibrationFileError,
+    ChainError,
+    ObservationError,
+)
 from astropolcal.files import atomic_path
 from astropolcal.plotting.accuracy import plot_accuracy
 from astropolcal.plotting.differences import plot_double_differences
@@ -68,14 +73,12 @@ def save_all(calibration, folder):
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise AstropolcalError(
-            f"{folder}: cannot be created: {error.strerror or error}"
-        ) from error
+        raise AstropolcalError(f"{folder}: cannot be created: {error.strerror or error}") from error
     paths = []
     for name, draw in _figures(calibration):
         try:
             figure = draw()
-        except (ChainError, CalibrationFileError):
+        except (ChainError, CalibrationFileError, ObservationError):
             continue
         paths.append(_save(figure, folder / f"{name}.png"))
     return paths

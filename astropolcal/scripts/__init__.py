@@ -1,4 +1,4 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""The ``astropolcal`` command."""
+"""The ``astropolcal`` command; its entry point is `astropolcal.scripts.main.main`."""
 
-__all__ = ["calibrate", "common", "info", "main", "simulate"]
+__all__ = []

@@ -7,6 +7,7 @@ A new optic needs one entry in ``CASES``; the message of
 """
 
 import importlib
+import inspect
 import pkgutil
 from dataclasses import dataclass, field
 
@@ -85,6 +86,10 @@ class Case:
     smooth: st.SearchStrategy | None = None
     settings: dict = field(default_factory=dict)
 
+    @property
+    def differentiable(self):
+        return self.values if self.smooth is None else self.smooth
+
 
 def case(optic, expected, smooth=None, settings=None, **values):
     strategy = st.fixed_dictionaries(values)
@@ -121,9 +126,7 @@ CASES = {
         circular=DEGREES,
     ),
     "LinearPolarizer": case(optics.LinearPolarizer, mueller.linear_polarizer),
-    "LinearRetarder": case(
-        optics.LinearRetarder, mueller.linear_retarder, retardance=DEGREES
-    ),
+    "LinearRetarder": case(optics.LinearRetarder, mueller.linear_retarder, retardance=DEGREES),
     "MuellerElement": Case(
         optics.MuellerElement,
         mueller_elements(),
@@ -180,7 +183,7 @@ def draw_per_wavelength(data, strategy):
 
 
 def draw_smooth(data, label):
-    strategy = CASES[label].smooth or CASES[label].values
+    strategy = CASES[label].differentiable
     if data.draw(st.booleans()):
         return draw_per_wavelength(data, strategy)
     return data.draw(strategy)
@@ -204,7 +207,7 @@ def test_every_optic_has_a_case():
 def test_case_covers_every_parameter(label, data):
     own = set(CASES[label].optic().own_names)
     assert set(data.draw(CASES[label].values)) == own, f"{label}: {HOW}"
-    assert set(data.draw(CASES[label].smooth or CASES[label].values)) == own, f"{label}: {HOW}"
+    assert set(data.draw(CASES[label].differentiable)) == own, f"{label}: {HOW}"
 
 
 def _defined_optics():
@@ -238,7 +241,7 @@ def test_parameters_are_declared_in_full(name):
     assert optic.param_names[0] == "theta", "theta comes first, as the derivatives do"
     for key in optic.param_names:
         parameter = getattr(optic, key)
-        assert parameter.description, f"{name}.{key}: give the Parameter a description"
+        assert parameter.__doc__, f"{name}.{key}: give the Parameter a description"
         assert parameter.bounds != (None, None) or parameter.fixed, (
             f"{name}.{key}: give the Parameter bounds, or fixed=True where it is known"
         )
@@ -380,7 +383,7 @@ def test_derivatives_against_differences(label, data, angle):
 @given(data=st.data())
 @settings(max_examples=8)
 def test_derivative_to_theta_may_vary_with_wavelength(label, data):
-    values = data.draw(CASES[label].smooth or CASES[label].values)
+    values = data.draw(CASES[label].differentiable)
     optic = build(label, values, theta=[-20, 3, 50] * u.deg)
     found = optic.mueller_derivatives(WAVELENGTH)["theta"].to_value(1 / u.rad)
     np.testing.assert_allclose(found, differences(optic, "theta"), rtol=0, atol=1e-7)
@@ -404,7 +407,7 @@ def test_any_unit_gives_the_same_optic(label, data, angle):
         other = CASES[label].optic(**others, **CASES[label].settings)
         assert [getattr(other, k).unit for k in values] == [getattr(optic, k).unit for k in values]
         np.testing.assert_allclose(
-            other.mueller(wavelength), optic.mueller(WAVELENGTH), rtol=0, atol=1e-12
+            other.mueller(wavelength), optic.mueller(WAVELENGTH), rtol=0, atol=1e-11
         )
 
 
@@ -465,6 +468,7 @@ def test_value_of_other_number_of_wavelengths_is_refused(label):
 @every
 def test_unknown_and_positional_arguments_are_refused(label):
     cls = CASES[label].optic
+    assert {"theta", "mount", "name", *cls().own_names} <= set(inspect.signature(cls).parameters)
     with pytest.raises(ParameterError, match=r"parameter 'retardence'"):
         cls(retardence=1 * u.deg)
     with pytest.raises(ParameterError, match=r"by keyword: \('theta'"):

@@ -14,8 +14,8 @@ from astropy.table import QTable
 
 import astropolcal
 from astropolcal import Calibration, Observations, instruments
+from astropolcal.scripts._simulate import EXAMPLE
 from astropolcal.scripts.main import build_parser, main
-from astropolcal.scripts.simulate import EXAMPLE
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 EXAMPLE_FILE = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"

@@ -1,9 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal simulate``: beam fluxes of an instrument, with noise."""
 
-from astropolcal.scripts.common import check_outputs, edit_chains, write_json
-
-__all__ = ["EXAMPLE", "add_parser", "run"]
+from astropolcal.scripts._common import check_outputs, edit_chains, write_json
 
 #: What the packaged example was made with.
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}

@@ -3,9 +3,7 @@
 
 from pathlib import Path
 
-from astropolcal.scripts.common import write_json
-
-__all__ = ["add_parser", "run"]
+from astropolcal.scripts._common import write_json
 
 
 def add_parser(commands):

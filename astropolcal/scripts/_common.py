@@ -13,8 +13,6 @@ from astropolcal.chain import find_optic, leaves, remove_optic
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import atomic_path
 
-__all__ = ["check_outputs", "edit_chains", "read_datasets", "write_json"]
-
 
 def check_outputs(*paths):
     """Raise before any work is done if an output's folder is missing or is a file."""

@@ -3,9 +3,7 @@
 
 from pathlib import Path
 
-from astropolcal.scripts.common import check_outputs, edit_chains, read_datasets, write_json
-
-__all__ = ["add_parser", "run"]
+from astropolcal.scripts._common import check_outputs, edit_chains, read_datasets, write_json
 
 _EPILOG = """\
 examples:

@@ -1,0 +1,68 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""A CHARIS-like truth, away from all bounds, and what it measures."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import instruments
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+CHARIS = instruments.get("charis")
+DEROTATOR = np.linspace(45, 132.5, 8) * u.deg
+
+
+def charis_chain(kind="linear", *, fixed=True, wavelength=None, **options):
+    """The chain where a fit starts; the two gauge angles fixed or free."""
+    chain = CHARIS.chain(derotator=kind, wavelength=wavelength, **options)
+    for name in ("hwp", "derotator"):
+        chain[name].theta.fixed = fixed
+    return chain
+
+
+def charis_truth(chain):
+    """A copy of the chain with values like those of the fit to Dataset 3."""
+    truth = chain.copy()
+    n = truth["wollaston"].efficiency.size
+    truth["wollaston"].efficiency = np.linspace(0.96, 0.98, n)
+    truth["hwp"].w_sio2, truth["hwp"].w_mgf2 = 1.6542 * u.mm, 1.2919 * u.mm
+    if "calibration_polarizer" in truth.submodel_names:
+        truth["calibration_polarizer"].theta = 90.4 * u.deg
+    for name, angle in (("hwp", -0.3), ("derotator", 0.4)):
+        if not truth[name].theta.fixed:
+            truth[name].theta = angle * u.deg
+    if "diagonal" in truth["derotator"].param_names:
+        truth["derotator"].diagonal = np.linspace(-5, -2, n) * u.deg
+        truth["derotator"].circular = np.linspace(3, 5, n) * u.deg
+    return truth
+
+
+def charis_frames(derotator=DEROTATOR):
+    return half_wave_plate_cycles(derotator=derotator)
+
+
+def observe(truth, frames=None, wavelength=None, **options):
+    wavelength = CHARIS.wavelength if wavelength is None else wavelength
+    return simulate(truth, wavelength, charis_frames() if frames is None else frames, **options)
+
+
+@pytest.fixture(scope="session")
+def make():
+    """The helpers of this file, for tests."""
+    from types import SimpleNamespace
+
+    return SimpleNamespace(
+        charis=CHARIS, chain=charis_chain, truth=charis_truth, frames=charis_frames, observe=observe
+    )
+
+
+@pytest.fixture(scope="session")
+def charis_data(shared_data):
+    """Read a dataset of real measurements by a part of its name."""
+    from astropolcal.observations import Observations
+
+    def read(name):
+        (path,) = (shared_data / "data" / "charis").glob(f"{name}*.ecsv")
+        return Observations.read(path)
+
+    return read

@@ -1,0 +1,394 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Calibrations of simulated data: they arrive, say how well, and object to nonsense."""
+
+import json
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, TRFLSQFitter
+
+from astropolcal.calibration import Calibration, calibrate, to_dict
+from astropolcal.chain import leaves
+from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError, FitError
+from astropolcal.measurement import Measurement, Tie
+from astropolcal.observations import OBSERVABLES, NormalizedSingleDifference
+
+FEW = [1.2, 1.6, 2.0, 2.2] * u.um
+
+
+def true_vector(cal, truth):
+    """Truth in the order of the fitted vector, canonical units."""
+    return cal.measurement.free.__class__([truth], len(cal.wavelength)).start()
+
+
+@pytest.fixture(scope="module")
+def few(make):
+    """Four wavelengths: chain to start from, truth, and noisy data."""
+    chain = make.chain(wavelength=FEW)
+    truth = make.truth(chain)
+    meta = {"source": "polarized", "instrument": "charis"}
+    return chain, truth, make.observe(truth, wavelength=FEW, seed=11, meta=meta, name="few")
+
+
+@pytest.fixture(scope="module")
+def calibrated(few):
+    chain, _, data = few
+    return calibrate(chain, data, weights="errors", instrument="charis")
+
+
+# --- it arrives at the truth ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("observable", sorted(OBSERVABLES))
+@pytest.mark.parametrize("kind", ["linear", "elliptical"])
+def test_noiseless_data_give_back_the_truth(make, observable, kind):
+    chain = make.chain(kind, wavelength=FEW)
+    truth = make.truth(chain)
+    data = make.observe(truth, wavelength=FEW, noise=False)
+    cal = calibrate(chain, data, observable=observable, cross_validate=False)
+    assert cal.settings["observable"] == observable
+    np.testing.assert_allclose(cal.residuals, 0, atol=1e-7)
+    np.testing.assert_allclose(cal.measurement.vector(), true_vector(cal, truth), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("strategy", ["joint", "two-step"])
+def test_noisy_data_give_the_truth_within_errors(few, strategy):
+    chain, truth, data = few
+    cal = calibrate(chain, data, weights="errors", strategy=strategy, cross_validate=False)
+    assert cal.converged
+    stds = cal.covariance.stds * cal.measurement.free.factors()
+    pulls = (cal.measurement.vector() - true_vector(cal, truth)) / stds
+    # the two-step procedure is not the least-squares minimum, but within its neighbourhood
+    assert np.abs(pulls).max() < {"joint": 4, "two-step": 6}[strategy]
+    chi2 = np.sum((cal.residuals / cal.measurement.sigma) ** 2) / (cal.measurement.n_data - len(pulls))
+    assert chi2 == pytest.approx(1.0, abs={"joint": 0.5, "two-step": 1.0}[strategy])
+
+
+def test_unknown_errors_are_scaled_to_the_residuals(few):
+    """Without weights the covariance is (J J^T)^-1 times sum r^2 / (n - rank)."""
+    chain, _, data = few
+    cal = calibrate(chain, data, cross_validate=False)
+    slopes = cal.measurement.jacobian(cal.measurement.vector())
+    variance = np.sum(cal.residuals**2) / (cal.measurement.n_data - 11)
+    stds = np.sqrt(np.diag(np.linalg.inv(slopes @ slopes.T)) * variance)
+    expected = stds / cal.measurement.free.factors()
+    np.testing.assert_allclose(cal.covariance.stds, expected, rtol=1e-5)
+
+
+def test_known_errors_are_taken_as_they_are(few):
+    """Twice the errors of the table, twice those of the parameters, the same values."""
+    from astropolcal.observations import Observations
+
+    chain, _, data = few
+    table = data.to_table()
+    for beam in ("right", "left"):
+        table[f"flux_{beam}_err"] *= 2
+    pair = (data, Observations.from_table(table))
+    one, two = (calibrate(chain, d, weights="errors", cross_validate=False) for d in pair)
+    np.testing.assert_allclose(two.covariance.stds, 2 * one.covariance.stds, rtol=1e-3)
+
+
+@pytest.mark.parametrize("fitter", [TRFLSQFitter, LevMarLSQFitter, DogBoxLSQFitter])
+def test_any_fitter_reaches_the_same_minimum(few, calibrated, fitter):
+    chain, _, data = few
+    cal = calibrate(chain, data, weights="errors", fitter=fitter(), cross_validate=False)
+    assert cal.settings["fitter"] == fitter.__name__
+    stds = cal.covariance.stds * cal.measurement.free.factors()
+    shift = (cal.measurement.vector() - calibrated.measurement.vector()) / stds
+    assert np.abs(shift).max() < 0.02
+
+
+def test_chain_given_is_not_changed(few):
+    chain, _, data = few
+    before = [np.copy(v) for leaf in leaves(chain) for v in leaf.canonical_values()]
+    calibrate(chain, data, cross_validate=False)
+    after = [v for leaf in leaves(chain) for v in leaf.canonical_values()]
+    for old, new in zip(before, after, strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+def test_result_has_units_bounds_and_fixed_flags(few, calibrated):
+    chain, _, _ = few
+    assert calibrated.chain["hwp"].w_sio2.unit == u.mm
+    assert calibrated.chain["hwp"].theta.fixed
+    for old, new in zip(leaves(chain), leaves(calibrated.chain), strict=True):
+        for key in old.param_names:
+            assert getattr(old, key).bounds == getattr(new, key).bounds
+
+
+def test_observable_may_be_an_object(few):
+    chain, _, data = few
+    cal = calibrate(chain, data, observable=NormalizedSingleDifference(), cross_validate=False)
+    assert cal.fit["n_data"] == data.n_frames * len(FEW)
+
+
+def test_masked_cells_are_left_out(few):
+    chain, truth, data = few
+    mask = np.zeros((data.n_frames, len(FEW)), dtype=bool)
+    mask[3, 1] = mask[10] = True
+    cal = calibrate(chain, data.with_mask(mask, "test"), weights="errors", cross_validate=False)
+    assert cal.datasets[0].n_masked == 1 + len(FEW)
+    assert cal.accuracy["n"].tolist() == [31, 30, 31, 31]
+    stds = cal.covariance.stds * cal.measurement.free.factors()
+    assert np.abs((cal.measurement.vector() - true_vector(cal, truth)) / stds).max() < 4
+
+
+def test_single_wavelength_finds_its_branch(make):
+    """With one bin every parameter belongs to it, so the search must look there too."""
+    lam = [1600] * u.nm
+    chain = make.chain(wavelength=lam)
+    for key in ("w_sio2", "w_mgf2"):
+        getattr(chain["hwp"], key).fixed = True
+    truth = chain.copy()
+    truth["derotator"].retardance = [150.0] * u.deg
+    data = make.observe(truth, wavelength=lam, seed=2)
+    chain["derotator"].retardance = [-20.0] * u.deg
+    lost, found = (
+        calibrate(chain, data, weights="errors", search=s, cross_validate=False) for s in (False, True)
+    )
+    chi2 = [np.sum((c.residuals / c.measurement.sigma) ** 2) for c in (lost, found)]
+    assert chi2[0] > 1000
+    assert chi2[1] < 80  # 32 data, 3 parameters
+
+
+# --- ties and several datasets ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("strategy", ["joint", "two-step"])
+def test_ties_are_kept(few, strategy):
+    chain, _, data = few
+    ties = {"derotator.theta": Tie("calibration_polarizer.theta", 0.5, offset=-45 * u.deg)}
+    cal = calibrate(chain, data, ties=ties, strategy=strategy, cross_validate=False)
+    polarizer = cal.chain["calibration_polarizer"].theta.value
+    assert cal.chain["derotator"].theta.value == pytest.approx(0.5 * polarizer - 45)
+    known = cal.parameter_values()["derotator.theta"]
+    assert known["tied"] == "calibration_polarizer.theta"
+    assert "derotator.theta" not in cal.covariance.names
+    assert not any("derotator.theta" in row for row in cal.parameters["name"])
+
+
+def test_two_datasets_share_optics_and_halve_the_variance(make):
+    """The same frames with and without the beam switcher: errors fall by sqrt(2)."""
+    pair = [make.chain(wavelength=FEW, optics_in=o) for o in ([], ["nbs"])]
+    truths = [make.truth(c) for c in pair]
+    data = [
+        make.observe(t, wavelength=FEW, seed=i, name=f"set {i}") for i, t in enumerate(truths)
+    ]
+    both = calibrate(pair, data, weights="errors", cross_validate=False)
+    alone = calibrate(pair[0], data[0], weights="errors", cross_validate=False)
+    assert [record.name for record in both.datasets] == ["set 0", "set 1"]
+    assert both.covariance.names == alone.covariance.names
+    for name in ("hwp.w_sio2", "calibration_polarizer.theta", "wollaston.efficiency[2]"):
+        ratio = both.covariance.std(name) / alone.covariance.std(name)
+        assert float(ratio) == pytest.approx(np.sqrt(0.5), abs=0.02), name
+    values = [chain["derotator"].retardance.value for chain in both.chains]
+    np.testing.assert_array_equal(values[0], values[1])
+    stds = both.covariance.stds * both.measurement.free.factors()
+    assert np.abs((both.measurement.vector() - true_vector(both, truths[0])) / stds).max() < 4
+
+
+def test_polarized_and_unpolarized_data_together(make):
+    pair = [make.chain(wavelength=FEW, source=s) for s in ("polarized", "unpolarized")]
+    truths = [make.truth(c) for c in pair]
+    truths[1]["fold_mirror"].diattenuation = [0.012, 0.010, 0.009, 0.008]
+    data = [make.observe(t, wavelength=FEW, seed=i) for i, t in enumerate(truths)]
+    cal = calibrate(pair, data, weights="errors", cross_validate=False)
+    known = cal.parameter_values()["fold_mirror.diattenuation"]
+    assert known["identifiable"].all()
+    pulls = (known["value"] - truths[1]["fold_mirror"].diattenuation.value) / known["std"]
+    assert np.abs(pulls).max() < 4
+
+
+# --- two steps -----------------------------------------------------------------------------
+
+
+def test_two_step_records_its_stages(few):
+    chain, truth, data = few
+    cal = calibrate(chain, data, strategy="two-step", cross_validate=False)
+    titles = [stage["title"] for stage in cal.stages]
+    assert titles == [
+        "per wavelength, misalignments held",
+        "global",
+        "per wavelength, global parameters held",
+    ]
+    first, second, third = (stage["parameters"] for stage in cal.stages)
+    assert sorted(first) == ["derotator.retardance", "hwp.retardance", "wollaston.efficiency"]
+    assert sorted(second) == ["calibration_polarizer.theta", "hwp.w_mgf2", "hwp.w_sio2"]
+    assert sorted(third) == ["derotator.retardance", "wollaston.efficiency"]
+    # the plate is replaced by one retardance a wavelength, near what its law gives
+    law = truth["hwp"].retardance(FEW).to_value(u.deg)
+    np.testing.assert_allclose(first["hwp.retardance"].to_value(u.deg), law, atol=3)
+    assert u.isclose(second["hwp.w_sio2"], cal.chain["hwp"].w_sio2.quantity)
+    assert cal.stages[2]["residual_rms"] <= cal.stages[1]["residual_rms"] * (1 + 1e-9)
+
+
+def test_joint_fit_is_at_least_as_good_as_two_steps(few, calibrated):
+    chain, _, data = few
+    two = calibrate(chain, data, weights="errors", strategy="two-step", cross_validate=False)
+    sigma = two.measurement.sigma
+    chi2 = [np.sum((c.residuals / sigma) ** 2) for c in (calibrated, two)]
+    assert chi2[0] <= chi2[1] * (1 + 1e-9)
+
+
+# --- objections ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"strategy": "three-step"}, "strategy = 'three-step'; allowed are joint, two-step"),
+        ({"weights": "none"}, "weights = 'none'; allowed are None and 'errors'"),
+    ],
+)
+def test_unknown_choice_is_refused(few, options, words):
+    chain, _, data = few
+    with pytest.raises(FitError, match=words):
+        calibrate(chain, data, **options)
+
+
+def test_weights_without_errors_are_refused(few):
+    from astropolcal.observations import Observations
+
+    chain, _, data = few
+    table = data.to_table()
+    table.remove_columns(["flux_right_err", "flux_left_err"])
+    bare = Observations.from_table(table)
+    with pytest.raises(FitError, match="128 of 128 data have no error"):
+        calibrate(chain, bare, weights="errors")
+    assert calibrate(chain, bare, cross_validate=False).converged
+
+
+def test_nothing_to_fit_is_refused(few):
+    chain, _, data = few
+    fixed = chain.copy()
+    for leaf in leaves(fixed):
+        for key in leaf.param_names:
+            getattr(leaf, key).fixed = True
+    with pytest.raises(FitError, match="nothing to fit"):
+        calibrate(fixed, data)
+
+
+def test_more_parameters_than_data_are_refused(make):
+    chain = make.chain("elliptical", fixed=False, wavelength=FEW)
+    data = make.observe(chain, make.frames([45] * u.deg), FEW, seed=1)
+    with pytest.raises(FitError, match=r"21 free parameters but only 16 data"):
+        calibrate(chain, data)
+
+
+def test_fit_that_does_not_arrive_warns(few, monkeypatch):
+    from astropolcal.calibration import fit
+
+    chain, _, data = few
+    monkeypatch.setattr(fit, "_MAX_EVALUATIONS", 1)
+    with pytest.warns(AstropolcalWarning, match="did not converge"):
+        cal = calibrate(chain, data, search=False, cross_validate=False)
+    assert not cal.converged
+    assert "NOT CONVERGED" in cal.summary()
+
+
+def test_fitter_that_breaks_is_a_fit_error(few):
+    class Broken(TRFLSQFitter):
+        def __call__(self, *args, **kwargs):
+            raise ValueError("x0 is infeasible")
+
+    chain, _, data = few
+    with pytest.raises(FitError, match="Broken failed: x0 is infeasible"):
+        calibrate(chain, data, fitter=Broken())
+
+
+# --- the result ------------------------------------------------------------------------------
+
+
+def test_dictionary_follows_the_contract(calibrated):
+    result = to_dict(calibrated)
+    again = json.loads(json.dumps(result, allow_nan=False))
+    assert again == result
+    assert set(result) >= {
+        "instrument", "observable", "fitter", "seconds", "n_data", "n_free", "rank", "datasets",
+        "parameters", "null_directions",
+    }  # fmt: skip
+    assert result["instrument"] == "charis"
+    assert result["n_free"] == result["rank"] == 11
+    (dataset,) = result["datasets"]
+    assert set(dataset) >= {
+        "name", "source", "wavelength_nm", "n", "s_res_percent", "s_mean_percent", "s_cv_percent",
+    }  # fmt: skip
+    assert {len(dataset[key]) for key in ("wavelength_nm", "n", "s_res_percent")} == {4}
+    for name, entry in result["parameters"].items():
+        assert set(entry) >= {"value", "unit", "std", "fixed", "at_bound", "identifiable"}, name
+    assert result["parameters"]["hwp.w_sio2"]["unit"] == "mm"
+    assert len(result["parameters"]["derotator.retardance"]["value"]) == 4
+    assert result["parameters"]["wollaston.theta"]["std"] is None
+
+
+def test_dictionary_of_a_two_step_fit_is_json_too(few):
+    chain, _, data = few
+    cal = calibrate(chain, data, strategy="two-step", cross_validate=False)
+    result = json.loads(json.dumps(cal.to_dict(), allow_nan=False))
+    assert len(result["stages"]) == 3
+    assert result["datasets"][0]["s_cv_percent"] == [None] * 4
+
+
+def test_undetermined_parameters_are_null_in_json(make):
+    chain = make.chain("elliptical", fixed=False, wavelength=FEW)
+    cal = calibrate(chain, make.observe(make.truth(chain), wavelength=FEW, seed=3))
+    result = json.loads(json.dumps(cal.to_dict(), allow_nan=False))
+    assert result["rank"] == result["n_free"] - len(result["null_directions"])
+    assert result["parameters"]["hwp.theta"]["std"] is None
+    assert result["parameters"]["hwp.theta"]["identifiable"] is False
+    for direction in result["null_directions"]:
+        assert set(direction) == {"words", "parameters"}
+
+
+def test_parameter_table_has_a_row_a_free_value(calibrated):
+    table = calibrated.parameters
+    assert len(table) == len(calibrated.covariance)
+    assert list(table["name"]) == calibrated.covariance.names
+    np.testing.assert_allclose(table["std"], calibrated.covariance.stds)
+    row = table[list(table["name"]).index("hwp.w_sio2")]
+    assert row["unit"] == "mm"
+    assert row["value"] == pytest.approx(1.6542, abs=0.001)
+
+
+def test_fixed_parameters_have_no_error(calibrated):
+    known = calibrated.parameter_values()["hwp.theta"]
+    assert known["fixed"]
+    assert np.isnan(known["std"])
+    assert not known["identifiable"]
+
+
+def test_record_of_the_data(few, calibrated):
+    _, _, data = few
+    (record,) = calibrated.datasets
+    assert (record.name, record.source, record.n_frames, record.n_masked) == ("few", "polarized", 64, 0)
+    assert record.content_hash == data.content_hash
+    assert calibrated.provenance["astropolcal"]
+    assert calibrated.instrument == "charis"
+
+
+def test_measurement_of_new_data_predicts_them(make, few, calibrated):
+    _, truth, _ = few
+    new = make.observe(truth, make.frames([50, 100] * u.deg), FEW, seed=12)
+    measurement = calibrated.measurement_of(new)
+    pulls = measurement.residuals() / measurement.sigma
+    assert isinstance(measurement, Measurement)
+    assert pulls.std() == pytest.approx(1.0, abs=0.35)
+
+
+def test_residuals_need_data(few, calibrated):
+    import dataclasses
+
+    stored = dataclasses.replace(calibrated, measurement=None)
+    assert isinstance(stored, Calibration)
+    with pytest.raises(CalibrationFileError, match="holds no observations"):
+        _ = stored.residuals
+
+
+def test_words_name_what_matters(calibrated):
+    words = calibrated.summary()
+    assert "Calibration of charis from few" in words
+    assert "hwp.w_sio2" in words
+    assert "s_cv" in words
+    assert max(len(line) for line in words.splitlines()) <= 80
+    assert "11 free parameters, rank 11" in repr(calibrated)

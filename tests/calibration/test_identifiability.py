@@ -1,0 +1,256 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What data determine: analytic null directions, ranks, and honest errors.
+
+The gauge freedoms at one wavelength follow from the Mueller algebra: (i) the
+45 deg retardance and the derotator's misalignment, (ii) the circular
+retardance and a common rotation of polarizer and half-wave plate.
+"""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from astropolcal import optics
+from astropolcal.calibration import analyse, calibrate
+from astropolcal.calibration.identifiability import physical_scale
+from astropolcal.measurement import FreeParameters, Measurement
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+FRAMES = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)
+
+
+def finding_of(measurement, held=None):
+    vector = measurement.vector()
+    return analyse(measurement.free, measurement.jacobian(vector), held)
+
+
+def angles_chain(free=("polarizer", "wollaston")):
+    """Polarizer and Wollaston, whose angles the data see as a difference only."""
+    chain = (
+        optics.LinearPolarizer(theta=20 * u.deg, name="polarizer")
+        | optics.LinearRetarder(retardance=0 * u.deg, mount="hwp", name="hwp")
+        | optics.WollastonPrism(theta=3 * u.deg, efficiency=0.9, name="wollaston")
+    )
+    chain["hwp"].retardance.fixed = True
+    chain["wollaston"].efficiency.fixed = True
+    for name in free:
+        chain[name].theta.fixed = False
+    return chain
+
+
+# --- analytic cases -------------------------------------------------------------------------
+
+
+def test_common_rotation_of_polarizer_and_analyser_changes_nothing():
+    """Without a retarder only the difference of both angles counts: Malus's law."""
+    chain = angles_chain()
+    data = simulate(chain, 1.6 * u.um, FRAMES, noise=False)
+    measurement = Measurement(chain, data, observable="normalized_single_difference")
+    finding, covariance = finding_of(measurement)
+    assert finding.rank == 1
+    np.testing.assert_allclose(np.abs(finding.null_vectors), [[np.sqrt(0.5)] * 2], atol=1e-12)
+    assert not finding.identifiable.any()
+    assert np.isnan(covariance).all()
+    assert finding.directions[0]["words"].endswith("+1 deg")
+    assert finding.directions[0]["parameters"] == pytest.approx(
+        {"polarizer.theta": 1.0, "wollaston.theta": 1.0}
+    )
+
+
+def test_fixing_one_of_them_determines_the_other():
+    chain = angles_chain(free=("polarizer",))
+    data = simulate(chain, 1.6 * u.um, FRAMES, noise=False)
+    measurement = Measurement(chain, data, observable="normalized_single_difference")
+    finding, covariance = finding_of(measurement)
+    assert finding.rank == finding.n_free == 1
+    assert finding.identifiable.all()
+    assert not len(finding.directions)
+    slope = measurement.jacobian(measurement.vector())
+    assert covariance[0, 0] == pytest.approx(1 / np.sum(slope**2))
+
+
+def test_double_difference_does_not_see_a_plate_that_does_nothing():
+    chain = angles_chain()
+    data = simulate(chain, 1.6 * u.um, FRAMES, noise=False)
+    finding, _ = finding_of(Measurement(chain, data))
+    assert finding.rank == 0
+    assert {d["words"] for d in finding.directions} == {
+        "polarizer.theta changes no datum: it cannot be determined",
+        "wollaston.theta changes no datum: it cannot be determined",
+    }
+
+
+def test_one_wavelength_has_rank_six_of_eight(make):
+    """The count of the gauge freedoms at one wavelength, with the HWP retardance free."""
+    chain = make.chain("elliptical", fixed=False, wavelength=[1.6] * u.um)
+    train = chain.copy()
+    for key, value in (("horizontal", -95.0), ("diagonal", -3.0), ("circular", 4.0)):
+        setattr(train["derotator"], key, [value] * u.deg)
+    chain = (
+        train["calibration_polarizer"]
+        | optics.LinearRetarder(
+            retardance=-170 * u.deg, mount="hwp", name="hwp", fixed={"theta": False}
+        )
+        | train["derotator"]
+        | train["wollaston"]
+    )
+    data = simulate(chain, 1.6 * u.um, FRAMES, noise=False)
+    finding, _ = finding_of(Measurement(chain, data))
+    assert (finding.rank, finding.n_free) == (6, 8)
+
+
+def test_diagonal_retardance_is_a_misalignment_at_first_order():
+    """(i): turning a retarder d by a small angle a gives a 45 deg retardance 2 d a."""
+    chain = (
+        optics.LinearPolarizer(theta=90 * u.deg, name="polarizer")
+        | optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
+        | optics.EllipticalRetarder(
+            horizontal=100 * u.deg, mount="derotator", name="derotator", fixed={"theta": False}
+        )
+        | optics.WollastonPrism(efficiency=0.97, name="wollaston")
+    )
+    for parameter in (chain["hwp"].retardance, chain["derotator"].circular):
+        parameter.fixed = True
+    data = simulate(chain, 1.6 * u.um, FRAMES, noise=False)
+    finding, _ = finding_of(Measurement(chain, data))
+    (direction,) = finding.directions
+    moved = direction["parameters"]
+    assert set(moved) == {"derotator.theta", "derotator.diagonal"}
+    ratio = moved["derotator.diagonal"] / moved["derotator.theta"]
+    # T(-a) M T(a) turns the retardance vector by 2 a in the direction of -45 deg
+    assert abs(ratio) == pytest.approx(2 * np.deg2rad(100.0), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fixed", "rank", "n_free"),
+    [
+        ("elliptical", False, 91, 93),
+        ("elliptical", True, 91, 91),
+        ("linear", False, 49, 49),
+        ("linear", True, 47, 47),
+    ],
+)
+def test_rank_of_the_calibration_of_charis(make, kind, fixed, rank, n_free):
+    """93 parameters of the paper have two null directions; two fixed angles remove them."""
+    truth = make.truth(make.chain(kind, fixed=fixed))
+    finding, _ = finding_of(Measurement(truth, make.observe(truth, noise=False)))
+    assert (finding.rank, finding.n_free) == (rank, n_free)
+    assert len(finding.directions) == n_free - rank
+    if n_free > rank:
+        leads = {d["words"].split(" by ")[0] for d in finding.directions}
+        assert leads <= {"hwp.theta", "derotator.theta", "calibration_polarizer.theta"}
+        known = dict(zip(finding.names, finding.identifiable, strict=True))
+        assert known["hwp.w_sio2"]
+        assert known["wollaston.efficiency[3]"]
+        assert not known["derotator.circular[3]"]
+
+
+# --- the null directions are true ------------------------------------------------------------
+
+
+@settings(max_examples=20)
+@given(weights=st.tuples(st.floats(-1, 1), st.floats(-1, 1)).filter(lambda w: max(map(abs, w)) > 0.1))
+def test_step_along_the_null_directions_leaves_the_data_unchanged(weights, make):
+    """To second order: half the step leaves a quarter of the change."""
+    truth = make.truth(make.chain("elliptical", fixed=False))
+    measurement = Measurement(truth, make.observe(truth, noise=False))
+    finding, _ = finding_of(measurement)
+    vector = measurement.vector()
+    direction = np.array(weights) @ finding.null_vectors * physical_scale(measurement.free)
+    step = direction / np.abs(direction).max() * np.deg2rad(0.5)
+
+    def change(share):
+        return np.abs(measurement.predict(vector + share * step) - measurement.observed).max()
+
+    other = np.zeros_like(step)
+    other[measurement.free.by_name["derotator.horizontal"].slice] = np.deg2rad(0.5)
+    ordinary = np.abs(measurement.predict(vector + other) - measurement.observed).max()
+    assert change(1.0) < 0.05 * ordinary
+    assert change(0.5) < 0.27 * change(1.0)
+
+
+def test_null_vectors_are_orthonormal_and_null(make):
+    truth = make.truth(make.chain("elliptical", fixed=False))
+    measurement = Measurement(truth, make.observe(truth, noise=False))
+    finding, _ = finding_of(measurement)
+    null = finding.null_vectors
+    np.testing.assert_allclose(null @ null.T, np.eye(2), atol=1e-12)
+    scaled = measurement.jacobian(measurement.vector()) * physical_scale(measurement.free)[:, None]
+    assert np.abs(null @ scaled).max() < 1e-9 * finding.singular_values[0]
+    np.testing.assert_allclose(finding.singular_values[91:], 0, atol=1e-9 * finding.singular_values[0])
+
+
+# --- errors ------------------------------------------------------------------------------------
+
+
+def test_covariance_is_the_inverse_normal_matrix(make):
+    truth = make.truth(make.chain())
+    measurement = Measurement(truth, make.observe(truth, seed=1))
+    whitened = measurement.jacobian(measurement.vector()) / measurement.sigma
+    finding, covariance = analyse(measurement.free, whitened)
+    assert finding.identifiable.all()
+    np.testing.assert_allclose(covariance @ (whitened @ whitened.T), np.eye(47), atol=1e-5)
+
+
+def test_held_parameter_counts_as_known(make):
+    """At a bound: no error of its own, and the others are as if it were fixed."""
+    truth = make.truth(make.chain())
+    data = make.observe(truth, seed=1)
+    measurement = Measurement(truth, data)
+    held = np.array([name == "calibration_polarizer.theta" for name in measurement.free.names])
+    finding, covariance = finding_of(measurement, held)
+    assert not finding.identifiable[held].any()
+    assert np.isnan(covariance[held]).all()
+    truth["calibration_polarizer"].theta.fixed = True
+    _, expected = finding_of(Measurement(truth, data))
+    np.testing.assert_allclose(covariance[np.ix_(~held, ~held)], expected, rtol=1e-6)
+
+
+def test_parameter_that_ends_at_a_bound_is_flagged(make):
+    chain = make.chain(wavelength=[1.2, 1.6, 2.2] * u.um)
+    truth = make.truth(chain)
+    chain["calibration_polarizer"].theta.bounds = (89.8, 90.2)  # the truth is 90.4
+    data = make.observe(truth, wavelength=[1.2, 1.6, 2.2] * u.um, seed=1)
+    cal = calibrate(chain, data, cross_validate=False)
+    assert cal.at_bound == ["calibration_polarizer.theta"]
+    known = cal.parameter_values()["calibration_polarizer.theta"]
+    assert known["at_bound"]
+    assert not known["identifiable"]
+    assert np.isnan(known["std"])
+    assert "At a bound" in cal.summary()
+    assert known["value"] == pytest.approx(90.2)
+
+
+def test_scale_is_a_degree_a_micrometre_or_a_percent():
+    chain = optics.TwoLayerWaveplate(name="plate", fixed={"theta": False}) | optics.WollastonPrism(
+        name="wollaston"
+    )
+    free = FreeParameters([chain], 1)
+    assert free.names == ["plate.theta", "plate.w_sio2", "plate.w_mgf2", "wollaston.efficiency"]
+    np.testing.assert_allclose(physical_scale(free), [np.deg2rad(1.0), 1.0, 1.0, 0.01])
+
+
+def test_words_say_rank_and_directions(make):
+    truth = make.truth(make.chain("elliptical", fixed=False))
+    finding, _ = finding_of(Measurement(truth, make.observe(truth, noise=False)))
+    words = str(finding)
+    assert words.startswith("The data determine 91 combinations of 93 free parameters.")
+    assert words.count("cannot be told from") == 2
+
+
+def test_more_parameters_than_data_is_no_obstacle():
+    free = FreeParameters([optics.WollastonPrism(name="w", fixed={"theta": False})], 1)
+    finding, covariance = analyse(free, np.array([[1.0], [0.0]]))
+    assert finding.rank == 1
+    assert finding.identifiable.tolist() == [True, False]
+    np.testing.assert_allclose(covariance, [[1, np.nan], [np.nan, np.nan]])
+
+
+def test_no_information_at_all():
+    free = FreeParameters([optics.WollastonPrism(name="w")], 1)
+    finding, covariance = analyse(free, np.zeros((1, 4)))
+    assert finding.rank == 0
+    assert np.isnan(covariance).all()

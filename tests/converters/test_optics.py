@@ -1,0 +1,293 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Optics and chains of optics survive an ASDF file with all their constraints."""
+
+import io
+
+import asdf
+import astropy.units as u
+import numpy as np
+import pytest
+from asdf.exceptions import ValidationError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from astropolcal import optics
+from astropolcal.chain import leaves
+from astropolcal.converters.optics import (
+    OPTIC_MODULES,
+    OpticConverter,
+    node_from_optic,
+    optic_from_node,
+    optic_tag,
+)
+from astropolcal.exceptions import CalibrationFileError
+from astropolcal.optics import OPTICS
+
+NAMES = sorted(OPTICS)
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+some_bounds = st.tuples(st.none() | numbers, st.none() | numbers)
+
+
+def written(thing):
+    """Return the bytes of an ASDF file that holds one thing."""
+    buffer = io.BytesIO()
+    asdf.AsdfFile({"thing": thing}).write_to(buffer)
+    return buffer.getvalue()
+
+
+def read(content):
+    """Read the thing, validated, with failed conversions as errors."""
+    with asdf.config_context() as config:
+        config.validate_on_read = True
+        config.warn_on_failed_conversion = False
+        with asdf.open(io.BytesIO(content), lazy_load=False, memmap=False) as file:
+            return file["thing"]
+
+
+def round_trip(thing):
+    return read(written(thing))
+
+
+def assert_same(optic, again):
+    """Compare all of two optics, values to the last bit."""
+    assert type(again) is type(optic)
+    assert again._settings() == optic._settings()
+    assert again.param_names == optic.param_names
+    for key in optic.param_names:
+        old, new = getattr(optic, key), getattr(again, key)
+        assert new.shape == old.shape
+        assert np.asarray(new.value).tobytes() == np.asarray(old.value, dtype=float).tobytes()
+        assert new.unit == old.unit
+        assert new.fixed is old.fixed
+        assert new.bounds == old.bounds
+        assert new.tied is False
+
+
+@st.composite
+def an_optic(draw, name):
+    """Any values, shapes, names, mounts, fixed flags and bounds."""
+    cls = OPTICS[name]
+    n = draw(st.integers(1, 5))
+    value = numbers | st.lists(numbers, min_size=n, max_size=n)
+    extra = {"beam": draw(st.sampled_from(["right", "left"]))} if name == "WollastonPrism" else {}
+    optic = cls(
+        name=draw(st.none() | st.text(max_size=8)),
+        mount=draw(st.sampled_from([None, "hwp", "-altitude", "nul l"])),
+        **{key: np.array(draw(value)) * (cls._declared(key).unit or 1) for key in cls.param_names},
+        **extra,
+    )
+    for key in draw(st.lists(st.sampled_from(cls.param_names), unique=True)):
+        getattr(optic, key).fixed = draw(st.booleans())
+        getattr(optic, key).bounds = draw(some_bounds)
+    return optic
+
+
+# ---- the registry ------------------------------------------------------------------
+
+
+def test_every_optic_has_a_converter():
+    missing = sorted(set(OPTICS) ^ set(OPTIC_MODULES))
+    assert not missing, (
+        f"{missing}: an optic that calibration files can hold needs its module in OPTIC_MODULES "
+        "(converters/optics.py), a schema resources/schemas/optics/<name>-1.0.0.yaml with each "
+        "parameter and its unit, and an entry in resources/manifests"
+    )
+    for name, cls in OPTICS.items():
+        assert OpticConverter(name).types == [f"{cls.__module__}.{cls.__qualname__}"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_asdf_knows_the_optic(name):
+    manager = asdf.AsdfFile().extension_manager
+    assert manager.handles_type(OPTICS[name])
+    assert manager.handles_tag(optic_tag(name))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_defaults_survive(name):
+    optic = OPTICS[name](name="it")
+    assert_same(optic, round_trip(optic))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=10)
+@given(data=st.data())
+def test_anything_survives(name, data):
+    optic = data.draw(an_optic(name))
+    assert_same(optic, round_trip(optic))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=40)
+@given(data=st.data())
+def test_anything_survives_its_node(name, data):
+    optic = data.draw(an_optic(name))
+    assert_same(optic, optic_from_node(name, node_from_optic(optic)))
+
+
+# ---- what others lose --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bounds", [(0, None), (None, 0), (0, 0), (None, None), (-np.inf, 3)])
+def test_bounds_that_look_false_survive(bounds):
+    optic = optics.LinearRetarder(name="r", bounds={"retardance": bounds, "theta": bounds})
+    again = round_trip(optic)
+    assert again.retardance.bounds == again.theta.bounds == tuple(bounds)
+
+
+def test_freed_parameter_stays_free_though_its_class_fixes_it():
+    optic = optics.MuellerElement(name="window", fixed={"m11": False, "theta": False})
+    again = round_trip(optic)
+    assert not again.m11.fixed
+    assert not again.theta.fixed
+    assert again.m22.fixed
+
+
+def test_shape_of_one_value_a_wavelength_survives():
+    optic = optics.LinearRetarder(retardance=[3.0] * u.deg, name="r")
+    assert round_trip(optic).retardance.shape == optic.retardance.shape
+
+
+def test_signed_zero_survives():
+    again = round_trip(optics.LinearRetarder(retardance=[-0.0, 0.0] * u.deg))
+    assert np.signbit(again.retardance.value).tolist() == [True, False]
+
+
+def test_position_of_a_frame_is_not_stored():
+    optic = optics.Rotator(mount="hwp", name="it")
+    optic.position = 45 * u.deg
+    assert round_trip(optic).position == 0 * u.deg
+    assert "position" not in node_from_optic(optic)
+
+
+# ---- chains ------------------------------------------------------------------------
+
+
+def make_chain():
+    return (
+        optics.LinearPolarizer(
+            theta=90 * u.deg, name="polarizer", fixed={"theta": False}, bounds={"theta": (0, None)}
+        )
+        | optics.TwoLayerWaveplate(mount="hwp", name="hwp", bounds={"w_sio2": (None, 2.0)})
+        | optics.EllipticalRetarder(horizontal=[1, 2, 3] * u.deg, name="derotator")
+        | optics.WollastonPrism(efficiency=[0.9, 0.95, 1.0], beam="left", name="wollaston")
+    )
+
+
+def test_chain_survives_with_all_constraints():
+    chain = make_chain()
+    again = round_trip(chain)
+    for old, new in zip(leaves(chain), leaves(again), strict=True):
+        assert_same(old, new)
+
+
+def test_chain_gives_the_same_light():
+    wavelength = [1.2, 1.6, 2.0] * u.um
+    expected = make_chain()(wavelength, 1.0, 0.3, 0.2, 0.1)
+    found = round_trip(make_chain())(wavelength, 1.0, 0.3, 0.2, 0.1)
+    for one, other in zip(expected, found, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_chain_joined_from_the_right_survives():
+    first, second, third = (optics.Rotator(theta=i * u.deg, name=f"r{i}") for i in range(3))
+    again = round_trip(first | (second | third))
+    assert [leaf.theta.value for leaf in leaves(again)] == [0, 1, 2]
+
+
+def test_default_lazy_reading_gives_arrays():
+    content = written(optics.LinearRetarder(retardance=[1, 2] * u.deg))
+    with asdf.open(io.BytesIO(content)) as file:
+        optic = file["thing"]
+    assert type(optic.retardance.value) is np.ndarray
+    assert optic.retardance.value.tolist() == [1, 2]
+
+
+# ---- what is refused -----------------------------------------------------------------
+
+
+class Homemade(optics.LinearRetarder):
+    """An optic of a user."""
+
+
+def test_optic_outside_the_registry_is_refused():
+    with pytest.raises(CalibrationFileError, match=r"'mine' is a .*Homemade, which files cannot"):
+        node_from_optic(Homemade(name="mine"))
+
+
+def test_namesake_of_an_optic_is_refused():
+    impostor = type("Rotator", (optics.LinearRetarder,), {})
+    with pytest.raises(CalibrationFileError, match="which files cannot hold"):
+        node_from_optic(impostor(name="mine"))
+
+
+def test_callable_tie_is_refused():
+    optic = optics.LinearRetarder(name="r")
+    optic.retardance.tied = lambda model: model.theta
+    with pytest.raises(CalibrationFileError, match=r"r\.retardance has a callable 'tied'.*Tie"):
+        written(optic)
+
+
+def test_prior_is_refused():
+    optic = optics.LinearRetarder(name="r")
+    optic.retardance.prior = lambda value: 0.0
+    with pytest.raises(CalibrationFileError, match=r"r\.retardance has a callable 'prior'"):
+        written(optic)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_value_that_is_no_number_is_refused(value):
+    optic = optics.LinearRetarder(name="r")
+    optic.retardance.value = value
+    with pytest.raises(CalibrationFileError, match=r"r\.retardance = .* finite"):
+        written(optic)
+
+
+def test_unit_changed_behind_the_optics_back_is_refused():
+    optic = optics.LinearRetarder(name="r")
+    optic.retardance._set_unit(u.rad, force=True)
+    with pytest.raises(CalibrationFileError, match=r"r\.retardance is in rad, allowed is deg"):
+        written(optic)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("unit: deg", "unit: rad"),
+        ("unit: deg", "unit: mm"),
+        ("unit: deg", "notunit: deg"),
+        ("fixed: true", "fixed: 1"),
+        ("fixed: true", "fixed: 'no'"),
+        ("bounds: [-180.0, 180.0]", "bounds: [-180.0]"),
+        ("bounds: [-180.0, 180.0]", "bounds: [-180.0, high]"),
+        ("value: 0.98", "value: high"),
+        ("value: 0.98", "value: [0.98]"),
+        ("value: 0.98", "value: 0.98\n      unit: deg"),
+        ("name: wollaston", "name: 5"),
+        ("name: wollaston", "colour: red"),
+        ("mount: stage", "mount: '-'"),
+        ("beam: right", "beam: upper"),
+        ("efficiency:", "efficacy:"),
+    ],
+)
+def test_schema_refuses(old, new):
+    optic = optics.WollastonPrism(efficiency=0.98, mount="stage", name="wollaston")
+    content = written(optic)
+    assert content.count(old.encode()) == 1
+    read(content)
+    with pytest.raises(ValidationError):
+        read(content.replace(old.encode(), new.encode()))
+
+
+@pytest.mark.parametrize(
+    ("datatype", "shape", "data"),
+    [("int64", "[2]", "[1, 2]"), ("float64", "[1, 2]", "[[1.0, 2.0]]")],
+)
+def test_schema_refuses_arrays_of_another_kind(datatype, shape, data):
+    with asdf.config_context() as config:
+        config.array_inline_threshold = 10
+        text = written(optics.LinearRetarder(retardance=[1, 2] * u.deg)).decode()
+    assert "data: [1.0, 2.0]" in text
+    text = text.replace("datatype: float64", f"datatype: {datatype}").replace("[2]", shape)
+    with pytest.raises(ValidationError):
+        read(text.replace("[1.0, 2.0]", data).encode())

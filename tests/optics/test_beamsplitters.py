@@ -1,0 +1,75 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The Wollaston prism and its two beams."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from astropolcal import mueller
+from astropolcal.exceptions import ParameterError
+from astropolcal.optics import LinearPolarizer, WollastonPrism
+
+FRACTION = st.floats(0, 1)
+
+
+@given(efficiency=FRACTION, q=st.floats(-1, 1), theta=st.floats(-90, 90))
+def test_beams_share_the_light(efficiency, q, theta):
+    prism = WollastonPrism(efficiency=efficiency, theta=theta * u.deg)
+    right, left = prism.beams(1.6 * u.um, 1, q, 0, 0)
+    assert right[1] + left[1] == pytest.approx(1, abs=1e-14)
+    expected = efficiency * q * np.cos(2 * np.radians(theta))
+    assert right[1] - left[1] == pytest.approx(expected, abs=1e-14)
+
+
+@pytest.mark.parametrize(("beam", "sign"), [("right", 1), ("left", -1)])
+def test_beam_of_the_paper(beam, sign):
+    eta = 0.9
+    expected = 0.5 * np.array([[1, sign * eta, 0, 0], [sign * eta, 1, 0, 0], [0] * 4, [0] * 4])
+    found = WollastonPrism(efficiency=eta, beam=beam).mueller()
+    np.testing.assert_array_equal(found, expected)
+
+
+@given(efficiency=FRACTION)
+def test_unpolarized_light_is_halved_and_polarized(efficiency):
+    for beam in ("right", "left"):
+        matrix = WollastonPrism(efficiency=efficiency, beam=beam).mueller()
+        assert matrix[0, 0] == 0.5
+        assert mueller.polarizance(matrix) == pytest.approx(efficiency, abs=1e-12)
+        assert np.all(mueller.is_passive(matrix))
+
+
+def test_perfect_prism_is_two_polarizers():
+    for beam, angle in (("right", 0), ("left", 90)):
+        np.testing.assert_allclose(
+            WollastonPrism(beam=beam).mueller(),
+            LinearPolarizer(theta=angle * u.deg).mueller(),
+            rtol=0,
+            atol=1e-15,
+        )
+
+
+def test_beams_leave_the_prism_as_it_is():
+    prism = WollastonPrism(beam="left", efficiency=[0.9, 0.8], name="wollaston")
+    right, left = prism.beams([1.2, 1.6] * u.um, 1, 1, 0, 0)
+    np.testing.assert_allclose(right[1], [0.95, 0.9])
+    np.testing.assert_allclose(left[1], [0.05, 0.1])
+    assert prism.beam == "left"
+
+
+def test_beams_stand_where_the_prism_stands():
+    prism = WollastonPrism(mount="rotator")
+    prism.position = 90 * u.deg
+    right, left = prism.beams(1.6 * u.um, 1, 1, 0, 0)
+    assert (right[1], left[1]) == (pytest.approx(0, abs=1e-15), pytest.approx(1))
+
+
+@pytest.mark.parametrize("beam", ["up", None, 1])
+def test_unknown_beam_is_refused(beam):
+    with pytest.raises(ParameterError, match=r"allowed are \['left', 'right'\]"):
+        WollastonPrism(beam=beam)
+    prism = WollastonPrism()
+    with pytest.raises(ParameterError, match="beam"):
+        prism.beam = beam
+    assert prism.beam == "right"

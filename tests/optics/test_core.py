@@ -1,0 +1,194 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The base of all optics: mounts, positions, light, and the rotation derivative."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.modeling import Parameter
+from hypothesis import given
+from hypothesis import strategies as st
+
+from astropolcal import mueller
+from astropolcal.exceptions import ParameterError
+from astropolcal.optics import (
+    Diattenuator,
+    LinearPolarizer,
+    LinearRetarder,
+    Optic,
+    rotation_generator,
+)
+
+WAVELENGTH = [1.2, 1.6, 2.1] * u.um
+
+
+class TwoParameters(Optic):
+    """Not of the package: what a user would write."""
+
+    first = Parameter(default=1.0, bounds=(0, 2), description="an attenuation")
+    second = Parameter(default=0.0, unit=u.um, bounds=(0, 2), description="a path")
+
+    def _matrix(self, dispersion, first, second):
+        phase = second / np.asarray(dispersion)
+        return np.asarray(first)[..., None, None] * mueller.linear_retarder(phase * u.rad)
+
+    def _derivatives(self, dispersion, first, second):
+        raise NotImplementedError
+
+
+def test_an_optic_is_abstract():
+    with pytest.raises(TypeError, match="abstract"):
+        Optic()
+
+
+def test_an_optic_of_ones_own():
+    optic = TwoParameters(first=0.5, second=800 * u.nm, theta=30 * u.deg)
+    assert optic.param_names == ("theta", "first", "second")
+    assert optic.second.value == pytest.approx(0.8)
+    expected = 0.5 * mueller.rotate(mueller.linear_retarder(0.5 * u.rad), 30 * u.deg)
+    np.testing.assert_allclose(optic.mueller(1.6 * u.um), expected, rtol=0, atol=1e-14)
+
+
+# --- rotation ----------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 2**32 - 1), angle=st.floats(-180, 180))
+def test_rotation_generator_against_differences(seed, angle):
+    matrix = np.random.default_rng(seed).normal(size=(3, 4, 4))
+    turned = mueller.rotate(matrix, angle * u.deg)
+    step = 1e-3 * u.rad
+
+    def at(shift):
+        return mueller.rotate(matrix, angle * u.deg + shift * step)
+
+    expected = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step.value)
+    np.testing.assert_allclose(rotation_generator(turned), expected, rtol=0, atol=1e-9)
+
+
+def test_rotation_generator_leaves_its_argument_alone():
+    matrix = np.arange(16.0).reshape(4, 4)
+    rotation_generator(matrix)
+    np.testing.assert_array_equal(matrix, np.arange(16.0).reshape(4, 4))
+
+
+# --- where the optic stands ----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mount", "stage", "sign"), [(None, None, 1), ("hwp", "hwp", 1), ("-altitude", "altitude", -1)]
+)
+def test_mount_names_a_stage_and_a_sign(mount, stage, sign):
+    optic = LinearRetarder(mount=mount)
+    assert (optic.mount, optic.stage, optic.stage_sign) == (mount, stage, sign)
+
+
+@pytest.mark.parametrize("mount", ["", "-", "--hwp", " ", 3, ["hwp"]])
+def test_mount_that_is_no_name_is_refused(mount):
+    with pytest.raises(ParameterError, match=r"mount = .* must be None or the name of a stage"):
+        LinearRetarder(mount=mount)
+
+
+def test_position_has_a_unit():
+    optic = LinearRetarder(mount="hwp")
+    optic.position = 90 * u.deg
+    assert optic.position.to_value(u.rad) == pytest.approx(np.pi / 2)
+    with pytest.raises(ParameterError, match="position = 90 needs a unit"):
+        optic.position = 90
+    with pytest.raises(ParameterError, match=r"position = .* must be finite"):
+        optic.position = [0, np.nan] * u.deg
+    with pytest.raises(ParameterError, match="position = nan deg must be finite"):
+        optic.mueller(position=np.nan * u.deg)
+
+
+def test_positions_broadcast_against_wavelengths():
+    optic = LinearRetarder(retardance=[100, 120, 140] * u.deg, mount="hwp")
+    angles = [0, 10, 20, 30] * u.deg
+    grid = optic.mueller(WAVELENGTH, angles[:, None])
+    assert grid.shape == (4, 3, 4, 4)
+    for i, angle in enumerate(angles):
+        for j, retardance in enumerate(optic.retardance.value):
+            expected = mueller.rotate(mueller.linear_retarder(retardance * u.deg), angle)
+            np.testing.assert_allclose(grid[i, j], expected, rtol=0, atol=1e-14)
+    with pytest.raises(ParameterError, match=r"give the positions the shape \(n_frames, 1\)"):
+        optic.mueller(WAVELENGTH, angles)
+
+
+# --- light ---------------------------------------------------------------------------
+
+
+def test_scalar_light_stays_scalar():
+    through = LinearPolarizer()(1.6 * u.um, 1, 0, 0, 0)
+    assert [np.shape(x) for x in through] == [()] * 5
+    assert through[0] == 1.6 * u.um
+
+
+def test_light_at_many_positions_needs_its_shape():
+    optic = LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    optic.position = [0, 22.5, 45] * u.deg
+    with pytest.raises(ParameterError, match=r"hwp stands at 3 positions: give light of shape"):
+        optic(1.6 * u.um, 1, 1, 0, 0)
+    ones = np.ones(3)
+    _, _, q, u_, _ = optic(1.6 * u.um, ones, ones, 0 * ones, 0 * ones)
+    np.testing.assert_allclose(q, [1, 0, -1], atol=1e-14)
+    np.testing.assert_allclose(u_, [0, 1, 0], atol=1e-14)
+
+
+@pytest.mark.parametrize("wavelength", [0 * u.um, -1 * u.um, np.nan * u.um, [1, 0] * u.um])
+def test_wavelength_is_positive(wavelength):
+    with pytest.raises(ParameterError, match="must be positive"):
+        LinearRetarder().mueller(wavelength)
+
+
+def test_wavelength_needs_a_unit_of_length():
+    with pytest.raises(ParameterError, match="needs a unit such as um"):
+        LinearRetarder()(1.6, 1, 0, 0, 0)
+    with pytest.raises(ParameterError, match="wavelength has unit s"):
+        LinearRetarder().mueller(1.6 * u.s)
+
+
+# --- what astropy offers -------------------------------------------------------------
+
+
+def test_complex_values_are_refused():
+    with pytest.raises(ParameterError, match="complex"):
+        LinearRetarder(retardance=1j * u.deg)
+    with pytest.raises(ParameterError, match="complex"):
+        Diattenuator(diattenuation=0.1j)
+
+
+def test_percent_is_a_number():
+    assert Diattenuator(diattenuation=5 * u.percent).diattenuation.value == pytest.approx(0.05)
+
+
+def test_parameter_of_another_optic_is_a_value():
+    one = LinearRetarder(retardance=1 * u.rad)
+    other = LinearRetarder(retardance=one.retardance)
+    assert other.retardance.value == pytest.approx(np.degrees(1))
+    assert other.retardance is not one.retardance
+
+
+def test_constraints_can_be_given_when_the_optic_is_made():
+    optic = LinearRetarder(
+        retardance=90 * u.deg, bounds={"retardance": (80, 100)}, fixed={"theta": False}
+    )
+    assert optic.retardance.bounds == (80, 100)
+    assert not optic.theta.fixed
+    # and the class is not touched
+    assert LinearRetarder().retardance.bounds == (-360, 360)
+    assert LinearRetarder().theta.fixed
+
+
+def test_parameters_of_different_lengths_are_refused():
+    with pytest.raises(ParameterError, match="LinearRetarder"):
+        LinearRetarder(retardance=[1, 2] * u.deg, theta=[1, 2, 3] * u.deg)
+
+
+def test_model_sets_are_refused():
+    with pytest.raises(ParameterError, match="LinearRetarder"):
+        LinearRetarder(retardance=[1, 2] * u.deg, n_models=2)
+
+
+def test_values_are_canonical_floats():
+    optic = LinearRetarder(retardance=[90, 180] * u.deg, theta=45 * u.deg)
+    theta, retardance = optic.canonical_values()
+    assert theta == pytest.approx(np.pi / 4)
+    np.testing.assert_allclose(retardance, [np.pi / 2, np.pi], rtol=1e-15)

@@ -1,0 +1,112 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The figure of accuracies."""
+
+from dataclasses import replace
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.plotting import plot_accuracy
+
+PUBLISHED = {"goal": ([1200, 2200] * u.nm, [0.1, 0.001] * u.percent)}
+
+
+def lines(axes):
+    return {line.get_label().split(" ")[0].rstrip(":"): line for line in axes.lines}
+
+
+def test_curves_are_the_accuracy_table(elliptical):
+    (axes,) = plot_accuracy(elliptical).axes
+    drawn = lines(axes)
+    assert list(drawn) == ["s_res", "s_mean", "s_cv"]
+    for name, line in drawn.items():
+        np.testing.assert_allclose(line.get_ydata(), elliptical.accuracy[name].value)
+        np.testing.assert_allclose(line.get_xdata(), [1200, 1400, 1600, 1900, 2200])
+    assert len({line.get_marker() for line in drawn.values()}) == 3
+    assert len({line.get_color() for line in drawn.values()}) == 3
+
+
+def test_legend_defines_every_curve_outside_the_axes(elliptical):
+    figure = plot_accuracy(elliptical)
+    figure.draw_without_rendering()
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert len(texts) == 3
+    assert "√(Σr²/(n" in texts[0]
+    assert "s_res/√n" in texts[1]
+    assert "left out of the fit" in texts[2]
+    box = figure.legends[0].get_window_extent()
+    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
+
+
+def test_labels_have_units(elliptical):
+    (axes,) = plot_accuracy(elliptical).axes
+    assert axes.get_xlabel() == "wavelength (nm)"
+    assert axes.get_ylabel() == "accuracy (% of polarization)"
+    assert "n = 20" in axes.get_title()
+    assert "k = 6" in axes.get_title()
+
+
+def test_unknown_cross_validation_is_said(single_angle):
+    figure = plot_accuracy(single_angle)
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts[2].startswith("s_cv: not known")
+
+
+def test_reference_curves_and_logarithmic_axis(elliptical):
+    (axes,) = plot_accuracy(elliptical, PUBLISHED).axes
+    reference = lines(axes)["goal"]
+    np.testing.assert_allclose(reference.get_ydata(), [0.1, 0.001])
+    assert axes.get_yscale() == "log"
+    low, high = axes.get_ylim()
+    assert low < 0.001
+    assert high > elliptical.accuracy["s_res"].value.max()
+
+
+def test_similar_values_are_drawn_on_a_linear_axis_from_zero(single_angle):
+    (axes,) = plot_accuracy(single_angle).axes
+    assert axes.get_yscale() == "linear"
+    assert axes.get_ylim()[0] == 0
+
+
+def test_one_panel_a_dataset(several):
+    figure = plot_accuracy(several)
+    assert [axes.get_title().split(":")[0] for axes in figure.axes] == ["polarized", "unpolarized"]
+    assert figure.axes[0].get_ylim() == figure.axes[1].get_ylim()
+
+
+def test_calibration_without_data_will_do(elliptical):
+    assert len(plot_accuracy(replace(elliptical, measurement=None)).axes) == 1
+
+
+def test_many_datasets_are_counted_in_the_title(elliptical):
+    many = replace(elliptical, datasets=elliptical.datasets * 3)
+    assert plot_accuracy(many).get_suptitle().endswith("bench: 3 datasets")
+
+
+def test_fit_that_did_not_converge_is_marked(elliptical):
+    failed = replace(elliptical, fit=elliptical.fit | {"converged": False})
+    assert "NOT CONVERGED" in plot_accuracy(failed).get_suptitle()
+    assert "NOT CONVERGED" not in plot_accuracy(elliptical).get_suptitle()
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        ([1200, 2200] * u.nm, [0.1, 0.2]),
+        ([1200, 2200] * u.nm, [0.1, 0.2] * u.deg),
+        ([1200, 2200], [0.1, 0.2] * u.percent),
+        ([1200, 2200] * u.nm,),
+        None,
+    ],
+)
+def test_reference_without_units_is_refused(elliptical, curve):
+    with pytest.raises(ParameterError, match="reference 'mine' must be a pair"):
+        plot_accuracy(elliptical, {"mine": curve})
+
+
+def test_reference_of_other_length_is_refused(elliptical):
+    curve = ([1200, 1500, 2200] * u.nm, [0.1, 0.2] * u.percent)
+    with pytest.raises(ParameterError, match="3 wavelengths but 2 accuracies"):
+        plot_accuracy(elliptical, {"mine": curve})

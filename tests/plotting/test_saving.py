@@ -1,0 +1,145 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Files of figures, and what drawing leaves behind."""
+
+import subprocess
+import sys
+from copy import copy
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.plotting import (
+    plot_accuracy,
+    plot_double_differences,
+    plot_efficiency,
+    plot_parameters,
+    plot_residuals,
+    plot_retardances,
+    save_all,
+)
+
+DRAW = [
+    plot_accuracy,
+    plot_double_differences,
+    plot_efficiency,
+    plot_parameters,
+    plot_residuals,
+    plot_retardances,
+]
+
+
+def names(paths):
+    return [path.name for path in paths]
+
+
+def test_writes_every_figure_as_png(elliptical, tmp_path):
+    folder = tmp_path / "new" / "figures"
+    paths = save_all(elliptical, folder)
+    assert names(paths) == [
+        "double_differences.png",
+        "residuals.png",
+        "accuracy.png",
+        "retardances.png",
+        "efficiency.png",
+    ]
+    # nothing half-written or temporary stays behind
+    assert sorted(folder.iterdir()) == sorted(paths)
+    for path in paths:
+        image = imread(path)
+        assert min(image.shape[:2]) > 600
+        assert np.ptp(image[..., 0]) == 1
+
+
+def test_each_dataset_has_its_double_differences(several, tmp_path):
+    found = names(save_all(several, tmp_path))
+    assert found[:2] == ["double_differences.png", "double_differences_2.png"]
+    assert found[-1] == "other_parameters.png"
+
+
+def test_calibration_without_data_gets_the_other_figures(elliptical, tmp_path):
+    paths = save_all(replace(elliptical, measurement=None), tmp_path)
+    assert names(paths) == ["accuracy.png", "retardances.png", "efficiency.png"]
+
+
+def test_dataset_without_a_datum_is_left_out(several, tmp_path):
+    measurement = copy(several.measurement)
+    empty = copy(measurement.datasets[1])
+    empty.n_data = 0
+    measurement.datasets = [measurement.datasets[0], empty]
+    without = replace(several, measurement=measurement)
+    with pytest.raises(ObservationError, match="unpolarized: no datum is left to draw"):
+        plot_double_differences(without, dataset=1)
+    assert "double_differences_2.png" not in names(save_all(without, tmp_path))
+
+
+@pytest.mark.parametrize("name", ["masked", "undetermined", "single_angle"])
+def test_every_kind_of_calibration_is_drawn(name, request, tmp_path):
+    assert len(save_all(request.getfixturevalue(name), tmp_path)) == 5
+
+
+def test_existing_files_are_replaced(elliptical, tmp_path):
+    path = tmp_path / "accuracy.png"
+    path.write_text("old")
+    save_all(elliptical, str(tmp_path))
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_failure_leaves_the_old_file_whole(elliptical, tmp_path, monkeypatch):
+    def fail(self, path, **_):
+        path.write_text("half a fig")
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "double_differences.png"
+    path.write_text("old")
+    monkeypatch.setattr(Figure, "savefig", fail)
+    with pytest.raises(AstropolcalError, match="No space left on device"):
+        save_all(elliptical, tmp_path)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_folder_that_is_a_file_is_refused(elliptical, tmp_path):
+    path = tmp_path / "taken"
+    path.write_text("")
+    with pytest.raises(AstropolcalError, match="taken: cannot be created"):
+        save_all(elliptical, path)
+
+
+@pytest.mark.parametrize("draw", DRAW, ids=lambda draw: draw.__name__)
+def test_drawing_leaves_no_state_behind(draw, elliptical):
+    from matplotlib import pyplot as plt
+
+    before = dict(mpl.rcParams)
+    figure = draw(elliptical)
+    assert isinstance(figure, Figure)
+    assert plt.get_fignums() == []
+    assert dict(mpl.rcParams) == before
+
+
+@pytest.mark.parametrize("draw", DRAW, ids=lambda draw: draw.__name__)
+def test_text_is_readable_and_stays_on_the_page(draw, undetermined):
+    figure = draw(undetermined)
+    figure.draw_without_rendering()
+    assert figure.get_layout_engine() is not None
+    sizes = [text.get_fontsize() for axes in figure.axes for text in axes.texts]
+    sizes += [axes.xaxis.label.get_fontsize() for axes in figure.axes]
+    assert min(sizes) >= 10
+    page = figure.bbox
+    title = figure._suptitle.get_window_extent()
+    assert page.x0 <= title.x0
+    assert title.x1 <= page.x1
+    for axes in figure.axes:
+        box = axes.get_tightbbox()
+        assert box.y0 >= page.y0 - 1
+        assert box.y1 <= page.y1 + 1
+        assert box.x0 >= page.x0 - 1
+
+
+def test_importing_the_package_does_not_import_matplotlib():
+    code = "import sys, astropolcal.plotting; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

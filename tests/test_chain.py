@@ -1,0 +1,436 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Chains: their optics, their edits, and the system Mueller matrix with derivatives."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.modeling import CompoundModel
+from astropy.modeling.models import Identity, Scale
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from astropolcal import optics
+from astropolcal.chain import (
+    at_positions,
+    find_optic,
+    insert_optic,
+    join,
+    leaves,
+    remove_optic,
+    replace_optic,
+    stages,
+    system_mueller,
+    system_mueller_derivatives,
+    with_beam,
+)
+from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
+from astropolcal.units import canonical_unit
+
+SEED = st.integers(0, 2**32 - 1)
+WAVELENGTH = [1.2, 1.6, 2.1] * u.um
+STAGES = ("a", "b", "c")
+
+
+@pytest.fixture
+def charis():
+    """The chain of the CHARIS paper for the polarized internal source."""
+    return (
+        optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer")
+        | optics.TwoLayerWaveplate(mount="hwp", name="hwp")
+        | optics.EllipticalRetarder(
+            horizontal=[99, 120, 150] * u.deg, diagonal=4 * u.deg, mount="derotator", name="der"
+        )
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+
+
+def names(chain):
+    return [leaf.name for leaf in leaves(chain)]
+
+
+def random_positions(rng, shape):
+    return {stage: rng.uniform(-180, 180, shape) * u.deg for stage in STAGES}
+
+
+# --- the paper's product, written out one frame and wavelength at a time ------------------
+
+
+def turn(angle):
+    c, s = np.cos(2 * angle), np.sin(2 * angle)
+    return np.array([[1, 0, 0, 0], [0, c, s, 0], [0, -s, c, 0], [0, 0, 0, 1]])
+
+
+def plain_product(chain, j, positions):
+    """T(-theta) M T(theta) of each optic, for wavelength j and positions in radian."""
+    total = np.eye(4)
+    for leaf in leaves(chain):
+        theta = np.radians(np.broadcast_to(leaf.theta.value, 3)[j])
+        values = {
+            key: np.broadcast_to(getattr(leaf, key).value, 3)[j] * (getattr(leaf, key).unit or 1)
+            for key in leaf.own_names
+        }
+        own = type(leaf)(**values, **({"beam": leaf.beam} if hasattr(leaf, "beam") else {}))
+        if leaf.mount:
+            sign = -1 if leaf.mount[0] == "-" else 1
+            theta = theta + sign * positions[leaf.mount.strip("-")]
+        if isinstance(leaf, optics.Rotator):
+            total = turn(theta) @ total
+        else:
+            total = turn(-theta) @ own.mueller(WAVELENGTH[j]) @ turn(theta) @ total
+    return total
+
+
+@given(seed=SEED, n_optics=st.integers(1, 7))
+@settings(max_examples=30)
+def test_system_mueller_is_the_plain_product(random_chain, seed, n_optics):
+    rng = np.random.default_rng(seed)
+    chain = random_chain(rng, 3, n_optics, split=rng.random() < 0.5)
+    positions = random_positions(rng, 4)
+    found = system_mueller(chain, WAVELENGTH, positions)
+    assert found.shape == (4, 3, 4, 4)
+    for i, j in np.ndindex(4, 3):
+        here = {stage: angle.to_value(u.rad)[i] for stage, angle in positions.items()}
+        expected = plain_product(chain, j, here)
+        np.testing.assert_allclose(found[i, j], expected, rtol=0, atol=1e-12)
+
+
+@given(seed=SEED)
+@settings(max_examples=30)
+def test_light_through_the_chain_is_the_system_matrix(random_chain, seed):
+    rng = np.random.default_rng(seed)
+    chain = random_chain(rng, 3)
+    positions = random_positions(rng, 4)
+    source = rng.normal(size=4)
+    columns = {name: positions[name][:, None] for name in stages(chain)}
+    through = at_positions(chain, **columns)(WAVELENGTH, *source)
+    light = np.stack(np.broadcast_arrays(*through[1:]), axis=-1)
+    expected = system_mueller(chain, WAVELENGTH, positions) @ source
+    light = np.broadcast_to(light, expected.shape)
+    np.testing.assert_allclose(light, expected, rtol=0, atol=1e-12)
+
+
+@given(seed=SEED)
+@settings(max_examples=20)
+def test_light_of_one_frame_and_wavelength(random_chain, seed):
+    rng = np.random.default_rng(seed)
+    chain = random_chain(rng, 0)
+    positions = random_positions(rng, None)
+    here = {name: positions[name] for name in stages(chain)}
+    through = at_positions(chain, **here)(1.6 * u.um, 1, 0.2, -0.3, 0.1)
+    matrix = system_mueller(chain, 1.6 * u.um, positions)
+    assert matrix.shape == (4, 4)
+    np.testing.assert_allclose(through[1:], matrix @ [1, 0.2, -0.3, 0.1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("wavelength", [1.6 * u.um, [1.2, 1.6, 2.1] * u.um])
+@pytest.mark.parametrize("frames", [None, 1, 5])
+def test_shapes(charis, wavelength, frames):
+    chain = charis if np.ndim(wavelength) else remove_optic(charis, "der")
+    angle = np.zeros(frames or ()) * u.deg
+    expected = (() if frames is None else (frames,)) + np.shape(wavelength) + (4, 4)
+    positions = dict.fromkeys(stages(chain), angle)
+    assert system_mueller(chain, wavelength, positions).shape == expected
+    for derivative in system_mueller_derivatives(chain, wavelength, positions).values():
+        assert derivative.shape == expected
+
+
+def test_shape_does_not_depend_on_what_the_optics_need():
+    chain = optics.ParityFlip(name="nbs")
+    positions = {"hwp": np.zeros(5) * u.deg}
+    assert system_mueller(chain).shape == (4, 4)
+    assert system_mueller(chain, WAVELENGTH).shape == (3, 4, 4)
+    assert system_mueller(chain, None, positions).shape == (5, 4, 4)
+    assert system_mueller(chain, WAVELENGTH, positions).shape == (5, 3, 4, 4)
+
+
+def test_stage_that_stands_still_may_be_scalar(charis):
+    scalar = {"hwp": [0, 45] * u.deg, "derotator": 30 * u.deg}
+    full = scalar | {"derotator": [30, 30] * u.deg}
+    np.testing.assert_array_equal(
+        system_mueller(charis, WAVELENGTH, scalar), system_mueller(charis, WAVELENGTH, full)
+    )
+
+
+@pytest.mark.parametrize("unit", [u.nm, u.m, u.AA])
+def test_wavelength_and_positions_in_any_unit(charis, unit):
+    positions = {"hwp": [0, 22.5] * u.deg, "derotator": [10, 20] * u.deg}
+    others = {name: angle.to(u.arcmin) for name, angle in positions.items()}
+    np.testing.assert_allclose(
+        system_mueller(charis, WAVELENGTH.to(unit), others),
+        system_mueller(charis, WAVELENGTH, positions),
+        rtol=0,
+        atol=1e-11,
+    )
+
+
+# --- derivatives --------------------------------------------------------------------------
+
+
+def moved(chain, name, change):
+    """A copy of the chain with ``optic.parameter`` moved, in canonical units."""
+    optic, key = name.split(".")
+    old = find_optic(chain, optic)
+    unit = getattr(old, key).unit
+    step = change if unit is None else change * (u.rad if unit == u.deg else u.um)
+    new = old.with_parameters(**{key: getattr(old, key).value * (unit or 1) + step})
+    return replace_optic(chain, optic, new)
+
+
+@given(seed=SEED)
+@settings(max_examples=6)
+def test_derivatives_against_differences(random_chain, seed):
+    rng = np.random.default_rng(seed)
+    chain = random_chain(rng, 3, 4, split=True)
+    positions = random_positions(rng, 2)
+    derivatives = system_mueller_derivatives(chain, WAVELENGTH, positions)
+    wanted = [f"{leaf.name}.{key}" for leaf in leaves(chain) for key in leaf.param_names]
+    assert set(derivatives) == set(wanted)
+    for name in rng.choice(wanted, 6):
+        step = 1e-4
+
+        def at(shift, name=name, step=step):
+            return system_mueller(moved(chain, name, shift * step), WAVELENGTH, positions)
+
+        expected = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
+        found = derivatives[name].to_value(canonical_unit(derivatives[name].unit ** -1) ** -1)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8, err_msg=name)
+
+
+@given(seed=SEED)
+@settings(max_examples=15)
+def test_turning_everything_is_turning_the_light(random_chain, seed):
+    # the derivatives to all angles together are that of T(-a) M T(a)
+    rng = np.random.default_rng(seed)
+    chain = random_chain(rng, 3, 5)
+    for leaf in leaves(chain):
+        if isinstance(leaf, optics.Rotator):
+            chain = replace_optic(chain, leaf.name, optics.ParityFlip(name=leaf.name))
+    positions = random_positions(rng, 2)
+    derivatives = system_mueller_derivatives(chain, WAVELENGTH, positions)
+    total = sum(d.to_value(1 / u.rad) for name, d in derivatives.items() if name.endswith("theta"))
+    expected = optics.rotation_generator(system_mueller(chain, WAVELENGTH, positions))
+    np.testing.assert_allclose(total, expected, rtol=0, atol=1e-12)
+
+
+def test_derivative_of_one_optic_is_its_own(charis):
+    optic = find_optic(charis, "der")
+    chain = optics.ParityFlip(name="nbs") | optic
+    angle = [10, 20] * u.deg
+    found = system_mueller_derivatives(chain, WAVELENGTH, {"derotator": angle})
+    own = optic.mueller_derivatives(WAVELENGTH, angle[:, None])
+    flip = np.diag([1, -1, 1, -1])
+    for key in optic.param_names:
+        assert found[f"der.{key}"].unit == 1 / u.deg
+        np.testing.assert_allclose(
+            found[f"der.{key}"].value, own[key].value @ flip, rtol=0, atol=1e-15
+        )
+
+
+def test_derivatives_need_names():
+    with pytest.raises(ChainError, match="ParityFlip needs a name"):
+        system_mueller_derivatives(optics.ParityFlip() | optics.WollastonPrism(name="wollaston"))
+
+
+# --- what is refused ------------------------------------------------------------------------
+
+
+def test_missing_stage(charis):
+    with pytest.raises(ChainError, match=r"optic der stands on stage 'derotator', but positions"):
+        system_mueller(charis, WAVELENGTH, {"hwp": 0 * u.deg})
+    with pytest.raises(ChainError, match=r"has only \[\]"):
+        system_mueller_derivatives(charis, WAVELENGTH)
+
+
+def test_stages_of_different_lengths(charis):
+    positions = {"hwp": [0, 45] * u.deg, "derotator": [1, 2, 3] * u.deg}
+    for function in (system_mueller, system_mueller_derivatives):
+        with pytest.raises(ChainError, match=r"different shapes: .*'hwp': \(2,\)"):
+            function(charis, WAVELENGTH, positions)
+
+
+def test_bad_wavelengths_and_positions(charis):
+    still = {"hwp": 0 * u.deg, "derotator": 0 * u.deg}
+    with pytest.raises(ParameterError, match=r"der\.horizontal has 3 values"):
+        system_mueller(charis, 1.6 * u.um, still)
+    with pytest.raises(ParameterError, match="depends on wavelength: give one"):
+        system_mueller(charis, None, still)
+    with pytest.raises(ParameterError, match=r"wavelength has shape \(1, 3\)"):
+        system_mueller(charis, WAVELENGTH[None], still)
+    with pytest.raises(ParameterError, match="needs a unit such as um"):
+        system_mueller(charis, [1.2, 1.6, 2.1], still)
+    with pytest.raises(WavelengthRangeError):
+        system_mueller(charis, [1.2, 1.6, 99] * u.um, still)
+    with pytest.raises(ParameterError, match="hwp = 3 needs a unit"):
+        system_mueller(charis, WAVELENGTH, still | {"hwp": 3})
+    with pytest.raises(ParameterError, match="hwp = nan deg must be finite"):
+        system_mueller(charis, WAVELENGTH, still | {"hwp": np.nan * u.deg})
+
+
+def test_optics_share_no_name():
+    one = optics.ParityFlip(name="nbs")
+    with pytest.raises(ChainError, match="need different names; nbs occurs more than once"):
+        leaves(one | optics.Depolarizer(name="nbs"))
+    with pytest.raises(ChainError, match="nbs occurs more than once"):
+        join([one, one])
+    with pytest.raises(ChainError, match="nbs occurs more than once"):
+        insert_optic(one, optics.Depolarizer(name="nbs"), after="nbs")
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (optics.ParityFlip() + optics.ParityFlip(), r"joined with \|, not with \+"),
+        (optics.ParityFlip() & optics.ParityFlip(), r"not with &"),
+        (optics.ParityFlip() | Identity(5), "Identity is not an optic"),
+        (Scale(2), "Scale is not an optic"),
+        ("hwp", "str is not an optic"),
+        (None, "NoneType is not an optic"),
+    ],
+)
+def test_what_is_no_chain(model, message):
+    for function in (leaves, stages, system_mueller, lambda chain: join([chain, chain])):
+        with pytest.raises(ChainError, match=message):
+            function(model)
+
+
+def test_chain_of_nothing():
+    with pytest.raises(ChainError, match="at least one optic"):
+        join([])
+    with pytest.raises(ChainError, match="at least one optic"):
+        remove_optic(optics.ParityFlip(name="nbs"), "nbs")
+
+
+def test_unknown_optic(charis):
+    with pytest.raises(ChainError, match=r"no optic 'wolaston'.*did you mean 'wollaston'\?"):
+        find_optic(charis, "wolaston")
+    with pytest.raises(ChainError, match=r"it has calibration_polarizer, hwp, der, wollaston$"):
+        find_optic(charis, "zzz")
+    with pytest.raises(ChainError, match="it has no optic with a name"):
+        find_optic(optics.ParityFlip(), "nbs")
+    for edit in (remove_optic, lambda c, n: replace_optic(c, n, optics.ParityFlip())):
+        with pytest.raises(ChainError, match="no optic 'm3'"):
+            edit(charis, "m3")
+
+
+# --- edits ----------------------------------------------------------------------------------
+
+
+def test_leaves_in_the_order_of_the_light(charis):
+    assert names(charis) == ["calibration_polarizer", "hwp", "der", "wollaston"]
+    assert leaves(charis)[1] is charis["hwp"]
+    assert names(charis[0] | (charis[1] | (charis[2] | charis[3]))) == names(charis)
+    assert leaves(charis[0]) == [charis[0]]
+
+
+def test_join_is_the_inverse_of_leaves(charis):
+    assert all(a is b for a, b in zip(leaves(join(leaves(charis))), leaves(charis), strict=True))
+    assert join(iter([charis[0]])) is charis[0]
+    assert names(join([charis, optics.ParityFlip(name="nbs")]))[-1] == "nbs"
+
+
+def test_edits_share_the_rest_and_leave_the_chain_alone(charis):
+    before = names(charis)
+    nbs = optics.ParityFlip(name="nbs")
+    assert names(insert_optic(charis, nbs, after="hwp"))[1:4] == ["hwp", "nbs", "der"]
+    assert names(insert_optic(charis, nbs, before="hwp"))[1:3] == ["nbs", "hwp"]
+    assert names(insert_optic(charis, nbs, after="wollaston"))[-1] == "nbs"
+    assert names(remove_optic(charis, "der")) == ["calibration_polarizer", "hwp", "wollaston"]
+    edited = replace_optic(charis, "der", nbs)
+    assert names(edited) == ["calibration_polarizer", "hwp", "nbs", "wollaston"]
+    assert edited["hwp"] is charis["hwp"]
+    assert names(charis) == before
+
+
+@pytest.mark.parametrize("neighbours", [{}, {"after": "hwp", "before": "der"}])
+def test_insert_needs_one_neighbour(charis, neighbours):
+    with pytest.raises(ChainError, match="exactly one neighbour"):
+        insert_optic(charis, optics.ParityFlip(name="nbs"), **neighbours)
+
+
+def test_insert_beside_an_unknown_neighbour(charis):
+    with pytest.raises(ChainError, match="no optic 'nbs'"):
+        insert_optic(charis, optics.ParityFlip(), after="nbs")
+
+
+def test_stages_are_named_once_and_without_sign(charis):
+    assert stages(charis) == ("hwp", "derotator")
+    sky = optics.Rotator(mount="p") | optics.Rotator(mount="-a") | optics.ParityFlip(mount="a")
+    assert stages(sky) == ("p", "a")
+    assert stages(optics.ParityFlip()) == ()
+
+
+def test_with_beam_is_a_copy(charis):
+    left = with_beam(charis, "left")
+    assert (left["wollaston"].beam, charis["wollaston"].beam) == ("left", "right")
+    assert left["wollaston"].efficiency.value == 0.98
+    with pytest.raises(ParameterError, match="beam = 'up'"):
+        with_beam(charis, "up")
+    with pytest.raises(ChainError, match="no beam splitter"):
+        with_beam(remove_optic(charis, "wollaston"), "left")
+
+
+def test_the_beams_add_up_to_the_light_before_the_prism(charis):
+    positions = {"hwp": [0, 22.5] * u.deg, "derotator": [10, 30] * u.deg}
+    both = sum(
+        system_mueller(with_beam(charis, beam), WAVELENGTH, positions)[..., 0, :]
+        for beam in ("right", "left")
+    )
+    before = system_mueller(remove_optic(charis, "wollaston"), WAVELENGTH, positions)
+    np.testing.assert_allclose(both, before[..., 0, :], rtol=0, atol=1e-14)
+
+
+def test_at_positions_is_a_copy(charis):
+    moved = at_positions(charis, hwp=45 * u.deg)
+    assert moved["hwp"].position.to_value(u.deg) == pytest.approx(45)
+    assert moved["der"].position == charis["hwp"].position == 0 * u.rad
+    with pytest.raises(ChainError, match=r"no stage 'altitude' in the chain; it has hwp, derot"):
+        at_positions(charis, altitude=1 * u.deg)
+    with pytest.raises(ChainError, match="it has none"):
+        at_positions(optics.ParityFlip(), hwp=1 * u.deg)
+    with pytest.raises(ParameterError, match="needs a unit"):
+        at_positions(charis, hwp=45)
+
+
+# --- what we rely on in astropy ---------------------------------------------------------------
+
+
+def test_astropy_idioms(charis):
+    assert charis.submodel_names == ("calibration_polarizer", "hwp", "der", "wollaston")
+    assert charis.n_submodels == 4
+    assert charis["wollaston"].efficiency == 0.98
+    copy = charis.copy()
+    copy["wollaston"].efficiency = 0.5
+    assert charis["wollaston"].efficiency == 0.98
+    assert copy["hwp"].mount == "hwp"
+    replaced = charis.replace_submodel("der", optics.ParityFlip(name="nbs"))
+    assert names(replaced) == ["calibration_polarizer", "hwp", "nbs", "wollaston"]
+    assert "der" in charis.submodel_names
+
+
+def test_constraints_survive_a_copy(charis):
+    charis["der"].theta.fixed, charis["der"].theta.bounds = False, (-5, 5)
+    copy = charis.copy()["der"].theta
+    assert (copy.fixed, copy.bounds) == (False, (-5, 5))
+
+
+def test_private_behaviour_of_astropy(charis):
+    # `leaves` walks the tree by these attributes
+    assert isinstance(charis, CompoundModel)
+    assert charis.op == "|"
+    assert isinstance(charis.left, CompoundModel)
+    assert charis.right is charis["wollaston"]
+    # an optic's parameters live in its __dict__, and are those of the compound
+    assert charis["wollaston"].__dict__["efficiency"] is charis["wollaston"].efficiency
+    assert charis.efficiency_3 is charis["wollaston"].efficiency
+    # the class keeps the declaration that `Optic._declared` reads
+    assert type(charis["hwp"]).__dict__["w_sio2"].unit == u.mm
+    assert optics.Optic.standard_broadcasting is False
+    # inherited parameters come first
+    assert charis["der"].param_names == ("theta", "horizontal", "diagonal", "circular")
+
+
+def test_change_through_the_compound_reaches_the_optic(charis):
+    charis.efficiency_3 = 0.5
+    assert charis["wollaston"].efficiency.value == 0.5
+    charis.theta_1 = 3 * u.deg
+    assert charis["hwp"].theta.quantity == 3 * u.deg
