@@ -12,6 +12,7 @@ from astropolcal.propagation import Propagator
 
 __all__ = ["Dataset", "as_pairs"]
 
+
 def as_pairs(chain, observations, positions):
     """
     Return chain, observations and positions of every dataset, from one or several of each.
@@ -103,6 +104,11 @@ class Dataset:
         columns = self.frames.T.ravel()
         given = _positions(chain, observations, positions)
         placed = {stage: angle[columns] for stage, angle in given.items()}
+        #: Position of each stage in the frames of each datum, radian,
+        #: (frames_per_datum, n_groups).
+        self.positions = {
+            stage: angle.reshape(self.frames.T.shape) for stage, angle in placed.items()
+        }
         # where nothing moves all frames are alike, but there are as many
         placed = placed or {"frame": np.zeros(columns.size)}
         try:

@@ -65,20 +65,10 @@ class DataGrid:
 
     def position(self, stage):
         """Return the position (rad) of a stage, shape (frames_per_datum, n_groups)."""
-        stages = self._stages()
-        if stage in stages:
-            return stages[stage]
+        # as the model has them, which need not be the table's columns
+        if stage in self.part.positions:
+            return self.part.positions[stage]
         return self.part.observations.position(stage)[self.part.frames.T]
-
-    def _stages(self):
-        """Positions as the model has them, which need not be the table's columns."""
-        propagator, shape = self.part.propagator, self.part.frames.T.shape
-        nodes = [*propagator._common, *propagator._arms[0]]
-        return {
-            node.leaf.stage: (node.leaf.stage_sign * node.stage_angle).reshape(shape)
-            for node in nodes
-            if node.leaf.stage
-        }
 
     def series(self):
         """Return the data by setting of the half-wave plate, ordered by its angle."""
@@ -96,7 +86,7 @@ class DataGrid:
         )
 
     def _steady(self, member):
-        others = {s: a[:, member] for s, a in self._stages().items() if s != "derotator"}
+        others = {s: a[:, member] for s, a in self.part.positions.items() if s != "derotator"}
         if any(np.ptp(angle, axis=1).max() > np.deg2rad(SAME_ANGLE) for angle in others.values()):
             return None
         return {stage: angle.mean(axis=1) for stage, angle in others.items()}

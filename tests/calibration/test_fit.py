@@ -141,9 +141,9 @@ def test_single_wavelength_finds_its_branch(make):
     for key in ("w_sio2", "w_mgf2"):
         getattr(chain["hwp"], key).fixed = True
     truth = chain.copy()
-    truth["derotator"].retardance = [150.0] * u.deg
+    truth["derotator"].retardance = [100.0] * u.deg
     data = make.observe(truth, wavelength=lam, seed=2)
-    chain["derotator"].retardance = [-20.0] * u.deg
+    chain["derotator"].retardance = [330.0] * u.deg
     lost, found = (
         calibrate(chain, data, weights="errors", search=s, cross_validate=False) for s in (False, True)
     )

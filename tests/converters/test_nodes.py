@@ -105,7 +105,7 @@ def test_checksum_tells_trees_apart(one, other):
 
 def repr_sorted(tree):
     if isinstance(tree, dict):
-        return sorted((key, repr_sorted(value)) for key, value in tree.items())
+        return "mapping", sorted((key, repr_sorted(value)) for key, value in tree.items())
     return [repr_sorted(item) for item in tree] if isinstance(tree, list) else repr(tree)
 
 

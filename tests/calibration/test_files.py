@@ -1,0 +1,535 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""A calibration file gives back what was written, or says in one line why not."""
+
+import dataclasses
+import io
+import os
+import stat
+
+import asdf
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import Calibration, calibrate, optics
+from astropolcal.calibration import Covariance, DatasetRecord
+from astropolcal.chain import join, leaves
+from astropolcal.converters.calibration import calibration_from_node, node_from_calibration
+from astropolcal.exceptions import CalibrationFileError
+from astropolcal.measurement import Tie
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+WAVELENGTH = [1.2, 1.6, 2.2] * u.um
+
+
+def make_chain(flip=False):
+    """Polarizer, half-wave plate, derotator and Wollaston: 4 + 2 x 3 free parameters."""
+    train = [
+        optics.LinearPolarizer(
+            theta=90 * u.deg, name="polarizer", fixed={"theta": False}, bounds={"theta": (0, None)}
+        ),
+        optics.TwoLayerWaveplate(
+            w_sio2=1.65 * u.mm, w_mgf2=1.29 * u.mm, mount="hwp", name="hwp", fixed={"theta": False}
+        ),
+        optics.LinearRetarder(
+            retardance=[-220, -110, -57] * u.deg, mount="derotator", name="derotator"
+        ),
+        optics.WollastonPrism(efficiency=[0.97, 0.98, 0.99], name="wollaston"),
+    ]
+    if flip:
+        train.insert(3, optics.ParityFlip(name="flip"))
+    return join(train)
+
+
+def make_calibration(**options):
+    """Calibrate two nights, with and without a flip, in two steps, with a tie."""
+    chains = [make_chain(), make_chain(flip=True)]
+    frames = half_wave_plate_cycles(derotator=[45, 60, 80, 100] * u.deg)
+    metas = ({"date": "2025-05-01", "instrument": "bench"}, {"date": "2025-10-02", "n": 3})
+    nights = [
+        simulate(chains[i], WAVELENGTH, frames, seed=i, meta=metas[i], name=f"night{i}")
+        for i in range(2)
+    ]
+    options = {
+        "strategy": "two-step",
+        "ties": {"derotator.theta": Tie("hwp.theta", 0.5, 0.1 * u.deg)},
+        "instrument": "bench",
+    } | options
+    return calibrate(chains, nights, **options)
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return make_calibration()
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "calibration.asdf"
+
+
+@pytest.fixture(scope="module")
+def content(calibration, tmp_path_factory):
+    """Bytes of a good file."""
+    path = tmp_path_factory.mktemp("good") / "calibration.asdf"
+    calibration.write(path)
+    return path.read_bytes()
+
+
+def assert_same(one, other):
+    """Compare all of two calibrations, numbers to the last bit."""
+    assert node_from_calibration(one)["checksum"] == node_from_calibration(other)["checksum"]
+    assert other.to_dict() == one.to_dict()
+    assert other.summary() == one.summary()
+    assert other.covariance == one.covariance
+    assert other.ties == one.ties
+
+
+def assert_refused(path, content, message):
+    path.write_bytes(content)
+    with pytest.raises(CalibrationFileError, match=message) as caught:
+        Calibration.read(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ")
+    assert "\n" not in text
+
+
+def replaced(content, old, new, count=1):
+    """Return the file with text replaced; the old text must be there."""
+    assert old in content
+    return content.replace(old, new, count)
+
+
+# ---- what comes back -----------------------------------------------------------------
+
+
+def test_everything_comes_back(calibration, path):
+    calibration.write(path)
+    assert_same(calibration, Calibration.read(path))
+
+
+def test_calibration_of_the_test_has_what_is_to_be_tested(calibration):
+    assert calibration.stages
+    assert calibration.ties
+    assert len(calibration.datasets) == 2
+    assert calibration.fit["seconds"] > 0
+
+
+def test_chains_come_back(calibration, path):
+    calibration.write(path)
+    again = Calibration.read(path)
+    for old_chain, new_chain in zip(calibration.chains, again.chains, strict=True):
+        for old, new in zip(leaves(old_chain), leaves(new_chain), strict=True):
+            assert type(new) is type(old)
+            assert new._settings() == old._settings()
+            for key in old.param_names:
+                a, b = getattr(old, key), getattr(new, key)
+                assert np.array_equal(a.value, b.value)
+                assert (a.unit, a.fixed, a.bounds) == (b.unit, b.fixed, b.bounds)
+    assert again.chain["polarizer"].theta.bounds == (0, None)
+    shared = [chain["derotator"].retardance.value for chain in again.chains]
+    assert np.array_equal(*shared)
+
+
+def test_arrays_and_tables_come_back(calibration, path):
+    calibration.write(path)
+    again = Calibration.read(path)
+    assert again.wavelength.unit == calibration.wavelength.unit
+    assert np.array_equal(again.wavelength, calibration.wavelength)
+    for key in ("singular_values", "null_vectors", "identifiable"):
+        old, new = (getattr(c.identifiability, key) for c in (calibration, again))
+        assert new.dtype == old.dtype
+        assert np.array_equal(new, old)
+    for old, new in zip(calibration.datasets, again.datasets, strict=True):
+        assert new.meta == old.meta
+        assert new.content_hash == old.content_hash
+        assert new.accuracy.colnames == old.accuracy.colnames
+        for name in old.accuracy.colnames:
+            assert np.array_equal(new.accuracy[name], old.accuracy[name])
+            assert getattr(new.accuracy[name], "unit", None) == old.accuracy[name].unit
+    assert again.measurement is None
+    with pytest.raises(CalibrationFileError, match="holds no observations"):
+        _ = again.residuals
+
+
+def test_predictions_come_back(calibration, path):
+    calibration.write(path)
+    frames = half_wave_plate_cycles(derotator=[50, 70] * u.deg)
+    new = simulate(make_chain(), WAVELENGTH, frames, seed=5)
+    old, again = (c.measurement_of(new).residuals() for c in (calibration, Calibration.read(path)))
+    assert np.array_equal(old, again)
+
+
+def test_what_is_not_determined_comes_back(path):
+    # one derotator angle, everything free: parameters at bounds, NaN in the covariance
+    chain = make_chain()
+    chain["derotator"].theta.fixed = False
+    frames = half_wave_plate_cycles(derotator=[45] * u.deg)
+    table = simulate(chain, WAVELENGTH, frames, seed=3)
+    calibration = calibrate(chain, table, search=False, cross_validate=False)
+    assert np.isnan(calibration.covariance.matrix).any()
+    assert calibration.identifiability.directions
+    calibration.write(path)
+    again = Calibration.read(path)
+    assert_same(calibration, again)
+    assert again.identifiability.directions == calibration.identifiability.directions
+    assert again.at_bound == calibration.at_bound
+
+
+def test_chain_of_one_optic_comes_back(path):
+    chain = optics.WollastonPrism(efficiency=0.9, name="wollaston")
+    frames = half_wave_plate_cycles(derotator=[45, 60] * u.deg)
+    table = simulate(chain, WAVELENGTH, frames, seed=3, source=[1, 0.5, 0, 0])
+    calibration = calibrate(chain, table, search=False, observable="normalized_single_difference")
+    calibration.write(path)
+    assert repr(Calibration.read(path).chain) == repr(calibration.chain)
+
+
+def test_name_of_a_chain_comes_back(calibration, path):
+    changed = dataclasses.replace(calibration, chains=[c.copy() for c in calibration.chains])
+    changed.chains[0].name = "bench in May"
+    changed.write(path)
+    assert [chain.name for chain in Calibration.read(path).chains] == ["bench in May", None]
+
+
+def test_file_of_a_file_is_the_same(calibration, content, path):
+    path.write_bytes(content)
+    Calibration.read(path).write(path, overwrite=True)
+    assert path.read_bytes() == content
+
+
+def test_no_field_is_forgotten(calibration):
+    fields = {field.name for field in dataclasses.fields(Calibration)} - {"measurement"}
+    node = node_from_calibration(calibration)
+    message = "write and read every field in converters/calibration.py, and bump the schema"
+    assert set(node) - {"checksum", "validity", "written_with"} == fields, message
+    record = {field.name for field in dataclasses.fields(DatasetRecord)}
+    assert set(node["datasets"][0]) == record, message
+    tie = {field.name for field in dataclasses.fields(Tie)}
+    assert set(node["ties"][0]) == tie | {"target"}, message
+    finding = {field.name for field in dataclasses.fields(calibration.identifiability)}
+    assert set(node["identifiability"]) == finding, message
+    assert set(node["covariance"]) == set(vars(calibration.covariance)), message
+    assert set(node["stages"][0]) == set(calibration.stages[0]), message
+
+
+def test_file_says_for_what_it_holds(content):
+    with asdf.open(io.BytesIO(content), _force_raw_types=True) as file:
+        node = file["calibration"]
+    assert node["validity"] == {
+        "instrument": "bench",
+        "dates": ["2025-05-01", "2025-10-02"],
+        "optics_in_beam": [
+            ["polarizer", "hwp", "derotator", "wollaston"],
+            ["polarizer", "hwp", "derotator", "flip", "wollaston"],
+        ],
+    }
+    assert node["written_with"]["asdf"] == asdf.__version__
+    assert node["datasets"][1]["meta"]["n"] == 3
+
+
+def test_any_asdf_file_may_hold_a_calibration(calibration):
+    buffer = io.BytesIO()
+    asdf.AsdfFile({"mine": {"nights": [calibration]}}).write_to(buffer)
+    buffer.seek(0)
+    with asdf.open(buffer) as file:
+        again = file["mine"]["nights"][0]
+    assert_same(calibration, again)
+
+
+def test_file_rewritten_with_asdf_in_another_layout_is_the_same(calibration, content, path):
+    # all arrays in compressed blocks: other bytes, same content
+    with asdf.open(io.BytesIO(content)) as file, asdf.config_context() as config:
+        config.array_inline_threshold = 0
+        file.write_to(path, all_array_compression="zlib")
+    assert path.read_bytes() != content
+    assert_same(calibration, Calibration.read(path))
+
+
+def test_works_without_entry_points(calibration, path):
+    with asdf.config_context() as config:
+        config.remove_extension(package="astropolcal")
+        config.remove_resource_mapping(package="astropolcal")
+        calibration.write(path)
+        assert_same(calibration, Calibration.read(path))
+
+
+def test_settings_of_the_user_do_not_matter(calibration, path):
+    with asdf.config_context() as config:
+        config.array_inline_threshold = 10**6
+        config.all_array_storage = "external"
+        config.validate_on_read = False
+        config.warn_on_failed_conversion = True
+        calibration.write(path)
+        assert_refused(path, replaced(path.read_bytes(), b"unit: deg", b"unit: rad"), "invalid at")
+        assert config.all_array_storage == "external"
+
+
+# ---- what is refused on writing ----------------------------------------------------------
+
+
+def assert_not_written(calibration, path, message, **options):
+    before = sorted(path.parent.iterdir()) if path.parent.is_dir() else None
+    with pytest.raises(CalibrationFileError, match=message) as caught:
+        calibration.write(path, **options)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+    if before is not None:
+        assert sorted(path.parent.iterdir()) == before
+
+
+def test_existing_file_is_kept(calibration, path):
+    path.write_text("precious")
+    assert_not_written(calibration, path, "exists already; overwrite=True replaces it")
+    assert path.read_text() == "precious"
+    calibration.write(path, overwrite=True)
+    assert_same(calibration, Calibration.read(path))
+
+
+def test_folder_in_place_of_a_file(calibration, tmp_path):
+    assert_not_written(calibration, tmp_path, "is a folder", overwrite=True)
+
+
+def test_missing_folder(calibration, tmp_path):
+    assert_not_written(calibration, tmp_path / "no" / "x.asdf", "cannot be written: no folder")
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write all")
+def test_folder_without_permission(calibration, tmp_path):
+    folder = tmp_path / "closed"
+    folder.mkdir(mode=stat.S_IRUSR | stat.S_IXUSR)
+    assert_not_written(calibration, folder / "x.asdf", "cannot be written: Permission denied")
+
+
+def test_failure_of_the_system_leaves_nothing(calibration, path, monkeypatch):
+    def refuse(*args):
+        raise PermissionError(13, "Permission denied")
+
+    path.write_text("precious")
+    monkeypatch.setattr(os, "replace", refuse)
+    assert_not_written(calibration, path, "cannot be written: Permission denied", overwrite=True)
+    assert path.read_text() == "precious"
+
+
+def test_failure_midway_leaves_nothing(calibration, path, monkeypatch):
+    def stop(self, obj, tag, ctx):
+        raise RuntimeError("no more")
+
+    monkeypatch.setattr("astropolcal.converters.optics.OpticConverter.to_yaml_tree", stop)
+    path.write_text("precious")
+    message = "cannot be written: RuntimeError: no more"
+    assert_not_written(calibration, path, message, overwrite=True)
+    assert path.read_text() == "precious"
+
+
+class Homemade(optics.LinearRetarder):
+    """An optic of a user."""
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"at_bound": ["hwp.thickness"]}, "at_bound names 'hwp.thickness'"),
+        ({"datasets": []}, "2 chains but 0 datasets"),
+        ({"wavelength": [1.2, 1.6] * u.um}, "has 3 values; allowed are 1 or 2"),
+        ({"wavelength": 1.2 * u.um}, "must be a list of positive lengths"),
+        ({"wavelength": [-1, 1, 2] * u.um}, "must be a list of positive lengths"),
+        ({"wavelength": [1, 2, 3] * u.deg}, "invalid at .*wavelength.unit: 'deg' is not one of"),
+        ({"ties": {"derotator.theta": Tie("polarizer.retardance")}}, "no parameter 'polarizer"),
+        ({"ties": {"hwp.colour": Tie("hwp.theta")}}, "no parameter 'hwp.colour'"),
+        ({"covariance": Covariance(["hwp.theta"], [u.deg], [[1]])}, "covariance of 1 parameters"),
+        ({"settings": {"fitter": len}}, "settings.fitter is a builtin_function_or_method"),
+        ({"settings": {}}, "invalid at .*settings: 'observable' is a required property"),
+        ({"fit": {"seconds": "long", "n_data": 1, "converged": True}}, "invalid at .*fit.seconds"),
+    ],
+)
+def test_inconsistent_calibration_is_not_written(calibration, path, change, message):
+    assert_not_written(dataclasses.replace(calibration, **change), path, message)
+
+
+def test_covariance_of_other_parameters_is_not_written(calibration, path):
+    good = calibration.covariance
+    names = ["other.theta", *good.names[1:]]
+    units = [u.rad, *good.units[1:]]
+    for covariance, message in (
+        (Covariance(names, good.units, good.matrix), "covariance of 'other.theta', where"),
+        (Covariance(good.names, units, good.matrix), "is in rad, allowed is deg"),
+    ):
+        changed = dataclasses.replace(calibration, covariance=covariance)
+        assert_not_written(changed, path, message)
+
+
+@pytest.mark.parametrize("key", ["singular_values", "null_vectors", "identifiable"])
+def test_identifiability_of_another_size_is_not_written(calibration, path, key):
+    wrong = dataclasses.replace(calibration.identifiability, **{key: np.zeros((2, 2))})
+    changed = dataclasses.replace(calibration, identifiability=wrong)
+    assert_not_written(changed, path, f"{key} have shape")
+
+
+def test_datasets_that_disagree_are_not_written(calibration, path):
+    changed = dataclasses.replace(calibration, chains=[c.copy() for c in calibration.chains])
+    changed.chains[1]["hwp"].w_sio2 = 1.0 * u.mm
+    assert_not_written(changed, path, "hwp.w_sio2 has different values in different datasets")
+
+
+def test_accuracy_without_a_column_is_not_written(calibration, path):
+    record = dataclasses.replace(
+        calibration.datasets[0], accuracy=calibration.datasets[0].accuracy["wavelength", "n"]
+    )
+    changed = dataclasses.replace(calibration, datasets=[record, calibration.datasets[1]])
+    assert_not_written(changed, path, "night0 has no column k, s_res, s_mean, s_cv")
+
+
+def test_homemade_optic_is_not_written(calibration, path):
+    chains = [
+        join(
+            Homemade(retardance=leaf.retardance.value * u.deg, mount="derotator", name="derotator")
+            if leaf.name == "derotator"
+            else leaf
+            for leaf in leaves(chain)
+        )
+        for chain in calibration.chains
+    ]
+    changed = dataclasses.replace(calibration, chains=chains)
+    assert_not_written(changed, path, "'derotator' is a .*Homemade, which files cannot hold")
+
+
+# ---- what is refused on reading ----------------------------------------------------------
+
+
+def test_missing_file(path):
+    with pytest.raises(CalibrationFileError, match="no such file") as caught:
+        Calibration.read(path)
+    assert str(path) in str(caught.value)
+
+
+def test_folder(tmp_path):
+    with pytest.raises(CalibrationFileError, match="is a folder, not a file"):
+        Calibration.read(tmp_path)
+
+
+@pytest.mark.parametrize("junk", [b"", b"#AS", b"SIMPLE  =  T", b"\x00" * 100, b"{'a': 1}\n...\n"])
+def test_not_asdf(path, junk):
+    assert_refused(path, junk, "not an ASDF file")
+
+
+def test_asdf_of_something_else(path):
+    asdf.AsdfFile({"data": np.arange(3)}).write_to(path)
+    content = path.read_bytes()
+    assert_refused(path, content, "not an astropolcal calibration: it has no 'calibration'|trunc")
+    asdf.AsdfFile({"calibration": {"a": 1}}).write_to(path)
+    content = path.read_bytes()
+    assert_refused(path, content, "not an astropolcal calibration: 'calibration' has no tag")
+    asdf.AsdfFile({"calibration": np.arange(99)}).write_to(path)
+    assert_refused(path, path.read_bytes(), "not an astropolcal calibration: .*ndarray")
+
+
+def test_other_versions(path, content):
+    for old, new, message in (
+        (b"calibration-1.0.0>", b"calibration-2.0.0>", "calibration of version 2.0.0; this"),
+        (b"calibration-1.0.0>", b"calibration-1.0.1>", "reads version 1.0.0"),
+        (b"linear_polarizer-1.0.0>", b"linear_polarizer-1.1.0>", "unknown kind or version"),
+        (b"linear_polarizer-1.0.0>", b"circular_polarizer-1.0.0>", "damaged: .*not recognized"),
+    ):
+        assert_refused(path, replaced(content, old, new), message)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"unit: deg", b"unit: rad", r"invalid at .*theta\.unit: 'rad' is not one of \['deg'\]"),
+        (b"unit: mm", b"unit: um", r"invalid at .*unit: 'um' is not one of \['mm'\]"),
+        (b"unit: nm", b"unit: deg", r"invalid at .*wavelength"),
+        (b"n_data: ", b"n_data: -", "invalid at .*n_data"),
+        (b"strategy: two-step", b"strategy: joint", "does not match its checksum"),
+        (b"night1", b"night2", "does not match its checksum"),
+        (b"mount: hwp", b"mount: hwq", "does not match its checksum"),
+        (b"fixed: true", b"fixed: false", "does not match its checksum"),
+        (b"fixed: true", b"fixed: maybe", "'maybe' is not of type 'boolean'"),
+        (b"  stages:", b"  phases:", "'phases' was unexpected|'stages' is a required property"),
+        (b"shape: [3]", b"shape: [4]", "damaged|invalid"),
+        (b"shape: [10, 10]", b"shape: [5, 20]", "checksum"),
+        (b"source: 0", b"source: 'http://localhost/other.asdf'", "refers to another file"),
+        (b"mount: hwp", b"mount: {$ref: 'other.asdf#/name'}", "refers to another file"),
+        (b"mount: hwp", b"mount: !!python/object/apply:os.getpid []", "unknown kind"),
+        (b"mount: hwp", b"mount: !!python/name:os.getpid ''", "unknown kind"),
+        (b"mount: hwp", b"mount: !<tag:example.org:thing-1.0.0> {}", "unknown kind"),
+        (b"mount: hwp", b"mount: [unclosed", "damaged"),
+        (b"mount: hwp", b"mount: *missing", "damaged"),
+        (b"calibration:", b"calibration: &loop {a: *loop}\nold:", "not an astropolcal calibration"),
+    ],
+)
+def test_changed_file(path, content, old, new, message):
+    assert_refused(path, replaced(content, old, new), message)
+
+
+def test_changed_number_in_a_block(path, content):
+    start = content.index(b"\xd3BLK") + 54 + 8
+    changed = content[:start] + bytes([content[start] ^ 1]) + content[start + 1 :]
+    assert_refused(path, changed, "checksum")
+
+
+def test_inconsistent_content_with_a_right_checksum(calibration, content):
+    with asdf.open(io.BytesIO(content), lazy_load=False, memmap=False) as file:
+        node = node_from_calibration(file["calibration"])
+    from astropolcal.converters.calibration import _checksum
+
+    node["covariance"]["names"] = node["covariance"]["names"][::-1]
+    with pytest.raises(CalibrationFileError, match="does not match its checksum"):
+        calibration_from_node(node)
+    node["checksum"] = _checksum(node)
+    with pytest.raises(CalibrationFileError, match=r"covariance of .*, where .* is free"):
+        calibration_from_node(node)
+
+
+def test_truncation_at_any_byte(path, content):
+    # by far most lengths are seen at the end of the file; the others are those to test
+    ends = [n for n in range(len(content)) if content[:n].endswith(b"\n...\n")]
+    assert ends, "arrays in blocks come after the end of the tree"
+    spread = np.linspace(0, len(content) - 1, 100).astype(int).tolist()
+    for n in [*ends, *spread, len(content) - 1]:
+        assert_refused(path, content[:n], "truncated|not an ASDF file|damaged")
+
+
+def refusal(path, content, expected):
+    """Return why a file is refused, or None if it gives the calibration expected."""
+    path.write_bytes(content)
+    try:
+        again = Calibration.read(path)
+    except CalibrationFileError as error:
+        return str(error)
+    # what changed was in the header, or in the padding
+    assert again.to_dict() == expected
+    return None
+
+
+def test_mutated_file_is_refused_or_the_same(calibration, path, content):
+    rng = np.random.default_rng(11)
+    expected = calibration.to_dict()
+    reasons = []
+    # what YAML can read gets further than any byte
+    for allowed in (np.arange(256), np.frombuffer(b"0123456789.-eabcn: []{}\n", np.uint8)):
+        for _ in range(150):
+            changed = np.frombuffer(content, np.uint8).copy()
+            places = rng.integers(len(content), size=rng.integers(1, 4))
+            changed[places] = rng.choice(allowed, size=len(places))
+            reasons.append(refusal(path, changed.tobytes(), expected))
+    reasons = [reason for reason in reasons if reason]
+    assert len(reasons) > 200
+    assert any("does not match its checksum" in reason for reason in reasons)
+    assert any("invalid at" in reason for reason in reasons)
+    assert not any("\n" in reason for reason in reasons)
+
+
+def test_cut_and_doubled_pieces_are_refused_or_the_same(calibration, path, content):
+    rng = np.random.default_rng(12)
+    expected = calibration.to_dict()
+    reasons = []
+    for _ in range(60):
+        first, last = np.sort(rng.integers(len(content), size=2))
+        last = min(last, first + 200)
+        piece = content[first:last] * int(rng.choice([0, 2]))
+        reasons.append(refusal(path, content[:first] + piece + content[last:], expected))
+    reasons = [reason for reason in reasons if reason]
+    assert len(reasons) > 40
+    assert not any("\n" in reason for reason in reasons)

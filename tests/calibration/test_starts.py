@@ -1,0 +1,206 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The search for the right mirror branch, all wavelengths at once."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import optics
+from astropolcal.calibration import BinProblem, calibrate, search_branches
+from astropolcal.measurement import Measurement
+
+N_BINS = 22
+
+
+def problem_of(start, data):
+    measurement = Measurement(start, data)
+    return BinProblem(measurement, 1 / measurement.sigma)
+
+
+def anywhere(make, kind, seed):
+    """A truth whose retardances lie anywhere within +-340 deg, and the default start."""
+    rng = np.random.default_rng(seed)
+    start = make.chain(kind)
+    truth = start.copy()
+    truth["hwp"].w_sio2, truth["hwp"].w_mgf2 = 1.6542 * u.mm, 1.2919 * u.mm
+    truth["calibration_polarizer"].theta = 90.4 * u.deg
+    main = "retardance" if kind == "linear" else "horizontal"
+    setattr(truth["derotator"], main, rng.uniform(-340, 340, N_BINS) * u.deg)
+    if kind == "elliptical":
+        for key in ("diagonal", "circular"):
+            setattr(truth["derotator"], key, rng.uniform(-5, 5, N_BINS) * u.deg)
+    return start, truth, make.observe(truth, seed=seed)
+
+
+# --- recovery from wrong branches ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("kind", ["linear", "elliptical"])
+def test_every_wavelength_finds_a_branch_that_explains_it(make, kind, seed):
+    """Chi-square of 32 data in each bin; a wrong valley gives 1e3 to 1e7."""
+    start, _, data = anywhere(make, kind, seed)
+    cal = calibrate(start, data, weights="errors", cross_validate=False)
+    pulls = cal.residuals / cal.measurement.sigma
+    assert np.bincount(cal.measurement.bins, pulls**2).max() < 75
+
+
+def test_without_search_wavelengths_stay_in_wrong_branches(make):
+    """The test above can fail: this is what it would look like."""
+    start, _, data = anywhere(make, "linear", 0)
+    cal = calibrate(start, data, weights="errors", search=False, cross_validate=False)
+    pulls = cal.residuals / cal.measurement.sigma
+    assert np.sum(np.bincount(cal.measurement.bins, pulls**2) > 1000) > 5
+
+
+def test_found_branch_is_the_truth_or_its_exact_mirror(make):
+    """A linear retarder of d and of d - 2 pi (or d + 2 pi) are the same optic."""
+    start, truth, data = anywhere(make, "linear", 3)
+    cal = calibrate(start, data, weights="errors", cross_validate=False)
+    found, true = (c["derotator"].retardance.value for c in (cal.chain, truth))
+    error = (found - true + 180) % 360 - 180
+    assert np.abs(error).max() < 0.1
+    assert np.abs(found - true).max() > 300
+
+
+def test_thicknesses_survive_the_search(make):
+    start, truth, data = anywhere(make, "elliptical", 4)
+    cal = calibrate(start, data, weights="errors", cross_validate=False)
+    for key in ("w_sio2", "w_mgf2"):
+        error = getattr(cal.chain["hwp"], key).quantity - getattr(truth["hwp"], key).quantity
+        assert abs(error) < 4 * cal.covariance.std(f"hwp.{key}")
+
+
+# --- moved flags --------------------------------------------------------------------------
+
+
+def test_flags_name_the_wavelengths_that_moved(make):
+    start = make.chain()
+    truth = start.copy()
+    far = [3, 11, 20]
+    values = start["derotator"].retardance.value.copy()
+    values[far] = [-40.0, -200.0, 150.0]
+    truth["derotator"].retardance = values * u.deg
+    problem = problem_of(start, make.observe(truth, seed=1))
+    vector, moved = search_branches(problem, problem.measurement.vector())
+    assert set(np.flatnonzero(moved)) <= set(far)
+    costs = problem.costs(vector)
+    assert costs.max() < 40
+
+
+def test_bin_that_is_right_does_not_move(make):
+    truth = make.truth(make.chain("elliptical"))
+    problem = problem_of(truth, make.observe(truth, seed=2))
+    vector, moved = search_branches(problem, problem.measurement.vector())
+    assert not moved.any()
+    assert (problem.costs(vector) <= problem.costs(problem.measurement.vector())).all()
+
+
+def test_parameters_common_to_all_wavelengths_are_not_touched(make):
+    start, _, data = anywhere(make, "elliptical", 5)
+    problem = problem_of(start, data)
+    before = problem.measurement.vector()
+    after, _ = search_branches(problem, before.copy())
+    common = np.ones(before.size, dtype=bool)
+    common[problem.elements] = False
+    assert common.sum() == 3
+    np.testing.assert_array_equal(after[common], before[common])
+
+
+def test_search_stays_within_bounds(make):
+    start = make.chain("elliptical", bounds="paper")
+    truth = make.truth(start)
+    problem = problem_of(start, make.observe(truth, seed=6))
+    vector, _ = search_branches(problem, problem.measurement.vector())
+    low, high = problem.measurement.free.bounds()
+    assert (vector >= low).all()
+    assert (vector <= high).all()
+
+
+def test_nothing_per_wavelength_leaves_the_start_alone(make):
+    chain = make.chain()
+    for name, key in (("derotator", "retardance"), ("wollaston", "efficiency")):
+        getattr(chain[name], key).fixed = True
+    problem = problem_of(chain, make.observe(chain, seed=1))
+    vector, moved = search_branches(problem, problem.measurement.vector())
+    np.testing.assert_array_equal(vector, problem.measurement.vector())
+    assert not moved.any()
+
+
+# --- the problem of the bins --------------------------------------------------------------------
+
+
+def test_costs_add_up_to_the_whole(make):
+    start, _, data = anywhere(make, "linear", 1)
+    problem = problem_of(start, data)
+    measurement = problem.measurement
+    whole = 0.5 * np.sum((measurement.residuals() / measurement.sigma) ** 2)
+    assert problem.costs(measurement.vector()).sum() == pytest.approx(whole)
+
+
+def test_bins_with_fewer_data_are_padded(make):
+    truth = make.truth(make.chain())
+    data = make.observe(truth, seed=1)
+    mask = np.zeros((data.n_frames, N_BINS), dtype=bool)
+    mask[:16, 4] = True
+    problem = problem_of(truth, data.with_mask(mask, "test"))
+    residuals = problem.residuals(problem.measurement.vector())
+    assert residuals.shape == (N_BINS, 32)
+    assert np.count_nonzero(residuals[4]) == 24
+    assert np.count_nonzero(residuals[5]) == 32
+
+
+def test_polish_reaches_the_minimum_of_every_bin(make):
+    truth = make.truth(make.chain("elliptical"))
+    start = truth.copy()
+    start["derotator"].horizontal = truth["derotator"].horizontal.value * u.deg + 3 * u.deg
+    start["wollaston"].efficiency = np.full(N_BINS, 0.9)
+    problem = problem_of(start, make.observe(truth, noise=False))
+    vector, costs = problem.polish(problem.measurement.vector())
+    assert costs.max() < 1e-6
+    measurement = problem.measurement
+    true = Measurement(truth, measurement.datasets[0].observations).vector()
+    np.testing.assert_allclose(vector, true, rtol=1e-4, atol=1e-4)
+
+
+def test_polish_is_not_held_up_at_a_bound(make):
+    """An efficiency that wants to exceed 1 stays there while the others go on."""
+    truth = make.truth(make.chain("elliptical"))
+    data = make.observe(truth, noise=False)
+    start = truth.copy()
+    start["wollaston"].efficiency.bounds = (0.0, 0.95)  # the truth is above
+    start["wollaston"].efficiency = np.full(N_BINS, 0.949)
+    start["derotator"].horizontal = truth["derotator"].horizontal.value * u.deg + 3 * u.deg
+    problem = problem_of(start, data)
+    few, costs = problem.polish(problem.measurement.vector())
+    _, limit = problem.polish(few, iterations=200)
+    np.testing.assert_allclose(costs, limit, rtol=1e-3)
+    efficiency = problem.measurement.free.by_name["wollaston.efficiency"].slice
+    np.testing.assert_allclose(few[efficiency], 0.95)
+
+
+@pytest.mark.parametrize(
+    ("build", "expected"),
+    [
+        (lambda g: optics.EllipticalRetarder(horizontal=g, diagonal=g, circular=g, name="x"), ["x.horizontal"]),
+        (lambda g: optics.LinearRetarder(retardance=g, name="x"), ["x.retardance"]),
+        (
+            lambda g: optics.LinearRetarder(retardance=g, theta=g, name="x", fixed={"theta": False}),
+            ["x.retardance"],
+        ),
+        (lambda g: optics.LinearRetarder(retardance=g, name="x", bounds={"retardance": (0, 90)}), []),
+        (lambda g: optics.TwoLayerWaveplate(w_sio2=g.value * u.mm, w_mgf2=g.value * u.mm, name="x"), []),
+    ],
+)
+def test_scan_runs_along_the_main_retardance(make, build, expected):
+    """Neither an angle of orientation nor a thickness is a retardance to scan."""
+    grid = np.linspace(1, 2, 3) * u.deg
+    lam = [1.2, 1.6, 2.0] * u.um
+    chain = (
+        optics.LinearPolarizer(theta=30 * u.deg, name="polarizer")
+        | optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
+        | build(grid)
+        | optics.WollastonPrism(efficiency=0.9, name="wollaston")
+    )
+    problem = problem_of(chain, make.observe(chain, wavelength=lam, seed=1))
+    assert [problem.slots[row].name for row, *_ in problem.main_retardances()] == expected
