@@ -69,7 +69,7 @@ if not ONLINE:
     builtin = (
         r"(bool|bytes|dict|float|int|list|object|str|tuple|type|property|None|True|False"
         r"|[A-Z]\w*(Error|Warning|Exception)|Exception"
-        r"|(abc|collections|contextlib|dataclasses|enum|functools|pathlib|typing)\..*)"
+        r"|(abc|argparse|collections|contextlib|dataclasses|enum|functools|pathlib|typing)\..*)"
     )
     nitpick_ignore_regex += [
         (r"py:.*", rf"({'|'.join(EXTERNAL)})(\..*)?"),

@@ -74,7 +74,7 @@ def test_get_suggests_a_near_match():
 
 
 def test_get_lists_what_is_known_when_nothing_is_near():
-    with pytest.raises(InstrumentError, match="known are .*charis") as caught:
+    with pytest.raises(InstrumentError, match=r"known are .*charis") as caught:
         instruments.get("zzzzzz")
     assert "did you mean" not in str(caught.value)
     assert isinstance(caught.value, AstropolcalError)
@@ -96,7 +96,9 @@ def test_name_that_is_taken_is_refused(registry):
         instruments.register(other)
 
 
-@pytest.mark.parametrize("thing", [CHARIS(), int, "charis", type("Nameless", (Plugin,), {"name": ""})])
+@pytest.mark.parametrize(
+    "thing", [CHARIS(), int, "charis", type("Nameless", (Plugin,), {"name": ""})]
+)
 def test_only_named_instrument_classes_are_registered(registry, thing):
     with pytest.raises(InstrumentError, match="not an Instrument with a name"):
         instruments.register(thing)

@@ -51,7 +51,20 @@ class Covariance:
 
     @classmethod
     def from_canonical(cls, free, matrix):
-        """Make it from a matrix in canonical units and the `FreeParameters` it belongs to."""
+        """
+        Make it from a matrix in canonical units.
+
+        Parameters
+        ----------
+        free : FreeParameters
+            The free parameters that the rows belong to.
+        matrix : `~numpy.ndarray`
+            Shape (n_free, n_free), in radian, micrometre or 1.
+
+        Returns
+        -------
+        Covariance
+        """
         units = [slot.unit for slot in free.slots for _ in range(slot.size)]
         per_unit = np.array([1 / canonical_factor(unit) for unit in units])
         return cls(free.names, units, matrix * per_unit[:, None] * per_unit[None, :])

@@ -77,7 +77,8 @@ def calibrate(
     ties : dict of str to Tie, optional
         Parameters that follow others.
     positions : sequence of dict, optional
-        Position of every stage for each dataset, see `Measurement`.
+        Position of every stage for each dataset, see
+        `~astropolcal.measurement.Measurement`.
     wavelength : `~astropy.units.Quantity`, optional
         Grid of the parameters given per wavelength.
     search : bool

@@ -154,7 +154,7 @@ class Calibration:
         dataset : int
             Which of the calibration's chains is meant.
         positions : dict, optional
-            Position of every stage, see `Measurement`.
+            Position of every stage, see `~astropolcal.measurement.Measurement`.
 
         Returns
         -------

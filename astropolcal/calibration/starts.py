@@ -107,7 +107,9 @@ class BinProblem:
     def _step(self, vector, damping):
         normal, gradient = self._normal_equations(vector)
         here = vector[self.elements]
-        held = (((here <= self._low) & (gradient.T > 0)) | ((here >= self._high) & (gradient.T < 0))).T
+        held = (
+            ((here <= self._low) & (gradient.T > 0)) | ((here >= self._high) & (gradient.T < 0))
+        ).T
         # a parameter that leans against its bound must not slow down the others
         normal = np.where(held[:, :, None] | held[:, None, :], 0.0, normal)
         gradient = np.where(held, 0.0, gradient)

@@ -169,7 +169,8 @@ def _identifiability_node(finding):
         "names": list(finding.names),
         "rank": int(finding.rank),
         "singular_values": finding.singular_values.copy(),
-        "null_vectors": finding.null_vectors.copy(),
+        # row by row: some versions of asdf cannot read an empty matrix
+        "null_vectors": [row.copy() for row in finding.null_vectors],
         "identifiable": finding.identifiable.copy(),
         "directions": [
             {
@@ -304,11 +305,12 @@ def _identifiability(node):
 
     from astropolcal.calibration import Identifiability
 
+    names, vectors = list(node["names"]), node["null_vectors"]
     return Identifiability(
-        names=list(node["names"]),
+        names=names,
         rank=node["rank"],
         singular_values=np.array(node["singular_values"]),
-        null_vectors=np.array(node["null_vectors"]),
+        null_vectors=np.array(vectors) if vectors else np.zeros((0, len(names))),
         identifiable=np.array(node["identifiable"]),
         directions=[
             {

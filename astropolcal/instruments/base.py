@@ -12,7 +12,6 @@ from astropolcal.observations import common_wavelengths
 __all__ = ["Instrument"]
 
 
-
 class Instrument(ABC):
     """
     Base of all instruments; a subclass is one file.

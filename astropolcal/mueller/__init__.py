@@ -2,9 +2,9 @@
 """
 Mueller algebra: pure functions on arrays of shape (..., 4, 4).
 
-Three parts: the elementary matrices and their rotation (`elements`), the
-polar decomposition and the scalars drawn from a matrix (`decomposition`), and
-which matrices nature allows (`physicality`).
+Three parts: the elementary matrices and their rotation (``elements``), the
+polar decomposition and the scalars drawn from a matrix (``decomposition``), and
+which matrices nature allows (``physicality``).
 
 An optic of matrix M turned by an angle is ``T(-angle) M T(angle)``; a matrix
 acts on Stokes vectors (I, Q, U, V) in the sense of `astropolcal.stokes`.

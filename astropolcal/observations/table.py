@@ -4,7 +4,6 @@
 """
 
 import dataclasses
-import os
 from pathlib import Path
 
 import astropy.units as u
@@ -13,6 +12,7 @@ from astropy.table import Table
 from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError
+from astropolcal.files import atomic_path
 from astropolcal.observations.grid import build_grid
 from astropolcal.observations.hashing import hash_columns
 from astropolcal.observations.pairing import pair_frames
@@ -247,7 +247,7 @@ class Observations:
         """
         SHA-256 of the content (str), the same for any order of rows and format of numbers.
 
-        Numbers count to 12 significant digits in canonical units; of `meta`, only
+        Numbers count to 12 significant digits in canonical units; of ``meta``, only
         the instrument and the source belong to the content.
         """
         if self._hash is None:
@@ -585,18 +585,16 @@ class Observations:
         path = Path(path)
         if path.exists() and not overwrite:
             raise ObservationError(f"{path}: exists already; overwrite=True replaces it")
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
-            with open(temporary, "x", encoding="utf-8") as stream:
+            with atomic_path(path, ObservationError) as temporary:
                 # a plain Table gives a header that people can read, unlike a QTable
-                Table(self.to_table()).write(stream, format="ascii.ecsv")
-            os.replace(temporary, path)
+                Table(self.to_table()).write(temporary, format="ascii.ecsv")
+        except ObservationError:
+            raise
         except Exception as error:  # meta may hold what YAML cannot represent
             raise ObservationError(
                 f"{path}: cannot be written: {' '.join(str(error).split())}"
             ) from error
-        finally:
-            temporary.unlink(missing_ok=True)
 
 
 def _count(number, noun):

@@ -82,7 +82,9 @@ def test_each_dataset_has_its_own_accuracy(chain, measurement):
 def test_accuracy_of_pure_photon_noise_is_its_error(make, chain):
     data = make.observe(chain, wavelength=LAM, seed=5)
     cal = calibrate(chain, data, cross_validate=False)
-    sigma = [np.sqrt(np.mean(cal.measurement.sigma[cal.measurement.bins == i] ** 2)) for i in range(3)]
+    sigma = [
+        np.sqrt(np.mean(cal.measurement.sigma[cal.measurement.bins == i] ** 2)) for i in range(3)
+    ]
     ratio = cal.accuracy["s_res"].to_value(u.one) / sigma
     # relative error of a standard deviation from 27 degrees of freedom: 14 %
     np.testing.assert_allclose(ratio, 1, atol=0.5)
@@ -161,7 +163,9 @@ def test_the_fit_itself_is_left_alone(measurement):
 
 def test_fewer_than_three_groups_give_nan(make, chain):
     data = make.observe(chain, make.frames([45, 80] * u.deg), LAM, seed=1)
-    held_out = cross_validated_residuals(Measurement(chain, data), Measurement(chain, data).vector())
+    held_out = cross_validated_residuals(
+        Measurement(chain, data), Measurement(chain, data).vector()
+    )
     assert np.isnan(held_out).all()
     cal = calibrate(chain, data)
     assert np.isnan(cal.accuracy["s_cv"]).all()
@@ -182,7 +186,8 @@ def test_weights_are_used(make, chain, measurement):
     bad = np.abs(spoiled.observed - measurement.observed) > 0
     weights = np.where(bad, 0.0, 1.0)
     given = [
-        cross_validated_residuals(m, m.vector(), weights, groups)[~bad] for m in (measurement, spoiled)
+        cross_validated_residuals(m, m.vector(), weights, groups)[~bad]
+        for m in (measurement, spoiled)
     ]
     np.testing.assert_allclose(given[0], given[1], rtol=0, atol=1e-7)
 

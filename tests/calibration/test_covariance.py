@@ -52,13 +52,18 @@ def test_matrix_is_a_copy(covariance):
 
 
 def test_unknown_name_is_refused(covariance):
-    with pytest.raises(ParameterError, match="no parameter 'hwp.phase'"):
+    with pytest.raises(ParameterError, match=r"no parameter 'hwp.phase'"):
         covariance.std("hwp.phase")
 
 
 @pytest.mark.parametrize(
     ("names", "units", "shape"),
-    [(NAMES, UNITS, (2, 2)), (NAMES, UNITS, (3, 2)), (NAMES[:2], UNITS, (3, 3)), (NAMES, UNITS[:2], (3, 3))],
+    [
+        (NAMES, UNITS, (2, 2)),
+        (NAMES, UNITS, (3, 2)),
+        (NAMES[:2], UNITS, (3, 3)),
+        (NAMES, UNITS[:2], (3, 3)),
+    ],
 )
 def test_shapes_must_agree(names, units, shape):
     with pytest.raises(ParameterError, match="covariance of"):

@@ -408,6 +408,14 @@ def test_folder(tmp_path):
         Calibration.read(tmp_path)
 
 
+def test_file_that_the_system_refuses(path, content, monkeypatch):
+    def refuse(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(path), "read_bytes", refuse)
+    assert_refused(path, content, "Permission denied")
+
+
 @pytest.mark.parametrize("junk", [b"", b"#AS", b"SIMPLE  =  T", b"\x00" * 100, b"{'a': 1}\n...\n"])
 def test_not_asdf(path, junk):
     assert_refused(path, junk, "not an ASDF file")

@@ -49,7 +49,9 @@ def test_noiseless_data_give_back_the_truth(make, observable, kind):
     cal = calibrate(chain, data, observable=observable, cross_validate=False)
     assert cal.settings["observable"] == observable
     np.testing.assert_allclose(cal.residuals, 0, atol=1e-7)
-    np.testing.assert_allclose(cal.measurement.vector(), true_vector(cal, truth), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        cal.measurement.vector(), true_vector(cal, truth), rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("strategy", ["joint", "two-step"])
@@ -61,7 +63,9 @@ def test_noisy_data_give_the_truth_within_errors(few, strategy):
     pulls = (cal.measurement.vector() - true_vector(cal, truth)) / stds
     # the two-step procedure is not the least-squares minimum, but within its neighbourhood
     assert np.abs(pulls).max() < {"joint": 4, "two-step": 6}[strategy]
-    chi2 = np.sum((cal.residuals / cal.measurement.sigma) ** 2) / (cal.measurement.n_data - len(pulls))
+    chi2 = np.sum((cal.residuals / cal.measurement.sigma) ** 2) / (
+        cal.measurement.n_data - len(pulls)
+    )
     assert chi2 == pytest.approx(1.0, abs={"joint": 0.5, "two-step": 1.0}[strategy])
 
 
@@ -145,7 +149,8 @@ def test_single_wavelength_finds_its_branch(make):
     data = make.observe(truth, wavelength=lam, seed=2)
     chain["derotator"].retardance = [330.0] * u.deg
     lost, found = (
-        calibrate(chain, data, weights="errors", search=s, cross_validate=False) for s in (False, True)
+        calibrate(chain, data, weights="errors", search=s, cross_validate=False)
+        for s in (False, True)
     )
     chi2 = [np.sum((c.residuals / c.measurement.sigma) ** 2) for c in (lost, found)]
     assert chi2[0] > 1000
@@ -172,9 +177,7 @@ def test_two_datasets_share_optics_and_halve_the_variance(make):
     """The same frames with and without the beam switcher: errors fall by sqrt(2)."""
     pair = [make.chain(wavelength=FEW, optics_in=o) for o in ([], ["nbs"])]
     truths = [make.truth(c) for c in pair]
-    data = [
-        make.observe(t, wavelength=FEW, seed=i, name=f"set {i}") for i, t in enumerate(truths)
-    ]
+    data = [make.observe(t, wavelength=FEW, seed=i, name=f"set {i}") for i, t in enumerate(truths)]
     both = calibrate(pair, data, weights="errors", cross_validate=False)
     alone = calibrate(pair[0], data[0], weights="errors", cross_validate=False)
     assert [record.name for record in both.datasets] == ["set 0", "set 1"]
@@ -361,7 +364,12 @@ def test_fixed_parameters_have_no_error(calibrated):
 def test_record_of_the_data(few, calibrated):
     _, _, data = few
     (record,) = calibrated.datasets
-    assert (record.name, record.source, record.n_frames, record.n_masked) == ("few", "polarized", 64, 0)
+    assert (record.name, record.source, record.n_frames, record.n_masked) == (
+        "few",
+        "polarized",
+        64,
+        0,
+    )
     assert record.content_hash == data.content_hash
     assert calibrated.provenance["astropolcal"]
     assert calibrated.instrument == "charis"

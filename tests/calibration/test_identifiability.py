@@ -152,7 +152,9 @@ def test_rank_of_the_calibration_of_charis(make, kind, fixed, rank, n_free):
 
 
 @settings(max_examples=20)
-@given(weights=st.tuples(st.floats(-1, 1), st.floats(-1, 1)).filter(lambda w: max(map(abs, w)) > 0.1))
+@given(
+    weights=st.tuples(st.floats(-1, 1), st.floats(-1, 1)).filter(lambda w: max(map(abs, w)) > 0.1)
+)
 def test_step_along_the_null_directions_leaves_the_data_unchanged(weights, make):
     """To second order: half the step leaves a quarter of the change."""
     truth = make.truth(make.chain("elliptical", fixed=False))
@@ -180,7 +182,9 @@ def test_null_vectors_are_orthonormal_and_null(make):
     np.testing.assert_allclose(null @ null.T, np.eye(2), atol=1e-12)
     scaled = measurement.jacobian(measurement.vector()) * physical_scale(measurement.free)[:, None]
     assert np.abs(null @ scaled).max() < 1e-9 * finding.singular_values[0]
-    np.testing.assert_allclose(finding.singular_values[91:], 0, atol=1e-9 * finding.singular_values[0])
+    np.testing.assert_allclose(
+        finding.singular_values[91:], 0, atol=1e-9 * finding.singular_values[0]
+    )
 
 
 # --- errors ------------------------------------------------------------------------------------

@@ -182,14 +182,27 @@ def test_polish_is_not_held_up_at_a_bound(make):
 @pytest.mark.parametrize(
     ("build", "expected"),
     [
-        (lambda g: optics.EllipticalRetarder(horizontal=g, diagonal=g, circular=g, name="x"), ["x.horizontal"]),
+        (
+            lambda g: optics.EllipticalRetarder(horizontal=g, diagonal=g, circular=g, name="x"),
+            ["x.horizontal"],
+        ),
         (lambda g: optics.LinearRetarder(retardance=g, name="x"), ["x.retardance"]),
         (
-            lambda g: optics.LinearRetarder(retardance=g, theta=g, name="x", fixed={"theta": False}),
+            lambda g: optics.LinearRetarder(
+                retardance=g, theta=g, name="x", fixed={"theta": False}
+            ),
             ["x.retardance"],
         ),
-        (lambda g: optics.LinearRetarder(retardance=g, name="x", bounds={"retardance": (0, 90)}), []),
-        (lambda g: optics.TwoLayerWaveplate(w_sio2=g.value * u.mm, w_mgf2=g.value * u.mm, name="x"), []),
+        (
+            lambda g: optics.LinearRetarder(retardance=g, name="x", bounds={"retardance": (0, 90)}),
+            [],
+        ),
+        (
+            lambda g: optics.TwoLayerWaveplate(
+                w_sio2=g.value * u.mm, w_mgf2=g.value * u.mm, name="x"
+            ),
+            [],
+        ),
     ],
 )
 def test_scan_runs_along_the_main_retardance(make, build, expected):

@@ -57,7 +57,16 @@ def optic(draw, name):
     """Any optic that is not the beam splitter, with theta free."""
     kind = draw(
         st.sampled_from(
-            ["linear", "elliptical", "plate", "diattenuator", "both", "depolarizer", "flip", "rotator"]
+            [
+                "linear",
+                "elliptical",
+                "plate",
+                "diattenuator",
+                "both",
+                "depolarizer",
+                "flip",
+                "rotator",
+            ]
         )
     )
     mount = draw(st.sampled_from([None, "hwp", "derotator", "-hwp"]))
@@ -158,7 +167,9 @@ def test_two_datasets_share_their_optics(make_chain, frames):
     data = [simulate(c, WAVELENGTH, frames, noise=False) for c in pair]
     measurement = Measurement(pair, data)
     assert measurement.free.size == Measurement(pair[0], data[0]).free.size
-    assert [s.stop - s.start for s in measurement.segments] == [d.n_data for d in measurement.datasets]
+    assert [s.stop - s.start for s in measurement.segments] == [
+        d.n_data for d in measurement.datasets
+    ]
     np.testing.assert_allclose(measurement.residuals(), 0, atol=1e-12)
     assert_jacobian_right(measurement)
     halves = [Measurement(c, d) for c, d in zip(pair, data, strict=True)]
@@ -429,7 +440,9 @@ def test_copy_is_independent_but_shares_the_data(chain, observations):
     assert measurement.chains[0]["polarizer"].theta.value == 90
     assert clone.chains[0]["polarizer"].theta.value == pytest.approx(90 + np.rad2deg(0.1))
     assert measurement.polarizer_theta.value == pytest.approx(np.pi / 2)
-    np.testing.assert_array_equal(clone.predict(clone.vector()), measurement.predict(clone.vector()))
+    np.testing.assert_array_equal(
+        clone.predict(clone.vector()), measurement.predict(clone.vector())
+    )
 
 
 def test_sigma_is_the_error_of_the_data(chain, frames):

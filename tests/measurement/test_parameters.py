@@ -127,18 +127,18 @@ def test_wrong_number_of_values():
 
 def test_number_of_values_of_fixed_parameters_counts_too():
     chain = two_optics(fixed={"retardance": True})
-    with pytest.raises(ParameterError, match="plate.retardance has 3 values"):
+    with pytest.raises(ParameterError, match=r"plate.retardance has 3 values"):
         FreeParameters([chain], 22)
 
 
 def test_free_in_one_chain_and_fixed_in_another():
     chains = [two_optics(), two_optics(fixed={"retardance": True})]
-    with pytest.raises(ParameterError, match="plate.retardance differs between datasets"):
+    with pytest.raises(ParameterError, match=r"plate.retardance differs between datasets"):
         FreeParameters(chains, 3)
 
 
 def test_different_shapes_in_two_chains():
-    with pytest.raises(ParameterError, match="plate.retardance differs between datasets in shape"):
+    with pytest.raises(ParameterError, match=r"plate.retardance differs between datasets in shape"):
         FreeParameters([two_optics(), two_optics(retardance=10 * u.deg)], 3)
 
 
@@ -169,7 +169,7 @@ def test_impossible_tie(ties, words):
 
 
 def test_offset_of_a_wrong_unit():
-    with pytest.raises(ParameterError, match="offset of plate.theta"):
+    with pytest.raises(ParameterError, match=r"offset of plate.theta"):
         FreeParameters(
             [two_optics()], 3, {"plate.theta": Tie("wollaston.efficiency", offset=1 * u.mm)}
         )
@@ -184,7 +184,9 @@ def test_grid_is_the_sorted_union_of_the_datasets():
     table["wavelength"] = table["wavelength"] * 1.000001
     table["wavelength"][table["bin"] == 2] *= 1.1
     second = Observations.from_table(table)
-    np.testing.assert_allclose(common_wavelengths([second, first]), [1.2, 1.6, 2.2, 2.42], rtol=1e-5)
+    np.testing.assert_allclose(
+        common_wavelengths([second, first]), [1.2, 1.6, 2.2, 2.42], rtol=1e-5
+    )
 
 
 def test_grid_that_is_given_is_taken():

@@ -562,7 +562,10 @@ def test_with_parameters_changes_only_the_values(label, data):
     for key, value in values.items():
         np.testing.assert_array_equal(getattr(other, key).value, value)
         assert np.shape(getattr(optic, key).value) == ()
+    optic.theta.tied = optic.theta.prior = abs
     same = optic.with_parameters()
+    assert same.theta.tied is same.theta.prior is abs
+    optic.theta.tied, optic.theta.prior = False, None
     assert state(same) == state(optic)
     np.testing.assert_array_equal(same.mueller(WAVELENGTH), optic.mueller(WAVELENGTH))
 
