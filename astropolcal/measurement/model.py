@@ -88,10 +88,11 @@ class Measurement(FittableModel):
         pairs = as_pairs(chain, observations, positions)
         if copy:
             pairs = [(item.copy(), obs, position) for item, obs, position in pairs]
-        self.chains = [item for item, _, _ in pairs]
+        self._chains = [item for item, _, _ in pairs]
+        self._chains_are_shared = False
         self.observable = get_observable(observable)
         self.wavelength = common_wavelengths([obs for _, obs, _ in pairs], wavelength)
-        self.free = FreeParameters(self.chains, len(self.wavelength), ties)
+        self.free = FreeParameters(self._chains, len(self.wavelength), ties)
         self.datasets = [
             Dataset(item, obs, self.observable, self.free, self.wavelength, position)
             for item, obs, position in pairs
@@ -142,14 +143,47 @@ class Measurement(FittableModel):
         """Names of the free scalar parameters, one an element of the flat vector."""
         return self._param_names
 
+    # a fitter asks these for every evaluation; astropy would build a table of all constraints
+    @property
+    def has_fixed(self):
+        """Whether a scalar parameter is fixed."""
+        return any(self.__dict__[label].fixed for label in self._param_names)
+
+    @property
+    def has_tied(self):
+        """Whether a scalar parameter has a callable tie."""
+        return any(self.__dict__[label].tied for label in self._param_names)
+
+    @property
+    def has_bounds(self):
+        """Whether a scalar parameter has a bound."""
+        return any(self.__dict__[label].bounds != (None, None) for label in self._param_names)
+
     def __deepcopy__(self, memo):
-        # fitters copy the model: the data do not change, so only chains and values are copied
-        for item in (self.datasets, self.observed, self.sigma, self.index, self.observable):
-            memo[id(item)] = item
+        # every fitter copies the model: what does not change is shared, and the chains are
+        # copied when somebody looks at them
         new = self.__class__.__new__(self.__class__)
         memo[id(self)] = new
-        new.__dict__.update(copy_module.deepcopy(self.__dict__, memo))
+        shared = dict(self.__dict__, _chains_are_shared=True)
+        own = {key: shared.pop(key) for key in ("_parameters", "_param_metrics", "_mconstraints")}
+        new.__dict__.update(shared)
+        new.__dict__.update(copy_module.deepcopy(own, memo))
+        for label in self._param_names:
+            parameter = copy_module.copy(self.__dict__[label])
+            parameter.model = new
+            new.__dict__[label] = parameter
+            parameter.value = float(self.__dict__[label].value)
+        self._chains_are_shared = True
         return new
+
+    @property
+    def chains(self):
+        """The chain of each dataset; `put_back` writes the values into them."""
+        if self._chains_are_shared:
+            self._chains = [chain.copy() for chain in self._chains]
+            self.free = self.free.of_chains(self._chains)
+            self._chains_are_shared = False
+        return self._chains
 
     # ---- evaluation ---------------------------------------------------------
 
@@ -221,8 +255,9 @@ class Measurement(FittableModel):
 
     def put_back(self, vector=None):
         """Write values (by default the current ones) into the chains and return these."""
+        chains = self.chains
         self.free.put_back(self.vector() if vector is None else vector)
-        return self.chains
+        return chains
 
     def residuals(self, vector=None):
         """Return observed minus predicted data, shape (n_data,)."""

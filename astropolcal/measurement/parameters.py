@@ -8,6 +8,7 @@ becomes one number a wavelength of the common grid. Ties are linear and are
 applied here, so that the Jacobian stays exact.
 """
 
+import copy
 from dataclasses import dataclass
 
 import astropy.units as u
@@ -190,6 +191,12 @@ class FreeParameters:
                 self._append(name, parameters[0])
         self.by_name = {slot.name: slot for slot in self.slots}
         self._followers = {name: self._follower(name, tie) for name, tie in self.ties.items()}
+
+    def of_chains(self, chains):
+        """Return the same parameters, bound to copies of the chains."""
+        new = copy.copy(self)
+        new._table = parameter_table(chains)
+        return new
 
     def _append(self, name, parameter):
         size = int(np.size(parameter.value))
