@@ -361,6 +361,15 @@ def test_published_parameters_reproduce_the_published_accuracy(published, shared
     np.testing.assert_allclose(s_rel, published["s_rel_elliptical_dataset3"], rtol=0, atol=1e-5)
 
 
+def test_meta_of_the_published_chain_lead_to_it():
+    instrument = CHARIS()
+    table = _observations(**instrument.published_meta())
+    assert instrument.check(table) is None
+    source, optics_in = instrument.setup(table)
+    expected = instrument.published().submodel_names
+    assert instrument.chain(source, optics_in).submodel_names == expected
+
+
 def test_published_chain_of_the_instrument_agrees_with_the_table(published):
     chain = CHARIS().published()
     derotator = chain["derotator"]

@@ -51,7 +51,7 @@ def calibrate(
     ties=None,
     positions=None,
     wavelength=None,
-    search=True,
+    search=None,
     instrument=None,
     cross_validate=True,
 ):
@@ -81,9 +81,10 @@ def calibrate(
         `~astropolcal.measurement.Measurement`.
     wavelength : `~astropy.units.Quantity`, optional
         Grid of the parameters given per wavelength.
-    search : bool
+    search : bool, optional
         Whether to look for the best mirror branch of each wavelength; without
-        it the fit goes downhill from the chain's own values.
+        it the fit goes downhill from the chain's own values. By default the
+        joint strategy searches, and the two-step one, like the paper, does not.
     instrument : str, optional
         Name to record.
     cross_validate : bool
@@ -116,6 +117,7 @@ def calibrate(
     """
     if strategy not in STRATEGIES:
         raise FitError(f"strategy = {strategy!r}; allowed are {', '.join(STRATEGIES)}")
+    search = strategy == "joint" if search is None else search
     started = time.perf_counter()
     fitter = TRFLSQFitter() if fitter is None else fitter
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
@@ -126,6 +128,10 @@ def calibrate(
         outcome, stages = _joint(measurement, weight, fitter, search), []
     else:
         outcome, stages = _two_step(measurement, weight, fitter, search, options)
+    if not outcome["converged"]:
+        warnings.warn(
+            f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
+        )
     seconds = time.perf_counter() - started
     return _result(
         measurement,
@@ -182,14 +188,24 @@ def _run(measurement, weight, fitter):
             raise FitError(f"{type(fitter).__name__} failed: {error}") from error
     info = fitter.fit_info if hasattr(fitter, "fit_info") and fitter.fit_info else {}
     said = [str(w.message) for w in caught if "unsuccessful" in str(w.message)]
-    arrived = not said
-    message = said[0] if said else str(info.get("message", "")).strip()
+    outside = _outside_bounds(measurement)
+    if outside:
+        said.append(f"{type(fitter).__name__} left the bounds of {', '.join(outside)}")
     evaluations = info.get("nfev")
     return {
-        "converged": arrived,
-        "message": message,
+        "converged": not said,
+        "message": said[-1] if said else str(info.get("message", "")).strip(),
         "evaluations": None if evaluations is None else int(evaluations),
     }
+
+
+def _outside_bounds(measurement):
+    """Return the names of parameters that a fitter without bounds left outside of theirs."""
+    low, high = measurement.free.bounds()
+    vector = measurement.vector()
+    slack = _AT_BOUND * np.maximum(1.0, np.abs(vector))
+    outside = (vector < low - slack) | (vector > high + slack)
+    return [measurement.free.names[i] for i in np.flatnonzero(outside)]
 
 
 def _joint(measurement, weight, fitter, search):
@@ -207,10 +223,6 @@ def _joint(measurement, weight, fitter, search):
         if not moved.any():
             break
         measurement.parameters = better
-    if not outcome["converged"]:
-        warnings.warn(
-            f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=4
-        )
     return outcome
 
 
@@ -229,18 +241,19 @@ def _two_step(measurement, weight, fitter, search, options):
 
     loose = [_loosened(chain, measurement.wavelength * u.um) for chain in measurement.chains]
     first = _step_of(loose, single, parts, ties, options)
-    outcome = _joint(first, weight, fitter, search)
+    outcomes = [_joint(first, weight, fitter, search)]
     stages.append(_stage("per wavelength, misalignments held", first))
     _copy_values(first.put_back(), measurement.chains)
 
     for title, held in (("global", several), ("per wavelength, global parameters held", single)):
         step = _step_of(measurement.chains, held, parts, ties, options)
         if step.free.size:
-            outcome = _run(step, weight, fitter)
+            outcomes.append(_run(step, weight, fitter))
         stages.append(_stage(title, step))
         _copy_values(step.put_back(), measurement.chains)
     measurement.parameters = measurement.free.start()
-    return outcome, stages
+    # the first step that did not arrive spoils those behind it
+    return next((o for o in outcomes if not o["converged"]), outcomes[-1]), stages
 
 
 def _step_of(chains, held, parts, ties, options):

@@ -78,7 +78,7 @@ def add_parser(commands):
         action="append",
         default=[],
         metavar="NAME",
-        help="free a parameter, such as dichroic.retardance",
+        help="free a parameter, such as wollaston.theta",
     )
     parser.add_argument(
         "--without",

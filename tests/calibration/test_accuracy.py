@@ -192,6 +192,24 @@ def test_weights_are_used(make, chain, measurement):
     np.testing.assert_allclose(given[0], given[1], rtol=0, atol=1e-7)
 
 
+def test_weighted_calibration_is_cross_validated_with_its_weights(chain, measurement):
+    table = measurement.datasets[0].observations.to_table()
+    noisy = np.abs(table["derotator"].to_value(u.deg) - 70.0) < 0.1
+    for beam in ("right", "left"):
+        table[f"flux_{beam}_err"][noisy] *= 100
+    cal = calibrate(chain, _spoil(Observations.from_table(table), 70.0), weights="errors")
+    vector, weights = cal.measurement.vector(), 1 / cal.measurement.sigma
+    residuals = cal.measurement.residuals()
+    expected, other = (
+        accuracy_table(
+            cal.measurement, 0, residuals, cross_validated_residuals(cal.measurement, vector, w)
+        )["s_cv"].value
+        for w in (weights, None)
+    )
+    np.testing.assert_allclose(cal.accuracy["s_cv"].value, expected, rtol=1e-6)
+    assert np.abs(other / expected - 1).max() > 0.01
+
+
 def test_calibration_can_be_cross_validated_afterwards(measurement, chain):
     data = measurement.datasets[0].observations
     later = calibrate(chain, data, cross_validate=False)

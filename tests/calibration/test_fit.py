@@ -6,7 +6,7 @@ import json
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, TRFLSQFitter
+from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, LMLSQFitter, TRFLSQFitter
 
 from astropolcal.calibration import Calibration, calibrate, to_dict
 from astropolcal.chain import leaves
@@ -171,6 +171,20 @@ def test_ties_are_kept(few, strategy):
     assert known["tied"] == "calibration_polarizer.theta"
     assert "derotator.theta" not in cal.covariance.names
     assert not any("derotator.theta" in row for row in cal.parameters["name"])
+    assert cal.measurement_of(data).free.size == len(cal.covariance)
+
+
+def test_what_follows_a_held_parameter_is_held_at_its_place(few, make):
+    """In the first of the two steps a tie must count although its source does not move."""
+    chain, truth, _ = few
+    truth = truth.copy()
+    truth["derotator"].theta = (0.5 * 90.4 - 40) * u.deg
+    ties = {"derotator.theta": Tie("calibration_polarizer.theta", 0.5, offset=-40 * u.deg)}
+    data = make.observe(truth, wavelength=FEW, noise=False)
+    cal = calibrate(chain, data, ties=ties, strategy="two-step", cross_validate=False)
+    # the polarizer is 0.4 deg off in the first step; the derotator would be by 5 deg
+    assert cal.stages[0]["residual_rms"] < 0.02
+    assert cal.chain["derotator"].theta.value == pytest.approx(5.2, abs=0.05)
 
 
 def test_two_datasets_share_optics_and_halve_the_variance(make):
@@ -288,6 +302,42 @@ def test_fit_that_does_not_arrive_warns(few, monkeypatch):
         cal = calibrate(chain, data, search=False, cross_validate=False)
     assert not cal.converged
     assert "NOT CONVERGED" in cal.summary()
+
+
+def test_step_that_does_not_arrive_warns_too(few, monkeypatch):
+    from astropolcal.calibration import fit
+
+    chain, _, data = few
+    monkeypatch.setattr(fit, "_MAX_EVALUATIONS", 1)
+    with pytest.warns(AstropolcalWarning, match="did not converge"):
+        cal = calibrate(chain, data, strategy="two-step", cross_validate=False)
+    assert not cal.converged
+
+
+def test_fitter_that_leaves_the_bounds_is_told_on(few):
+    """`LMLSQFitter` knows no bounds and does not say so."""
+    chain, _, data = few
+    tight = chain.copy()
+    tight["calibration_polarizer"].theta.bounds = (89.8, 90.2)  # the truth is 90.4
+    with pytest.warns(AstropolcalWarning, match=r"LMLSQFitter left the bounds of calibration_pol"):
+        cal = calibrate(tight, data, fitter=LMLSQFitter(), search=False, cross_validate=False)
+    assert not cal.converged
+
+
+def test_two_steps_search_for_branches_only_when_asked(make):
+    """The paper's procedure goes downhill from its start."""
+    start = make.chain(wavelength=FEW)
+    truth = make.truth(start)
+    data = make.observe(truth, wavelength=FEW, seed=1)
+    start["derotator"].retardance = [330, 300, 20, 10] * u.deg
+    rms = {
+        search: calibrate(
+            start, data, strategy="two-step", search=search, cross_validate=False
+        ).stages[0]["residual_rms"]
+        for search in (None, False, True)
+    }
+    assert rms[None] == rms[False]
+    assert rms[True] < 0.1 * rms[False]
 
 
 def test_fitter_that_breaks_is_a_fit_error(few):

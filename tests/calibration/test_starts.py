@@ -88,6 +88,20 @@ def test_flags_name_the_wavelengths_that_moved(make):
     assert costs.max() < 40
 
 
+def test_scan_begins_at_the_origin(make):
+    """Where a bin went astray with all of its parameters, the chain's own values lead back."""
+    start = make.chain("elliptical")
+    truth = make.truth(start)
+    problem = problem_of(start, make.observe(truth, seed=1))
+    origin = problem.measurement.vector()
+    astray = origin.copy()
+    rng = np.random.default_rng(0)
+    astray[problem.elements[1:3]] = rng.uniform(-3, 3, (2, N_BINS))
+    led, (lost, _) = search_branches(problem, astray, origin)[0], search_branches(problem, astray)
+    assert problem.costs(led).max() < 5e4
+    assert problem.costs(lost).max() > 20 * problem.costs(led).max()
+
+
 def test_bin_that_is_right_does_not_move(make):
     truth = make.truth(make.chain("elliptical"))
     problem = problem_of(truth, make.observe(truth, seed=2))

@@ -403,6 +403,14 @@ def test_parameters_belong_to_the_instance():
     assert Measurement._param_names == ()
 
 
+def test_parameter_may_be_replaced_by_a_parameter(chain, observations):
+    """As astropy does it when it copies a model."""
+    measurement = Measurement(chain, observations)
+    parameter = measurement.polarizer_theta.copy()
+    measurement.polarizer_theta = parameter
+    assert measurement.polarizer_theta is parameter
+
+
 def test_chains_given_are_not_changed(chain, observations):
     before = [np.array(v) for leaf in chain for v in leaf.canonical_values()]
     measurement = Measurement(chain, observations)
