@@ -9,10 +9,10 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 
 # Okabe & Ito (2008), distinct for all kinds of colour vision; yellow is too pale for lines
-BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 WINE = "#882255"  # the eighth, from P. Tol's "muted" scheme
-COLORS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, WINE)
+COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK, WINE)
 # one more than colours: the pairs repeat only after 72 series
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "h")
 GREY = "0.45"

@@ -10,7 +10,7 @@ from astropolcal.plotting._style import (
     BLUE,
     GREEN,
     MINUS,
-    VERMILLION,
+    VERMILION,
     canvas,
     heading,
     legend_outside,
@@ -23,7 +23,7 @@ __all__ = ["plot_accuracy"]
 
 _CURVES = {
     "s_res": (
-        VERMILLION,
+        VERMILION,
         "o",
         f"s_res = √(Σr²/(n {MINUS} k)): scatter of one datum about the model",
     ),

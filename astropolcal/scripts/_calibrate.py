@@ -15,14 +15,7 @@ examples:
 
 
 def add_parser(commands):
-    """
-    Add the subcommand to the command's parser.
-
-    Parameters
-    ----------
-    commands : object
-        What `argparse.ArgumentParser.add_subparsers` returns.
-    """
+    """Add the subcommand to what ``add_subparsers`` returned."""
     import argparse
 
     parser = commands.add_parser(
@@ -96,19 +89,7 @@ def add_parser(commands):
 
 
 def run(arguments):
-    """
-    Calibrate, print the summary and write what was asked for.
-
-    Parameters
-    ----------
-    arguments : `argparse.Namespace`
-        The parsed arguments.
-
-    Raises
-    ------
-    AstropolcalError
-        On bad input; nothing is written then.
-    """
+    """Calibrate, print the summary and write what was asked for."""
     from astropolcal import instruments
     from astropolcal.calibration import calibrate
     from astropolcal.observations import get_observable

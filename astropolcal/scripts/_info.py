@@ -7,14 +7,7 @@ from astropolcal.scripts._common import write_json
 
 
 def add_parser(commands):
-    """
-    Add the subcommand to the command's parser.
-
-    Parameters
-    ----------
-    commands : object
-        What `argparse.ArgumentParser.add_subparsers` returns.
-    """
+    """Add the subcommand to what ``add_subparsers`` returned."""
     parser = commands.add_parser(
         "info",
         help="say what a calibration or an observation table holds",
@@ -28,19 +21,7 @@ def add_parser(commands):
 
 
 def run(arguments):
-    """
-    Print what the file holds.
-
-    Parameters
-    ----------
-    arguments : `argparse.Namespace`
-        The parsed arguments.
-
-    Raises
-    ------
-    AstropolcalError
-        If the file cannot be read.
-    """
+    """Print what the file holds."""
     if arguments.instruments:
         from astropolcal import instruments
 

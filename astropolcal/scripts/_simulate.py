@@ -8,14 +8,7 @@ EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 
 
 def add_parser(commands):
-    """
-    Add the subcommand to the command's parser.
-
-    Parameters
-    ----------
-    commands : object
-        What `argparse.ArgumentParser.add_subparsers` returns.
-    """
+    """Add the subcommand to what ``add_subparsers`` returned."""
     parser = commands.add_parser(
         "simulate",
         help="simulate an observation table, with photon and read noise",
@@ -93,19 +86,7 @@ def _angles(text):
 
 
 def run(arguments):
-    """
-    Simulate and write the table.
-
-    Parameters
-    ----------
-    arguments : `argparse.Namespace`
-        The parsed arguments.
-
-    Raises
-    ------
-    AstropolcalError
-        On bad input; nothing is written then.
-    """
+    """Simulate and write the table."""
     import astropy.units as u
 
     from astropolcal.simulation import half_wave_plate_cycles, simulate

@@ -152,7 +152,7 @@ def test_callable_tie_is_refused():
 @pytest.mark.parametrize(
     ("ties", "words"),
     [
-        ({"plate.thta": Tie("plate.theta")}, "no parameter 'plate.thta'"),
+        ({"plate.teta": Tie("plate.theta")}, "no parameter 'plate.teta'"),
         ({"plate.theta": Tie("plate.nothing")}, "no parameter 'plate.nothing'"),
         ({"plate.theta": Tie("plate.theta")}, "the source is itself tied"),
         (
