@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from astropy.modeling import FittableModel, Parameter
 
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement.datasets import Dataset, as_pairs
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import common_wavelengths, get_observable
@@ -143,7 +143,21 @@ class Measurement(FittableModel):
         """Names of the free scalar parameters, one an element of the flat vector."""
         return self._param_names
 
-    # a fitter asks these for every evaluation; astropy would build a table of all constraints
+    # A fitter asks for the following again and again. Astropy looks every parameter up by name
+    # in tables it builds anew; with one scalar a parameter, plain loops give the same.
+    @property
+    def parameters(self):
+        """Values of the scalar parameters, shape (n_free,)."""
+        return self.vector()
+
+    @parameters.setter
+    def parameters(self, values):
+        values = np.asarray(values, dtype=float).ravel()
+        if values.size != len(self._param_names):
+            raise ParameterError(f"{values.size} values for {len(self._param_names)} parameters")
+        for label, value in zip(self._param_names, values.tolist(), strict=True):
+            self.__dict__[label].value = value
+
     @property
     def has_fixed(self):
         """Whether a scalar parameter is fixed."""
@@ -164,10 +178,11 @@ class Measurement(FittableModel):
         # copied when somebody looks at them
         new = self.__class__.__new__(self.__class__)
         memo[id(self)] = new
-        shared = dict(self.__dict__, _chains_are_shared=True)
-        own = {key: shared.pop(key) for key in ("_parameters", "_param_metrics", "_mconstraints")}
-        new.__dict__.update(shared)
-        new.__dict__.update(copy_module.deepcopy(own, memo))
+        new.__dict__.update(self.__dict__, _chains_are_shared=True)
+        new.__dict__["_parameters"] = self._parameters.copy()
+        for key in ("_mconstraints", "_constraints_cache", "_user_inverse", "_meta"):
+            if key in self.__dict__:
+                new.__dict__[key] = copy_module.copy(self.__dict__[key])
         for label in self._param_names:
             parameter = copy_module.copy(self.__dict__[label])
             parameter.model = new
@@ -251,7 +266,7 @@ class Measurement(FittableModel):
 
     def vector(self):
         """Return the current values of the scalar parameters, shape (n_free,)."""
-        return np.array([getattr(self, label).value for label in self._param_names], dtype=float)
+        return np.array([self.__dict__[label].value for label in self._param_names], dtype=float)
 
     def put_back(self, vector=None):
         """Write values (by default the current ones) into the chains and return these."""

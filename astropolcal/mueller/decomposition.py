@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller.elements import _mueller_array
@@ -278,6 +277,9 @@ class LuChipman:
 def _rotation_vector(block):
     """Return the retardance vectors of rotation blocks of shape (..., 3, 3)."""
     # a retarder of vector d is the rotation exp(-[d]x), hence the sign
+    # slow to import, and only this function needs it
+    from scipy.spatial.transform import Rotation
+
     flat = -Rotation.from_matrix(block.reshape(-1, 3, 3)).as_rotvec()
     # at half a wave both signs are the same retarder: take the first
     # component that is not zero as positive
