@@ -17,6 +17,9 @@ __all__ = ["BinProblem", "search_branches"]
 _SCAN_STEP = np.deg2rad(15.0)
 _N_VALLEYS = 4
 _CLEARLY_BETTER = 0.99
+# a polish ends when no bin gains a thousandth in a step, or is about to
+_STILL_GAINING = 0.999
+_STUCK = 1.0
 
 
 class BinProblem:
@@ -99,9 +102,12 @@ class BinProblem:
             trial[self.elements] = self._step(vector, damping)
             new = self.costs(trial)
             better = new < costs
+            gaining = new < _STILL_GAINING * costs
             vector[self.elements[:, better]] = trial[self.elements[:, better]]
             costs = np.where(better, new, costs)
             damping = np.where(better, damping / 5, damping * 8)
+            if not np.any(gaining | (~better & (damping < _STUCK))):
+                break
         return vector, costs
 
     def _step(self, vector, damping):
