@@ -10,7 +10,13 @@ from astropolcal.calibration.accuracy import (
 )
 from astropolcal.calibration.covariance import Covariance
 from astropolcal.calibration.fit import calibrate
-from astropolcal.calibration.identifiability import Identifiability, analyse
+from astropolcal.calibration.gauge import describe_gauge, settle
+from astropolcal.calibration.identifiability import (
+    Identifiability,
+    analyse,
+    null_space,
+    physical_scale,
+)
 from astropolcal.calibration.result import Calibration, DatasetRecord
 from astropolcal.calibration.starts import BinProblem, search_branches
 from astropolcal.calibration.summary import summary, to_dict
@@ -25,8 +31,12 @@ __all__ = [
     "analyse",
     "calibrate",
     "cross_validated_residuals",
+    "describe_gauge",
     "leave_out_groups",
+    "null_space",
+    "physical_scale",
     "search_branches",
+    "settle",
     "summary",
     "to_dict",
 ]

@@ -175,16 +175,10 @@ def cross_validated_residuals(measurement, vector, weights=None, groups=None):
 def _fit_without(measurement, vector, out, weights):
     model = measurement.copy()
     model.parameters = vector
-    keep = ~out
+    noise = np.std(model.residuals()) if weights is None else 1.0
+    index, observed, weights = model.fit_arguments(weights, noise, keep=~out)
     with warnings.catch_warnings():
         # a fit that stops early still gives an honest, if poorer, prediction
         warnings.simplefilter("ignore")
-        TRFLSQFitter()(
-            model,
-            measurement.index[keep],
-            measurement.observed[keep],
-            weights=None if weights is None else weights[keep],
-            maxiter=50,
-            inplace=True,
-        )
+        TRFLSQFitter()(model, index, observed, weights=weights, maxiter=50, inplace=True)
     return model.vector()

@@ -17,17 +17,20 @@ import astropy
 import astropy.units as u
 import numpy as np
 import scipy
+from astropy.modeling import Model
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
 
 from astropolcal.calibration.accuracy import accuracy_table
 from astropolcal.calibration.covariance import Covariance
+from astropolcal.calibration.gauge import describe_gauge, open_parameters, settle
 from astropolcal.calibration.identifiability import analyse
 from astropolcal.calibration.result import Calibration, DatasetRecord
 from astropolcal.calibration.starts import BinProblem, search_branches
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError
 from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.units import to_unit
 from astropolcal.version import version
 
 __all__ = ["calibrate"]
@@ -52,6 +55,8 @@ def calibrate(
     positions=None,
     wavelength=None,
     search=None,
+    gauge="minimal",
+    fix=None,
     instrument=None,
     cross_validate=True,
 ):
@@ -85,6 +90,13 @@ def calibrate(
         Whether to look for the best mirror branch of each wavelength; without
         it the fit goes downhill from the chain's own values. By default the
         joint strategy searches, and the two-step one, like the paper, does not.
+    gauge : {"minimal", None}
+        Which solution to take where the data leave a choice: that with the
+        least change of the parameters common to all wavelengths, or wherever
+        the fit happens to end. The choice is recorded in ``settings``.
+    fix : dict of str to `~astropy.units.Quantity` or None, optional
+        Parameters to hold, ``"optic.parameter"``, at a value or (None) at
+        that of the chain: another way to choose a gauge.
     instrument : str, optional
         Name to record.
     cross_validate : bool
@@ -121,9 +133,11 @@ def calibrate(
     started = time.perf_counter()
     fitter = TRFLSQFitter() if fitter is None else fitter
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
+    chain = chain if fix is None else _fixed(chain, fix)
     measurement = Measurement(chain, observations, ties=ties, **options)
     weight = _weights(measurement, weights)
     _check(measurement)
+    origin = measurement.vector()
     if strategy == "joint":
         outcome, stages = _joint(measurement, weight, fitter, search), []
     else:
@@ -132,6 +146,7 @@ def calibrate(
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
         )
+    chosen = _settled(measurement, weight, origin, gauge)
     seconds = time.perf_counter() - started
     return _result(
         measurement,
@@ -142,11 +157,35 @@ def calibrate(
             "fitter": type(fitter).__name__,
             "strategy": strategy,
             "weights": weights,
+            "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
         },
         fit={"seconds": seconds, "n_data": measurement.n_data, **outcome},
         stages=stages,
         cross_validate=cross_validate,
     )
+
+
+def _fixed(chain, fix):
+    """Return copies of the chains with parameters held."""
+    single = isinstance(chain, Model)
+    copies = [item.copy() for item in ([chain] if single else chain)]
+    table = parameter_table(copies)
+    for name, value in fix.items():
+        if name not in table:
+            raise FitError(f"fix: no parameter {name!r}; there are {', '.join(table)}")
+        for parameter in table[name]:
+            if value is not None:
+                number = to_unit(value, parameter.unit, name)
+                parameter.value = np.broadcast_to(number, np.shape(parameter.value)).copy()
+            parameter.fixed = True
+    return copies[0] if single else copies
+
+
+def _settled(measurement, weight, origin, gauge):
+    """Choose the gauge where there is a choice; return what the data leave open."""
+    if gauge == "minimal" and not measurement.free.priors:
+        return settle(BinProblem(measurement, weight), weight, origin)
+    return open_parameters(measurement, weight)
 
 
 def _check(measurement):
@@ -176,14 +215,19 @@ def _run(measurement, weight, fitter):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", AstropyWarning)
         try:
-            fitter(
-                measurement,
-                measurement.index,
-                measurement.observed,
-                weights=weight,
-                maxiter=_MAX_EVALUATIONS,
-                inplace=True,
-            )
+            # a prior weighs against equal weights as much as the residuals say
+            for _ in range(2 if weight is None and measurement.n_priors else 1):
+                index, observed, weights = measurement.fit_arguments(
+                    weight, _noise(measurement, weight)
+                )
+                fitter(
+                    measurement,
+                    index,
+                    observed,
+                    weights=weights,
+                    maxiter=_MAX_EVALUATIONS,
+                    inplace=True,
+                )
         except (ValueError, np.linalg.LinAlgError) as error:
             raise FitError(f"{type(fitter).__name__} failed: {error}") from error
     info = fitter.fit_info if hasattr(fitter, "fit_info") and fitter.fit_info else {}
@@ -197,6 +241,14 @@ def _run(measurement, weight, fitter):
         "message": said[-1] if said else str(info.get("message", "")).strip(),
         "evaluations": None if evaluations is None else int(evaluations),
     }
+
+
+def _noise(measurement, weight):
+    """Return the standard deviation of a datum of weight one: the residuals', if not known."""
+    if weight is not None or not measurement.n_priors:
+        return 1.0
+    freedom = max(measurement.n_data - measurement.free.size, 1)
+    return float(np.sqrt(np.sum(measurement.residuals() ** 2) / freedom))
 
 
 def _outside_bounds(measurement):
@@ -301,7 +353,8 @@ def _result(measurement, weight, *, settings, fit, stages, cross_validate):
     vector = measurement.vector()
     held = _at_bounds(measurement.free, vector)
     whitened = measurement.jacobian(vector) * (1.0 if weight is None else weight)
-    finding, unscaled = analyse(measurement.free, whitened, held)
+    priors = measurement.free.prior_jacobian(vector) * _noise(measurement, weight)
+    finding, unscaled = analyse(measurement.free, whitened, held, priors)
     residuals = measurement.residuals(vector)
     freedom = max(measurement.n_data - finding.rank, 1)
     scale = np.sum(residuals**2) / freedom if weight is None else 1.0

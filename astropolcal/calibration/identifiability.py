@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 
-__all__ = ["Identifiability", "analyse"]
+__all__ = ["Identifiability", "analyse", "null_space", "physical_scale"]
 
 # singular values below this share of the largest count as zero
 _RANK_TOLERANCE = 1e-9
@@ -70,7 +70,38 @@ class Identifiability:
         return "\n".join(lines)
 
 
-def analyse(free, jacobian, held=None):
+def null_space(free, jacobian):
+    """
+    Return the directions in which no datum changes.
+
+    Parameters
+    ----------
+    free : FreeParameters
+        The free parameters.
+    jacobian : `~numpy.ndarray`
+        Whitened derivative of the data, shape (n_free, n_data).
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Orthonormal rows, shape (n_free - rank, n_free), in steps of a degree,
+        a micrometre or a percent.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal import optics
+    >>> from astropolcal.calibration import null_space
+    >>> from astropolcal.measurement import FreeParameters
+    >>> free = FreeParameters([optics.WollastonPrism(name="wollaston")], 1)
+    >>> null_space(free, np.zeros((1, 4))).shape
+    (1, 1)
+    """
+    _, right, rank = _decompose((jacobian * physical_scale(free)[:, None]).T)
+    return right[rank:]
+
+
+def analyse(free, jacobian, held=None, priors=None):
     """
     Find the rank, the null directions and the unscaled covariance.
 
@@ -82,14 +113,18 @@ def analyse(free, jacobian, held=None):
         Whitened derivative of the data, shape (n_free, n_data).
     held : `~numpy.ndarray`, optional
         True for parameters that sit at a bound; they count as fixed.
+    priors : `~numpy.ndarray`, optional
+        Derivative of the priors' residuals in units of the noise, shape
+        (n_free, n_priors). They enter the covariance, not the rank.
 
     Returns
     -------
     identifiability : Identifiability
-        The finding.
+        What the data alone determine.
     covariance : `~numpy.ndarray`
         Shape (n_free, n_free), canonical units, for unit noise; NaN in the
-        rows and columns of parameters that are held or not identifiable.
+        rows and columns of parameters that are held, or that data and priors
+        together do not determine.
 
     Examples
     --------
@@ -107,9 +142,9 @@ def analyse(free, jacobian, held=None):
     singular, right, rank = _decompose(scaled)
     null = right[rank:]
     identifiable = (np.abs(null) < _STILL).all(axis=0) & ~held
+    if priors is not None and priors.size:
+        scaled = np.concatenate([scaled, (priors * scale[:, None]).T])
     covariance = _covariance(scaled, held, scale)
-    unknown = ~identifiable
-    covariance[unknown] = covariance[:, unknown] = np.nan
     finding = Identifiability(
         names=free.names,
         rank=rank,
@@ -131,18 +166,39 @@ def _decompose(scaled):
 
 
 def _covariance(scaled, held, scale):
-    """Return the covariance for unit noise, with the held parameters taken as known."""
+    """Return the covariance for unit noise, NaN for what is held or not determined."""
     live = np.flatnonzero(~held)
     out = np.full((scale.size, scale.size), np.nan)
     if live.size:
         singular, right, rank = _decompose(scaled[:, live])
         half = right[:rank] / singular[:rank, None] * scale[live]
-        out[np.ix_(live, live)] = half.T @ half
+        known = (np.abs(right[rank:]) < _STILL).all(axis=0)
+        out[np.ix_(live[known], live[known])] = (half.T @ half)[np.ix_(known, known)]
     return out
 
 
 def physical_scale(free):
-    """Return one degree, one micrometre or one percent of each parameter, canonical."""
+    """
+    Return one degree, one micrometre or one percent of each parameter, canonical.
+
+    Parameters
+    ----------
+    free : FreeParameters
+        The free parameters.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (n_free,).
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.calibration import physical_scale
+    >>> from astropolcal.measurement import FreeParameters
+    >>> physical_scale(FreeParameters([optics.WollastonPrism(name="wollaston")], 1)).tolist()
+    [0.01]
+    """
     kinds = [_step(slot.unit)[0] for slot in free.slots]
     return np.repeat(kinds, [slot.size for slot in free.slots])
 

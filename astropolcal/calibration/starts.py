@@ -77,7 +77,7 @@ class BinProblem:
         residual = self.residuals(vector)
         return blocks @ np.swapaxes(blocks, 1, 2), np.einsum("bsd,bd->bs", blocks, residual)
 
-    def polish(self, vector, iterations=12):
+    def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING):
         """
         Improve the per-wavelength parameters by batched Levenberg-Marquardt.
 
@@ -86,7 +86,9 @@ class BinProblem:
         vector : `~numpy.ndarray`
             Start, shape (n_free,).
         iterations : int
-            Number of steps.
+            Largest number of steps.
+        still_gaining : float
+            It ends when no bin falls below this share of its cost in a step.
 
         Returns
         -------
@@ -102,7 +104,7 @@ class BinProblem:
             trial[self.elements] = self._step(vector, damping)
             new = self.costs(trial)
             better = new < costs
-            gaining = new < _STILL_GAINING * costs
+            gaining = new < still_gaining * costs
             vector[self.elements[:, better]] = trial[self.elements[:, better]]
             costs = np.where(better, new, costs)
             damping = np.where(better, damping / 5, damping * 8)

@@ -47,6 +47,7 @@ def summary(calibration):
         *(_accuracy_lines(record) for record in calibration.datasets),
         _wavelength_lines(calibration, known),
         list(_wrap([str(calibration.identifiability)])),
+        _gauge_lines(calibration),
         _bound_lines(calibration),
     ]
     return "\n\n".join("\n".join(part) for part in parts if part)
@@ -149,6 +150,11 @@ def _by_wavelength(accuracy):
     return {round(w, 2): s for w, s in zip(nm, accuracy["s_mean"].value, strict=True)}
 
 
+def _gauge_lines(calibration):
+    gauge = calibration.settings.get("gauge")
+    return list(_wrap([f"Gauge: {gauge}"])) if gauge else []
+
+
 def _bound_lines(calibration):
     if not calibration.at_bound:
         return []
@@ -194,6 +200,7 @@ def to_dict(calibration):
         "fitter": settings["fitter"],
         "strategy": settings["strategy"],
         "weights": settings["weights"],
+        "gauge": settings.get("gauge"),
         "seconds": fit["seconds"],
         "converged": calibration.converged,
         "n_data": fit["n_data"],

@@ -5,5 +5,16 @@ Chains and observations as one fittable model with an analytic Jacobian.
 
 from astropolcal.measurement.model import Measurement
 from astropolcal.measurement.parameters import FreeParameters, Slot, Tie, parameter_table
+from astropolcal.measurement.priors import BoundPrior, Normal, Uniform, bind_prior
 
-__all__ = ["FreeParameters", "Measurement", "Slot", "Tie", "parameter_table"]
+__all__ = [
+    "BoundPrior",
+    "FreeParameters",
+    "Measurement",
+    "Normal",
+    "Slot",
+    "Tie",
+    "Uniform",
+    "bind_prior",
+    "parameter_table",
+]

@@ -108,6 +108,8 @@ class Measurement(FittableModel):
         if not self.n_data:
             raise ObservationError("no datum is left: every frame is masked or unpaired")
         self.index = np.arange(self.n_data, dtype=float)
+        #: Number of residuals that priors add behind the data.
+        self.n_priors = self.free.prior_residuals(self.free.start()).size
         self.observed = np.concatenate([d.observed for d in self.datasets])
         self.sigma = np.concatenate([d.sigma for d in self.datasets])
         #: Wavelength (index on the common grid) of each datum.
@@ -247,20 +249,74 @@ class Measurement(FittableModel):
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def evaluate(self, x, *parameters):
-        """Return the predicted data of index ``x``."""
-        return self._pick(self.predict(_vector(parameters)), x)
+        """Return the predicted data of index ``x``; behind the data come the priors."""
+        vector = _vector(parameters)
+        return self._pick(self.predict(vector), x, self.free.prior_residuals, vector)
 
     def fit_deriv(self, x, *parameters):
         """Return the derivative of the data of index ``x``, (n_free, n_data)."""
-        return self._pick(self.jacobian(_vector(parameters)), x)
+        vector = _vector(parameters)
+        return self._pick(self.jacobian(vector), x, self.free.prior_jacobian, vector)
 
-    def _pick(self, values, x):
+    def _pick(self, values, x, prior, vector):
         if np.array_equal(x, self.index):
             return values
+        if self.n_priors:
+            values = np.concatenate([values, prior(vector)], axis=-1)
         index = np.asarray(x)
-        if np.any((index < 0) | (index >= self.n_data) | (index != np.floor(index))):
-            raise ObservationError(f"index of a datum must be a whole number below {self.n_data}")
+        if np.any((index < 0) | (index >= values.shape[-1]) | (index != np.floor(index))):
+            raise ObservationError(
+                f"index of a datum must be a whole number below {values.shape[-1]}"
+            )
         return values[..., index.astype(int)]
+
+    def fit_arguments(self, weights=None, noise=1.0, keep=None):
+        """
+        Return what a fitter takes: index, data and weights, with the priors as data.
+
+        Parameters
+        ----------
+        weights : `~numpy.ndarray`, optional
+            Weight of each datum, shape (n_data,); None for equal weights.
+        noise : float
+            Standard deviation of a datum of weight one; sets how much a prior
+            weighs against the data.
+        keep : `~numpy.ndarray`, optional
+            True for the data that take part, shape (n_data,).
+
+        Returns
+        -------
+        index, observed : `~numpy.ndarray`
+            Shape (n_data + n_priors,), or fewer with ``keep``.
+        weights : `~numpy.ndarray` or None
+            None where all weigh the same.
+        """
+        take = np.ones(self.n_data, dtype=bool) if keep is None else keep
+        index, observed = self.index[take], self.observed[take]
+        weights = None if weights is None else weights[take]
+        if not self.n_priors:
+            return index, observed, weights
+        weights = np.ones(index.size) if weights is None else weights
+        return (
+            np.concatenate([index, self.n_data + np.arange(self.n_priors)]),
+            np.concatenate([observed, np.zeros(self.n_priors)]),
+            np.concatenate([weights, np.full(self.n_priors, noise)]),
+        )
+
+    def log_prior(self, vector):
+        """
+        Return the log density of the priors, minus infinity outside the bounds.
+
+        Parameters
+        ----------
+        vector : array_like
+            Canonical values, shape (n_free,).
+
+        Returns
+        -------
+        float
+        """
+        return self.free.log_prior(vector)
 
     # ---- results --------------------------------------------------------------
 

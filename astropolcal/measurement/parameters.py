@@ -16,6 +16,7 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError
+from astropolcal.measurement.priors import bind_prior
 from astropolcal.units import canonical_factor, to_unit
 
 __all__ = ["FreeParameters", "Slot", "Tie", "parameter_table"]
@@ -190,6 +191,12 @@ class FreeParameters:
             if not parameters[0].fixed and name not in self.ties:
                 self._append(name, parameters[0])
         self.by_name = {slot.name: slot for slot in self.slots}
+        #: Priors of free parameters, with the slot each belongs to.
+        self.priors = [
+            (slot, bind_prior(prior, slot.name, slot.unit, slot.bounds))
+            for slot in self.slots
+            if (prior := self._table[slot.name][0].prior) is not None
+        ]
         self._followers = {name: self._follower(name, tie) for name, tie in self.ties.items()}
 
     def of_chains(self, chains):
@@ -265,17 +272,61 @@ class FreeParameters:
         vector = np.empty(self.size)
         for slot in self.slots:
             vector[slot.slice] = np.ravel(self._table[slot.name][0].value) * slot.factor
+        for slot, prior in self.priors:
+            # a value that the prior excludes starts at the prior's mode
+            low, high = prior.canonical_support()
+            here = vector[slot.slice]
+            excluded = (here < low) | (here > high)
+            vector[slot.slice] = np.where(excluded, prior.mode * slot.factor, here)
         return vector
 
     def bounds(self):
         """Return lower and upper bounds, shape (n_free,) each."""
         pairs = [slot.canonical_bounds() for slot in self.slots for _ in range(slot.size)]
-        low, high = np.array(pairs, dtype=float).reshape(-1, 2).T
+        low, high = np.array(pairs, dtype=float).reshape(-1, 2).T.copy()
+        for slot, prior in self.priors:
+            start, end = prior.canonical_support()
+            low[slot.slice] = np.maximum(low[slot.slice], start)
+            high[slot.slice] = np.minimum(high[slot.slice], end)
         return low, high
 
     def factors(self):
         """Return the factor from declared to canonical unit of every element."""
         return np.repeat([slot.factor for slot in self.slots], [slot.size for slot in self.slots])
+
+    def log_prior(self, vector):
+        """
+        Return the log density of the priors, minus infinity outside the bounds.
+
+        Parameters
+        ----------
+        vector : array_like
+            Canonical values, shape (n_free,).
+
+        Returns
+        -------
+        float
+        """
+        vector = np.asarray(vector, dtype=float)
+        low, high = self.bounds()
+        if np.any(vector < low) or np.any(vector > high):
+            return -np.inf
+        return float(sum(prior.log_density(vector[slot.slice]) for slot, prior in self.priors))
+
+    def prior_residuals(self, vector):
+        """Return the residuals of the priors that are not flat, one an element of theirs."""
+        parts = [p.residual(vector[slot.slice]) for slot, p in self.priors if not p.is_flat]
+        return np.concatenate(parts) if parts else np.empty(0)
+
+    def prior_jacobian(self, vector):
+        """Return the derivative of `prior_residuals`, shape (n_free, n_residuals)."""
+        parts = []
+        for slot, prior in self.priors:
+            if not prior.is_flat:
+                block = np.zeros((self.size, slot.size))
+                np.fill_diagonal(block[slot.slice], prior.slope(vector[slot.slice]))
+                parts.append(block)
+        return np.concatenate(parts, axis=1) if parts else np.empty((self.size, 0))
 
     def lookup(self, name):
         """

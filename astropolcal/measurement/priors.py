@@ -1,0 +1,220 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Prior knowledge of parameters, used by fits and samplers alike.
+
+A prior sits in astropy's place for it, ``parameter.prior``: `Normal` or
+`Uniform` with units, or any frozen scipy distribution of the value in the
+parameter's unit. For a fit a prior is one more datum, whose residual r obeys
+``r**2 / 2 = -log density`` up to a constant; where the density is zero there
+is a bound.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.units import canonical_factor, to_unit
+
+__all__ = ["BoundPrior", "Normal", "Uniform", "bind_prior"]
+
+# step of the numerical derivative of a general prior's residual, in its standard deviations
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class Normal:
+    """
+    Normal prior.
+
+    Parameters
+    ----------
+    mean, std : `~astropy.units.Quantity` or float
+        In any unit that converts to the parameter's.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import optics
+    >>> from astropolcal.measurement import Normal
+    >>> hwp = optics.TwoLayerWaveplate(mount="hwp", name="hwp", fixed={"theta": False})
+    >>> hwp.theta.prior = Normal(0 * u.deg, 0.1 * u.deg)
+    """
+
+    mean: object
+    std: object
+
+    def frozen(self, unit, name):
+        """Return the scipy distribution of the value in ``unit``."""
+        from scipy.stats import norm
+
+        mean, std = (float(to_unit(v, unit, f"prior of {name}")) for v in (self.mean, self.std))
+        if not (np.isfinite(mean) and np.isfinite(std) and std > 0):
+            raise ParameterError(f"prior of {name}: Normal({mean}, {std}) needs a positive std")
+        return norm(mean, std)
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """
+    Uniform prior: tighter bounds.
+
+    Parameters
+    ----------
+    low, high : `~astropy.units.Quantity` or float
+        In any unit that converts to the parameter's.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.measurement import Uniform
+    >>> Uniform(-1 * u.deg, 1 * u.deg).high
+    <Quantity 1. deg>
+    """
+
+    low: object
+    high: object
+
+    def frozen(self, unit, name):
+        """Return the scipy distribution of the value in ``unit``."""
+        from scipy.stats import uniform
+
+        low, high = (float(to_unit(v, unit, f"prior of {name}")) for v in (self.low, self.high))
+        if not (np.isfinite(low) and np.isfinite(high) and high > low):
+            raise ParameterError(f"prior of {name}: Uniform({low}, {high}) needs low below high")
+        return uniform(low, high - low)
+
+
+@dataclass(frozen=True)
+class BoundPrior:
+    """
+    A prior bound to a parameter, on canonical values.
+
+    Parameters
+    ----------
+    name : str
+        ``"optic.parameter"``.
+    distribution : object
+        Frozen scipy distribution of the value in the declared unit.
+    factor : float
+        From declared to canonical unit.
+    mode : float
+        Where the density is largest, in the declared unit.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.measurement import Normal, bind_prior
+    >>> prior = bind_prior(Normal(0 * u.deg, 1 * u.deg), "hwp.theta", u.deg, (-5, 5))
+    >>> float(prior.residual(2 * u.deg.to(u.rad)).round(9))
+    2.0
+    """
+
+    name: str
+    distribution: object
+    factor: float
+    mode: float
+
+    @property
+    def is_flat(self):
+        """Whether it only bounds, as a uniform prior does."""
+        return self.distribution.dist.name == "uniform"
+
+    def canonical_support(self):
+        """Return where the density is not zero, canonical."""
+        low, high = self.distribution.support()
+        return low * self.factor, high * self.factor
+
+    def log_density(self, canonical):
+        """Return the log density per declared unit, summed over the values."""
+        return float(np.sum(self.distribution.logpdf(np.asarray(canonical) / self.factor)))
+
+    def residual(self, canonical):
+        """Return signed residuals whose half square is minus the log density, less its least."""
+        value = np.asarray(canonical, dtype=float) / self.factor
+        if self.distribution.dist.name == "norm":
+            return (value - self.distribution.mean()) / self.distribution.std()
+        depth = self.distribution.logpdf(self.mode) - self.distribution.logpdf(value)
+        return np.sign(value - self.mode) * np.sqrt(2 * np.maximum(depth, 0.0))
+
+    def slope(self, canonical):
+        """Return the derivative of `residual` per canonical unit."""
+        canonical = np.asarray(canonical, dtype=float)
+        if self.distribution.dist.name == "norm":
+            return np.full(canonical.shape, 1 / (self.distribution.std() * self.factor))
+        step = _STEP * self.distribution.std() * self.factor
+        low, high = self.canonical_support()
+        up, down = np.minimum(canonical + step, high), np.maximum(canonical - step, low)
+        return (self.residual(up) - self.residual(down)) / (up - down)
+
+
+def bind_prior(prior, name, unit, bounds):
+    """
+    Check a prior against its parameter and bind it.
+
+    Parameters
+    ----------
+    prior : Normal, Uniform or frozen scipy distribution
+        The prior.
+    name : str
+        ``"optic.parameter"``.
+    unit : `~astropy.units.Unit` or None
+        Unit of the parameter.
+    bounds : tuple
+        Bounds of the parameter in that unit, None where open.
+
+    Returns
+    -------
+    BoundPrior
+
+    Raises
+    ------
+    ParameterError
+        If it is no distribution, has the wrong unit, or lies outside the bounds.
+
+    Examples
+    --------
+    >>> from scipy.stats import truncnorm
+    >>> from astropolcal.measurement import bind_prior
+    >>> bind_prior(truncnorm(-5, 0, 1, 0.01), "wollaston.efficiency", None, (0, 1)).mode
+    1.0
+    """
+    distribution = prior.frozen(unit, name) if hasattr(prior, "frozen") else prior
+    if not (hasattr(distribution, "logpdf") and hasattr(distribution, "support")):
+        raise ParameterError(
+            f"prior of {name} is a {type(prior).__name__}; allowed are Normal, Uniform and "
+            "frozen continuous distributions of scipy.stats"
+        )
+    mode = _mode(distribution)
+    low, high = (
+        -np.inf if bounds[0] is None else bounds[0],
+        np.inf if bounds[1] is None else bounds[1],
+    )
+    start, end = distribution.support()
+    if (
+        start >= high
+        or end <= low
+        or (distribution.dist.name != "uniform" and not low <= mode <= high)
+    ):
+        raise ParameterError(
+            f"prior of {name} peaks at {mode:g} on ({start:g}, {end:g}), outside the bounds "
+            f"{low:g} to {high:g} {unit or ''}".rstrip()
+        )
+    return BoundPrior(name, distribution, canonical_factor(unit), mode)
+
+
+def _mode(distribution):
+    """Return where the density peaks, by a search between far quantiles."""
+    from scipy.optimize import minimize_scalar
+
+    if distribution.dist.name in ("norm", "uniform"):
+        return float(distribution.mean())
+    ends = distribution.ppf([1e-6, 1 - 1e-6])
+    inside = minimize_scalar(
+        lambda x: -distribution.logpdf(x),
+        bounds=tuple(ends),
+        method="bounded",
+        options={"xatol": 1e-10 * (ends[1] - ends[0])},
+    ).x
+    candidates = [inside, *(x for x in distribution.support() if np.isfinite(x))]
+    return float(max(candidates, key=distribution.logpdf))
