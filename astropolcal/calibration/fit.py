@@ -24,7 +24,7 @@ from astropy.utils.exceptions import AstropyWarning
 from astropolcal.calibration.accuracy import accuracy_table
 from astropolcal.calibration.covariance import Covariance
 from astropolcal.calibration.gauge import describe_gauge, open_parameters, settle
-from astropolcal.calibration.identifiability import analyse
+from astropolcal.calibration.identifiability import analyse, complete
 from astropolcal.calibration.result import Calibration, DatasetRecord
 from astropolcal.calibration.starts import BinProblem, search_branches
 from astropolcal.chain import join, leaves
@@ -355,6 +355,7 @@ def _result(measurement, weight, *, settings, fit, stages, cross_validate):
     whitened = measurement.jacobian(vector) * (1.0 if weight is None else weight)
     priors = measurement.free.prior_jacobian(vector) * _noise(measurement, weight)
     finding, unscaled = analyse(measurement.free, whitened, held, priors)
+    complete(finding, measurement, vector)
     residuals = measurement.residuals(vector)
     freedom = max(measurement.n_data - finding.rank, 1)
     scale = np.sum(residuals**2) / freedom if weight is None else 1.0

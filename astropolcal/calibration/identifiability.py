@@ -12,7 +12,11 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 
-__all__ = ["Identifiability", "analyse", "null_space", "physical_scale"]
+from astropolcal.calibration.harmonics import harmonic_words
+from astropolcal.calibration.mirrors import mirror_solutions
+from astropolcal.calibration.sky import sky_consequences
+
+__all__ = ["Identifiability", "analyse", "complete", "null_space", "physical_scale"]
 
 # singular values below this share of the largest count as zero
 _RANK_TOLERANCE = 1e-9
@@ -42,7 +46,12 @@ class Identifiability:
     identifiable : `~numpy.ndarray`
         Whether each parameter is determined, shape (n_free,).
     directions : list of dict
-        For each null direction its ``words`` and the ``parameters`` that move.
+        For each null direction its ``words``, the ``parameters`` that move, and
+        what it does to the ``sky``, see `sky_consequences`.
+    sampling : list of str
+        Harmonics that the half-wave-plate angles cannot separate.
+    mirrors : list of str
+        Discrete mirror solutions within the bounds.
 
     Examples
     --------
@@ -58,6 +67,8 @@ class Identifiability:
     null_vectors: np.ndarray
     identifiable: np.ndarray
     directions: list = field(default_factory=list)
+    sampling: list = field(default_factory=list)
+    mirrors: list = field(default_factory=list)
 
     @property
     def n_free(self):
@@ -67,6 +78,8 @@ class Identifiability:
     def __str__(self):
         lines = [f"The data determine {self.rank} combinations of {self.n_free} free parameters."]
         lines += [f"  - {direction['words']}" for direction in self.directions]
+        lines += [f"  - {words}" for words in self.sampling]
+        lines += [f"  - mirror solution: {words}" for words in self.mirrors]
         return "\n".join(lines)
 
 
@@ -154,6 +167,73 @@ def analyse(free, jacobian, held=None, priors=None):
         directions=_directions(free, null),
     )
     return finding, covariance
+
+
+def complete(finding, measurement, vector):
+    """
+    Add to a finding what it means on sky, the sampling and the mirror solutions.
+
+    Parameters
+    ----------
+    finding : Identifiability
+        As `analyse` gives it; it is changed.
+    measurement : Measurement
+        The measurement.
+    vector : `~numpy.ndarray`
+        The solution, canonical values, shape (n_free,).
+
+    Returns
+    -------
+    Identifiability
+        The same object.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration import analyse, complete
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
+    >>> observations = simulate(charis.published(), charis.wavelength, frames, seed=1)
+    >>> measurement = Measurement(charis.chain(optics_in=["nbs"]), observations)
+    >>> vector = measurement.vector()
+    >>> finding, _ = analyse(measurement.free, measurement.jacobian(vector))
+    >>> complete(finding, measurement, vector).directions[0]["sky"]["aolp_deg"]
+    [1.0, 1.0]
+    """
+    free = measurement.free
+    scaled = [vector for vector, _ in _reduced(free, finding.null_vectors)]
+    canonical = np.array(scaled).reshape(-1, free.size) * physical_scale(free)
+    consequences = sky_consequences(measurement, vector, canonical)
+    for direction, sky in zip(finding.directions, consequences, strict=True):
+        if sky is not None:
+            direction["sky"] = sky
+            direction["words"] += _sky_words(sky)
+    angles = {
+        round(float(angle), 6)
+        for dataset in measurement.datasets
+        for angle in dataset.observations.position("hwp")
+    }
+    finding.sampling = harmonic_words(np.array(sorted(angles)))
+    finding.mirrors = mirror_solutions(measurement, vector)
+    return finding
+
+
+def _sky_words(sky):
+    turn, gain = sky["aolp_deg"], sky["dolp_percent"]
+    return (
+        f"; on sky this turns the AoLP by {_range(turn)} deg and changes the DoLP by "
+        f"{_range(gain)} % of itself"
+    )
+
+
+def _range(span):
+    low, high = span
+    if max(abs(low), abs(high)) < 0.005:
+        return "less than 0.01"
+    return f"{low:+.2g}" if high - low < 0.005 else f"{low:+.2g} to {high:+.2g}"
 
 
 def _decompose(scaled):

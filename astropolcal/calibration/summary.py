@@ -211,6 +211,8 @@ def to_dict(calibration):
             name: _parameter(entry) for name, entry in calibration.parameter_values().items()
         },
         "null_directions": calibration.identifiability.directions,
+        "sampling": list(calibration.identifiability.sampling),
+        "mirror_solutions": list(calibration.identifiability.mirrors),
         "at_bound": list(calibration.at_bound),
         "stages": [_plain(stage) for stage in calibration.stages],
         "provenance": dict(calibration.provenance),

@@ -175,6 +175,7 @@ def _identifiability_node(finding):
         "directions": [
             {
                 "words": str(direction["words"]),
+                **({"sky": plain(direction["sky"], "sky")} if "sky" in direction else {}),
                 # a list, as a mapping would lose the order
                 "parameters": [
                     {"name": name, "value": plain(value, name)}
@@ -183,6 +184,8 @@ def _identifiability_node(finding):
             }
             for direction in finding.directions
         ],
+        "sampling": list(finding.sampling),
+        "mirrors": list(finding.mirrors),
     }
 
 
@@ -304,6 +307,7 @@ def _identifiability(node):
     import numpy as np
 
     from astropolcal.calibration import Identifiability
+    from astropolcal.converters.nodes import plain
 
     names, vectors = list(node["names"]), node["null_vectors"]
     return Identifiability(
@@ -316,9 +320,12 @@ def _identifiability(node):
             {
                 "words": direction["words"],
                 "parameters": {entry["name"]: entry["value"] for entry in direction["parameters"]},
+                **({"sky": plain(direction["sky"])} if "sky" in direction else {}),
             }
             for direction in node["directions"]
         ],
+        sampling=list(node["sampling"]),
+        mirrors=list(node["mirrors"]),
     )
 
 

@@ -74,6 +74,20 @@ def add_parser(commands):
         help="free a parameter, such as wollaston.theta",
     )
     parser.add_argument(
+        "--prior",
+        action="append",
+        default=[],
+        metavar="NAME=MEAN+-STD",
+        help="normal prior on a parameter, such as hwp.theta=0+-0.1deg",
+    )
+    parser.add_argument(
+        "--gauge",
+        choices=("minimal", "none"),
+        default="minimal",
+        help="where the data leave a choice: the least misalignments (default), or where the "
+        "fit ends",
+    )
+    parser.add_argument(
         "--without",
         action="append",
         default=[],
@@ -101,7 +115,8 @@ def run(arguments):
     datasets = read_datasets(files)
     instrument = instruments.get(arguments.instrument or _stated(datasets))
     chains = instrument.chains_for(datasets, derotator=arguments.derotator, bounds=arguments.bounds)
-    chains = edit_chains(chains, without=arguments.without, free=arguments.free, fix=arguments.fix)
+    edits = {key: getattr(arguments, key) for key in ("without", "free", "fix", "prior")}
+    chains = edit_chains(chains, **edits)
     calibration = calibrate(
         chains,
         datasets,
@@ -109,6 +124,7 @@ def run(arguments):
         observable=arguments.observable,
         weights=None if arguments.weights == "none" else arguments.weights,
         positions=[instrument.positions(*pair) for pair in zip(datasets, chains, strict=True)],
+        gauge=None if arguments.gauge == "none" else arguments.gauge,
         instrument=instrument.name,
     )
     say(calibration.summary())

@@ -50,7 +50,7 @@ def read_datasets(paths):
     return datasets
 
 
-def edit_chains(chains, *, without=(), free=(), fix=()):
+def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
     """
     Return the chains with optics taken out and parameters freed or fixed.
 
@@ -65,6 +65,8 @@ def edit_chains(chains, *, without=(), free=(), fix=()):
     fix : sequence of str
         The same, with ``=VALUE`` to set it; a number without unit is in the
         parameter's own.
+    prior : sequence of str
+        ``optic.parameter=MEAN+-STD``, units as for ``fix``; frees the parameter.
 
     Returns
     -------
@@ -92,6 +94,11 @@ def edit_chains(chains, *, without=(), free=(), fix=()):
             if value:
                 _set(name, parameter, value)
             parameter.fixed = True
+    for text in prior:
+        name, _, value = text.partition("=")
+        for parameter in _parameters(chains, name):
+            parameter.prior = _normal(name, parameter, value)
+            parameter.fixed = False
     return chains
 
 
@@ -109,7 +116,23 @@ def _parameters(chains, name):
     return found
 
 
-def _set(name, parameter, text):
+def _normal(name, parameter, text):
+    """Return the normal prior that MEAN+-STD describes, in the parameter's unit."""
+    from astropolcal.measurement import Normal
+
+    mean, separator, std = text.partition("+-")
+    if not separator:
+        raise ParameterError(f"prior {name}={text}: write it as MEAN+-STD, such as 0+-0.1deg")
+    unit = 1 if parameter.unit is None else parameter.unit
+    # "0+-0.1deg" gives its unit once
+    bare = re.fullmatch(r"\s*[-+.\deE]+\s*", mean)
+    own = re.sub(r"^\s*[-+.\d]+(?:[eE][-+]?\d+)?\s*", "", std)
+    values = (_value(name, parameter, t) for t in ((mean + own if bare else mean), std))
+    return Normal(*(value * unit for value in values))
+
+
+def _value(name, parameter, text):
+    """Return the number that a text with or without unit means, in the parameter's unit."""
     match = re.fullmatch(r"\s*([-+.\d]+(?:[eE][-+]?\d+)?)\s*([A-Za-z%].*)?", text)
     number, unit = match.groups() if match else ("", None)
     try:
@@ -123,12 +146,16 @@ def _set(name, parameter, text):
             raise ParameterError(
                 f"{name}={text}: the unit must be convertible to {parameter.unit or 'a number'}"
             ) from None
-    low, high = parameter.bounds
-    if (
-        not np.isfinite(value)
-        or (low is not None and value < low)
-        or (high is not None and value > high)
-    ):
+    return value
+
+
+def _set(name, parameter, text):
+    value = _value(name, parameter, text)
+    low, high = (
+        -np.inf if parameter.bounds[0] is None else parameter.bounds[0],
+        np.inf if parameter.bounds[1] is None else parameter.bounds[1],
+    )
+    if not (np.isfinite(value) and low <= value <= high):
         raise ParameterError(
             f"{name}={text}: allowed is {low} to {high} {parameter.unit or ''}".rstrip()
         )

@@ -101,6 +101,18 @@ def test_fix_free_and_without_edit_the_model(small, tmp_path):
     assert "nbs.theta" not in parameters
 
 
+def test_priors_and_gauge(small, tmp_path):
+    out = tmp_path / "out.json"
+    arguments = ["--prior", "hwp.theta=0+-0.1deg", "--prior", "derotator.theta=0deg+-6arcmin"]
+    assert main(["calibrate", str(small), "-q", "--json", str(out), *arguments]) == 0
+    summary = json.loads(out.read_text())
+    assert summary["gauge"].startswith("prior on hwp.theta, derotator.theta")
+    for name in ("hwp.theta", "derotator.theta"):
+        assert summary["parameters"][name]["std"] == pytest.approx(0.1, rel=0.05)
+    assert main(["calibrate", str(small), "-q", "--json", str(out), "--gauge", "none"]) == 0
+    assert "accident" in json.loads(out.read_text())["gauge"]
+
+
 @pytest.mark.parametrize(
     ("option", "free"), [(("--derotator", "linear"), 3 * 2 + 5), (("--strategy", "two-step"), 17)]
 )
@@ -140,6 +152,10 @@ def test_plots_are_saved(small, tmp_path, capsys):
         (["--fix", "hwp.theta=1mm"], "convertible to deg"),
         (["--fix", "hwp.theta=abc"], "not a number"),
         (["--fix", "hwp.tilt"], "no parameter 'tilt'"),
+        (["--prior", "hwp.theta=0"], "MEAN"),
+        (["--prior", "hwp.theta=0+-1mm"], "convertible to deg"),
+        (["--prior", "hwp.theta=9+-1"], "outside the bounds"),
+        (["--prior", "hwp.theta=0+-0"], "positive std"),
         (["--free", "hpw"], "did you mean 'hwp'"),
         (["--without", "m3"], "no optic 'm3'"),
         (["-o", "nowhere/cal.asdf"], "no folder"),

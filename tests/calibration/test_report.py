@@ -1,0 +1,188 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Harmonics, mirror solutions and consequences on sky, in numbers and in words."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from astropolcal import Calibration, calibrate, instruments, optics
+from astropolcal.calibration import (
+    harmonic_conditions,
+    harmonic_words,
+    mirror_solutions,
+    sky_consequences,
+)
+from astropolcal.chain import join
+from astropolcal.measurement import Measurement
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+CHARIS = instruments.get("charis")
+WAVELENGTH = CHARIS.wavelength[[7, 11, 16]]
+EIGHT = np.deg2rad(np.arange(8) * 11.25)
+
+
+# ---- harmonics ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("n", "expected"),
+    # computed independently: singular values of the design matrix, as in the physics notes
+    [(8, (1.414, 27.48, 14184)), (16, (1.414, 1.414, 53.58)), (32, (1.414, 1.414, 1.414))],
+)
+def test_condition_numbers(n, expected):
+    found = harmonic_conditions(np.deg2rad(np.arange(n) * 11.25))
+    np.testing.assert_allclose(list(found.values()), expected, rtol=1e-3)
+
+
+def test_too_few_angles_separate_nothing():
+    found = harmonic_conditions(np.deg2rad([0, 45, 22.5, 67.5]))
+    assert found[(0, 4)] == pytest.approx(np.sqrt(2))
+    assert found[(0, 2, 4)] == np.inf
+
+
+def test_words_name_the_angles_to_add():
+    second, first = harmonic_words(EIGHT)
+    assert "0 to 78.75 deg" in second
+    assert "harmonic 2" in second
+    assert "add 90 to 168.75 deg" in second
+    assert "harmonic 1, 2" in first
+    assert "add 90 to 348.75 deg" in first
+    assert harmonic_words(np.deg2rad(np.arange(32) * 11.25)) == []
+
+
+@given(st.sampled_from([4, 8, 12, 16]), st.floats(0, 20))
+def test_following_the_advice_cures_it(n, start):
+    angles = np.deg2rad(start + np.arange(n) * 11.25)
+    words = harmonic_words(angles)
+    if words:
+        low, high = _advised(words[-1])
+        added = np.deg2rad(np.arange(low, high + 1e-6, 11.25))
+        assert harmonic_words(np.concatenate([angles, added])) == []
+
+
+def _advised(words):
+    first, _, last = words.rsplit("add ", 1)[1].removesuffix(" deg").partition(" to ")
+    return float(first), float(last)
+
+
+# ---- mirror solutions ------------------------------------------------------------------
+
+
+def _measurement(chain):
+    frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
+    return Measurement(chain, simulate(chain, WAVELENGTH, frames, noise=False))
+
+
+def _polarimeter(**derotator):
+    return (
+        optics.LinearPolarizer(theta=90 * u.deg, name="polarizer")
+        | optics.LinearRetarder(retardance=[170, 172, 175] * u.deg, mount="hwp", name="hwp")
+        | optics.EllipticalRetarder(
+            horizontal=[100, 80, 60] * u.deg,
+            diagonal=[4, 3, 2] * u.deg,
+            circular=[5, 5, 4] * u.deg,
+            mount="derotator",
+            name="derotator",
+            **derotator,
+        )
+        | optics.WollastonPrism(efficiency=[0.98, 0.97, 0.96], name="wollaston")
+    )
+
+
+def test_all_mirror_solutions_of_free_retarders():
+    measurement = _measurement(_polarimeter())
+    found = mirror_solutions(measurement, measurement.vector())
+    assert [words.split(":")[0] for words in found] == ["hwp", "derotator", "hwp, derotator"]
+
+
+def test_bounds_exclude_mirror_solutions():
+    bounds = dict.fromkeys(("horizontal", "diagonal", "circular"), (0, 360))
+    measurement = _measurement(_polarimeter(bounds=bounds))
+    assert [w.split(":")[0] for w in mirror_solutions(measurement, measurement.vector())] == ["hwp"]
+
+
+def test_a_waveplate_of_two_layers_has_no_other_hand():
+    chain = CHARIS.chain("polarized", wavelength=WAVELENGTH)
+    measurement = _measurement(chain)
+    found = mirror_solutions(measurement, measurement.vector())
+    assert [words.split(":")[0] for words in found] == ["derotator"]
+
+
+# ---- on sky -----------------------------------------------------------------------------
+
+
+def _direction(measurement, **changes):
+    out = np.zeros((1, measurement.free.size))
+    for name, value in changes.items():
+        out[0, measurement.free.by_name[name.replace("__", ".")].slice] = value
+    return out
+
+
+def test_efficiency_changes_the_dolp_alone():
+    measurement = _measurement(_polarimeter())
+    efficiency = np.array([0.98, 0.97, 0.96])
+    one_percent = _direction(measurement, wollaston__efficiency=-0.01 * efficiency)
+    (sky,) = sky_consequences(measurement, measurement.vector(), one_percent)
+    # a model of one percent less efficiency finds one percent more polarization
+    assert sky["dolp_percent"] == pytest.approx([1.0, 1.0], abs=1e-3)
+    assert sky["aolp_deg"] == pytest.approx([0.0, 0.0], abs=1e-6)
+
+
+def test_turning_everything_turns_the_sky():
+    chain = _polarimeter()
+    for name in ("hwp", "derotator", "wollaston"):
+        chain[name].theta.fixed = False
+    measurement = _measurement(chain)
+    turn = dict.fromkeys(("hwp__theta", "derotator__theta", "wollaston__theta"), np.deg2rad(1))
+    (sky,) = sky_consequences(measurement, measurement.vector(), _direction(measurement, **turn))
+    assert sky["aolp_deg"] == pytest.approx([1.0, 1.0], abs=1e-4)
+    assert sky["dolp_percent"] == pytest.approx([0.0, 0.0], abs=1e-3)
+
+
+def test_the_polarizer_is_not_on_sky():
+    chain = _polarimeter()
+    chain["polarizer"].theta.fixed = False
+    measurement = _measurement(chain)
+    (sky,) = sky_consequences(
+        measurement, measurement.vector(), _direction(measurement, polarizer__theta=1.0)
+    )
+    assert sky == {"aolp_deg": [0.0, 0.0], "dolp_percent": [0.0, 0.0]}
+
+
+def test_without_a_half_wave_plate_there_is_no_sky():
+    chain = join([optics.LinearRetarder(retardance=90 * u.deg, mount="derotator", name="derotator"),
+                  optics.WollastonPrism(name="wollaston")])  # fmt: skip
+    measurement = _measurement(chain)
+    assert sky_consequences(measurement, measurement.vector(), np.ones((2, 2))) == [None, None]
+
+
+# ---- all of it in a calibration -----------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    chain = CHARIS.chain("polarized", wavelength=WAVELENGTH)
+    frames = half_wave_plate_cycles(derotator=np.arange(45, 120, 12.5) * u.deg)
+    observations = simulate(chain, WAVELENGTH, frames, seed=6)
+    return calibrate(chain, observations, cross_validate=False)
+
+
+def test_the_report_says_all_of_it(calibration):
+    text = " ".join(calibration.summary().split())
+    assert "calibration_polarizer.theta by +1 deg cannot be told from hwp.theta by +1 deg" in text
+    assert "on sky this turns the AoLP by +1 deg" in text
+    assert "separate harmonic 2 badly" in text
+    assert "mirror solution: derotator" in text
+    summary = calibration.to_dict()
+    assert summary["null_directions"][0]["sky"]["aolp_deg"] == pytest.approx([1, 1], abs=1e-3)
+    assert len(summary["sampling"]) == 2
+    assert len(summary["mirror_solutions"]) == 1
+
+
+def test_the_report_is_in_the_file(calibration, tmp_path):
+    calibration.write(tmp_path / "cal.asdf")
+    again = Calibration.read(tmp_path / "cal.asdf")
+    assert again.to_dict() == calibration.to_dict()
+    assert str(again.identifiability) == str(calibration.identifiability)
