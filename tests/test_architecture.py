@@ -30,7 +30,18 @@ MAX_MEDIAN_FUNCTION_LINES = 9
 
 FORBIDDEN_IMPORTS = {"pickle", "cPickle", "dill", "marshal", "shelve"}
 FORBIDDEN_CALLS = {"eval", "exec", "yaml.load", "yaml.full_load", "yaml.unsafe_load"}
-HEAVY = ("asdf", "dask", "distributed", "emcee", "matplotlib", "photutils", "specutils")
+HEAVY = (
+    "arviz_stats",
+    "asdf",
+    "corner",
+    "dask",
+    "distributed",
+    "emcee",
+    "h5py",
+    "matplotlib",
+    "photutils",
+    "specutils",
+)
 
 WITHOUT_REFERENCE_PAGE = {"converters", "data", "extension", "resources", "scripts", "version"}
 

@@ -8,9 +8,12 @@ from astropolcal.calibration.accuracy import (
     cross_validated_residuals,
     leave_out_groups,
 )
-from astropolcal.calibration.covariance import Covariance
+from astropolcal.calibration.covariance import Covariance, full_covariance
+from astropolcal.calibration.derived import Derived, propagate
+from astropolcal.calibration.errors import standard_errors
 from astropolcal.calibration.fit import calibrate
 from astropolcal.calibration.gauge import describe_gauge, settle
+from astropolcal.calibration.goodness import LackOfFit, lack_of_fit
 from astropolcal.calibration.harmonics import harmonic_conditions, harmonic_words
 from astropolcal.calibration.identifiability import (
     Identifiability,
@@ -19,33 +22,90 @@ from astropolcal.calibration.identifiability import (
     null_space,
     physical_scale,
 )
+from astropolcal.calibration.log_posterior import LogPosterior, residual_noise
 from astropolcal.calibration.mirrors import mirror_solutions
+from astropolcal.calibration.noise import (
+    NoiseEstimate,
+    estimate_noise,
+    noise_from_errors,
+    noise_from_null_channel,
+    noise_from_replicates,
+)
+from astropolcal.calibration.posterior import Posterior, autocorrelation, autocorrelation_time
+from astropolcal.calibration.profile import Profile, profile
+from astropolcal.calibration.quantities import (
+    derived_data,
+    derived_efficiency,
+    derived_mueller,
+    derived_retardance,
+    derived_sky,
+)
+from astropolcal.calibration.resampling import Resampled, bootstrap
 from astropolcal.calibration.result import Calibration, DatasetRecord
+from astropolcal.calibration.sampling import sample
 from astropolcal.calibration.sky import sky_consequences
 from astropolcal.calibration.starts import BinProblem, search_branches
 from astropolcal.calibration.summary import summary, to_dict
+from astropolcal.calibration.target_accuracy import (
+    absolute_accuracy,
+    four_accuracies,
+    groups_by,
+    propagate_accuracy,
+    target_accuracy,
+)
 
 __all__ = [
     "BinProblem",
     "Calibration",
     "Covariance",
     "DatasetRecord",
+    "Derived",
     "Identifiability",
+    "LackOfFit",
+    "LogPosterior",
+    "NoiseEstimate",
+    "Posterior",
+    "Profile",
+    "Resampled",
+    "absolute_accuracy",
     "accuracy_table",
     "analyse",
+    "autocorrelation",
+    "autocorrelation_time",
+    "bootstrap",
     "calibrate",
     "complete",
     "cross_validated_residuals",
+    "derived_data",
+    "derived_efficiency",
+    "derived_mueller",
+    "derived_retardance",
+    "derived_sky",
     "describe_gauge",
+    "estimate_noise",
+    "four_accuracies",
+    "full_covariance",
+    "groups_by",
     "harmonic_conditions",
     "harmonic_words",
+    "lack_of_fit",
     "leave_out_groups",
     "mirror_solutions",
+    "noise_from_errors",
+    "noise_from_null_channel",
+    "noise_from_replicates",
     "null_space",
     "physical_scale",
+    "profile",
+    "propagate",
+    "propagate_accuracy",
+    "residual_noise",
+    "sample",
     "search_branches",
     "settle",
     "sky_consequences",
+    "standard_errors",
     "summary",
+    "target_accuracy",
     "to_dict",
 ]

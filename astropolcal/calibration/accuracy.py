@@ -143,7 +143,8 @@ def cross_validated_residuals(measurement, vector, weights=None, groups=None):
     Returns
     -------
     `~numpy.ndarray`
-        Shape (n_data,); all NaN where there are fewer than three groups.
+        Shape (n_data,); all NaN where there are fewer than three derotator
+        angles, or fewer than two groups of those given.
 
     Examples
     --------
@@ -160,10 +161,12 @@ def cross_validated_residuals(measurement, vector, weights=None, groups=None):
     >>> bool(abs(residuals).max() < 0.01)
     True
     """
+    # two derotator angles are too few to predict one from the other; nights need not be
+    fewest = 3 if groups is None else 2
     groups = leave_out_groups(measurement) if groups is None else np.asarray(groups)
     held_out = np.full(measurement.n_data, np.nan)
     labels = np.unique(groups)
-    if len(labels) < 3:
+    if len(labels) < fewest:
         return held_out
     for label in labels:
         out = groups == label

@@ -1,12 +1,26 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Covariance of calibrated parameters, with their names and units."""
+"""
+Covariance of calibrated parameters, with their names and units.
+
+The matrix has no number for a parameter that the data leave open. What the
+data do know of such parameters (a sum of two angles, say) is kept beside it:
+the determined directions with their errors (``factor``) and the open ones
+(``null``). With these, the error of anything derived from the parameters is
+right: finite where the open directions do not move it, infinite where they do.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
 
+from astropolcal.calibration.identifiability import _decompose, _step
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor
 
-__all__ = ["Covariance"]
+__all__ = ["Covariance", "full_covariance"]
+
+# a quantity that changes by less than this share of its slope stands still
+_STILL = 1e-5
 
 
 class Covariance:
@@ -22,6 +36,12 @@ class Covariance:
     matrix : array_like
         Shape (n, n); NaN in the rows and columns of parameters that the data
         do not determine.
+    factor : array_like, optional
+        Directions that the data determine, each as long as its standard
+        error, shape (rank, n); ``factor.T @ factor`` is the covariance as far
+        as it is known. Zero for parameters held at a bound.
+    null : array_like, optional
+        Directions that stay open, shape (n_open, n).
 
     Raises
     ------
@@ -37,7 +57,10 @@ class Covariance:
     <Quantity 0.2 deg>
     """
 
-    def __init__(self, names, units, matrix):
+    #: Determined and open directions; None where only the matrix is known.
+    factor = null = None
+
+    def __init__(self, names, units, matrix, factor=None, null=None):
         self.names = list(names)
         self.units = list(units)
         self.matrix = np.array(matrix, dtype=float)
@@ -48,6 +71,17 @@ class Covariance:
             )
         if not np.allclose(self.matrix, self.matrix.T, rtol=1e-6, atol=1e-30, equal_nan=True):
             raise ParameterError("a covariance matrix must be symmetric")
+        if factor is not None:
+            self.factor = self._rows("factor", factor)
+        if null is not None:
+            self.null = self._rows("null", null)
+
+    def _rows(self, key, rows):
+        """Return directions as an array of rows."""
+        rows = np.array(rows, dtype=float).reshape(-1, len(self.names))
+        if not np.isfinite(rows).all():
+            raise ParameterError(f"{key} of a covariance has a value that is not finite")
+        return rows
 
     @classmethod
     def from_canonical(cls, free, matrix):
@@ -80,7 +114,12 @@ class Covariance:
         if not isinstance(other, Covariance):
             return NotImplemented
         same = self.names == other.names and self.units == other.units
-        return same and np.array_equal(self.matrix, other.matrix, equal_nan=True)
+        arrays = ((getattr(self, key), getattr(other, key)) for key in ("matrix", "factor", "null"))
+        return same and all(
+            (a is None and b is None)
+            or (a is not None and b is not None and np.array_equal(a, b, equal_nan=True))
+            for a, b in arrays
+        )
 
     __hash__ = None
 
@@ -126,3 +165,208 @@ class Covariance:
         """Correlation matrix, shape (n, n), NaN where not determined."""
         stds = self.stds
         return self.matrix / stds[:, None] / stds[None, :]
+
+    def propagate(self, slopes):
+        """
+        Return the covariance of quantities that depend on the parameters.
+
+        Parameters
+        ----------
+        slopes : array_like
+            Derivative of each quantity to each parameter in its declared unit,
+            shape (n_quantities, n) or (n,) for one quantity.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (n_quantities, n_quantities), or a scalar for one quantity.
+            On the diagonal infinity for what moves along an open direction,
+            NaN for what depends on parameters at a bound alone, or on
+            undetermined ones where ``factor`` is not known; outside of the
+            diagonal NaN in the rows and columns of both.
+
+        Raises
+        ------
+        ParameterError
+            If the slopes have another shape.
+
+        Examples
+        --------
+        Of two angles the data know the sum only:
+
+        >>> import astropy.units as u
+        >>> import numpy as np
+        >>> from astropolcal.calibration import Covariance
+        >>> covariance = Covariance(["a.theta", "b.theta"], [u.deg, u.deg],
+        ...                         np.full((2, 2), np.nan), factor=[[0.1, 0.1]], null=[[1, -1]])
+        >>> float(covariance.propagate([1, 1]).round(3)), float(covariance.propagate([1, 0]))
+        (0.04, inf)
+        """
+        slopes = np.asarray(slopes, dtype=float)
+        if slopes.ndim not in (1, 2) or slopes.shape[-1] != len(self):
+            raise ParameterError(
+                f"slopes of shape {slopes.shape} do not fit a covariance of {len(self)} parameters"
+            )
+        matrix = self._spread(np.atleast_2d(slopes)).covariance()
+        return matrix[0, 0] if slopes.ndim == 1 else matrix
+
+    def _spread(self, slopes):
+        axes = self._axes()
+        scaled = slopes * axes.steps
+        return axes.spread(scaled @ axes.known.T, scaled @ axes.open.T, scaled @ axes.blind.T)
+
+    def _axes(self):
+        """Split the space of the parameters, each in degree, micrometre or percent."""
+        steps = np.array([_step(unit)[0] / canonical_factor(unit) for unit in self.units])
+        undetermined = ~np.isfinite(np.diag(self.matrix))
+        empty = np.zeros((0, len(self)))
+        null = empty if self.null is None else self.null / steps
+        if self.factor is not None:
+            factor = self.factor / steps
+            # at a bound: neither in what is known nor in what is open
+            moves = np.abs(np.concatenate([factor, null])).max(axis=0, initial=0.0) > 0
+            blind = undetermined & ~moves
+        else:
+            factor, blind = self._factor_of_matrix(steps, ~undetermined), undetermined
+        sigmas = np.linalg.norm(factor, axis=1)
+        known = factor / np.where(sigmas > 0, sigmas, 1.0)[:, None]
+        return _Axes(steps, known, sigmas, null, np.eye(len(self))[blind], self.factor is None)
+
+    def _factor_of_matrix(self, steps, known):
+        """Return the determined directions of the parameters that have an error."""
+        matrix = self.matrix[np.ix_(known, known)] / steps[known, None] / steps[known]
+        variance, vectors = np.linalg.eigh(matrix)
+        factor = np.zeros((len(variance), len(self)))
+        factor[:, known] = (vectors * np.sqrt(variance.clip(0))).T
+        return factor
+
+
+@dataclass
+class _Axes:
+    """Orthonormal directions in parameter space: known, open, and blind (no statement)."""
+
+    steps: np.ndarray
+    known: np.ndarray
+    sigmas: np.ndarray
+    open: np.ndarray
+    blind: np.ndarray
+    partial: bool
+
+    def spread(self, along_known, along_open, along_blind):
+        """Return the spread of quantities from their slopes along the axes, (k, n_axes) each."""
+        parts = [along_known, along_open, along_blind]
+        size = np.sqrt(sum(np.sum(part**2, axis=1) for part in parts))
+        limit = _STILL * size
+        is_open = np.abs(along_open).max(axis=1, initial=0.0) > limit
+        blind = np.abs(along_blind).max(axis=1, initial=0.0) > limit
+        if not self.partial:
+            # with a parameter at its bound taken as known there is an error, unless it is all
+            blind &= np.abs(along_known).max(axis=1, initial=0.0) <= limit
+        return _Spread(along_known * self.sigmas, is_open, blind & ~is_open)
+
+
+@dataclass
+class _Spread:
+    """How far quantities move for one sigma along each known direction, (k, rank)."""
+
+    moved: np.ndarray
+    is_open: np.ndarray
+    is_blind: np.ndarray
+
+    def stds(self):
+        std = np.sqrt(np.sum(self.moved**2, axis=1))
+        return np.where(self.is_open, np.inf, np.where(self.is_blind, np.nan, std))
+
+    def covariance(self):
+        matrix = self.moved @ self.moved.T
+        unknown = self.is_open | self.is_blind
+        matrix[unknown] = matrix[:, unknown] = np.nan
+        diagonal = np.arange(len(matrix))[self.is_open]
+        matrix[diagonal, diagonal] = np.inf
+        return matrix
+
+
+def full_covariance(calibration):
+    """
+    Return the covariance of a calibration with its determined and open directions.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration. One read from a file gives the directions only if the
+        file holds them; otherwise errors are known for what depends on
+        determined parameters, and the rest is NaN or infinite.
+
+    Returns
+    -------
+    Covariance
+        With the matrix of ``calibration.covariance``, ``factor`` and ``null``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import full_covariance
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> full_covariance(cal).factor.shape
+    (49, 49)
+    """
+    known = calibration.covariance
+    if known.factor is not None:
+        return known
+    if calibration.measurement is None:
+        return Covariance(known.names, known.units, known.matrix, null=_open_of_file(calibration))
+    measurement = calibration.measurement
+    scaled, steps = _whitened(calibration)
+    live = np.array([name not in set(calibration.at_bound) for name in known.names], dtype=bool)
+    singular, right, rank = _decompose(scaled[:, live])
+    factor, null = np.zeros((rank, live.size)), np.zeros((live.sum() - rank, live.size))
+    factor[:, live] = right[:rank] / singular[:rank, None]
+    null[:, live] = right[rank:]
+    factor *= np.sqrt(residual_variance(calibration))
+    per_unit = steps / measurement.free.factors()
+    return Covariance(
+        known.names, known.units, known.matrix, factor=factor * per_unit, null=null * per_unit
+    )
+
+
+def residual_variance(calibration):
+    """Return the variance of a datum of weight one: 1 where the errors are given."""
+    measurement = calibration.measurement
+    if calibration.settings.get("weights") == "errors":
+        return 1.0
+    freedom = max(measurement.n_data - calibration.identifiability.rank, 1)
+    return float(np.sum(measurement.residuals() ** 2) / freedom)
+
+
+def prior_noise(measurement, weights):
+    """Return the noise against which priors weigh in a fit; the residuals' if not known."""
+    if weights is not None or not measurement.n_priors:
+        return 1.0
+    freedom = max(measurement.n_data - measurement.free.size, 1)
+    return float(np.sqrt(np.sum(measurement.residuals() ** 2) / freedom))
+
+
+def _whitened(calibration):
+    """Return the derivative of data and priors to one degree, micrometre or percent."""
+    measurement = calibration.measurement
+    vector, weights = measurement.vector(), calibration._weights()
+    jacobian = measurement.jacobian(vector) * (1.0 if weights is None else weights)
+    priors = measurement.free.prior_jacobian(vector) * prior_noise(measurement, weights)
+    steps = np.array([_step(unit)[0] for unit in calibration.covariance.units])
+    return (np.concatenate([jacobian, priors], axis=1) * steps[:, None]).T, steps
+
+
+def _open_of_file(calibration):
+    """Return the open directions that a file names, less those that a prior has closed."""
+    known = calibration.covariance
+    steps = np.array([_step(unit)[0] / canonical_factor(unit) for unit in known.units])
+    null = np.asarray(calibration.identifiability.null_vectors).reshape(-1, len(known))
+    undetermined = ~np.isfinite(np.diag(known.matrix))
+    undetermined &= [name not in set(calibration.at_bound) for name in known.names]
+    is_open = (np.abs(null[:, undetermined]) > _STILL).any(axis=1)
+    return null[is_open] * steps

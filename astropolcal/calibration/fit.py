@@ -22,13 +22,15 @@ from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
 
 from astropolcal.calibration.accuracy import accuracy_table
-from astropolcal.calibration.covariance import Covariance
+from astropolcal.calibration.covariance import Covariance, full_covariance, prior_noise
 from astropolcal.calibration.gauge import describe_gauge, open_parameters, settle
+from astropolcal.calibration.goodness import lack_of_fit
 from astropolcal.calibration.identifiability import analyse, complete
+from astropolcal.calibration.noise import noise_from_errors, noise_from_null_channel
 from astropolcal.calibration.result import Calibration, DatasetRecord
 from astropolcal.calibration.starts import BinProblem, search_branches
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import AstropolcalWarning, FitError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.units import to_unit
 from astropolcal.version import version
@@ -218,7 +220,7 @@ def _run(measurement, weight, fitter):
             # a prior weighs against equal weights as much as the residuals say
             for _ in range(2 if weight is None and measurement.n_priors else 1):
                 index, observed, weights = measurement.fit_arguments(
-                    weight, _noise(measurement, weight)
+                    weight, prior_noise(measurement, weight)
                 )
                 fitter(
                     measurement,
@@ -241,14 +243,6 @@ def _run(measurement, weight, fitter):
         "message": said[-1] if said else str(info.get("message", "")).strip(),
         "evaluations": None if evaluations is None else int(evaluations),
     }
-
-
-def _noise(measurement, weight):
-    """Return the standard deviation of a datum of weight one: the residuals', if not known."""
-    if weight is not None or not measurement.n_priors:
-        return 1.0
-    freedom = max(measurement.n_data - measurement.free.size, 1)
-    return float(np.sqrt(np.sum(measurement.residuals() ** 2) / freedom))
 
 
 def _outside_bounds(measurement):
@@ -353,7 +347,7 @@ def _result(measurement, weight, *, settings, fit, stages, cross_validate):
     vector = measurement.vector()
     held = _at_bounds(measurement.free, vector)
     whitened = measurement.jacobian(vector) * (1.0 if weight is None else weight)
-    priors = measurement.free.prior_jacobian(vector) * _noise(measurement, weight)
+    priors = measurement.free.prior_jacobian(vector) * prior_noise(measurement, weight)
     finding, unscaled = analyse(measurement.free, whitened, held, priors)
     complete(finding, measurement, vector)
     residuals = measurement.residuals(vector)
@@ -374,7 +368,33 @@ def _result(measurement, weight, *, settings, fit, stages, cross_validate):
         measurement=measurement,
         provenance=_provenance(),
     )
+    calibration.covariance = full_covariance(calibration)
+    calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
     return calibration.cross_validate() if cross_validate else calibration
+
+
+def _lack_of_fit(calibration):
+    """Hold the residuals against the noise that the table states, and that the data show."""
+    found = []
+    for noise_of in (noise_from_errors, _smooth_null):
+        try:
+            noise = noise_of(calibration.measurement)
+            test = lack_of_fit(calibration.measurement, calibration, noise)
+        except AstropolcalError:
+            continue  # no errors in the table, or no pairs: nothing to hold against
+        found.append(
+            {
+                "noise": noise.method,
+                "times_noise": float(np.sqrt(test.chi2 / test.expected)),
+                "p_value": float(test.p_value),
+                "words": test.words,
+            }
+        )
+    return found
+
+
+def _smooth_null(measurement):
+    return noise_from_null_channel(measurement, null_model="smooth")
 
 
 def _at_bounds(free, vector):

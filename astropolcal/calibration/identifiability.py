@@ -241,7 +241,7 @@ def _decompose(scaled):
     n_data, n_free = scaled.shape
     _, singular, right = np.linalg.svd(scaled, full_matrices=n_data < n_free)
     singular = np.pad(singular, (0, n_free - singular.size))
-    threshold = max(_RANK_TOLERANCE * singular[0], _NOTHING)
+    threshold = max(_RANK_TOLERANCE * singular.max(initial=0.0), _NOTHING)
     return singular, right, int(np.sum(singular > threshold))
 
 

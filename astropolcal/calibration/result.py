@@ -8,6 +8,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.accuracy import accuracy_table, cross_validated_residuals
+from astropolcal.calibration.target_accuracy import groups_by
 from astropolcal.chain import leaves
 from astropolcal.exceptions import CalibrationFileError
 
@@ -191,8 +192,9 @@ class Calibration:
 
         Parameters
         ----------
-        groups : `~numpy.ndarray`, optional
-            Group of each datum; by default its derotator angle.
+        groups : `~numpy.ndarray` or str, optional
+            Group of each datum, or what makes a group, see `groups_by`; by
+            default its derotator angle.
 
         Returns
         -------
@@ -200,6 +202,8 @@ class Calibration:
             Itself.
         """
         live = self._live()
+        if isinstance(groups, str):
+            groups = groups_by(live, groups)
         held_out = cross_validated_residuals(live, live.vector(), self._weights(), groups)
         residuals = live.residuals()
         for i, record in enumerate(self.datasets):

@@ -98,6 +98,8 @@ class BinProblem:
             Cost of each bin there.
         """
         vector = vector.copy()
+        if not self.slots:
+            return vector, self.costs(vector)
         costs, damping = self.costs(vector), np.full(self.n_bins, 1e-3)
         for _ in range(iterations):
             trial = vector.copy()

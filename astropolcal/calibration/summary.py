@@ -46,6 +46,7 @@ def summary(calibration):
         _global_lines(known),
         *(_accuracy_lines(record) for record in calibration.datasets),
         _wavelength_lines(calibration, known),
+        _goodness_lines(calibration),
         list(_wrap([str(calibration.identifiability)])),
         _gauge_lines(calibration),
         _bound_lines(calibration),
@@ -150,6 +151,12 @@ def _by_wavelength(accuracy):
     return {round(w, 2): s for w, s in zip(nm, accuracy["s_mean"].value, strict=True)}
 
 
+def _goodness_lines(calibration):
+    found = calibration.fit.get("lack_of_fit") or []
+    lines = [f"  - {test['words']}" for test in found]
+    return list(_wrap(["Goodness of fit", *lines])) if lines else []
+
+
 def _gauge_lines(calibration):
     gauge = calibration.settings.get("gauge")
     return list(_wrap([f"Gauge: {gauge}"])) if gauge else []
@@ -206,6 +213,7 @@ def to_dict(calibration):
         "n_data": fit["n_data"],
         "n_free": len(calibration.covariance),
         "rank": calibration.identifiability.rank,
+        "lack_of_fit": _plain(fit.get("lack_of_fit") or []),
         "datasets": [_dataset(record) for record in calibration.datasets],
         "parameters": {
             name: _parameter(entry) for name, entry in calibration.parameter_values().items()

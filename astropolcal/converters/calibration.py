@@ -155,11 +155,17 @@ def _chain_node(chain):
 def _covariance_node(covariance):
     from astropolcal.converters.nodes import unit_text
 
-    return {
+    node = {
         "names": list(covariance.names),
         "units": [unit_text(unit) for unit in covariance.units],
         "matrix": covariance.matrix.copy(),
     }
+    if covariance.factor is not None and covariance.factor.size:
+        node["factor"] = covariance.factor.copy()
+    if covariance.null is not None:
+        # row by row: some versions of asdf cannot read an empty matrix
+        node["open"] = [row.copy() for row in covariance.null]
+    return node
 
 
 def _identifiability_node(finding):
@@ -296,11 +302,19 @@ def _chain(node):
 
 
 def _covariance(node):
+    import numpy as np
+
     from astropolcal.calibration import Covariance
     from astropolcal.converters.nodes import unit_from_text
 
     units = [unit_from_text(text) for text in node["units"]]
-    return Covariance(node["names"], units, node["matrix"])
+    return Covariance(
+        node["names"],
+        units,
+        node["matrix"],
+        factor=node.get("factor"),
+        null=np.array(node["open"]) if "open" in node else None,
+    )
 
 
 def _identifiability(node):

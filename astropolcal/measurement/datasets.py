@@ -95,7 +95,6 @@ class Dataset:
     """
 
     def __init__(self, chain, observations, observable, free, wavelength, positions=None):
-        self.chain = chain
         self.observations = observations
         self.observable = observable
         self.n_free = free.size
@@ -115,7 +114,7 @@ class Dataset:
             self.propagator = Propagator(chain, observations.wavelength.to_value(u.um), placed)
         except WavelengthRangeError as error:
             raise WavelengthRangeError(f"{observations.name}: {error}") from None
-        self._plan(free)
+        self._plan(chain, free)
         self._observe(columns)
 
     # ---- data ----------------------------------------------------------------
@@ -157,11 +156,11 @@ class Dataset:
 
     # ---- parameters ------------------------------------------------------------
 
-    def _plan(self, free):
+    def _plan(self, chain, free):
         """Note which values of the chain come from which part of the flat vector."""
         self._constants = self.propagator.values()
         self._live = []
-        for i, leaf in enumerate(leaves(self.chain)):
+        for i, leaf in enumerate(leaves(chain)):
             for j, key in enumerate(leaf.param_names):
                 slot, factor, offset = free.lookup(f"{leaf.name}.{key}")
                 if slot is not None:

@@ -8,21 +8,26 @@ is imported when the first figure is drawn.
 """
 
 from astropolcal.plotting.accuracy import plot_accuracy
+from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
 from astropolcal.plotting.parameters import (
     plot_efficiency,
     plot_parameters,
     plot_retardances,
 )
+from astropolcal.plotting.posterior import plot_corner, plot_traces
 from astropolcal.plotting.residuals import plot_residuals
 from astropolcal.plotting.saving import save_all
 
 __all__ = [
     "plot_accuracy",
+    "plot_corner",
+    "plot_correlations",
     "plot_double_differences",
     "plot_efficiency",
     "plot_parameters",
     "plot_residuals",
     "plot_retardances",
+    "plot_traces",
     "save_all",
 ]

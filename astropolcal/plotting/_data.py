@@ -41,6 +41,7 @@ class DataGrid:
         measurement = calibration.measurement
         dataset = check_dataset(calibration, dataset)
         self.part = measurement.datasets[dataset]
+        self.chain = calibration.chains[dataset]
         if not self.part.n_data:
             raise ObservationError(f"{self.part.observations.name}: no datum is left to draw")
         self.observable = measurement.observable
@@ -105,7 +106,7 @@ class DataGrid:
         positions = {stage: np.repeat(p, n) for stage, p in series.positions.items()}
         positions["derotator"] = np.tile(angle, per_datum)
         # the chain's parameters are given on the calibration's own grid of wavelengths
-        propagator = Propagator(self.part.chain, self.calibrated_um, positions)
+        propagator = Propagator(self.chain, self.calibrated_um, positions)
         right, left = (
             flux[self.part.bins[bins]].reshape(len(bins), per_datum, n).transpose(1, 0, 2)
             for flux in propagator.fluxes()

@@ -11,6 +11,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.files import atomic_path
 from astropolcal.plotting.accuracy import plot_accuracy
+from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
 from astropolcal.plotting.parameters import (
     other_parameters,
@@ -93,6 +94,7 @@ def _figures(calibration):
     yield "accuracy", lambda: plot_accuracy(calibration)
     yield "retardances", lambda: plot_retardances(calibration)
     yield "efficiency", lambda: plot_efficiency(calibration)
+    yield "correlations", lambda: plot_correlations(calibration)
     yield "other_parameters", lambda: plot_parameters(calibration, other_parameters(calibration))
 
 

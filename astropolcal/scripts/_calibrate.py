@@ -29,6 +29,17 @@ def add_parser(commands):
     parser.add_argument("files", nargs="*", metavar="FILE", help="observation tables (ECSV)")
     parser.add_argument("-o", "--output", metavar="CAL.asdf", help="write the calibration here")
     parser.add_argument("--instrument", metavar="NAME", help="default: as the tables say")
+    _add_model_options(parser)
+    parser.add_argument("--plots", metavar="DIR", help="save the figures in this folder")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.set_defaults(run=run)
+
+
+def _add_model_options(parser):
+    """Add what says how the model is made and fitted."""
     parser.add_argument(
         "--derotator",
         metavar="MODEL",
@@ -94,12 +105,6 @@ def add_parser(commands):
         metavar="OPTIC",
         help="take an optic out of the model",
     )
-    parser.add_argument("--plots", metavar="DIR", help="save the figures in this folder")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
-    )
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
-    parser.set_defaults(run=run)
 
 
 def run(arguments):

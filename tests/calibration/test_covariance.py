@@ -4,11 +4,14 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from astropolcal import optics
-from astropolcal.calibration import Covariance
+from astropolcal.calibration import Calibration, Covariance, calibrate, full_covariance
 from astropolcal.exceptions import ParameterError
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement import FreeParameters, Normal
 
 NAMES, UNITS = ["hwp.theta", "hwp.w_sio2", "wollaston.efficiency"], [u.deg, u.mm, None]
 MATRIX = np.array([[0.04, 0.001, np.nan], [0.001, 0.0001, np.nan], [np.nan, np.nan, np.nan]])
@@ -83,3 +86,139 @@ def test_canonical_matrix_is_converted():
     assert covariance.names == ["plate.theta", "plate.w_sio2", "wollaston.efficiency"]
     np.testing.assert_allclose(covariance.stds, [np.rad2deg(1), 1e-3, 1])
     assert covariance.matrix[0, 1] == pytest.approx(np.rad2deg(1) * 1e-3)
+
+
+# --- what depends on the parameters -------------------------------------------------------
+
+ANGLES = ["polarizer.theta", "hwp.theta"]
+
+
+@pytest.fixture
+def sum_known():
+    """Two angles of which the data know the sum, to 0.2 deg, and an efficiency at its bound."""
+    factor = np.array([[0.1, 0.1, 0.0]])
+    return Covariance(
+        [*ANGLES, "wollaston.efficiency"],
+        [u.deg, u.deg, None],
+        np.full((3, 3), np.nan),
+        factor=factor,
+        null=[[1.0, -1.0, 0.0]],
+    )
+
+
+def test_sum_is_known_and_its_parts_are_not(sum_known):
+    assert sum_known.propagate([1, 1, 0]) == pytest.approx(0.04)
+    assert sum_known.propagate([1, 0, 0]) == np.inf
+    assert sum_known.propagate([0, 1, 0]) == np.inf
+    matrix = sum_known.propagate([[1, 1, 0], [1, 0, 0], [2, 2, 0]])
+    np.testing.assert_allclose(
+        matrix, [[0.04, np.nan, 0.08], [np.nan, np.inf, np.nan], [0.08, np.nan, 0.16]]
+    )
+
+
+def test_small_move_along_an_open_direction_is_infinite_too(sum_known):
+    assert sum_known.propagate([1, 1.001, 0]) == np.inf
+    # but a rounding error is not a move
+    assert np.isfinite(sum_known.propagate([1, 1 + 1e-9, 0]))
+
+
+def test_what_rests_on_a_bound_alone_has_no_error(sum_known):
+    assert np.isnan(sum_known.propagate([0, 0, 1]))
+    # beside others the bound counts as known
+    assert sum_known.propagate([1, 1, 5]) == pytest.approx(0.04)
+    assert sum_known.propagate([1, 0, 1]) == np.inf
+
+
+def test_constant_has_no_error(sum_known):
+    assert sum_known.propagate([0, 0, 0]) == 0
+
+
+def test_without_directions_determined_parameters_still_propagate(covariance):
+    assert covariance.propagate([1, 0, 0]) == pytest.approx(0.04)
+    assert covariance.propagate([1, 10, 0]) == pytest.approx(0.04 + 2 * 10 * 0.001 + 100 * 1e-4)
+    assert np.isnan(covariance.propagate([1, 0, 1]))
+
+
+def test_open_direction_of_a_covariance_without_factor():
+    """What a file tells that names its open directions only: infinite, or not known."""
+    known = Covariance(ANGLES, [u.deg, u.deg], np.full((2, 2), np.nan), null=[[1, -1]])
+    assert known.propagate([1, 0]) == np.inf
+    assert np.isnan(known.propagate([1, 1]))
+
+
+@settings(max_examples=30)
+@given(arrays(float, (2, 3), elements=st.floats(-10, 10)))
+def test_full_rank_is_the_textbook_formula(slopes):
+    root = np.array([[0.1, 0.0, 0.0], [0.02, 0.001, 0.0], [0.05, 0.002, 0.3]])
+    matrix = root.T @ root
+    made = Covariance(NAMES, UNITS, matrix, factor=root, null=np.zeros((0, 3)))
+    plain = Covariance(NAMES, UNITS, matrix)
+    expected = slopes @ matrix @ slopes.T
+    scale = 1e-9 * (1 + np.abs(expected).max())
+    np.testing.assert_allclose(made.propagate(slopes), expected, rtol=1e-6, atol=scale)
+    np.testing.assert_allclose(plain.propagate(slopes), expected, rtol=1e-6, atol=scale)
+
+
+@pytest.mark.parametrize("slopes", [[1, 2], [[1, 2]], np.ones((1, 1, 3)), 1.0])
+def test_slopes_must_fit(covariance, slopes):
+    with pytest.raises(ParameterError, match="do not fit"):
+        covariance.propagate(slopes)
+
+
+def test_directions_must_be_finite():
+    with pytest.raises(ParameterError, match="factor of a covariance"):
+        Covariance(["a.b"], [None], [[1.0]], factor=[[np.nan]])
+
+
+# --- of a calibration ---------------------------------------------------------------------
+
+LAM = [1.2, 1.6, 2.2] * u.um
+
+
+@pytest.mark.parametrize("weights", [None, "errors"])
+@pytest.mark.parametrize("fixed", [True, False])
+def test_directions_agree_with_the_matrix(make, fixed, weights):
+    truth = make.truth(make.chain("elliptical", fixed=fixed, wavelength=LAM))
+    data = make.observe(truth, wavelength=LAM, seed=1)
+    cal = calibrate(truth, data, weights=weights, search=False, cross_validate=False)
+    full = full_covariance(cal)
+    assert full == cal.covariance
+    rank = cal.identifiability.rank
+    assert full.factor.shape == (rank, len(full))
+    assert full.null.shape == (len(full) - rank, len(full))
+    known = np.isfinite(full.stds)
+    product = full.factor.T @ full.factor
+    np.testing.assert_allclose(
+        product[np.ix_(known, known)], full.matrix[np.ix_(known, known)], rtol=1e-6
+    )
+    variances = np.diag(full.propagate(np.eye(len(full))))
+    np.testing.assert_allclose(variances[known], full.stds[known] ** 2, rtol=1e-6)
+    assert np.isinf(variances[~known]).all()
+    assert known.all() == fixed
+
+
+def test_prior_closes_an_open_direction(make):
+    """With priors the error is finite, because the gauge has a name."""
+    truth = make.truth(make.chain("elliptical", fixed=False, wavelength=LAM))
+    for name in ("hwp", "derotator"):
+        truth[name].theta.prior = Normal(0 * u.deg, 0.1 * u.deg)
+    data = make.observe(truth, wavelength=LAM, seed=1)
+    cal = calibrate(truth, data, weights="errors", search=False, cross_validate=False)
+    full = full_covariance(cal)
+    assert not len(full.null)
+    slopes = np.eye(len(full))[full.names.index("hwp.theta")]
+    assert np.sqrt(full.propagate(slopes)) == pytest.approx(0.1, rel=0.05)
+    product = full.factor.T @ full.factor
+    np.testing.assert_allclose(product, cal.covariance.matrix, rtol=1e-6, atol=1e-14)
+
+
+def test_from_a_file_the_open_stays_open(make, tmp_path):
+    """Determined parameters as before; what the data leave open never gets a finite error."""
+    truth = make.truth(make.chain("elliptical", fixed=False, wavelength=LAM))
+    cal = calibrate(truth, make.observe(truth, wavelength=LAM, seed=1), cross_validate=False)
+    cal.write(tmp_path / "cal.asdf")
+    again = full_covariance(Calibration.read(tmp_path / "cal.asdf"))
+    here, there = (np.diag(c.propagate(np.eye(len(c)))) for c in (full_covariance(cal), again))
+    np.testing.assert_allclose(there, here, rtol=1e-6)
+    rng = np.random.default_rng(0)
+    assert not np.isfinite(np.diag(again.propagate(rng.normal(size=(5, len(again)))))).any()

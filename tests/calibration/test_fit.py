@@ -399,7 +399,7 @@ def test_undetermined_parameters_are_null_in_json(make):
     assert result["parameters"]["hwp.theta"]["std"] is None
     assert result["parameters"]["hwp.theta"]["identifiable"] is False
     for direction in result["null_directions"]:
-        assert set(direction) == {"words", "parameters"}
+        assert set(direction) == {"words", "parameters", "sky"}
 
 
 def test_parameter_table_has_a_row_a_free_value(calibrated):

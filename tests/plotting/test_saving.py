@@ -46,6 +46,7 @@ def test_writes_every_figure_as_png(elliptical, tmp_path):
         "accuracy.png",
         "retardances.png",
         "efficiency.png",
+        "correlations.png",
     ]
     # nothing half-written or temporary stays behind
     assert sorted(folder.iterdir()) == sorted(paths)
@@ -63,7 +64,7 @@ def test_each_dataset_has_its_double_differences(several, tmp_path):
 
 def test_calibration_without_data_gets_the_other_figures(elliptical, tmp_path):
     paths = save_all(replace(elliptical, measurement=None), tmp_path)
-    assert names(paths) == ["accuracy.png", "retardances.png", "efficiency.png"]
+    assert names(paths) == ["accuracy.png", "retardances.png", "efficiency.png", "correlations.png"]
 
 
 def test_dataset_without_a_datum_is_left_out(several, tmp_path):
@@ -79,7 +80,7 @@ def test_dataset_without_a_datum_is_left_out(several, tmp_path):
 
 @pytest.mark.parametrize("name", ["masked", "undetermined", "single_angle"])
 def test_every_kind_of_calibration_is_drawn(name, request, tmp_path):
-    assert len(save_all(request.getfixturevalue(name), tmp_path)) == 5
+    assert len(save_all(request.getfixturevalue(name), tmp_path)) == 6
 
 
 def test_existing_files_are_replaced(elliptical, tmp_path):

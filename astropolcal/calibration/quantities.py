@@ -1,0 +1,447 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Retardances, efficiencies, matrices, predictions and sky Stokes parameters with their errors."""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.calibration.derived import _derive, _slopes_of, propagate
+from astropolcal.chain import (
+    find_optic,
+    join,
+    leaves,
+    system_mueller,
+    system_mueller_derivatives,
+    with_beam,
+)
+from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
+from astropolcal.measurement import FreeParameters
+
+__all__ = [
+    "derived_data",
+    "derived_efficiency",
+    "derived_mueller",
+    "derived_retardance",
+    "derived_sky",
+]
+
+
+def derived_retardance(calibration, optic, wavelength=None, dataset=0):
+    r"""
+    Return the retardance of an optic with its error.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    optic : str
+        Name of a retarder: one that follows a law, a linear, or an elliptical
+        one, whose total retardance :math:`\sqrt{\Delta_H^2+\Delta_{45}^2+\Delta_R^2}`
+        is meant.
+    wavelength : `~astropy.units.Quantity`, optional
+        By default the calibration's grid; between its points, parameters given
+        per wavelength are interpolated linearly.
+    dataset : int
+        Which of the calibration's chains.
+
+    Returns
+    -------
+    Derived
+        In degree, of the shape of ``wavelength``.
+
+    Raises
+    ------
+    ChainError
+        If there is no such optic, or it is no retarder.
+    WavelengthRangeError
+        If a wavelength is outside the grid of its parameters or the law's range.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import derived_retardance
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> half_wave = derived_retardance(cal, "hwp", 1.65 * u.um)
+    >>> bool(half_wave.std < 0.1 * u.deg)
+    True
+    """
+    chain = calibration.chains[dataset]
+    leaf = find_optic(chain, optic)
+    lam = calibration.wavelength if wavelength is None else u.Quantity(wavelength)
+    components = [
+        key for key in ("retardance", "horizontal", "diagonal", "circular")
+        if key in leaf.param_names
+    ]  # fmt: skip
+    if not components:
+        if not callable(getattr(leaf, "retardance", None)):
+            raise ChainError(f"optic {optic!r} is a {type(leaf).__name__}, which has no retardance")
+        return propagate(
+            calibration, lambda *chains: find_optic(chains[dataset], optic).retardance(lam)
+        )
+    parts, weights = _at_wavelengths(calibration, leaf, components, lam)
+    if len(components) == 1:
+        value, slopes = parts[0], np.ones((1, *np.shape(lam)))
+    else:
+        value = np.sqrt(np.sum(parts**2, axis=0))
+        slopes = parts / np.where(value > 0, value, 1.0)
+    return _of_parameters(calibration, leaf, components, value * u.deg, slopes, weights)
+
+
+def derived_efficiency(calibration, wavelength=None, dataset=0):
+    """
+    Return the modulation efficiency of the beam splitter with its error.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    wavelength : `~astropy.units.Quantity`, optional
+        By default the calibration's grid; between its points the efficiency is
+        interpolated linearly.
+    dataset : int
+        Which of the calibration's chains.
+
+    Returns
+    -------
+    Derived
+        Of the shape of ``wavelength``.
+
+    Raises
+    ------
+    ChainError
+        If no optic has an efficiency.
+    WavelengthRangeError
+        If a wavelength is outside the grid.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import derived_efficiency
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> derived_efficiency(cal).value.shape
+    (22,)
+    """
+    found = [o for o in leaves(calibration.chains[dataset]) if "efficiency" in o.param_names]
+    if not found:
+        raise ChainError("no optic of the chain has an efficiency")
+    lam = calibration.wavelength if wavelength is None else u.Quantity(wavelength)
+    (value,), weights = _at_wavelengths(calibration, found[0], ["efficiency"], lam)
+    slopes = np.ones((1, *np.shape(lam)))
+    return _of_parameters(calibration, found[0], ["efficiency"], value, slopes, weights)
+
+
+def _at_wavelengths(calibration, leaf, keys, lam):
+    """Return parameters (degree or 1) at wavelengths, and the share of each grid point."""
+    grid = calibration.wavelength.to_value(u.nm)
+    order = np.argsort(grid)
+    wanted = np.atleast_1d(lam.to_value(u.nm))
+    several = any(np.size(getattr(leaf, key).value) > 1 for key in keys)
+    slack = 1e-6 * grid.max()
+    outside = (wanted < grid.min() - slack) | (wanted > grid.max() + slack)
+    if several and outside.any():
+        raise WavelengthRangeError(
+            f"wavelength {wanted[outside][0]:.2f} nm is outside the calibrated range "
+            f"{grid.min():.2f} to {grid.max():.2f} nm"
+        )
+    rows = [np.interp(wanted, grid[order], unit[order]) for unit in np.eye(grid.size)]
+    weights = np.stack(rows, axis=1)
+    parts = []
+    for key in keys:
+        parameter = getattr(leaf, key)
+        factor = 1.0 if parameter.unit is None else parameter.unit.to(u.deg)
+        value = np.ravel(parameter.value) * factor
+        parts.append(weights @ value if value.size > 1 else np.full(wanted.size, value[0]))
+    return np.array(parts).reshape(len(keys), *np.shape(lam)), weights
+
+
+def _of_parameters(calibration, leaf, keys, value, slopes, weights):
+    """Return a quantity that depends on parameters of one optic at the same wavelength."""
+    free = _free(calibration)
+    derivatives = {}
+    for key, slope in zip(keys, slopes, strict=True):
+        parameter = getattr(leaf, key)
+        factor = 1.0 if parameter.unit is None else parameter.unit.to(u.deg)
+        slot, *_ = free.lookup(f"{leaf.name}.{key}")
+        if slot is not None:
+            own = np.ravel(slope)[:, None] * weights if slot.per_wavelength else np.ravel(slope)
+            shape = (*np.shape(value), slot.size) if slot.per_wavelength else np.shape(value)
+            derivatives[f"{leaf.name}.{key}"] = (own * factor).reshape(shape)
+    slopes = _slopes_of(free, derivatives, np.shape(value))
+    return _derive(calibration, free, value[()], slopes)
+
+
+def derived_mueller(calibration, positions=None, wavelength=None, beam="right", dataset=0):
+    """
+    Return the system Mueller matrix with the error of each element.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    positions : dict of str to `~astropy.units.Quantity`, optional
+        Position of every stage, scalar or shape (n_frames,).
+    wavelength : `~astropy.units.Quantity`, optional
+        By default the calibration's grid, which is also the only choice where
+        parameters are given per wavelength.
+    beam : {"right", "left"}
+        The beam.
+    dataset : int
+        Which of the calibration's chains.
+
+    Returns
+    -------
+    Derived
+        Shape (n_frames, n_wavelengths, 4, 4), see
+        `~astropolcal.chain.system_mueller`.
+
+    Raises
+    ------
+    ChainError, ParameterError
+        As `~astropolcal.chain.system_mueller`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import derived_mueller
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> derived_mueller(cal, {"hwp": 0 * u.deg, "derotator": 45 * u.deg}).std.shape
+    (22, 4, 4)
+    """
+    lam = _grid(calibration, wavelength)
+    chain = with_beam(calibration.chains[dataset], beam)
+    value = system_mueller(chain, lam, positions)
+    slopes = {
+        name: slope.value
+        for name, slope in system_mueller_derivatives(chain, lam, positions).items()
+    }
+    axis = None if lam.ndim == 0 else -3
+    free = _free(calibration)
+    return _derive(calibration, free, value, _slopes_of(free, *_spread_out(free, slopes, axis)))
+
+
+def _grid(calibration, wavelength):
+    """Return the wavelengths of a matrix; those of the calibration if parameters are on them."""
+    grid = calibration.wavelength
+    if wavelength is None:
+        return grid
+    lam = u.Quantity(wavelength)
+    several = [slot for slot in _free(calibration).slots if slot.per_wavelength]
+    if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=1e-6)):
+        raise ParameterError(
+            f"{several[0].name} is known at the {grid.size} calibrated wavelengths only: "
+            "leave out wavelength"
+        )
+    return lam
+
+
+def _free(calibration):
+    return FreeParameters(calibration.chains, len(calibration.wavelength), calibration.ties)
+
+
+def _spread_out(free, slopes, axis):
+    """Give the derivatives to parameters per wavelength their own axis; drop the fixed ones."""
+    spread, shape = {}, ()
+    for name, slope in slopes.items():
+        shape = slope.shape
+        slot, *_ = free.lookup(name)
+        if slot is None:
+            continue
+        if slot.per_wavelength:
+            wide = np.zeros((*shape, slot.size))
+            for i in range(slot.size):
+                here = (*[slice(None)] * (len(shape) + axis), i)
+                wide[(*here, ..., i)] = slope[here]
+            slope = wide
+        spread[name] = slope
+    return spread, shape
+
+
+def derived_data(calibration, observations=None, dataset=0):
+    """
+    Return predicted data with the error that the calibration gives them.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    observations : Observations, optional
+        Frames to predict; by default those that were fitted, of all datasets.
+    dataset : int
+        With ``observations``, which of the calibration's chains they belong to.
+
+    Returns
+    -------
+    Derived
+        Shape (n_data,).
+
+    Raises
+    ------
+    CalibrationFileError
+        If the calibration was read from a file and no observations are given.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import derived_data
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> bool(derived_data(cal).is_determined.all())
+    True
+    """
+    if observations is None:
+        measurement = calibration._live()
+    else:
+        measurement = calibration.measurement_of(observations, dataset)
+    vector = measurement.vector()
+    jacobian = measurement.jacobian(vector).T * measurement.free.factors()
+    free = _free(calibration)
+    slopes = np.zeros((measurement.n_data, free.size))
+    columns = {name: i for i, name in enumerate(free.names)}
+    slopes[:, [columns[name] for name in measurement.free.names]] = jacobian
+    return _derive(calibration, free, measurement.predict(vector).copy(), slopes)
+
+
+def derived_sky(
+    calibration, q, u, positions, *, wavelength=None, modulator="hwp", chain=None, dataset=0
+):
+    """
+    Return the Stokes parameters recovered for a source, with the calibration's error.
+
+    A source of known q and u gives normalized double differences, which are
+    linearized and inverted with the calibrated chain by least squares; the
+    error is what a wrong calibration does to the result. Noise of the frames
+    is not included.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    q, u : float
+        Normalized Stokes parameters of the source, V = 0.
+    positions : dict of str to `~astropy.units.Quantity`
+        Position of every stage in the plus frames, scalar or shape (n_pairs,);
+        the modulator stands 45 degrees further in the minus frames.
+    wavelength : `~astropy.units.Quantity`, optional
+        By default the calibration's grid.
+    modulator : str
+        Stage of the half-wave plate.
+    chain : `~astropy.modeling.CompoundModel`, optional
+        Chain of the sky observation, whose optics bear the names and values of
+        the calibrated ones; by default the calibrated chain from its first
+        optic on a stage, so without those of the calibration source.
+    dataset : int
+        Which of the calibration's chains.
+
+    Returns
+    -------
+    Derived
+        q and u for each wavelength, shape (n_wavelengths, 2), or (2,) for a
+        scalar wavelength.
+
+    Raises
+    ------
+    ChainError
+        If a stage has no position, or the chain no optic on a stage.
+    ParameterError
+        If the positions do not determine q and u, or the source is unphysical.
+
+    Examples
+    --------
+    >>> import astropy.units as units
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import derived_sky
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * units.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> positions = {"hwp": [0, 22.5] * units.deg, "derotator": 60 * units.deg}
+    >>> derived_sky(cal, 0.01, 0.0, positions).value.shape
+    (22, 2)
+    """
+    if not np.hypot(q, u) <= 1:
+        raise ParameterError(f"q = {q}, u = {u}: more than 100 % of polarization")
+    lam = _grid(calibration, wavelength)
+    sky = _sky_chain(calibration.chains[dataset]) if chain is None else chain
+    numerator, denominator = _double_difference_rows(sky, lam, positions, modulator)
+    stokes = np.array([1.0, q, u, 0.0])
+    total = denominator[""] @ stokes
+    ratio = numerator[""] @ stokes / total
+    rows = (numerator[""] - ratio[..., None] * denominator[""]) / total[..., None]
+    inverse = _inverse(rows[..., 1:3])
+    slopes = {}
+    for name in numerator:
+        if name:
+            change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
+            slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
+    value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
+    free = _free(calibration)
+    axis = None if np.ndim(lam) == 0 else -2
+    return _derive(calibration, free, value, _slopes_of(free, *_spread_out(free, slopes, axis)))
+
+
+def _sky_chain(chain):
+    """Return the optics from the first on a stage: those before belong to the source."""
+    found = leaves(chain)
+    first = next((i for i, leaf in enumerate(found) if leaf.stage), None)
+    if first is None:
+        raise ChainError("the chain has no optic on a stage; give the chain of the sky observation")
+    return join(found[first:])
+
+
+def _double_difference_rows(chain, lam, positions, modulator):
+    """
+    Return rows of difference and sum of the four beams, and their derivatives.
+
+    Two dicts, ``""`` for the rows and ``"optic.parameter"`` for derivatives, of
+    shape (n_pairs, n_wavelengths, 4).
+    """
+    if modulator not in positions:
+        raise ChainError(f"no position of {modulator!r}; positions has {sorted(positions)}")
+    shape = np.broadcast_shapes(*(np.shape(angle) for angle in positions.values()), (1,))
+    angles = {
+        name: np.broadcast_to(u.Quantity(angle), shape, subok=True)
+        for name, angle in positions.items()
+    }
+    numerator, denominator = {}, {}
+    for beam, sign in (("right", 1), ("left", -1)):
+        arm = with_beam(chain, beam)
+        for turned, half in ((0, 1), (45, -1)):
+            at = angles | {modulator: angles[modulator] + turned * u.deg}
+            rows = {"": system_mueller(arm, lam, at)}
+            rows |= system_mueller_derivatives(arm, lam, at)
+            for name, matrix in rows.items():
+                row = np.asarray(getattr(matrix, "value", matrix))[..., 0, :]
+                numerator[name] = numerator.get(name, 0.0) + sign * half * row
+                denominator[name] = denominator.get(name, 0.0) + row
+    return numerator, denominator
+
+
+def _inverse(rows):
+    """Return the least-squares inverse over the pairs, (n_wavelengths, 2, n_pairs)."""
+    stacked = np.moveaxis(rows, 0, -2)
+    singular = np.linalg.svd(stacked, compute_uv=False)
+    if stacked.shape[-2] < 2 or np.any(singular[..., 1] < 1e-6 * singular[..., 0]):
+        raise ParameterError(
+            "the positions do not determine q and u: give pairs at two half-wave-plate angles, "
+            "such as 0 and 22.5 deg"
+        )
+    return np.linalg.pinv(stacked)

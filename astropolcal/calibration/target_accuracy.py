@@ -1,0 +1,435 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What an accuracy means for a target, and four accuracies side by side.
+
+The equations are those of McIntosh et al. (2026, Sec. 2.3), after van Holstein
+et al. 2020, A&A 633, A64 (doi:10.1051/0004-6361/201834996).
+"""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.calibration.accuracy import (
+    accuracy_table,
+    cross_validated_residuals,
+    leave_out_groups,
+)
+from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.units import angle_to_rad
+
+__all__ = [
+    "absolute_accuracy",
+    "four_accuracies",
+    "groups_by",
+    "propagate_accuracy",
+    "target_accuracy",
+]
+
+GROUPS = ("derotator", "cycle", "dataset")
+_COLUMNS = ("s_mean", "s_res", "s_cv")
+_CALIBRATIONS = {"polarized": "s_rel", "unpolarized": "s_unpol", "on_sky": "s_sky"}
+_SAME_ANGLE = np.deg2rad(0.5)
+_PLATE_STEPS = np.deg2rad(0.3)
+
+
+# ---- a target of any polarization ---------------------------------------------------------
+
+
+def absolute_accuracy(s_unpol, s_sky):
+    r"""
+    Return the error that scales with the intensity.
+
+    :math:`s_\mathrm{abs} = \sqrt{s_\mathrm{unpol}^2 + s_\mathrm{sky}^2}`
+    (paper, Sec. 2.3).
+
+    Parameters
+    ----------
+    s_unpol, s_sky : `~astropy.units.Quantity`
+        Accuracies of the unpolarized internal and of the on-sky calibration.
+
+    Returns
+    -------
+    `~astropy.units.Quantity`
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.calibration import absolute_accuracy
+    >>> absolute_accuracy(0.03 * u.percent, 0.04 * u.percent)
+    <Quantity 0.05 %>
+    """
+    return np.hypot(s_unpol, s_sky)
+
+
+def propagate_accuracy(dolp, aolp, s_rel, s_abs):
+    r"""
+    Return the accuracy of q, u, degree and angle of polarization of a target.
+
+    With :math:`q = p\cos 2\chi`, :math:`u = p\sin 2\chi` (paper, Sec. 2.3)
+
+    .. math::
+
+        s_Q = s_\mathrm{abs} + s_\mathrm{rel}|q|, \quad
+        s_U = s_\mathrm{abs} + s_\mathrm{rel}|u|, \quad
+        s_p = \sqrt{\frac{q^2 s_Q^2 + u^2 s_U^2}{q^2 + u^2}}, \quad
+        s_\chi = \frac{\sqrt{q^2 s_U^2 + u^2 s_Q^2}}{2 (q^2 + u^2)}.
+
+    Parameters
+    ----------
+    dolp : `~astropy.units.Quantity` or float
+        Degree of linear polarization, 0 to 1 (0 to 100 %).
+    aolp : `~astropy.units.Quantity`
+        Angle of linear polarization.
+    s_rel, s_abs : `~astropy.units.Quantity` or float
+        Relative and absolute accuracy. All four broadcast.
+
+    Returns
+    -------
+    dict of str to `~astropy.units.Quantity`
+        ``s_Q``, ``s_U``, ``s_p`` in percent; ``s_chi`` in degree, infinite for an
+        unpolarized target. It is linear error propagation: above some 30 deg
+        the angle is simply unknown.
+
+    Raises
+    ------
+    ParameterError
+        If a degree of polarization or an accuracy is not a possible one.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.calibration import propagate_accuracy
+    >>> s = propagate_accuracy(1 * u.percent, 0 * u.deg, 0.1 * u.percent, 0.03 * u.percent)
+    >>> s["s_p"].round(6), s["s_chi"].round(2)
+    (<Quantity 0.031 %>, <Quantity 0.86 deg>)
+    """
+    p = _fraction("dolp", dolp, 1.0)
+    rel, absolute = (_fraction(n, v) for n, v in (("s_rel", s_rel), ("s_abs", s_abs)))
+    chi = 2 * angle_to_rad(aolp, "aolp")
+    # q and u over p stay defined for an unpolarized target
+    along, across = np.abs(np.cos(chi)), np.abs(np.sin(chi))
+    s_q, s_u = absolute + rel * p * along, absolute + rel * p * across
+    s_p = np.hypot(along * s_q, across * s_u)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s_chi = np.where(p > 0, np.hypot(along * s_u, across * s_q) / (2 * p), np.inf)
+    percent = {"s_Q": s_q, "s_U": s_u, "s_p": s_p}
+    result = {key: 100 * value * u.percent for key, value in percent.items()}
+    return result | {"s_chi": np.rad2deg(s_chi) * u.deg}
+
+
+def _fraction(name, value, limit=np.inf):
+    number = np.asarray(u.Quantity(value).to_value(u.one), dtype=float)
+    if np.any(number < 0) or np.any(number > limit) or np.any(np.isinf(number)):
+        allowed = "0 to 1 (0 to 100 %)" if np.isfinite(limit) else "numbers from 0"
+        raise ParameterError(f"{name} = {value}; allowed are {allowed}")
+    return number
+
+
+def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None, column="s_mean"):
+    """
+    Return the accuracy of a calibrated instrument for a target, per wavelength.
+
+    Parameters
+    ----------
+    dolp : `~astropy.units.Quantity` or float
+        The target's degree of linear polarization; scalar or one a wavelength.
+    aolp : `~astropy.units.Quantity`
+        Its angle of linear polarization; scalar or one a wavelength.
+    polarized, unpolarized, on_sky : `~astropy.table.QTable`, optional
+        Accuracies of the calibrations with the internal source polarized
+        (s_rel) and unpolarized (s_unpol) and on an unpolarized standard star
+        (s_sky), such as ``Calibration.accuracy``. What is missing counts as
+        zero; its column is NaN and ``meta["words"]`` says so.
+    column : {"s_mean", "s_res", "s_cv"}
+        Which accuracy to take: the paper's is ``s_mean``, the error of a
+        prediction at one setting is ``s_cv``.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Columns ``wavelength``, ``s_rel``, ``s_unpol``, ``s_sky``, ``s_abs``, ``s_Q``,
+        ``s_U``, ``s_p`` (percent) and ``s_chi`` (degree), see `propagate_accuracy`;
+        meta ``column``, ``missing`` and ``words``.
+
+    Raises
+    ------
+    ParameterError
+        If there is no table at all, they have no such column, their wavelengths
+        differ, or the target is impossible.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal.calibration import target_accuracy
+    >>> lam = [1.2, 1.6] * u.um
+    >>> lamp = QTable({"wavelength": lam, "s_mean": [0.10, 0.05] * u.percent})
+    >>> star = QTable({"wavelength": lam, "s_mean": [0.03, 0.02] * u.percent})
+    >>> table = target_accuracy(1 * u.percent, 0 * u.deg, polarized=lamp, on_sky=star)
+    >>> table["s_p"].round(4)
+    <Quantity [0.031 , 0.0205] %>
+    >>> table.meta["missing"]
+    ['unpolarized']
+    """
+    given = {"polarized": polarized, "unpolarized": unpolarized, "on_sky": on_sky}
+    present = {name: table for name, table in given.items() if table is not None}
+    if not present:
+        raise ParameterError(f"no accuracy is given; at least one of {', '.join(given)} is needed")
+    wavelength = next(iter(present.values()))["wavelength"]
+    found = {name: _values(name, table, column, wavelength) for name, table in present.items()}
+    zero = np.zeros(len(wavelength)) * u.percent
+    s_rel, s_unpol, s_sky = (found.get(name, zero) for name in given)
+    s_abs = absolute_accuracy(s_unpol, s_sky)
+    result = QTable({"wavelength": wavelength})
+    for name, key in _CALIBRATIONS.items():
+        result[key] = found.get(name, zero * np.nan)
+    result["s_abs"] = s_abs if "unpolarized" in found or "on_sky" in found else zero * np.nan
+    for key, value in _for_target(dolp, aolp, s_rel, s_abs).items():
+        result[key] = value
+    missing = [name for name in given if name not in found]
+    result.meta |= {"column": column, "missing": missing, "words": _words(column, missing)}
+    return result
+
+
+def _for_target(dolp, aolp, s_rel, s_abs):
+    shape = s_rel.shape
+    for name, value in (("dolp", dolp), ("aolp", aolp)):
+        if np.shape(value) not in ((), shape):
+            raise ParameterError(
+                f"{name} has shape {np.shape(value)}; allowed are () and {shape}, one a wavelength"
+            )
+    return propagate_accuracy(dolp, aolp, s_rel, s_abs)
+
+
+def _values(name, table, column, wavelength):
+    if column not in _COLUMNS or column not in table.colnames:
+        raise ParameterError(
+            f"{name}: no column {column!r}; allowed are {', '.join(_COLUMNS)}, if present"
+        )
+    own = table["wavelength"]
+    if own.shape != wavelength.shape or not u.allclose(own, wavelength, rtol=SAME_WAVELENGTH):
+        raise ParameterError(
+            f"{name}: {len(own)} wavelengths from {own.min():.6g} to {own.max():.6g} are not the "
+            f"{len(wavelength)} from {wavelength.min():.6g} to {wavelength.max():.6g} of the others"
+        )
+    return u.Quantity(table[column]).to(u.percent)
+
+
+def _words(column, missing):
+    if not missing:
+        return f"all three calibrations count, by their {column}"
+    lacking = ", ".join(f"{name} ({_CALIBRATIONS[name]})" for name in missing)
+    return f"by {column}; without the calibration {lacking}: the accuracies are lower limits"
+
+
+# ---- four accuracies ------------------------------------------------------------------------
+
+
+def groups_by(measurement, by="derotator"):
+    """
+    Return the group of each datum for cross-validation.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    by : {"derotator", "cycle", "dataset"}
+        A group is a derotator angle of a dataset; a cycle of the half-wave
+        plate; or a whole dataset (a night). A cycle is the column ``cycle`` of the
+        frames where there is one; otherwise it ends where a plate angle
+        (of one state of a modulator) comes again or the derotator moves. A
+        datum belongs to the cycle of its plus frame.
+
+    Returns
+    -------
+    `~numpy.ndarray` of int
+        Shape (n_data,); numbered from 0.
+
+    Raises
+    ------
+    FitError
+        If a group has a single member at each wavelength, or there is one
+        group only, or no such way of grouping.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration import groups_by
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 60] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames)
+    >>> measurement = Measurement(charis.chain(), observations)
+    >>> [int(groups_by(measurement, by).max()) for by in ("derotator", "cycle")]
+    [1, 2]
+    """
+    if by not in GROUPS:
+        raise FitError(f"groups by {by!r}; allowed are {', '.join(GROUPS)}")
+    groups = leave_out_groups(measurement) if by == "derotator" else _groups(measurement, by)
+    names = _members(measurement, groups, by)
+    if len(names) < 2:
+        raise FitError(f"cross-validation by {by}: all data are in one group, {names[0][0]}")
+    for name, count in names:
+        if count < 2:
+            raise FitError(
+                f"cross-validation by {by}: group {name} has a single member; at least 2 data a "
+                "wavelength are needed, group by something else or leave it out"
+            )
+    return groups
+
+
+def _groups(measurement, by):
+    groups, first = [], 0
+    for part in measurement.datasets:
+        number = np.zeros(len(part.frames), dtype=int)
+        if by == "cycle":
+            number = _cycles(part.observations)[part.frames[:, 0]]
+        number = np.unique(number, return_inverse=True)[1]
+        groups.append(first + number[part.group_of_datum])
+        first += int(number.max()) + 1
+    return np.concatenate(groups)
+
+
+def _cycles(observations):
+    """Return the number of the half-wave-plate cycle of every frame."""
+    frames = observations.frames
+    if "cycle" in frames.colnames:
+        return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
+    plate = np.rint(np.mod(observations.position("hwp"), np.pi) / _PLATE_STEPS).astype(int)
+    # 180 deg is 0 deg again
+    plate %= round(np.pi / _PLATE_STEPS)
+    state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
+    moved = np.abs(np.diff(observations.position("derotator"), prepend=0.0)) > _SAME_ANGLE
+    cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
+    for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
+        if i and (moved[i] or key in seen):
+            number, seen = number + 1, set()
+        seen.add(key)
+        cycle[i] = number
+    return cycle
+
+
+def _members(measurement, groups, by):
+    """Return name and largest number of data at one wavelength of every group."""
+    found = []
+    for i, (part, where) in enumerate(zip(measurement.datasets, measurement.segments, strict=True)):
+        angle = np.rad2deg(part.observations.position("derotator"))[part.frames[:, 0]]
+        own, bins = groups[where], measurement.bins[where]
+        for k, label in enumerate(np.unique(own)):
+            rows = own == label
+            what = {
+                "derotator": f"{angle[part.group_of_datum[rows][0]]:g} deg",
+                "cycle": f"number {k}",
+                "dataset": f"number {i}",
+            }[by]
+            count = int(np.bincount(bins[rows]).max())
+            found.append((f"{by} {what} of {part.observations.name}", count))
+    return found
+
+
+def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
+    """
+    Return s_res, s_mean, s_cv and s_standard at each wavelength, side by side.
+
+    They answer four questions: how well the model follows the data it was fitted
+    to; how well the mean residual would be known, were residuals independent
+    (the paper's s_rel); how well settings left out of the fit are predicted; and
+    how well a dataset is predicted that no fit has seen.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one that was read from a file has its data no more, so
+        ``groups`` cannot be chosen.
+    standard : Observations or Measurement, optional
+        The dataset the fit never saw: observations with the set-up of
+        ``dataset``, or a measurement with a chain of its own, at its current
+        parameters.
+    dataset : int
+        Which dataset of the calibration.
+    groups : {"derotator", "cycle", "dataset"} or `~numpy.ndarray`, optional
+        Cross-validate anew by `groups_by`, or by the group of each datum; by
+        default ``s_cv`` is what the calibration remembers (derotator angles).
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Columns ``wavelength``, ``s_res``, ``s_mean``, ``s_cv``, ``s_standard``, in
+        percent; NaN where there is none. meta ``groups`` and ``standard``.
+
+    Raises
+    ------
+    FitError
+        If the standard was part of the fit, or groups are too few or have a
+        single member.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import four_accuracies
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> four_accuracies(cal, simulate(chain, charis.wavelength, frames, seed=3)).colnames
+    ['wavelength', 's_res', 's_mean', 's_cv', 's_standard']
+    """
+    table = calibration.datasets[dataset].accuracy
+    if groups is not None:
+        table = _cross_validated(calibration, dataset, groups)
+    result = table["wavelength", "s_res", "s_mean", "s_cv"].copy()
+    name = None
+    result["s_standard"] = np.full(len(result), np.nan) * u.percent
+    if standard is not None:
+        measurement = _independent(calibration, standard, dataset)
+        name = ", ".join(part.observations.name for part in measurement.datasets)
+        result["s_standard"] = _rms_at(measurement, result["wavelength"])
+    chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
+    result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
+    return result
+
+
+def _cross_validated(calibration, dataset, groups):
+    # residuals refuses a calibration without data in words of its own
+    residuals, live = calibration.residuals, calibration.measurement
+    if isinstance(groups, str):
+        groups = groups_by(live, groups)
+    by_errors = calibration.settings.get("weights") == "errors"
+    weights = 1 / live.sigma if by_errors else None
+    held_out = cross_validated_residuals(live, live.vector(), weights, groups)
+    if np.isnan(held_out).all():
+        raise FitError(f"{np.unique(groups).size} groups are too few for cross-validation")
+    return accuracy_table(live, dataset, residuals, held_out)
+
+
+def _independent(calibration, standard, dataset):
+    """Return the standard as a measurement, unless the fit has seen it."""
+    measurement = standard
+    if not hasattr(standard, "datasets"):
+        measurement = calibration.measurement_of(standard, dataset)
+    seen = {record.content_hash: record.name for record in calibration.datasets}
+    for part in measurement.datasets:
+        if part.observations.content_hash in seen:
+            raise FitError(
+                f"{part.observations.name} is no independent standard: the calibration was fitted "
+                f"to it as {seen[part.observations.content_hash]}"
+            )
+    return measurement
+
+
+def _rms_at(measurement, wavelength):
+    """Return the rms of the residuals at each wavelength, NaN where there are none."""
+    residuals = measurement.residuals()
+    own = measurement.wavelength[measurement.bins]
+    found = [
+        residuals[np.abs(own - value) <= SAME_WAVELENGTH * value]
+        for value in wavelength.to_value(u.um)
+    ]
+    rms = [np.sqrt(np.mean(r**2)) if r.size else np.nan for r in found]
+    return 100 * np.array(rms) * u.percent

@@ -1,0 +1,269 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Samples of a posterior: corner plot, traces, and autocorrelation."""
+
+import numpy as np
+
+from astropolcal.calibration import autocorrelation
+from astropolcal.calibration._optional import need
+from astropolcal.exceptions import ParameterError
+from astropolcal.plotting._style import BLACK, BLUE, GREY, MINUS, VERMILION, canvas, style
+
+__all__ = ["plot_corner", "plot_traces"]
+
+__doctest_requires__ = {"plot_corner": ["corner"]}
+
+# more panels than this cannot be read
+_MAX_CORNER = 12
+_MAX_TRACES = 16
+_DRAWN_STEPS = 2000
+_INCH = 2.1
+_MARGIN = 1.35
+# a fitted value closer than this to the range of the samples is drawn, in widths of the range
+_NEAR = 0.5
+
+
+def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
+    """
+    Draw the samples of each pair of parameters, and of each alone.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        The samples; its burn-in is left out.
+    parameters : sequence of str, optional
+        Names, such as ``hwp.w_sio2``; by default all.
+    fitted : bool
+        Whether to mark the values of the fit, where the posterior knows them.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    AstropolcalError
+        If corner is not installed.
+    ParameterError
+        If a parameter is unknown, has not moved, or there are more than 12.
+
+    Notes
+    -----
+    Contours hold 39, 86 and 99 % of the samples, 1, 2 and 3 sigma of a normal
+    distribution of two parameters; dashed lines are the quantiles 0.16, 0.5 and
+    0.84. Given are the autocorrelation time of each parameter, in steps, and the
+    correlation coefficient r of each pair.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropolcal.calibration import Posterior
+    >>> from astropolcal.plotting import plot_corner
+    >>> chain = np.random.default_rng(1).normal(size=(500, 8, 2))
+    >>> names = ["hwp.theta", "derotator.theta"]
+    >>> len(plot_corner(Posterior(names, [u.deg, u.deg], chain, chain[..., 0])).axes)
+    4
+    """
+    corner = need("corner", "the corner plot")
+    columns = _columns(posterior, parameters, _MAX_CORNER)
+    samples = posterior.samples()[:, columns]
+    stuck = [posterior.names[i] for i in columns[np.ptp(samples, axis=0) == 0]]
+    if stuck:
+        raise ParameterError(f"no corner plot: {', '.join(stuck)} did not move")
+    labels, shifts = _labels(posterior, columns, samples)
+    marks = posterior.fitted[columns] if fitted and posterior.fitted is not None else None
+    with style():
+        size = 1.2 + _INCH * len(columns)
+        figure = _corner_canvas(figure, size)
+        corner.corner(
+            samples - shifts,
+            fig=figure,
+            labels=labels,
+            label_kwargs={"fontsize": 9.5},
+            labelpad=0.06,
+            quantiles=(0.16, 0.5, 0.84),
+            levels=1 - np.exp([-0.5, -2.0, -4.5]),
+            fill_contours=True,
+            plot_datapoints=False,
+            bins=50,
+            color=BLUE,
+            max_n_ticks=4,
+            hist_kwargs={"linewidth": 1.5},
+        )
+        marks = None if marks is None else marks - shifts
+        _finish_corner(figure, posterior, columns, samples - shifts, marks)
+    return figure
+
+
+def _corner_canvas(figure, size):
+    """Return a figure whose panels corner may place itself."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        if figure is None:
+            return Figure(figsize=(size, size))
+        if isinstance(figure, Figure):
+            figure.set_layout_engine(None)
+    return figure
+
+
+def _columns(posterior, parameters, most):
+    names = posterior.names if parameters is None else list(parameters)
+    if not 1 <= len(names) <= most:
+        raise ParameterError(
+            f"{len(names)} parameters for one figure; allowed are 1 to {most}: name some with "
+            "parameters="
+        )
+    return np.array([posterior.index(name) for name in names])
+
+
+def _labels(posterior, columns, samples):
+    """
+    Return axis labels, and what is taken off each parameter's values for legible ticks.
+
+    A width of 0.1 um about 1654 um would leave no room for ticks.
+    """
+    labels, shifts = [], []
+    for i, column in enumerate(columns):
+        middle, width = np.median(samples[:, i]), np.ptp(samples[:, i])
+        digits = 1 - int(np.floor(np.log10(width)))
+        shift = round(middle, digits - 1) if abs(middle) > 20 * width else 0.0
+        taken = f"{'+' if shift < 0 else MINUS} {abs(shift):.{max(digits - 1, 0)}f}"
+        labels.append(_label(posterior, column, taken if shift else ""))
+        shifts.append(shift)
+    return labels, np.array(shifts)
+
+
+def _label(posterior, column, taken=""):
+    """Return name and unit on two lines, as names are longer than panels are high."""
+    optic, _, key = posterior.names[column].rpartition(".")
+    unit = posterior.units[column]
+    words = [key, taken, f"({unit})" if unit is not None else ""]
+    return f"{optic}\n".lstrip() + " ".join(word for word in words if word)
+
+
+def _finish_corner(figure, posterior, columns, samples, marks):
+    n = len(columns)
+    panels = np.array(figure.axes).reshape(n, n)
+    times = posterior.autocorrelation_times[columns]
+    for i, axes in enumerate(panels.diagonal()):
+        axes.set_title(f"τ = {times[i]:.0f} steps", fontsize=10)
+    for axes in figure.axes:
+        axes.grid(False)
+        axes.tick_params(labelsize=8.5)
+    if n > 1:
+        _write_correlations(panels, samples)
+    if marks is not None:
+        _mark(panels, marks, np.ptp(samples, axis=0))
+    width, height = figure.get_size_inches()
+    figure.subplots_adjust(left=_MARGIN / width, bottom=_MARGIN / height)
+    figure.suptitle(_heading(posterior, marks is not None), x=0.98, ha="right", va="top", y=0.98)
+
+
+def _write_correlations(panels, samples):
+    for row, values in enumerate(np.corrcoef(samples.T)):
+        for column in range(row):
+            panels[row, column].annotate(
+                f"r = {values[column]:.4f}", (0.04, 0.96), xycoords="axes fraction", va="top"
+            ).set_fontsize(8.5)
+
+
+def _mark(panels, marks, widths):
+    """Draw the fitted values where that does not change the range by much."""
+    for row in range(len(marks)):
+        for column in range(row + 1):
+            axes = panels[row, column]
+            lines = [(axes.axvline, axes.get_xlim, column)]
+            if row != column:
+                lines.append((axes.axhline, axes.get_ylim, row))
+            for draw, limits, k in lines:
+                low, high = limits()
+                if low - _NEAR * widths[k] < marks[k] < high + _NEAR * widths[k]:
+                    draw(marks[k], color=VERMILION, linewidth=1.2)
+
+
+def _heading(posterior, marked):
+    steps, walkers, _ = posterior.chain.shape
+    lines = [f"Posterior: {steps * posterior.thin} steps of {walkers} walkers"]
+    lines.append(f"{int(posterior.n_times)} times the longest autocorrelation time τ")
+    if not posterior.converged:
+        lines.append("(CHAIN TOO SHORT)")
+    if marked:
+        lines.append("orange: fitted values")
+    return "\n".join(lines)
+
+
+def plot_traces(posterior, parameters=None, *, figure=None):
+    r"""
+    Draw the walkers against steps, and the autocorrelation, one row a parameter.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        The samples.
+    parameters : sequence of str, optional
+        Names, such as ``hwp.w_sio2``; by default all, up to 16.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If a parameter is unknown, or there are more than 16.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropolcal.calibration import Posterior
+    >>> from astropolcal.plotting import plot_traces
+    >>> chain = np.random.default_rng(1).normal(size=(500, 8, 1))
+    >>> plot_traces(Posterior(["hwp.theta"], [u.deg], chain, chain[..., 0])).axes[0].get_ylabel()
+    'hwp\ntheta (deg)'
+    """
+    columns = _columns(posterior, parameters, _MAX_TRACES)
+    with style():
+        figure = canvas(figure, 10, 1.4 + 1.7 * len(columns))
+        panels = figure.subplots(len(columns), 2, sharex="col", squeeze=False, width_ratios=(2, 1))
+        for (trace, correlation), column in zip(panels, columns, strict=True):
+            _trace(trace, posterior, column)
+            _correlation(correlation, posterior, column)
+        panels[0, 0].set_title("walkers (grey: burn-in, left out)")
+        panels[0, 1].set_title("autocorrelation")
+        panels[-1, 0].set_xlabel("step")
+        panels[-1, 1].set_xlabel("lag (steps)")
+        figure.suptitle(_heading(posterior, marked=False))
+    return figure
+
+
+def _trace(axes, posterior, column):
+    steps = np.arange(1, len(posterior.chain) + 1) * posterior.thin
+    every = max(len(steps) // _DRAWN_STEPS, 1)
+    axes.plot(
+        steps[::every], posterior.chain[::every, :, column], color=BLUE, alpha=0.25, linewidth=0.5
+    )
+    axes.axvspan(0, posterior.burn_in * posterior.thin, color=GREY, alpha=0.25, linewidth=0)
+    axes.margins(x=0)
+    axes.set_ylabel(_label(posterior, column), fontsize=9.5)
+
+
+def _correlation(axes, posterior, column):
+    """Draw the autocorrelation out to twenty of the longest times, or as far as it goes."""
+    values = autocorrelation(posterior.chain[posterior.burn_in :, :, column])
+    longest = np.nanmax(posterior.autocorrelation_times, initial=1.0) / posterior.thin
+    shown = values[: max(int(10 * longest), 10)]
+    time = posterior.autocorrelation_times[column]
+    axes.plot(np.arange(len(shown)) * posterior.thin, shown, color=BLUE)
+    axes.axhline(0, color=BLACK, linewidth=0.7)
+    if np.isfinite(time):
+        axes.axvline(time, color=VERMILION, linewidth=1.2)
+        axes.annotate(
+            f"τ = {time:.0f}", (0.97, 0.88), xycoords="axes fraction", ha="right", va="top"
+        )

@@ -1,0 +1,69 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Speed of sampling on one core, and of the checkpoint.
+
+Not part of the normal run: ``pytest tests/benchmarks``.
+"""
+
+import time
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import calibrate, instruments
+from astropolcal.calibration import LogPosterior, sample
+from astropolcal.exceptions import AstropolcalWarning
+from astropolcal.measurement import Normal
+
+pytest.importorskip("emcee")
+pytest.importorskip("h5py")
+
+GLOBAL = ["hwp.w_sio2", "hwp.w_mgf2"]
+GLOBAL += [f"{name}.theta" for name in ("hwp", "derotator", "calibration_polarizer")]
+# the published path, measured on a machine of two cores: all bins of Dataset 3
+PUBLISHED = 2.3
+
+
+@pytest.fixture(scope="module")
+def calibration(shared_data):
+    """Dataset 3: 22 wavelengths x 64 frames, 93 parameters, the paper's priors."""
+    from astropolcal.observations import Observations
+
+    (path,) = (shared_data / "data" / "charis").glob("dataset3_*.ecsv")
+    data = Observations.read(path)
+    (chain,) = instruments.get("charis").chains_for([data])
+    for name, angle in (("calibration_polarizer", 90), ("hwp", 0), ("derotator", 0)):
+        chain[name].theta.prior = Normal(angle * u.deg, 1 * u.deg)
+    return calibrate(chain, data, cross_validate=False)
+
+
+@pytest.mark.parametrize("parameters", [GLOBAL, None], ids=["5 parameters", "93 parameters"])
+def test_log_posterior(calibration, parameters, capsys):
+    """The goal is 1,000 evaluations a second."""
+    log_posterior = LogPosterior(calibration.measurement, parameters=parameters)
+    walkers = np.tile(log_posterior.centre, (12, 1))
+    times = []
+    for _ in range(60):
+        started = time.perf_counter()
+        log_posterior(walkers)
+        times.append(time.perf_counter() - started)
+    rate = 12 / np.median(times)
+    with capsys.disabled():
+        print(f"\n  {rate:.0f} log-posteriors a second, {rate / PUBLISHED:.0f} times the published")
+    assert rate > 1000
+
+
+@pytest.mark.parametrize("with_checkpoint", [False, True])
+def test_run_of_the_paper(calibration, tmp_path, with_checkpoint, capsys):
+    """10,000 steps of 24 walkers in 5 parameters, from 1,000; the goal is minutes."""
+    path = tmp_path / "chain.h5" if with_checkpoint else None
+    started = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropolcalWarning)
+        sample(calibration, parameters=GLOBAL, n_steps=1000, seed=1, checkpoint=path)
+    minutes = (time.perf_counter() - started) * 10 / 60
+    with capsys.disabled():
+        print(f"\n  10,000 steps take {minutes:.1f} min, checkpoint: {with_checkpoint}")
+    assert minutes < 4

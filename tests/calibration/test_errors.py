@@ -1,0 +1,111 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Standard errors as published calibrations quote them."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from scipy.optimize import curve_fit
+
+from astropolcal.calibration import Calibration, calibrate, standard_errors
+from astropolcal.exceptions import CalibrationFileError, FitError
+
+LAM = [1.2, 1.6, 2.2] * u.um
+
+
+@pytest.fixture(scope="module")
+def cal(make):
+    truth = make.truth(make.chain("elliptical", wavelength=LAM))
+    data = make.observe(truth, wavelength=LAM, seed=1)
+    return calibrate(truth, data, search=False, cross_validate=False)
+
+
+def test_error_is_that_of_a_fit_of_one_wavelength(cal):
+    """Against scipy's curve_fit, which has the same formula, with the common parameters known."""
+    table = standard_errors(cal, method="van-holstein")
+    measurement = cal.measurement
+    vector = measurement.vector()
+    for i in range(3):
+        own = [slot.start + i for slot in measurement.free.slots if slot.per_wavelength]
+        rows = measurement.bins == i
+
+        def model(_, *values, own=own, rows=rows):
+            trial = vector.copy()
+            trial[own] = values
+            return measurement.predict(trial)[rows]
+
+        found, covariance = curve_fit(
+            model, np.arange(rows.sum()), measurement.observed[rows], p0=vector[own]
+        )
+        expected = np.sqrt(np.diag(covariance)) / measurement.free.factors()[own]
+        np.testing.assert_allclose(np.asarray(table["std"])[own], expected, rtol=0.02)
+        np.testing.assert_allclose(found, vector[own], atol=0.02)
+
+
+def test_common_parameters_are_named_as_held(cal):
+    table = standard_errors(cal, method="van-holstein")
+    held = ["calibration_polarizer.theta", "hwp.w_sio2", "hwp.w_mgf2"]
+    assert table.meta == {"method": "van-holstein", "held": held}
+    known = dict(zip(table["name"], table["std"], strict=True))
+    assert all(np.isnan(known[name]) for name in held)
+    assert np.isfinite(known["derotator.circular[2]"])
+    units = dict(zip(table["name"], table["unit"], strict=True))
+    assert (units["derotator.circular[2]"], units["wollaston.efficiency[0]"]) == ("deg", "")
+
+
+def test_it_is_too_small(cal):
+    """What is known of the common parameters is a part of the error."""
+    full, part = (
+        np.asarray(standard_errors(cal, m)["std"]) for m in ("covariance", "van-holstein")
+    )
+    both = np.isfinite(part)
+    assert np.median(part[both] / full[both]) < 0.9
+
+
+def test_covariance_method_is_the_covariance(cal):
+    table = standard_errors(cal)
+    np.testing.assert_array_equal(table["std"], cal.covariance.stds)
+    assert table.meta == {"method": "covariance", "held": []}
+
+
+def test_weights_count(make):
+    truth = make.truth(make.chain("linear", wavelength=LAM))
+    data = make.observe(truth, wavelength=LAM, seed=1)
+    plain, weighted = (
+        standard_errors(
+            calibrate(truth, data, weights=w, search=False, cross_validate=False), "van-holstein"
+        )
+        for w in (None, "errors")
+    )
+    ratio = np.asarray(plain["std"] / weighted["std"])
+    assert np.nanmedian(ratio) == pytest.approx(1, abs=0.3)
+    assert np.nanmax(np.abs(ratio - 1)) > 1e-4
+
+
+def test_singular_wavelength_has_no_error(make):
+    """No pseudo-inverse: two per-wavelength angles of which the data see the sum."""
+    from astropolcal import optics
+
+    angles = np.full(3, 5.0) * u.deg
+    chain = (
+        optics.LinearPolarizer(theta=0 * u.deg, name="polarizer")
+        | optics.Rotator(theta=angles, name="first", fixed={"theta": False})
+        | optics.Rotator(theta=angles, name="second", fixed={"theta": False})
+        | optics.LinearRetarder(retardance=np.full(3, 170) * u.deg, mount="hwp", name="hwp")
+        | optics.WollastonPrism(efficiency=0.97, name="wollaston", fixed={"efficiency": True})
+    )
+    data = make.observe(chain, wavelength=LAM, seed=1)
+    cal = calibrate(chain, data, search=False, cross_validate=False)
+    table = standard_errors(cal, "van-holstein")
+    known = dict(zip(table["name"], table["std"], strict=True))
+    assert all(np.isnan(known[f"{name}.theta[1]"]) for name in ("first", "second"))
+    assert np.isfinite(known["hwp.retardance[1]"])
+
+
+def test_bad_input_is_refused(cal, tmp_path):
+    with pytest.raises(FitError, match="method = 'jackknife'; allowed are covariance, van-hol"):
+        standard_errors(cal, "jackknife")
+    cal.write(tmp_path / "cal.asdf")
+    again = Calibration.read(tmp_path / "cal.asdf")
+    with pytest.raises(CalibrationFileError, match="holds no observations"):
+        standard_errors(again, "van-holstein")
+    assert len(standard_errors(again)) == len(standard_errors(cal))

@@ -1,0 +1,242 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Lack of fit: uniform probabilities where the model is true, tiny ones where it is not."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from scipy import stats
+
+from astropolcal import optics
+from astropolcal.calibration import (
+    calibrate,
+    lack_of_fit,
+    noise_from_errors,
+    noise_from_null_channel,
+    noise_from_replicates,
+)
+from astropolcal.chain import join
+from astropolcal.exceptions import FitError
+from astropolcal.measurement import Measurement
+from astropolcal.simulation import simulate
+
+LAM = [1.2, 1.6, 2.2] * u.um
+FAINT = {"flux": 1e6, "read_noise": 500.0}
+
+
+@pytest.fixture(scope="module")
+def chain(make):
+    return make.truth(make.chain(wavelength=LAM))
+
+
+@pytest.fixture(scope="module")
+def measurement(make, chain):
+    return Measurement(chain, make.observe(chain, wavelength=LAM, seed=1))
+
+
+def fit(measurement, weights=1.0, steps=4):
+    """Gauss-Newton from the truth, which is close enough."""
+    vector = measurement.vector()
+    for _ in range(steps):
+        slope = measurement.jacobian(vector) * weights
+        step = np.linalg.lstsq(slope.T, weights * measurement.residuals(vector), rcond=None)[0]
+        vector = vector + step
+    return vector
+
+
+def draw(measurement, rng, sigma=None):
+    """Give the measurement new data: its model at its current values, and noise."""
+    sigma = measurement.sigma if sigma is None else sigma
+    measurement.observed = measurement.predict(measurement.vector()) + rng.normal(0, sigma)
+
+
+def uniform(p):
+    """Probability of the values, were they uniform (Kolmogorov and Smirnov)."""
+    return stats.kstest(p, "uniform").pvalue
+
+
+# --- known noise --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_probabilities_are_uniform_for_a_true_model(measurement, weighted):
+    """Monte Carlo, 300 runs; a fit with equal weights is not the best one and yet calibrated."""
+    m, rng = measurement.copy(), np.random.default_rng(7)
+    sigma = m.sigma * np.array([1.0, 2.0, 1.0])[m.bins]
+    m.sigma = sigma
+    weights = 1 / sigma if weighted else np.ones(m.n_data)
+    total, single = [], []
+    for _ in range(300):
+        draw(m, rng, sigma)
+        test = lack_of_fit(m, fit(m, weights), weights=weights)
+        total.append(test.p_value)
+        single.append(test.table["p_value"][2])
+    assert uniform(total) > 0.01
+    assert uniform(single) > 0.01
+
+
+def test_expected_chi_square_by_hand(measurement):
+    """Best weights: n - rank in all, and the leverages' sum in each wavelength."""
+    weights = 1 / measurement.sigma
+    test = lack_of_fit(measurement, weights=weights)
+    slope = (measurement.jacobian(measurement.vector()) * weights).T
+    hat = slope @ np.linalg.pinv(slope)
+    assert test.expected == pytest.approx(96 - np.linalg.matrix_rank(slope))
+    assert test.expected == pytest.approx(96 - measurement.free.size)
+    for b, expected in enumerate(test.table["expected"]):
+        row = measurement.bins == b
+        assert expected == pytest.approx(row.sum() - np.trace(hat[np.ix_(row, row)]))
+    np.testing.assert_allclose(test.table["expected"].sum(), test.expected)
+    chi2 = np.sum((measurement.residuals() * weights) ** 2)
+    assert test.chi2 == pytest.approx(chi2)
+    assert test.p_value == pytest.approx(stats.chi2.sf(chi2, test.expected))
+
+
+def test_effective_freedom_by_brute_force(measurement):
+    """Equal weights, unequal noise: mean and variance of chi-square from the full matrices."""
+    sigma = measurement.sigma * np.array([1.0, 5.0, 1.0])[measurement.bins]
+    m = measurement.copy()
+    m.sigma = sigma
+    slope = m.jacobian(m.vector()).T
+    a = (np.eye(96) - slope @ np.linalg.pinv(slope)) * sigma / sigma[:, None]
+    table = lack_of_fit(m).table
+    for b in range(3):
+        row = m.bins == b
+        c = a[row] @ a[row].T
+        assert table["expected"][b] == pytest.approx(np.trace(c))
+        assert table["dof"][b] == pytest.approx(np.trace(c) ** 2 / np.trace(c @ c))
+
+
+def test_degenerate_parameters_count_once(make):
+    """With polarizer, plate and derotator free to turn, the rank counts, not the parameters."""
+    truth = make.truth(make.chain("elliptical", fixed=False, wavelength=LAM))
+    m = Measurement(truth, make.observe(truth, wavelength=LAM, seed=1))
+    rank = np.linalg.matrix_rank(m.jacobian(m.vector()), tol=1e-9)
+    assert rank < m.free.size
+    test = lack_of_fit(m, weights=1 / m.sigma)
+    assert test.expected == pytest.approx(m.n_data - rank)
+
+
+def test_parameter_at_its_bound_is_not_counted(make, chain):
+    truth = chain.copy()
+    truth["wollaston"].efficiency = np.ones(3)
+    m = Measurement(truth, make.observe(truth, wavelength=LAM, seed=1))
+    test = lack_of_fit(m, weights=1 / m.sigma)
+    assert test.expected == pytest.approx(96 - (m.free.size - 3))
+
+
+def test_data_that_were_not_fitted_have_all_their_freedom(make, chain, measurement):
+    cal = calibrate(chain, measurement.datasets[0].observations, cross_validate=False)
+    new = cal.measurement_of(make.observe(chain, wavelength=LAM, seed=2))
+    test = lack_of_fit(new, cal)
+    assert test.expected == 96
+    np.testing.assert_allclose(test.table["dof"], 32)
+    assert test.chi2 == lack_of_fit(new, fitted=False).chi2
+
+
+def test_calibration_brings_its_weights(chain, measurement):
+    data = measurement.datasets[0].observations
+    cal = calibrate(chain, data, weights="errors", cross_validate=False)
+    m = cal.measurement
+    same = lack_of_fit(m, m.vector(), weights=1 / m.sigma)
+    assert lack_of_fit(m, cal).p_value == same.p_value
+    assert same.p_value > 0.01
+    assert "agree with the noise" in same.words
+
+
+def test_wrong_model_is_found(make, measurement):
+    """A linear derotator fitted to data of an elliptical one."""
+    truth = make.truth(make.chain("elliptical", wavelength=LAM))
+    data = make.observe(truth, wavelength=LAM, seed=3)
+    cal = calibrate(make.chain(wavelength=LAM), data, cross_validate=False)
+    test = lack_of_fit(cal.measurement, cal)
+    assert test.p_value < 1e-12
+    assert (test.table["p_value"] < 1e-12).all()
+    assert "the model misses something" in test.words
+
+
+def test_overestimated_noise_is_told(measurement):
+    m = measurement.copy()
+    m.sigma = 3 * m.sigma
+    test = lack_of_fit(m)
+    assert test.p_value > 0.99
+    assert "overestimated" in test.words
+
+
+# --- estimated noise ----------------------------------------------------------------
+
+
+def test_f_test_with_the_null_channel_is_calibrated(make, chain):
+    """Monte Carlo, 100 runs of faintly polarized light, whose noise is the same in all data."""
+    source = optics.Diattenuator(diattenuation=0.2, fixed={"diattenuation": True}, name="source")
+    faint = join([source, *list(chain)[1:]])
+    total, single = [], []
+    for seed in range(100):
+        m = Measurement(faint, simulate(faint, LAM, make.frames(), seed=seed, **FAINT))
+        vector = fit(m)
+        test = lack_of_fit(m, vector, noise_from_null_channel(m, vector))
+        total.append(test.p_value)
+        single.append(test.table["p_value"][0])
+        assert test.table["dof_noise"][0] == 23
+    assert uniform(total) > 0.01
+    assert uniform(single) > 0.01
+
+
+def test_f_test_with_replicates_is_calibrated(make, chain):
+    """Monte Carlo, 200 runs: the classical test of lack of fit against pure error."""
+    twice = np.repeat([45, 70, 95, 120], 2) * u.deg
+    m = Measurement(chain, make.observe(chain, make.frames(twice), LAM, seed=1))
+    rng, total, single = np.random.default_rng(3), [], []
+    for _ in range(200):
+        draw(m, rng, np.full(m.n_data, 1e-4))
+        vector = fit(m)
+        test = lack_of_fit(m, vector, noise_from_replicates(m, vector))
+        total.append(test.p_value)
+        single.append(test.table["p_value"][1])
+    # one noise a wavelength is estimated, but the fit has equal weights
+    assert test.expected == pytest.approx(96 - m.free.size - 3 * 16, abs=1)
+    assert uniform(total) > 0.01
+    assert uniform(single) > 0.01
+
+
+def test_wrong_model_is_found_by_replicates(make):
+    truth = make.truth(make.chain("elliptical", wavelength=LAM))
+    twice = np.repeat([45, 70, 95, 120], 2) * u.deg
+    data = make.observe(truth, make.frames(twice), LAM, seed=3)
+    cal = calibrate(make.chain(wavelength=LAM), data, cross_validate=False)
+    test = lack_of_fit(cal.measurement, cal, noise_from_replicates(cal.measurement))
+    assert test.p_value < 1e-12
+
+
+# --- what cannot be tested ----------------------------------------------------------
+
+
+def test_no_freedom_left_gives_nan(make, chain):
+    data = make.observe(chain, make.frames([45] * u.deg), LAM, seed=1)
+    m = Measurement(chain, data.select(data.pairs()[:2].ravel()))
+    assert m.n_data < m.free.size
+    test = lack_of_fit(m, weights=1 / m.sigma)
+    assert np.isnan(test.p_value)
+    assert "no test" in test.words
+
+
+def test_noise_of_another_measurement_is_refused(make, chain, measurement):
+    other = Measurement(chain, make.observe(chain, make.frames([45] * u.deg), LAM, seed=1))
+    with pytest.raises(FitError, match="the noise is that of 12 data, the measurement has 96"):
+        lack_of_fit(measurement, noise=noise_from_errors(other))
+
+
+# --- real measurements --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("number", "low", "high"), [(1, 60, 85), (3, 30, 42)])
+def test_charis_residuals_are_no_noise(charis_data, number, low, high):
+    """Measured: 73 and 36 times the stated noise, and above the null channel's upper limit."""
+    from astropolcal import instruments
+
+    data = charis_data(f"dataset{number}_")
+    cal = calibrate(instruments.get("charis").chains_for([data]), data, cross_validate=False)
+    test = lack_of_fit(cal.measurement, cal)
+    assert low < np.sqrt(test.chi2 / test.expected) < high
+    assert (test.table["p_value"] < 1e-12).all()
+    null = noise_from_null_channel(cal.measurement, null_model="smooth")
+    assert lack_of_fit(cal.measurement, cal, null).p_value < 1e-12

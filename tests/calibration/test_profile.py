@@ -1,0 +1,192 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Profiles of chi-square: parabolas, flat lines, and bounds."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal.calibration import Calibration, Profile, calibrate, profile
+from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
+from astropolcal.measurement import Normal
+
+LAM = [1.2, 1.6, 2.2] * u.um
+
+
+def calibrated(make, kind="linear", fixed=True, **options):
+    truth = make.truth(make.chain(kind, fixed=fixed, wavelength=LAM))
+    data = make.observe(truth, wavelength=LAM, seed=1)
+    return calibrate(truth, data, search=False, cross_validate=False, **options)
+
+
+@pytest.fixture(scope="module")
+def cal(make):
+    return calibrated(make)
+
+
+# --- the profile of a well-behaved parameter ----------------------------------------------
+
+
+@pytest.mark.parametrize("weights", [None, "errors"])
+@pytest.mark.parametrize(
+    "name", ["hwp.w_sio2", "calibration_polarizer.theta", "derotator.retardance[1]"]
+)
+def test_profile_is_the_parabola_of_the_error(make, name, weights):
+    """Wilks: where the model is nearly linear, chi-square rises by one at one sigma."""
+    cal = calibrated(make, weights=weights)
+    made = profile(cal, name, n=7)
+    low, high = made.interval()
+    std = cal.covariance.std(name)
+    assert u.isclose((high - low) / 2, std, rtol=0.02)
+    assert u.isclose((high + low) / 2, made.best, atol=0.05 * std)
+    np.testing.assert_allclose(made.delta_chi2[[0, -1]], 9, rtol=0.1)
+    assert made.delta_chi2.min() == 0
+    assert made.values[np.argmin(made.delta_chi2)] == made.best
+    assert "at one sigma" in str(made)
+
+
+def test_others_are_refitted(cal):
+    """Two thicknesses correlate: holding all others would give a far narrower parabola."""
+    made = profile(cal, "hwp.w_sio2", n=5)
+    names = cal.covariance.names
+    i, j = names.index("hwp.w_sio2"), names.index("hwp.w_mgf2")
+    measurement = cal.measurement
+    held = measurement.vector()
+    held[i] = made.vectors[-1, i]
+    chi2 = np.sum(measurement.residuals(held) ** 2)
+    best = np.sum(measurement.residuals(made.vectors[-1]) ** 2)
+    assert chi2 > 10 * best
+    # the other follows with the slope of the covariance
+    slope = (made.vectors[-1, j] - made.vectors[0, j]) / (made.vectors[-1, i] - made.vectors[0, i])
+    expected = cal.covariance.matrix[i, j] / cal.covariance.matrix[i, i]
+    assert slope == pytest.approx(expected, rel=1e-3)
+
+
+def test_held_parameter_stays_where_it_is_held(cal):
+    made = profile(cal, "hwp.w_sio2", n=5)
+    i = cal.covariance.names.index("hwp.w_sio2")
+    np.testing.assert_allclose(made.vectors[:, i], made.values.to_value(u.um))
+
+
+def test_values_may_be_given_in_any_unit(cal):
+    best = cal.chain["hwp"].w_sio2.quantity
+    std = cal.covariance.std("hwp.w_sio2")
+    wanted = (best + np.array([-2, -1, 1, 2]) * std).to(u.um)
+    made = profile(cal, "hwp.w_sio2", wanted)
+    assert made.values.unit == u.mm
+    assert len(made.values) == 5  # the best one is added
+    np.testing.assert_allclose(made.delta_chi2, [4, 1, 0, 1, 4], rtol=0.05)
+
+
+def test_even_numbers_get_a_middle(cal):
+    assert len(profile(cal, "hwp.w_sio2", n=4).values) == 5
+
+
+def test_calibration_is_left_alone(cal):
+    before = cal.measurement.vector()
+    profile(cal, "hwp.w_sio2", n=3)
+    np.testing.assert_array_equal(cal.measurement.vector(), before)
+
+
+# --- what the data leave open -------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def open_gauge(make):
+    return calibrated(make, "elliptical", fixed=False)
+
+
+@pytest.mark.parametrize("name", ["hwp.theta", "derotator.theta", "derotator.circular[1]"])
+def test_flat_profile_is_unbounded_in_words(open_gauge, name):
+    made = profile(open_gauge, name, n=5)
+    assert made.delta_chi2.max() < 1e-3
+    low, high = made.interval()
+    assert low == -np.inf * u.deg
+    assert high == np.inf * u.deg
+    assert f"{name} is unbounded" in made.words
+    assert "the data do not determine it" in made.words
+    # it was really moved
+    assert u.isclose(np.ptp(made.values), 2 * u.deg)
+
+
+def test_determined_parameter_beside_open_ones(open_gauge):
+    made = profile(open_gauge, "hwp.w_sio2", n=5)
+    low, high = made.interval()
+    assert u.isclose((high - low) / 2, open_gauge.covariance.std("hwp.w_sio2"), rtol=0.02)
+
+
+def test_prior_bounds_what_the_data_leave_open(make):
+    chain = make.truth(make.chain("elliptical", fixed=False, wavelength=LAM))
+    chain["hwp"].theta.prior = Normal(0 * u.deg, 0.1 * u.deg)
+    data = make.observe(chain, wavelength=LAM, seed=1)
+    cal = calibrate(chain, data, weights="errors", search=False, cross_validate=False)
+    low, high = profile(cal, "hwp.theta", n=5).interval()
+    assert u.isclose((high - low) / 2, 0.1 * u.deg, rtol=0.02)
+
+
+def test_bound_ends_the_profile(make):
+    chain = make.truth(make.chain("linear", wavelength=LAM))
+    data = make.observe(chain, wavelength=LAM, seed=1)
+    chain["wollaston"].efficiency.bounds = (0, 0.965)
+    chain["wollaston"].efficiency = [0.96, 0.965, 0.965]
+    cal = calibrate(chain, data, search=False, cross_validate=False)
+    assert "wollaston.efficiency[2]" in cal.at_bound
+    made = profile(cal, "wollaston.efficiency[2]", n=5)
+    assert made.values.max() <= 0.965
+    low, high = made.interval()
+    assert 0.96 < low < 0.965
+    assert high == np.inf
+    assert made.words.endswith("does not limit it up to its bound 0.965")
+
+
+# --- intervals of given curves ------------------------------------------------------------
+
+
+def curve(values, rises, best=0.0):
+    return Profile("a.b", best, np.array(values, float), np.array(rises, float), np.zeros((1, 1)))
+
+
+def test_interval_of_an_exact_parabola():
+    x = np.linspace(-3, 3, 7)
+    low, high = curve(x, (x / 1.7) ** 2).interval()
+    assert (low, high) == (pytest.approx(-1.7), pytest.approx(1.7))
+    assert curve(x, (x / 1.7) ** 2).interval(2.25) == (pytest.approx(-2.55), pytest.approx(2.55))
+
+
+def test_interval_need_not_be_symmetric():
+    low, high = curve([-1, 0, 1, 2], [4, 0, 0.25, 1.5625]).interval()
+    assert low == pytest.approx(-0.5)
+    assert high == pytest.approx(1 + 0.5 / 0.75)
+
+
+def test_one_side_may_be_open():
+    made = curve([-1, 0, 1], [4, 0, 0.5])
+    assert made.interval()[1] == np.inf
+    assert made.words == (
+        "a.b is at least -0.5 at one sigma; chi-square does not limit it up to the last value 1"
+    )
+    assert "at most 0.5" in curve([-1, 0, 1], [0.5, 0, 4]).words
+
+
+# --- bad input ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"name": "hwp.phase"}, ParameterError, "no free parameter 'hwp.phase'; there are cal"),
+        ({"name": "hwp.theta"}, ParameterError, "no free parameter"),
+        ({"name": "hwp.w_sio2", "n": 2}, FitError, "n = 2"),
+        ({"name": "hwp.w_sio2", "values": [1.6]}, ParameterError, "needs a unit"),
+        ({"name": "hwp.w_sio2", "values": [1.6] * u.deg}, ParameterError, "not convertible"),
+        ({"name": "hwp.w_sio2", "values": [-1] * u.mm}, ParameterError, "outside its bounds"),
+    ],
+)
+def test_bad_input_is_refused(cal, options, error, message):
+    with pytest.raises(error, match=message):
+        profile(cal, **options)
+
+
+def test_calibration_from_a_file_has_no_data(cal, tmp_path):
+    cal.write(tmp_path / "cal.asdf")
+    with pytest.raises(CalibrationFileError, match="holds no observations"):
+        profile(Calibration.read(tmp_path / "cal.asdf"), "hwp.w_sio2")
