@@ -19,6 +19,7 @@ from astropolcal.calibration.identifiability import (
     Identifiability,
     analyse,
     complete,
+    examine,
     null_space,
     physical_scale,
 )
@@ -83,6 +84,7 @@ __all__ = [
     "derived_sky",
     "describe_gauge",
     "estimate_noise",
+    "examine",
     "four_accuracies",
     "full_covariance",
     "groups_by",

@@ -16,7 +16,14 @@ from astropolcal.calibration.harmonics import harmonic_words
 from astropolcal.calibration.mirrors import mirror_solutions
 from astropolcal.calibration.sky import sky_consequences
 
-__all__ = ["Identifiability", "analyse", "complete", "null_space", "physical_scale"]
+__all__ = [
+    "Identifiability",
+    "analyse",
+    "complete",
+    "examine",
+    "null_space",
+    "physical_scale",
+]
 
 # singular values below this share of the largest count as zero
 _RANK_TOLERANCE = 1e-9
@@ -167,6 +174,45 @@ def analyse(free, jacobian, held=None, priors=None):
         directions=_directions(free, null),
     )
     return finding, covariance
+
+
+def examine(measurement, weights=None):
+    """
+    Say what a measurement can determine, before anything is fitted.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Chains and observations; the current values count, so give plausible ones.
+    weights : `~numpy.ndarray`, optional
+        Weight of each datum, shape (n_data,).
+
+    Returns
+    -------
+    Identifiability
+        As in the result of a fit.
+
+    Examples
+    --------
+    Before a run is taken, on simulated frames:
+
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration import examine
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.published()
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
+    >>> planned = simulate(chain, charis.wavelength, frames, noise=False)
+    >>> finding = examine(Measurement(chain, planned))
+    >>> finding.rank, finding.n_free
+    (91, 93)
+    """
+    vector = measurement.vector()
+    jacobian = measurement.jacobian(vector) * (1.0 if weights is None else weights)
+    finding, _ = analyse(measurement.free, jacobian)
+    return complete(finding, measurement, vector)
 
 
 def complete(finding, measurement, vector):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.calibration import (
+    examine,
     harmonic_conditions,
     harmonic_words,
     mirror_solutions,
@@ -179,6 +180,20 @@ def test_the_report_says_all_of_it(calibration):
     assert summary["null_directions"][0]["sky"]["aolp_deg"] == pytest.approx([1, 1], abs=1e-3)
     assert len(summary["sampling"]) == 2
     assert len(summary["mirror_solutions"]) == 1
+
+
+def test_a_run_can_be_examined_before_it_is_fitted(calibration):
+    before = examine(calibration.measurement)
+    assert before.rank == calibration.identifiability.rank
+    assert [d["words"].split(" by ")[0] for d in before.directions] == [
+        d["words"].split(" by ")[0] for d in calibration.identifiability.directions
+    ]
+    frames = half_wave_plate_cycles(
+        hwp=np.arange(16) * 11.25 * u.deg, derotator=np.arange(45, 120, 12.5) * u.deg
+    )
+    chain = calibration.chain
+    planned = examine(Measurement(chain, simulate(chain, WAVELENGTH, frames, noise=False)))
+    assert len(planned.sampling) == 1 < len(before.sampling)
 
 
 def test_the_report_is_in_the_file(calibration, tmp_path):
