@@ -10,6 +10,8 @@ import numpy as np
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable
 
+from astropolcal.calibration.covariance import prior_noise
+
 __all__ = ["accuracy_table", "cross_validated_residuals", "leave_out_groups"]
 
 # derotator angles that differ by less belong to one group
@@ -178,7 +180,7 @@ def cross_validated_residuals(measurement, vector, weights=None, groups=None):
 def _fit_without(measurement, vector, out, weights):
     model = measurement.copy()
     model.parameters = vector
-    noise = np.std(model.residuals()) if weights is None else 1.0
+    noise = prior_noise(model, weights)
     index, observed, weights = model.fit_arguments(weights, noise, keep=~out)
     with warnings.catch_warnings():
         # a fit that stops early still gives an honest, if poorer, prediction

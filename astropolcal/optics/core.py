@@ -491,6 +491,6 @@ def turn(matrix):
     return out
 
 
-def blank(*values, size=4):
-    """Return zeros of the values' broadcast shape + (size, size)."""
-    return np.zeros((*np.broadcast_shapes(*(np.shape(v) for v in values)), size, size))
+def blank(*values):
+    """Return zeros of the values' broadcast shape + (4, 4)."""
+    return np.zeros((*np.broadcast_shapes(*(np.shape(v) for v in values)), 4, 4))
