@@ -13,7 +13,7 @@ from astropy.modeling import CompoundModel
 
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.optics import Optic
-from astropolcal.optics.core import finite_angle
+from astropolcal.optics.core import FLUXES, finite_position
 
 __all__ = [
     "at_positions",
@@ -318,11 +318,12 @@ def with_beam(chain, beam):
     0.0
     """
     copy = chain.copy()
-    splitters = [leaf for leaf in leaves(copy) if hasattr(leaf, "beam")]
-    if not splitters:
+    found = leaves(copy)
+    if not any(leaf.splits_light for leaf in found):
         raise ChainError("the chain has no beam splitter, so it has no beams")
-    for splitter in splitters:
-        splitter.beam = beam
+    for leaf in found:
+        if hasattr(leaf, "beam"):
+            leaf.beam = beam
     return copy
 
 
@@ -334,9 +335,10 @@ def at_positions(chain, **positions):
     ----------
     chain : Optic or `~astropy.modeling.CompoundModel`
         The chain.
-    **positions : `~astropy.units.Quantity`
-        Position of each stage by name; for many frames and wavelengths in one
-        call, of shape (n_frames, 1).
+    **positions : `~astropy.units.Quantity` or array_like
+        Position of each stage by name, an angle, or a number for those of
+        `~astropolcal.optics.COORDINATES`; for many frames and wavelengths in one
+        call, of shape (n_frames, 1), and (n_frames, n_wavelengths) for fluxes.
 
     Returns
     -------
@@ -348,7 +350,7 @@ def at_positions(chain, **positions):
     ChainError
         If the chain has no such stage.
     ParameterError
-        If a position is not an angle or not finite.
+        If a position is not finite, not an angle, or not a number where one is due.
 
     Examples
     --------
@@ -371,8 +373,8 @@ def at_positions(chain, **positions):
     return copy
 
 
-def _stage_angle(leaf, positions):
-    """Return the position (rad) of the leaf's stage, with an axis for the wavelengths."""
+def _stage_position(leaf, positions):
+    """Return the position of the leaf's stage in canonical floats, with its sign."""
     if leaf.stage is None:
         return 0.0
     if leaf.stage not in positions:
@@ -380,17 +382,14 @@ def _stage_angle(leaf, positions):
             f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}, but "
             f"positions has only {sorted(positions)}"
         )
-    return positions[leaf.stage]
+    return leaf.stage_sign * positions[leaf.stage]
 
 
 def _oriented_leaves(chain, wavelength, positions):
     """Yield each leaf with what its matrix needs: dispersion, angle, values."""
-    scalar = wavelength is None or np.ndim(wavelength) == 0
     for leaf in leaves(chain):
         dispersion, angle, values = leaf._resolve(wavelength, None)
-        stage = np.asarray(_stage_angle(leaf, positions))
-        stage = stage if scalar else stage[..., None]
-        yield leaf, dispersion, angle + leaf.stage_sign * stage, values
+        yield leaf, *leaf._moved(dispersion, angle, _stage_position(leaf, positions)), values
 
 
 def system_mueller(chain, wavelength=None, positions=None):
@@ -403,8 +402,10 @@ def system_mueller(chain, wavelength=None, positions=None):
         The chain; of a beam splitter, its ``beam`` (see `with_beam`).
     wavelength : `~astropy.units.Quantity`, optional
         Scalar or shape (n_wavelengths,).
-    positions : dict of str to `~astropy.units.Quantity`, optional
-        Position of every stage, scalar or shape (n_frames,).
+    positions : dict of str to `~astropy.units.Quantity` or array_like, optional
+        Position of every stage, scalar or shape (n_frames,): an angle, or a
+        number for those of `~astropolcal.optics.COORDINATES`. A flux is that
+        of the beam and may have shape (n_frames, n_wavelengths).
 
     Returns
     -------
@@ -415,11 +416,11 @@ def system_mueller(chain, wavelength=None, positions=None):
     Raises
     ------
     ChainError
-        If the position of a stage is missing, or two stages have different
-        numbers of positions.
+        If the position of a stage is missing, two stages have different numbers
+        of positions, or a flux has another number of wavelengths.
     ParameterError, WavelengthRangeError
         If a wavelength is missing, out of range, or does not match the
-        parameters given per wavelength.
+        parameters given per wavelength, or a position has the wrong unit.
 
     Examples
     --------
@@ -438,18 +439,28 @@ def system_mueller(chain, wavelength=None, positions=None):
 
 
 def _check_axes(wavelength, positions):
-    """Return the positions in radian, and the shape of positions and wavelengths."""
+    """Return the positions with an axis for wavelengths, and the shape of both together."""
     if np.ndim(wavelength) > 1:
         raise ParameterError(
             f"wavelength has shape {np.shape(wavelength)}; allowed are a scalar or one axis"
         )
-    positions = {name: finite_angle(value, name) for name, value in (positions or {}).items()}
-    shapes = {name: value.shape for name, value in positions.items()}
+    grid = () if wavelength is None else np.shape(wavelength)
+    placed, shapes = {}, {}
+    for name, value in (positions or {}).items():
+        position = finite_position(value, name)
+        one_each = name in FLUXES and position.ndim > 1
+        if one_each and position.shape[1:] != grid:
+            several = f" or (n_frames, {grid[0]})" if grid else ""
+            raise ChainError(
+                f"{name} has shape {position.shape}; allowed are a scalar, (n_frames,){several}"
+            )
+        shapes[name] = position.shape[:1] if one_each else position.shape
+        placed[name] = position[..., None] if grid and not one_each else position
     try:
         frames = np.broadcast_shapes(*shapes.values())
     except ValueError:
         raise ChainError(f"the positions have different shapes: {shapes}") from None
-    return positions, frames + (() if wavelength is None else np.shape(wavelength))
+    return placed, frames + grid
 
 
 def system_mueller_derivatives(chain, wavelength=None, positions=None):

@@ -16,6 +16,7 @@ __all__ = [
     "CalibrationFileError",
     "ChainError",
     "FitError",
+    "GapError",
     "InstrumentError",
     "ObservationError",
     "ParameterError",
@@ -53,6 +54,10 @@ class FitError(AstropolcalError, RuntimeError):
 
 class CalibrationFileError(AstropolcalError, ValueError):
     """A calibration file is damaged, of another version, or not ours."""
+
+
+class GapError(AstropolcalError, ValueError):
+    """A diagnosis of the gap cannot be made, or an effect is not what it says."""
 
 
 class AstropolcalWarning(AstropyUserWarning):

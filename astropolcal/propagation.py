@@ -9,13 +9,16 @@ two at its optic, so that all derivatives together cost about as much as a
 few evaluations. Everything is on canonical floats.
 
 Arrays of light have shape (n_wavelengths, 4, n_columns); a column is a frame,
-and an axis has length 1 as long as nothing has depended on it.
+and an axis has length 1 as long as nothing has depended on it. The matrix of an
+optic has shape (n_wavelengths, 4, 4), or (n_wavelengths, 4, 4, n_columns) where it
+changes from frame to frame.
 """
 
 import numpy as np
 
 from astropolcal.chain import leaves, with_beam
 from astropolcal.exceptions import ChainError
+from astropolcal.optics import FrameOptic
 
 __all__ = ["Propagator"]
 
@@ -23,19 +26,40 @@ __all__ = ["Propagator"]
 class _Node:
     """An optic of the chain, with what does not change in a fit."""
 
-    __slots__ = ("dispersion", "index", "leaf", "stage_angle")
+    __slots__ = ("dispersion", "index", "leaf", "per_frame", "stage_angle")
 
     def __init__(self, index, leaf, wavelength, positions):
         self.index = index
         self.leaf = leaf
-        self.dispersion = leaf._dispersion(wavelength)
-        self.stage_angle = leaf.stage_sign * positions[leaf.stage] if leaf.stage else 0.0
+        self.per_frame = isinstance(leaf, FrameOptic)
+        shift = leaf.stage_sign * _of_beam(leaf, positions) if leaf.stage else 0.0
+        if self.per_frame:
+            self.dispersion, self.stage_angle = leaf._moved(0.0, 0.0, np.atleast_2d(shift))
+        else:
+            self.dispersion, self.stage_angle = leaf._dispersion(wavelength), shift
 
     def matrix(self, values):
-        return _three_axes(self.leaf._matrix(self.dispersion, *values))
+        return self._shaped(self.leaf._matrix(self.dispersion, *self._along(values)))
 
     def derivatives(self, values):
-        return [_three_axes(d) for d in self.leaf._derivatives(self.dispersion, *values)]
+        found = self.leaf._derivatives(self.dispersion, *self._along(values))
+        return [self._shaped(derivative) for derivative in found]
+
+    def _along(self, values):
+        """Put values given per wavelength along the first of the frames' two axes."""
+        return [v[:, None] if np.ndim(v) else v for v in values] if self.per_frame else values
+
+    def _shaped(self, matrix):
+        """Return a matrix with its axis of wavelengths first and that of columns last."""
+        if self.per_frame:
+            return np.ascontiguousarray(np.moveaxis(matrix, 1, -1))
+        return matrix if matrix.ndim == 3 else matrix.reshape(-1, 4, 4)
+
+
+def _of_beam(leaf, positions):
+    """Return the positions of a leaf's stage; a flux has a first axis for the beams."""
+    given = np.asarray(positions[leaf.stage])
+    return given[1 if getattr(leaf, "beam", "right") == "left" else 0] if given.ndim == 3 else given
 
 
 class _Step:
@@ -59,15 +83,18 @@ class Propagator:
     wavelength : `~numpy.ndarray`
         Wavelengths in micrometre, shape (n_wavelengths,).
     positions : dict of str to `~numpy.ndarray`
-        Position of each stage in radian, shape (n_columns,).
+        Position of each stage, radian or a number, shape (n_columns,). What
+        differs between the beams, such as a flux, may have shape
+        (2, n_wavelengths, n_columns), the right beam first.
     source : sequence of float
         Stokes vector of the light that enters.
 
     Raises
     ------
     ChainError
-        If the chain has no beam splitter, a stage has no position, or the
-        stages have different numbers of positions.
+        If the chain has no beam splitter, a stage has no position, the stages
+        have different numbers of positions, or positions that differ between
+        the beams are given for an optic that does not.
 
     Examples
     --------
@@ -83,28 +110,17 @@ class Propagator:
     def __init__(self, chain, wavelength, positions, source=(1.0, 0.0, 0.0, 0.0)):
         wavelength = np.atleast_1d(np.asarray(wavelength, dtype=float))
         self.leaves = leaves(chain)
-        self._check(self.leaves, positions)
+        _check(self.leaves, positions, len(wavelength))
         self.wavelength = wavelength
         self.shape = (len(wavelength), _column_count(positions))
         self.source = np.asarray(source, dtype=float).reshape(1, 4, 1)
-        split = next(i for i, leaf in enumerate(self.leaves) if hasattr(leaf, "beam"))
+        split = next(i for i, leaf in enumerate(self.leaves) if leaf.depends_on_beam)
         make = [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(self.leaves)]
         self._common = make[:split]
         self._arms = [
             [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(leaves(arm))][split:]
             for arm in (with_beam(chain, "right"), with_beam(chain, "left"))
         ]
-
-    @staticmethod
-    def _check(found, positions):
-        if not any(hasattr(leaf, "beam") for leaf in found):
-            raise ChainError("the chain has no beam splitter, so it predicts no beam fluxes")
-        for leaf in found:
-            if leaf.stage and leaf.stage not in positions:
-                raise ChainError(
-                    f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}; "
-                    f"the observations give positions of {sorted(positions)}"
-                )
 
     def values(self):
         """
@@ -193,8 +209,25 @@ class Propagator:
         return values
 
 
+def _check(found, positions, n_wavelengths):
+    if not any(leaf.splits_light for leaf in found):
+        raise ChainError("the chain has no beam splitter, so it predicts no beam fluxes")
+    for leaf in found:
+        label = f"optic {leaf.name or type(leaf).__name__} stands on stage {leaf.stage!r}"
+        if leaf.stage and leaf.stage not in positions:
+            raise ChainError(f"{label}; the observations give positions of {sorted(positions)}")
+        shape = np.shape(positions[leaf.stage]) if leaf.stage else ()
+        if len(shape) > 1 and not (len(shape) == 3 and shape[:2] == (2, n_wavelengths)):
+            raise ChainError(
+                f"{label}, whose positions have shape {shape}; allowed are (n_columns,) and, "
+                f"beam by beam, (2, {n_wavelengths}, n_columns)"
+            )
+        if len(shape) == 3 and not leaf.depends_on_beam and leaf.stage != "total_flux":
+            raise ChainError(f"{label}, which differs between the beams, but the optic does not")
+
+
 def _column_count(positions):
-    counts = {name: np.size(angle) for name, angle in positions.items()}
+    counts = {name: np.shape(np.atleast_1d(angle))[-1] for name, angle in positions.items()}
     several = {count for count in counts.values() if count != 1}
     if len(several) > 1:
         raise ChainError(f"the stages have different numbers of positions: {counts}")
@@ -260,7 +293,7 @@ def _run(nodes, values, state):
         turn = angle - frame
         light = _rotate(light, turn)
         matrix = node.matrix(own)
-        out = matrix @ light
+        out = _act(matrix, light)
         steps.append(_Step(node, own, turn, light, matrix, out))
         light, frame = out, angle
     return steps, (light, frame)
@@ -274,7 +307,7 @@ def _back(steps, adjoint, by_optic, result):
             if 0 in wanted:
                 _add(result, (step.node.index, 0), 2 * _cross(adjoint, step.light))
             continue
-        inward = np.swapaxes(step.matrix, -1, -2) @ adjoint
+        inward = _act(step.matrix.swapaxes(1, 2), adjoint)
         if wanted:
             _at_optic(step, wanted, adjoint, inward, result)
         adjoint = _rotate(inward, -step.turn)
@@ -291,7 +324,7 @@ def _at_optic(step, wanted, adjoint, inward, result):
         derivatives = step.node.derivatives(step.values)
         for parameter in wanted:
             if parameter:
-                changed = derivatives[parameter - 1] @ step.light
+                changed = _act(derivatives[parameter - 1], step.light)
                 _add(result, (index, parameter), np.einsum("wsc,wsc->wc", *_same(adjoint, changed)))
 
 
@@ -322,5 +355,6 @@ def _rotate(light, angle):
     return out
 
 
-def _three_axes(matrix):
-    return matrix if matrix.ndim == 3 else matrix.reshape(-1, 4, 4)
+def _act(matrix, light):
+    """Return matrix times light; the matrix may have a last axis of columns."""
+    return matrix @ light if matrix.ndim == 3 else (matrix * light[:, None]).sum(axis=2)

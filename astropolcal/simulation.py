@@ -10,8 +10,9 @@ from astropy.table import QTable
 from astropolcal.chain import stages
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
+from astropolcal.optics.core import finite_position
 from astropolcal.propagation import Propagator
-from astropolcal.units import angle_to_rad, length_to_um
+from astropolcal.units import length_to_um
 
 __all__ = ["half_wave_plate_cycles", "simulate"]
 
@@ -137,7 +138,7 @@ def simulate(
 def _expected(chain, wavelength, frames, source):
     """Return the noiseless fluxes of both beams for unit source, (n_wavelengths, n_frames)."""
     positions = {
-        stage: angle_to_rad(frames[stage], stage)
+        stage: finite_position(frames[stage], stage)
         for stage in stages(chain)
         if stage in frames.colnames
     }

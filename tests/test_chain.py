@@ -69,15 +69,51 @@ def plain_product(chain, j, positions):
             key: np.broadcast_to(getattr(leaf, key).value, 3)[j] * (getattr(leaf, key).unit or 1)
             for key in leaf.own_names
         }
-        own = type(leaf)(**values, **({"beam": leaf.beam} if hasattr(leaf, "beam") else {}))
-        if leaf.mount:
-            sign = -1 if leaf.mount[0] == "-" else 1
-            theta = theta + sign * positions[leaf.mount.strip("-")]
+        settings = leaf._settings()
+        mount = settings.pop("mount")
+        own = type(leaf)(**values, **settings)
+        moved = 0.0
+        if mount:
+            moved = (-1 if mount[0] == "-" else 1) * positions[mount.strip("-")]
+        if not isinstance(leaf, optics.FrameOptic):
+            matrix, theta = own.mueller(WAVELENGTH[j]), theta + moved
+        else:
+            # without a sign, and at its own orientation
+            own.mount = mount and mount.strip("-")
+            unit = u.one if own.mount in optics.COORDINATES else u.rad
+            matrix = own.mueller(WAVELENGTH[j], moved * unit)
         if isinstance(leaf, optics.Rotator):
             total = turn(theta) @ total
         else:
-            total = turn(-theta) @ own.mueller(WAVELENGTH[j]) @ turn(theta) @ total
+            total = turn(-theta) @ matrix @ turn(theta) @ total
     return total
+
+
+@pytest.fixture
+def uneven():
+    """A chain that changes from frame to frame in every way."""
+    return (
+        optics.LinearPolarizer(theta=90 * u.deg, name="polarizer")
+        | optics.DriftRotator(rate=5 * u.deg, mount="-sequence", name="drift")
+        | optics.HarmonicRotator(cosine=3 * u.deg, mount="-hwp", name="encoder")
+        | optics.LinearRetarder(retardance=[150, 170, 190] * u.deg, mount="-hwp", name="hwp")
+        | optics.HarmonicRetarder(
+            sine=[10, 12, 14] * u.deg, theta=7 * u.deg, harmonic=2, mount="-hwp", name="tilt"
+        )
+        | optics.WollastonPrism(efficiency=0.9, name="wollaston")
+        | optics.HarmonicGain(cosine=0.1, differential=True, mount="hwp", name="wander")
+        | optics.FluxGain(right=0.2, left=[-0.1, 0.1, 0.3], mount="flux", name="bend")
+        | optics.FluxGain(right=0.1, left=0.2, power=-1, mount="previous_flux", name="persistence")
+    )
+
+
+def uneven_positions(rng, n_frames):
+    return {
+        "hwp": rng.uniform(-180, 180, n_frames) * u.deg,
+        "sequence": np.linspace(0, 1, n_frames),
+        "flux": rng.uniform(0.1, 1.0, (n_frames, 3)),
+        "previous_flux": rng.uniform(0.5, 2.0, (n_frames, 3)),
+    }
 
 
 @given(seed=SEED, n_optics=st.integers(1, 7))
@@ -163,6 +199,55 @@ def test_wavelength_and_positions_in_any_unit(charis, unit):
     )
 
 
+@pytest.mark.parametrize("beam", ["right", "left"])
+def test_frame_optics_in_the_plain_product(uneven, beam):
+    chain, positions = with_beam(uneven, beam), uneven_positions(np.random.default_rng(1), 5)
+    found = system_mueller(chain, WAVELENGTH, positions)
+    assert found.shape == (5, 3, 4, 4)
+    for i, j in np.ndindex(5, 3):
+        here = {"hwp": positions["hwp"][i].to_value(u.rad), "sequence": positions["sequence"][i]}
+        here |= {name: positions[name][i, j] for name in ("flux", "previous_flux")}
+        expected = plain_product(chain, j, here)
+        np.testing.assert_allclose(found[i, j], expected, rtol=0, atol=1e-13)
+
+
+def test_light_through_frame_optics(uneven):
+    positions = uneven_positions(np.random.default_rng(2), 5)
+    columns = positions | {name: positions[name][:, None] for name in ("hwp", "sequence")}
+    through = at_positions(uneven, **columns)(WAVELENGTH, 1, 0.2, 0.1, -0.1)
+    light = np.stack(np.broadcast_arrays(*through[1:]), axis=-1)
+    expected = system_mueller(uneven, WAVELENGTH, positions) @ [1, 0.2, 0.1, -0.1]
+    np.testing.assert_allclose(light, expected, rtol=0, atol=1e-13)
+
+
+def test_flux_may_be_the_same_at_all_wavelengths(uneven):
+    positions = uneven_positions(np.random.default_rng(3), 4)
+    same = positions | {"flux": np.linspace(0.1, 0.4, 4), "previous_flux": 1.5}
+    full = positions | {
+        "flux": np.repeat(np.linspace(0.1, 0.4, 4), 3).reshape(4, 3),
+        "previous_flux": np.full((4, 3), 1.5),
+    }
+    np.testing.assert_array_equal(
+        system_mueller(uneven, WAVELENGTH, same), system_mueller(uneven, WAVELENGTH, full)
+    )
+
+
+@pytest.mark.parametrize("wavelength", [None, 1.6 * u.um, [1.2, 1.6, 2.1] * u.um])
+@pytest.mark.parametrize("frames", [(), (4,)])
+def test_shapes_of_frame_optics(wavelength, frames):
+    chain = (
+        optics.HarmonicRetarder(cosine=20 * u.deg, mount="hwp", name="tilt")
+        | optics.WollastonPrism(name="wollaston")
+        | optics.FluxGain(right=0.1, mount="flux", name="bend")
+    )
+    hwp, flux = np.full(frames, 30) * u.deg, np.full(frames, 0.5)
+    found = system_mueller(chain, wavelength, {"hwp": hwp, "flux": flux})
+    grid = () if wavelength is None else wavelength.shape
+    assert found.shape == (*frames, *grid, 4, 4)
+    one = system_mueller(chain, None, {"hwp": 30 * u.deg, "flux": 0.5})
+    np.testing.assert_allclose(found, np.broadcast_to(one, found.shape), rtol=0, atol=1e-15)
+
+
 # --- derivatives --------------------------------------------------------------------------
 
 
@@ -194,6 +279,24 @@ def test_derivatives_against_differences(random_chain, seed):
         expected = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
         found = derivatives[name].to_value(canonical_unit(derivatives[name].unit ** -1) ** -1)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8, err_msg=name)
+
+
+@pytest.mark.parametrize("beam", ["right", "left"])
+def test_derivatives_of_frame_optics(uneven, beam):
+    chain, positions = with_beam(uneven, beam), uneven_positions(np.random.default_rng(4), 4)
+    derivatives = system_mueller_derivatives(chain, WAVELENGTH, positions)
+    wanted = [f"{leaf.name}.{key}" for leaf in leaves(chain) for key in leaf.param_names]
+    assert set(derivatives) == set(wanted)
+    step = 1e-3
+    for name in wanted:
+        at = [
+            system_mueller(moved(chain, name, n * step), WAVELENGTH, positions)
+            for n in (-2, -1, 1, 2)
+        ]
+        expected = (8 * (at[2] - at[1]) - (at[3] - at[0])) / (12 * step)
+        found = derivatives[name].to_value(canonical_unit(derivatives[name].unit ** -1) ** -1)
+        assert found.shape == (4, 3, 4, 4)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9, err_msg=name)
 
 
 @given(seed=SEED)
@@ -264,6 +367,32 @@ def test_bad_wavelengths_and_positions(charis):
         system_mueller(charis, WAVELENGTH, still | {"hwp": 3})
     with pytest.raises(ParameterError, match="hwp = nan deg must be finite"):
         system_mueller(charis, WAVELENGTH, still | {"hwp": np.nan * u.deg})
+
+
+def test_angle_and_number_are_not_exchanged(uneven):
+    positions = uneven_positions(np.random.default_rng(5), 2)
+    wrong = {
+        "hwp": (np.zeros(2), r"hwp = .* needs a unit such as rad"),
+        "sequence": ([0, 1] * u.deg, "sequence has unit deg, which is not convertible"),
+        "flux": ([5, 6] * u.adu, "flux has unit adu, which is not convertible"),
+        "previous_flux": ([1, np.inf], r"previous_flux = .* must be finite"),
+    }
+    for name, (value, message) in wrong.items():
+        with pytest.raises(ParameterError, match=message):
+            system_mueller(uneven, WAVELENGTH, positions | {name: value})
+        with pytest.raises(ParameterError, match=message.replace(name, "position", 1)):
+            at_positions(uneven, **{name: value})
+    with pytest.raises(ChainError, match=r"drift stands on stage 'sequence', but positions"):
+        system_mueller(uneven, WAVELENGTH, {"hwp": 0 * u.deg})
+
+
+@pytest.mark.parametrize("shape", [(2, 4), (3, 2), (2, 2, 3)])
+def test_flux_of_another_shape(uneven, shape):
+    positions = uneven_positions(np.random.default_rng(5), 2) | {"flux": np.ones(shape)}
+    with pytest.raises(ChainError, match=r"flux has shape .*; allowed are .* \(n_frames, 3\)"):
+        system_mueller(uneven, WAVELENGTH, positions)
+    with pytest.raises(ChainError, match=r"allowed are a scalar, \(n_frames,\)$"):
+        system_mueller(uneven["wollaston"], 1.6 * u.um, {"flux": np.ones((2, 3))})
 
 
 def test_optics_share_no_name():
@@ -367,6 +496,16 @@ def test_with_beam_is_a_copy(charis):
         with_beam(charis, "up")
     with pytest.raises(ChainError, match="no beam splitter"):
         with_beam(remove_optic(charis, "wollaston"), "left")
+
+
+def test_with_beam_turns_all_that_follow_a_beam(uneven):
+    left = with_beam(uneven, "left")
+    assert [leaf.name for leaf in leaves(left) if getattr(leaf, "beam", "") == "left"] == [
+        "wollaston", "wander", "bend", "persistence",
+    ]  # fmt: skip
+    assert uneven["bend"].beam == "right"
+    with pytest.raises(ChainError, match="no beam splitter"):
+        with_beam(uneven["wander"] | uneven["bend"], "left")
 
 
 def test_the_beams_add_up_to_the_light_before_the_prism(charis):

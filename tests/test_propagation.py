@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from astropolcal import optics
 from astropolcal.chain import (
+    at_positions,
     insert_optic,
     join,
     leaves,
@@ -18,7 +19,10 @@ from astropolcal.chain import (
     with_beam,
 )
 from astropolcal.exceptions import ChainError, ParameterError
+from astropolcal.measurement import Measurement
+from astropolcal.observations import OBSERVABLES
 from astropolcal.propagation import Propagator
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 from astropolcal.units import canonical_unit
 
 SEED = st.integers(0, 2**32 - 1)
@@ -38,14 +42,68 @@ def random_case(random_chain, seed, n_frames=N_FRAMES):
     return rng, chain, positions, source
 
 
-def with_unit(positions):
-    return {stage: angle * u.rad for stage, angle in positions.items()}
+def frame_case(seed, n_frames=N_FRAMES):
+    """
+    A chain that changes from frame to frame in every way, on both sides of the prism.
+
+    Parameters are scalars or one a wavelength, the stages have either sign, and
+    the fluxes differ between beams, wavelengths and frames.
+    """
+    rng = np.random.default_rng(seed)
+
+    def value(limit, unit=1):
+        return rng.uniform(-limit, limit, None if rng.random() < 0.5 else 3) * unit
+
+    def stage(name):
+        return rng.choice(["", "-"]) + name
+
+    def waves(limit, unit=1):
+        harmonic = int(rng.choice([1, 2, 4]))
+        return {"cosine": value(limit, unit), "sine": value(limit, unit), "harmonic": harmonic}
+
+    train = [
+        optics.LinearPolarizer(theta=value(90, u.deg), name="polarizer"),
+        optics.DriftRotator(rate=value(30, u.deg), mount=stage("sequence"), name="drift"),
+        optics.HarmonicRotator(**waves(30, u.deg), mount=stage("a"), name="encoder"),
+        optics.LinearRetarder(retardance=value(180, u.deg), mount=stage("a"), name="plate"),
+        optics.HarmonicRetarder(
+            **waves(60, u.deg), theta=value(90, u.deg), mount=stage("a"), name="tilt"
+        ),
+        optics.HarmonicGain(**waves(0.3), mount=stage("a"), name="dust"),
+        optics.WollastonPrism(efficiency=rng.uniform(0.2, 1), theta=5 * u.deg, name="wollaston"),
+        optics.HarmonicRetarder(**waves(60, u.deg), mount=stage("b"), name="window"),
+        optics.HarmonicGain(
+            **waves(0.3), differential=True, mount=stage("b"), theta=9 * u.deg, name="wander"
+        ),
+        optics.FluxGain(
+            right=value(0.4), left=value(0.4), reference=0.7, mount="flux", name="bend"
+        ),
+        optics.FluxGain(
+            right=value(0.2), left=value(0.2), power=-1, mount="previous_flux", name="lag"
+        ),
+    ]
+    positions = {name: rng.uniform(-3, 3, n_frames) for name in ("a", "b")}
+    positions["sequence"] = rng.uniform(0, 1, n_frames)
+    positions["flux"] = rng.uniform(0.1, 1, (2, 3, n_frames))
+    positions["previous_flux"] = rng.uniform(0.5, 2, (2, 3, n_frames))
+    source = np.array([1.0, *rng.uniform(-0.5, 0.5, 3)])
+    return rng, join(train), positions, source
+
+
+def with_unit(positions, beam):
+    """Positions as `system_mueller` takes them: angles with a unit, the fluxes of one beam."""
+    given_ = {}
+    for stage, position in positions.items():
+        position = position[BEAMS.index(beam)].T if position.ndim == 3 else position
+        given_[stage] = position if stage in optics.COORDINATES else position * u.rad
+    return given_
 
 
 def plain_fluxes(chain, positions, source):
     """Both fluxes by the system Mueller matrices, (n_wavelengths, n_frames) each."""
     matrices = [
-        system_mueller(with_beam(chain, beam), LAM * u.um, with_unit(positions)) for beam in BEAMS
+        system_mueller(with_beam(chain, beam), LAM * u.um, with_unit(positions, beam))
+        for beam in BEAMS
     ]
     return [(matrix @ source)[..., 0].T for matrix in matrices]
 
@@ -70,6 +128,46 @@ def test_as_many_frames_as_wavelengths(random_chain, seed):
     _, chain, positions, source = random_case(random_chain, seed, n_frames=3)
     found = Propagator(chain, LAM, positions, source).fluxes()
     np.testing.assert_allclose(found, plain_fluxes(chain, positions, source), rtol=0, atol=1e-12)
+
+
+@given(seed=SEED, n_frames=st.sampled_from([1, 3, 4]))
+@settings(max_examples=25)
+def test_fluxes_through_frame_optics_are_those_of_the_matrices(seed, n_frames):
+    _, chain, positions, source = frame_case(seed, n_frames)
+    found = Propagator(chain, LAM, positions, source).fluxes()
+    expected = plain_fluxes(chain, positions, source)
+    assert found[0].shape == (3, n_frames)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+@given(seed=SEED)
+@settings(max_examples=5)
+def test_fluxes_through_frame_optics_are_those_of_the_chain_itself(seed):
+    _, chain, positions, source = frame_case(seed)
+    found = Propagator(chain, LAM, positions, source).fluxes()
+    for beam, flux in zip(BEAMS, found, strict=True):
+        placed = with_unit(positions, beam)
+        columns = {name: p if p.ndim == 2 else p[:, None] for name, p in placed.items()}
+        _, intensity, *_ = at_positions(with_beam(chain, beam), **columns)(LAM * u.um, *source)
+        np.testing.assert_allclose(flux.T, intensity, rtol=0, atol=1e-13)
+
+
+def test_flux_may_be_the_same_in_both_beams():
+    _, chain, positions, source = frame_case(1)
+    same = positions | {"flux": np.linspace(0.1, 1, N_FRAMES)}
+    full = positions | {"flux": np.broadcast_to(same["flux"], (2, 3, N_FRAMES))}
+    found = [Propagator(chain, LAM, p, source).fluxes() for p in (same, full)]
+    np.testing.assert_array_equal(*found)
+
+
+def test_frame_optic_without_mount_stands_at_zero():
+    _, chain, positions, source = frame_case(2)
+    still = join(leaf.with_parameters() for leaf in leaves(chain))
+    for leaf in leaves(still):
+        leaf.mount = None
+    zero = {name: np.zeros(1) for name in positions}
+    found = [Propagator(c, LAM, zero, source).fluxes() for c in (still, chain)]
+    np.testing.assert_allclose(*found, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("mount", [None, "hwp"])
@@ -138,11 +236,21 @@ def every_parameter(chain):
 @settings(max_examples=40)
 def test_derivatives_are_those_of_the_matrices(random_chain, seed):
     rng, chain, positions, source = random_case(random_chain, seed)
+    assert_derivatives_of_the_matrices(rng, chain, positions, source)
+
+
+@given(seed=SEED)
+@settings(max_examples=15)
+def test_derivatives_of_frame_optics_are_those_of_the_matrices(seed):
+    assert_derivatives_of_the_matrices(*frame_case(seed))
+
+
+def assert_derivatives_of_the_matrices(rng, chain, positions, source):
     weights = rng.normal(size=(2, 3, N_FRAMES))
     wanted = every_parameter(chain)
     found = Propagator(chain, LAM, positions, source).forward().derivatives(wanted, weights)
     expected = [
-        system_mueller_derivatives(with_beam(chain, beam), LAM * u.um, with_unit(positions))
+        system_mueller_derivatives(with_beam(chain, beam), LAM * u.um, with_unit(positions, beam))
         for beam in BEAMS
     ]
     assert set(found) == set(wanted)
@@ -161,9 +269,23 @@ def test_derivatives_are_those_of_the_matrices(random_chain, seed):
 @settings(max_examples=15)
 def test_derivatives_against_differences(random_chain, seed):
     rng, chain, positions, source = random_case(random_chain, seed)
+    wanted = rng.permutation(every_parameter(chain))[:5]
+    assert_derivatives_are_differences(rng, chain, positions, source, wanted)
+
+
+@given(seed=SEED)
+@settings(max_examples=5)
+def test_derivatives_of_frame_optics_against_differences(seed):
+    rng, chain, positions, source = frame_case(seed)
+    wanted = every_parameter(chain)
+    assert len(wanted) == 28
+    assert_derivatives_are_differences(rng, chain, positions, source, wanted)
+
+
+def assert_derivatives_are_differences(rng, chain, positions, source, wanted):
     propagator = Propagator(chain, LAM, positions, source)
     weights = rng.normal(size=(2, 3, N_FRAMES))
-    for i, k in rng.permutation(every_parameter(chain))[:5]:
+    for i, k in wanted:
         step = 1e-4
 
         def at(shift, i=i, k=k, step=step):
@@ -208,8 +330,9 @@ def test_derivatives_are_linear_in_the_weights(random_chain, seed):
 
 
 def test_chain_without_beam_splitter():
-    with pytest.raises(ChainError, match="no beam splitter, so it predicts no beam fluxes"):
-        Propagator(optics.LinearPolarizer(), LAM, {})
+    for chain in (optics.LinearPolarizer(), optics.BeamGain(), optics.FluxGain()):
+        with pytest.raises(ChainError, match="no beam splitter, so it predicts no beam fluxes"):
+            Propagator(chain, LAM, {})
 
 
 def test_stage_without_position():
@@ -227,6 +350,28 @@ def test_stages_with_different_numbers_of_positions():
     assert still.fluxes()[0].shape == (3, 2)
 
 
+@pytest.mark.parametrize("shape", [(3, 4), (4, 3), (3, 3, 4), (2, 4, 3), (1, 2, 3, 4)])
+def test_positions_of_another_shape(shape):
+    chain = optics.WollastonPrism(name="wollaston") | optics.FluxGain(mount="flux", name="bend")
+    message = r"bend stands on stage 'flux', whose positions have shape .* \(2, 3, n_columns\)"
+    with pytest.raises(ChainError, match=message):
+        Propagator(chain, LAM, {"flux": np.ones(shape)})
+
+
+def test_flux_that_differs_between_beams_for_an_optic_that_does_not():
+    drift = optics.DriftRotator(mount="flux", name="drift")
+    for chain in (drift | optics.WollastonPrism(), optics.WollastonPrism() | drift):
+        with pytest.raises(ChainError, match=r"drift stands on stage 'flux', which differs betw"):
+            Propagator(chain, LAM, {"flux": np.ones((2, 3, 5))})
+
+
+def test_fluxes_with_different_numbers_of_positions():
+    chain = optics.LinearRetarder(mount="hwp") | optics.WollastonPrism()
+    chain = chain | optics.FluxGain(mount="flux")
+    with pytest.raises(ChainError, match=r"different numbers of positions: .*'flux': 5"):
+        Propagator(chain, LAM, {"hwp": np.zeros(2), "flux": np.ones((2, 3, 5))})
+
+
 def test_parameters_on_another_wavelength_grid():
     chain = optics.WollastonPrism(efficiency=[0.9, 0.8], name="wollaston")
     propagator = Propagator(chain, np.array([1.6]), {})
@@ -240,3 +385,62 @@ def test_parameters_on_another_wavelength_grid():
 def test_unknown_chain():
     with pytest.raises(ChainError, match="is not an optic"):
         Propagator("wollaston", LAM, {})
+
+
+# --- in a measurement -----------------------------------------------------------------------
+
+
+def observed_case(time=None):
+    """A chain whose gains follow the fluxes, and a table with masked cells that it may fit."""
+    ideal = (
+        optics.LinearPolarizer(theta=80 * u.deg, name="polarizer")
+        | optics.LinearRetarder(retardance=[150, 170, 190] * u.deg, mount="hwp", name="hwp")
+        | optics.WollastonPrism(efficiency=[0.9, 0.95, 0.97], name="wollaston")
+    )
+    frames = half_wave_plate_cycles(derotator=[45, 62] * u.deg)
+    if time is not None:
+        frames["time"] = time
+    observations = simulate(ideal, LAM * u.um, frames, flux=1e5, seed=3)
+    mask = np.zeros((observations.n_frames, 3), dtype=bool)
+    mask[3, 1] = mask[6] = True
+    chain = ideal
+    for optic in (
+        optics.DriftRotator(rate=1 * u.deg, mount="sequence", name="drift"),
+        optics.HarmonicRotator(sine=[1, 2, 3] * u.deg, harmonic=2, mount="-hwp", name="encoder"),
+        optics.HarmonicGain(cosine=0.02, mount="hwp", name="dust"),
+    ):
+        chain = insert_optic(chain, optic, before="hwp")
+    chain = (
+        chain
+        | optics.FluxGain(
+            right=-0.03, left=[0.01, 0.02, 0.03], reference=5e4, mount="flux", name="bend"
+        )
+        | optics.FluxGain(right=0.01, left=0.02, power=-1, mount="previous_flux", name="lag")
+    )
+    return chain, observations.with_mask(mask, "test")
+
+
+@pytest.mark.parametrize("observable", sorted(OBSERVABLES))
+def test_jacobian_of_a_measurement_with_frame_optics(observable):
+    chain, observations = observed_case(time=[*range(8, 16), *range(8)] * u.s)
+    measurement = Measurement(chain, observations, observable=observable)
+    vector = measurement.vector()
+    assert {"drift.rate", "bend.right", "lag.left"} <= set(measurement.free.by_name)
+    step = 1e-4
+    expected = []
+    for i in range(vector.size):
+        at = [measurement.predict(vector + n * step * (np.arange(vector.size) == i))
+              for n in (-2, -1, 1, 2)]  # fmt: skip
+        expected.append((8 * (at[2] - at[1]) - (at[3] - at[0])) / (12 * step))
+    found = measurement.jacobian(vector)
+    assert np.isfinite(measurement.residuals()).all()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
+
+
+def test_prediction_of_a_measurement_with_frame_optics():
+    chain, observations = observed_case(time=[*range(8, 16), *range(8)] * u.s)
+    measurement = Measurement(chain, observations, observable="normalized_single_difference")
+    positions = {stage: observations.position(stage) for stage in stages(chain)}
+    right, left = plain_fluxes(chain, positions, [1, 0, 0, 0])
+    expected = ((right - left) / (right + left))[~observations.mask.T]
+    np.testing.assert_allclose(measurement(measurement.index), expected, rtol=0, atol=1e-13)

@@ -8,9 +8,10 @@ from astropolcal.calibration.accuracy import (
     cross_validated_residuals,
     leave_out_groups,
 )
+from astropolcal.calibration.convergence import Convergence
 from astropolcal.calibration.covariance import Covariance, full_covariance
 from astropolcal.calibration.derived import Derived, propagate
-from astropolcal.calibration.errors import standard_errors
+from astropolcal.calibration.errors import robust_covariance, standard_errors
 from astropolcal.calibration.fit import calibrate
 from astropolcal.calibration.gauge import describe_gauge, settle
 from astropolcal.calibration.goodness import LackOfFit, lack_of_fit
@@ -23,7 +24,7 @@ from astropolcal.calibration.identifiability import (
     null_space,
     physical_scale,
 )
-from astropolcal.calibration.log_posterior import LogPosterior, residual_noise
+from astropolcal.calibration.log_posterior import LogPosterior
 from astropolcal.calibration.mirrors import mirror_solutions
 from astropolcal.calibration.noise import (
     NoiseEstimate,
@@ -45,6 +46,7 @@ from astropolcal.calibration.resampling import Resampled, bootstrap
 from astropolcal.calibration.result import Calibration, DatasetRecord
 from astropolcal.calibration.sampling import sample
 from astropolcal.calibration.sky import sky_consequences
+from astropolcal.calibration.standards import add_standard, standard_accuracy
 from astropolcal.calibration.starts import BinProblem, search_branches
 from astropolcal.calibration.summary import summary, to_dict
 from astropolcal.calibration.target_accuracy import (
@@ -52,12 +54,15 @@ from astropolcal.calibration.target_accuracy import (
     four_accuracies,
     groups_by,
     propagate_accuracy,
+    target_accuracies,
     target_accuracy,
 )
+from astropolcal.calibration.weighting import Weighting, noise_of, residual_noise, weighting_of
 
 __all__ = [
     "BinProblem",
     "Calibration",
+    "Convergence",
     "Covariance",
     "DatasetRecord",
     "Derived",
@@ -68,8 +73,10 @@ __all__ = [
     "Posterior",
     "Profile",
     "Resampled",
+    "Weighting",
     "absolute_accuracy",
     "accuracy_table",
+    "add_standard",
     "analyse",
     "autocorrelation",
     "autocorrelation_time",
@@ -96,18 +103,23 @@ __all__ = [
     "noise_from_errors",
     "noise_from_null_channel",
     "noise_from_replicates",
+    "noise_of",
     "null_space",
     "physical_scale",
     "profile",
     "propagate",
     "propagate_accuracy",
     "residual_noise",
+    "robust_covariance",
     "sample",
     "search_branches",
     "settle",
     "sky_consequences",
+    "standard_accuracy",
     "standard_errors",
     "summary",
+    "target_accuracies",
     "target_accuracy",
     "to_dict",
+    "weighting_of",
 ]

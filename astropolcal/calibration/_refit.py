@@ -2,9 +2,8 @@
 """Quick fits from a known solution: with other weights, or with parameters held."""
 
 import numpy as np
-from scipy.optimize import least_squares
 
-from astropolcal.calibration.covariance import prior_noise
+from astropolcal.calibration.weighting import weighting_of
 
 _MAX_EVALUATIONS = 100
 
@@ -15,9 +14,10 @@ class Refit:
     def __init__(self, calibration):
         self.measurement = calibration._live()
         self.solution = self.measurement.vector()
-        weights = calibration._weights()
+        weighting = weighting_of(calibration)
+        weights = weighting.weight
         self.weights = np.ones(self.measurement.n_data) if weights is None else weights
-        self._noise = prior_noise(calibration.measurement, calibration._weights())
+        self._noise = weighting.level
         self._low, self._high = self.measurement.free.bounds()
 
     def residuals(self, vector, weights):
@@ -38,6 +38,8 @@ class Refit:
         ``counts`` tells how often each datum occurs, ``held`` which elements
         stay as they are. Returns the vector, chi-square, and whether it arrived.
         """
+        from scipy.optimize import least_squares
+
         weights = self.weights if counts is None else self.weights * np.sqrt(counts)
         live = np.setdiff1d(np.arange(start.size), held)
         vector = start.copy()

@@ -1,6 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Accuracy of a calibration per wavelength: s_res, s_mean and cross-validated s_cv.
+Accuracy of a calibration per wavelength: s_res, s_mean, s_cv and s_standard.
+
+The first two look back at the data of the fit. The others are errors of
+predictions: of settings that were left out of the fit, and of a dataset that the
+fit never saw (a standard).
 """
 
 import warnings
@@ -11,11 +15,17 @@ from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable
 
 from astropolcal.calibration.covariance import prior_noise
+from astropolcal.calibration.groups import leave_out_groups
+from astropolcal.calibration.identifiability import null_space, physical_scale
+from astropolcal.exceptions import FitError
 
 __all__ = ["accuracy_table", "cross_validated_residuals", "leave_out_groups"]
 
-# derotator angles that differ by less belong to one group
-_SAME_ANGLE = np.deg2rad(0.5)
+# a datum that moves by less than this share of the largest slope does not move
+_STILL = 1e-6
+# what is named of a direction, as a share of its length
+_WORTH_A_WORD = 0.1
+_MOST_NAMES = 4
 
 
 def accuracy_table(measurement, dataset, residuals, held_out=None):
@@ -26,7 +36,8 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
     :math:`\sqrt{\sum r_i^2/(n-k)}`; ``s_mean`` is ``s_res`` over
     :math:`\sqrt{n}`, the paper's s_rel (paper, Sec. 2.3), with k the number of
     free parameters that act at that wavelength; ``s_cv`` is the rms of
-    residuals predicted for frames left out in groups.
+    residuals predicted for frames left out in groups; ``s_standard``, which
+    `add_standard` fills, that of datasets that the fit never saw.
 
     Parameters
     ----------
@@ -43,7 +54,8 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
     -------
     `~astropy.table.QTable`
         Columns ``wavelength``, ``n``, ``k``, ``s_res``, ``s_mean``, ``s_cv``,
-        the last three in percent, NaN where there are too few data.
+        ``s_standard``, the last four in percent, NaN where there are too few
+        data or none.
 
     Examples
     --------
@@ -57,7 +69,7 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
     >>> observations = simulate(charis.chain(), charis.wavelength, frames)
     >>> measurement = Measurement(charis.chain(), observations)
     >>> accuracy_table(measurement, 0, measurement.residuals()).colnames
-    ['wavelength', 'n', 'k', 's_res', 's_mean', 's_cv']
+    ['wavelength', 'n', 'k', 's_res', 's_mean', 's_cv', 's_standard']
     """
     part = measurement.datasets[dataset]
     residuals = residuals[measurement.segments[dataset]]
@@ -78,6 +90,7 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
             "s_res": (s_res * 100) * u.percent,
             "s_mean": (s_mean * 100) * u.percent,
             "s_cv": (np.array(s_cv) * 100) * u.percent,
+            "s_standard": np.full(len(n), np.nan) * u.percent,
         }
     )
 
@@ -85,46 +98,6 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
 def _rms(values):
     known = values[np.isfinite(values)]
     return np.sqrt(np.mean(known**2)) if known.size else np.nan
-
-
-def leave_out_groups(measurement):
-    """
-    Return the group of each datum for cross-validation: its derotator angle.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Number of the group, shape (n_data,); datasets have their own groups.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.calibration import leave_out_groups
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames)
-    >>> measurement = Measurement(charis.chain(), observations)
-    >>> int(leave_out_groups(measurement).max())
-    2
-    """
-    groups, first = [], 0
-    for dataset in measurement.datasets:
-        angle = dataset.observations.position("derotator")[dataset.frames[:, 0]]
-        order = np.argsort(angle)
-        new = np.concatenate([[0], np.cumsum(np.diff(angle[order]) > _SAME_ANGLE)])
-        group = np.empty(len(angle), dtype=int)
-        group[order] = new
-        groups.append(first + group[dataset.group_of_datum])
-        first += int(new[-1]) + 1
-    return np.concatenate(groups)
 
 
 def cross_validated_residuals(measurement, vector, weights=None, groups=None):
@@ -145,8 +118,15 @@ def cross_validated_residuals(measurement, vector, weights=None, groups=None):
     Returns
     -------
     `~numpy.ndarray`
-        Shape (n_data,); all NaN where there are fewer than three derotator
-        angles, or fewer than two groups of those given.
+        Shape (n_data,). NaN where the other groups do not determine the
+        prediction, and everywhere if there are fewer than three derotator angles
+        or, of groups that are given, fewer than two.
+
+    Raises
+    ------
+    FitError
+        If given groups are not one a datum, have a single member, or cannot be
+        predicted from the others.
 
     Examples
     --------
@@ -165,16 +145,67 @@ def cross_validated_residuals(measurement, vector, weights=None, groups=None):
     """
     # two derotator angles are too few to predict one from the other; nights need not be
     fewest = 3 if groups is None else 2
-    groups = leave_out_groups(measurement) if groups is None else np.asarray(groups)
+    labels = leave_out_groups(measurement) if groups is None else _checked(measurement, groups)
     held_out = np.full(measurement.n_data, np.nan)
-    labels = np.unique(groups)
-    if len(labels) < fewest:
+    found = np.unique(labels)
+    if len(found) < fewest:
         return held_out
-    for label in labels:
-        out = groups == label
+    jacobian = measurement.jacobian(vector)
+    for label in found:
+        out = labels == label
+        moved, blind = _undetermined(measurement, vector, jacobian, out, weights)
+        if groups is not None and blind.any():
+            raise FitError(_not_predicted(measurement, label, out, moved))
         fitted = _fit_without(measurement, vector, out, weights)
-        held_out[out] = measurement.residuals(fitted)[out]
+        # along what the others leave open the fit still stands where all data have put it
+        held_out[out] = np.where(blind, np.nan, measurement.residuals(fitted)[out])
     return held_out
+
+
+def _checked(measurement, groups):
+    groups = np.asarray(groups)
+    if groups.shape != (measurement.n_data,):
+        raise FitError(
+            f"groups of shape {groups.shape}; allowed is ({measurement.n_data},), one a datum"
+        )
+    labels, counts = np.unique(groups, return_counts=True)
+    if (counts < 2).any():
+        raise FitError(
+            f"cross-validation: group {labels[counts < 2][0]} has a single member; "
+            "at least 2 data are needed"
+        )
+    return groups
+
+
+def _undetermined(measurement, vector, jacobian, out, weights):
+    """
+    Return the moves that only the data left out can see, and which of these see them.
+
+    The moves are canonical, shape (n_moves, n_free).
+    """
+    scale = physical_scale(measurement.free)
+    kept = jacobian[:, ~out] * (1.0 if weights is None else weights[~out])
+    kept = np.concatenate([kept, measurement.free.prior_jacobian(vector)], axis=1)
+    null = null_space(measurement.free, kept) * scale
+    left, seen, right = np.linalg.svd(null @ jacobian[:, out], full_matrices=False)
+    limit = _STILL * np.abs(jacobian * scale[:, None]).max(initial=0.0)
+    moves = seen > limit
+    change = seen[moves, None] * right[moves]
+    return left.T[moves] @ null, (np.abs(change) > limit).any(axis=0)
+
+
+def _not_predicted(measurement, label, out, moved):
+    share = np.abs(moved / physical_scale(measurement.free)).max(axis=0)
+    slots = [s for s in measurement.free.slots if share[s.slice].max() > _WORTH_A_WORD]
+    return (
+        f"cross-validation: without group {label} ({out.sum()} data) the others do not determine "
+        f"{_listed([slot.name for slot in slots])}; group by something else"
+    )
+
+
+def _listed(names):
+    more = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _fit_without(measurement, vector, out, weights):

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from astropolcal.calibration.identifiability import _decompose, _step
+from astropolcal.calibration._directions import step_of
+from astropolcal.calibration.weighting import Weighting, around, weighting_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor
 
@@ -217,7 +218,7 @@ class Covariance:
 
     def _axes(self):
         """Split the space of the parameters, each in degree, micrometre or percent."""
-        steps = np.array([_step(unit)[0] / canonical_factor(unit) for unit in self.units])
+        steps = np.array([step_of(unit)[0] / canonical_factor(unit) for unit in self.units])
         undetermined = ~np.isfinite(np.diag(self.matrix))
         empty = np.zeros((0, len(self)))
         null = empty if self.null is None else self.null / steps
@@ -320,51 +321,57 @@ def full_covariance(calibration):
         return known
     if calibration.measurement is None:
         return Covariance(known.names, known.units, known.matrix, null=_open_of_file(calibration))
-    measurement = calibration.measurement
-    scaled, steps = _whitened(calibration)
-    live = np.array([name not in set(calibration.at_bound) for name in known.names], dtype=bool)
-    singular, right, rank = _decompose(scaled[:, live])
-    factor, null = np.zeros((rank, live.size)), np.zeros((live.sum() - rank, live.size))
-    factor[:, live] = right[:rank] / singular[:rank, None]
-    null[:, live] = right[rank:]
-    factor *= np.sqrt(residual_variance(calibration))
-    per_unit = steps / measurement.free.factors()
+    weighting = weighting_of(calibration)
+    return covariance_around(
+        calibration.measurement, around(calibration.measurement, weighting), weighting.level
+    )
+
+
+def covariance_around(measurement, whitened, level):
+    """
+    Return the covariance with its directions, of a problem that is decomposed once.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    whitened : Whitened
+        The problem around its solution.
+    level : float
+        Noise of a datum of weight one; without one there is no error.
+
+    Returns
+    -------
+    Covariance
+    """
+    free = measurement.free
+    known = Covariance.from_canonical(free, whitened.covariance() * level**2)
+    per_unit = whitened.scale / free.factors()
+    factor = whitened.factor() * (level * per_unit) if np.isfinite(level) else None
     return Covariance(
-        known.names, known.units, known.matrix, factor=factor * per_unit, null=null * per_unit
+        known.names, known.units, known.matrix, factor=factor, null=whitened.null() * per_unit
     )
 
 
 def residual_variance(calibration):
-    """Return the variance of a datum of weight one: 1 where the errors are given."""
-    measurement = calibration.measurement
-    if calibration.settings.get("weights") == "errors":
-        return 1.0
-    freedom = max(measurement.n_data - calibration.identifiability.rank, 1)
-    return float(np.sum(measurement.residuals() ** 2) / freedom)
+    """Return the variance of a datum of weight one: 1 where every datum has its own noise."""
+    return weighting_of(calibration).level ** 2
 
 
 def prior_noise(measurement, weights):
     """Return the noise against which priors weigh in a fit; the residuals' if not known."""
     if weights is not None or not measurement.n_priors:
         return 1.0
-    freedom = max(measurement.n_data - measurement.free.size, 1)
-    return float(np.sqrt(np.sum(measurement.residuals() ** 2) / freedom))
-
-
-def _whitened(calibration):
-    """Return the derivative of data and priors to one degree, micrometre or percent."""
-    measurement = calibration.measurement
-    vector, weights = measurement.vector(), calibration._weights()
-    jacobian = measurement.jacobian(vector) * (1.0 if weights is None else weights)
-    priors = measurement.free.prior_jacobian(vector) * prior_noise(measurement, weights)
-    steps = np.array([_step(unit)[0] for unit in calibration.covariance.units])
-    return (np.concatenate([jacobian, priors], axis=1) * steps[:, None]).T, steps
+    fitted = measurement.weighting
+    if fitted is not None and fitted.choice is None and fitted.is_known:
+        return fitted.level
+    return Weighting(None, np.full(measurement.n_data, np.nan)).started(measurement).level
 
 
 def _open_of_file(calibration):
     """Return the open directions that a file names, less those that a prior has closed."""
     known = calibration.covariance
-    steps = np.array([_step(unit)[0] / canonical_factor(unit) for unit in known.units])
+    steps = np.array([step_of(unit)[0] / canonical_factor(unit) for unit in known.units])
     null = np.asarray(calibration.identifiability.null_vectors).reshape(-1, len(known))
     undetermined = ~np.isfinite(np.diag(known.matrix))
     undetermined &= [name not in set(calibration.at_bound) for name in known.names]

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration._directions import led as _reduced
 from astropolcal.calibration.covariance import full_covariance
-from astropolcal.calibration.identifiability import _reduced
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement import FreeParameters
 from astropolcal.units import canonical_factor

@@ -22,13 +22,14 @@ from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
 
 from astropolcal.calibration.accuracy import accuracy_table
-from astropolcal.calibration.covariance import Covariance, full_covariance, prior_noise
-from astropolcal.calibration.gauge import describe_gauge, open_parameters, settle
+from astropolcal.calibration.covariance import covariance_around
+from astropolcal.calibration.gauge import describe_gauge, hold_silent, open_parameters, settled
 from astropolcal.calibration.goodness import lack_of_fit
-from astropolcal.calibration.identifiability import analyse, complete
+from astropolcal.calibration.identifiability import complete, finding_of
 from astropolcal.calibration.noise import noise_from_errors, noise_from_null_channel
 from astropolcal.calibration.result import Calibration, DatasetRecord
 from astropolcal.calibration.starts import BinProblem, search_branches
+from astropolcal.calibration.weighting import ROUNDS, around, describe, first_weighting
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
 from astropolcal.measurement import Measurement, parameter_table
@@ -38,11 +39,10 @@ from astropolcal.version import version
 __all__ = ["calibrate"]
 
 STRATEGIES = ("joint", "two-step")
-WEIGHTS = (None, "errors")
 _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
-# a parameter closer to its bound than this (canonical units) sits at it
-_AT_BOUND = 1e-5
+# a fitter without bounds may leave them by this share of a value
+_OUTSIDE = 1e-5
 
 
 def calibrate(
@@ -78,9 +78,14 @@ def calibrate(
         All parameters at once, or the paper's procedure.
     observable : str or Observable
         What is fitted; see `astropolcal.observations.OBSERVABLES`.
-    weights : {None, "errors"}
-        Equal weights, errors scaled to the residuals (the default, as the
-        errors of real tables are rarely complete), or one over the errors.
+    weights : {None, "wavelength", "errors"}, NoiseEstimate or array_like
+        Noise of the data, which sets their weights and the scale of all
+        errors. None: one level for all data, from the residuals (the default,
+        as the errors of real tables are rarely complete). ``"wavelength"``: one
+        level for each wavelength of each dataset, from the residuals, with the
+        fit repeated until both agree. ``"errors"``: the errors of the tables.
+        Or the noise itself, its standard deviation as one value, one a
+        wavelength or one a datum.
     ties : dict of str to Tie, optional
         Parameters that follow others.
     positions : sequence of dict, optional
@@ -112,10 +117,12 @@ def calibrate(
     Raises
     ------
     FitError
-        If there is nothing to fit, fewer data than free parameters, or the
-        weights are asked for where the table has no errors.
+        If there is nothing to fit, fewer data than free parameters, the
+        weights are asked for where the table has no errors, or the residuals
+        of a wavelength tell no noise.
     ChainError, ObservationError, ParameterError
-        If chain and observations do not fit together.
+        If chain and observations do not fit together, or a noise given is not
+        a possible one.
 
     Examples
     --------
@@ -137,28 +144,30 @@ def calibrate(
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
     chain = chain if fix is None else _fixed(chain, fix)
     measurement = Measurement(chain, observations, ties=ties, **options)
-    weight = _weights(measurement, weights)
+    weighting = first_weighting(measurement, weights)
     _check(measurement)
     origin = measurement.vector()
     if strategy == "joint":
-        outcome, stages = _joint(measurement, weight, fitter, search), []
+        (outcome, weighting), stages = _joint(measurement, weighting, fitter, search), []
     else:
-        outcome, stages = _two_step(measurement, weight, fitter, search, options)
+        outcome, weighting, stages = _two_step(measurement, weighting, fitter, search, options)
     if not outcome["converged"]:
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
         )
-    chosen = _settled(measurement, weight, origin, gauge)
+    hold_silent(measurement, origin)
+    chosen, weighting, whitened = _settled(measurement, weighting, origin, gauge)
     seconds = time.perf_counter() - started
     return _result(
         measurement,
-        weight,
+        whitened,
         settings={
             "instrument": instrument,
             "observable": measurement.observable.name,
             "fitter": type(fitter).__name__,
             "strategy": strategy,
-            "weights": weights,
+            "weights": weighting.choice,
+            "noise": describe(measurement, weighting),
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
         },
         fit={"seconds": seconds, "n_data": measurement.n_data, **outcome},
@@ -183,11 +192,25 @@ def _fixed(chain, fix):
     return copies[0] if single else copies
 
 
-def _settled(measurement, weight, origin, gauge):
-    """Choose the gauge where there is a choice; return what the data leave open."""
-    if gauge == "minimal" and not measurement.free.priors:
-        return settle(BinProblem(measurement, weight), weight, origin)
-    return open_parameters(measurement, weight)
+def _settled(measurement, weighting, origin, gauge):
+    """Choose the gauge where there is a choice; return what is open, noise and linear problem."""
+    if gauge == "minimal":
+        problem = BinProblem(measurement, weighting.weight, _level(weighting))
+        chosen, whitened = settled(problem, weighting, origin)
+    else:
+        whitened = around(measurement, weighting)
+        chosen = open_parameters(measurement.free, whitened)
+    if len(whitened.data.null):
+        hold_silent(measurement, origin)
+    measurement.weighting = weighting.updated(measurement, whitened)
+    if measurement.weighting.weight is not None and weighting.from_residuals:
+        whitened = around(measurement, measurement.weighting)
+    return chosen, measurement.weighting, whitened
+
+
+def _level(weighting):
+    """Return the noise against which priors weigh; one that is not known leaves them out."""
+    return weighting.level if weighting.is_known else 0.0
 
 
 def _check(measurement):
@@ -200,36 +223,36 @@ def _check(measurement):
         )
 
 
-def _weights(measurement, weights):
-    """Return one over sigma, or None for equal weights."""
-    if weights not in WEIGHTS:
-        raise FitError(f"weights = {weights!r}; allowed are None and 'errors'")
-    if weights is None:
-        return None
-    bad = ~(np.isfinite(measurement.sigma) & (measurement.sigma > 0))
-    if bad.any():
-        raise FitError(f"weights='errors', but {bad.sum()} of {bad.size} data have no error")
-    return 1 / measurement.sigma
+def _run(measurement, weighting, fitter):
+    """Fit in place until the noise agrees with the residuals; return how it went, and the noise."""
+    told = weighting.choice == "wavelength" or (weighting.from_residuals and measurement.n_priors)
+    if not told:
+        return _fit(measurement, weighting, fitter), weighting
+    if not weighting.is_known:
+        weighting = weighting.started(measurement)
+    for _ in range(ROUNDS):
+        outcome = _fit(measurement, weighting, fitter)
+        before, weighting = weighting, weighting.updated(measurement)
+        if weighting.agrees(before):
+            return outcome, weighting
+    message = f"the noise from the residuals did not settle in {ROUNDS} fits"
+    return outcome | {"converged": False, "message": message}, weighting
 
 
-def _run(measurement, weight, fitter):
+def _fit(measurement, weighting, fitter):
     """Fit in place; return whether it arrived, what it said, and how long it took."""
+    index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", AstropyWarning)
         try:
-            # a prior weighs against equal weights as much as the residuals say
-            for _ in range(2 if weight is None and measurement.n_priors else 1):
-                index, observed, weights = measurement.fit_arguments(
-                    weight, prior_noise(measurement, weight)
-                )
-                fitter(
-                    measurement,
-                    index,
-                    observed,
-                    weights=weights,
-                    maxiter=_MAX_EVALUATIONS,
-                    inplace=True,
-                )
+            fitter(
+                measurement,
+                index,
+                observed,
+                weights=weights,
+                maxiter=_MAX_EVALUATIONS,
+                inplace=True,
+            )
         except (ValueError, np.linalg.LinAlgError) as error:
             raise FitError(f"{type(fitter).__name__} failed: {error}") from error
     info = fitter.fit_info if hasattr(fitter, "fit_info") and fitter.fit_info else {}
@@ -249,33 +272,45 @@ def _outside_bounds(measurement):
     """Return the names of parameters that a fitter without bounds left outside of theirs."""
     low, high = measurement.free.bounds()
     vector = measurement.vector()
-    slack = _AT_BOUND * np.maximum(1.0, np.abs(vector))
+    slack = _OUTSIDE * np.maximum(1.0, np.abs(vector))
     outside = (vector < low - slack) | (vector > high + slack)
     return [measurement.free.names[i] for i in np.flatnonzero(outside)]
 
 
-def _joint(measurement, weight, fitter, search):
+def _joint(measurement, weighting, fitter, search):
     """Fit everything; go on as long as some bin finds a better mirror branch."""
-    problem = BinProblem(measurement, weight)
     origin = measurement.vector()
     if search:
-        measurement.parameters = search_branches(problem, origin)[0]
+        measurement.parameters = _first_search(measurement, weighting, origin)
     for left in reversed(range(_MAX_ROUNDS)):
-        outcome = _run(measurement, weight, fitter)
+        outcome, weighting = _run(measurement, weighting, fitter)
         # the last word belongs to the fit of all parameters, not to a search by bin
         if not search or not left:
             break
+        problem = BinProblem(measurement, weighting.weight, _level(weighting))
         better, moved = search_branches(problem, measurement.vector(), origin)
         if not moved.any():
             break
         measurement.parameters = better
-    return outcome
+    return outcome, weighting
+
+
+def _first_search(measurement, weighting, origin):
+    """Return the best branches; where no noise is known yet, first without the priors."""
+    problem = BinProblem(measurement, weighting.weight, _level(weighting))
+    found = search_branches(problem, origin)[0]
+    if weighting.is_known or not problem.has_priors:
+        return found
+    measurement.parameters = found
+    weighting = weighting.started(measurement)
+    problem = BinProblem(measurement, weighting.weight, weighting.level)
+    return search_branches(problem, origin)[0]
 
 
 # ---- the paper's procedure -----------------------------------------------------
 
 
-def _two_step(measurement, weight, fitter, search, options):
+def _two_step(measurement, weighting, fitter, search, options):
     """Per wavelength with misalignments held, then global, then per wavelength again."""
     parts = [dataset.observations for dataset in measurement.datasets]
     single = {slot.name for slot in measurement.free.slots if not slot.per_wavelength}
@@ -287,19 +322,21 @@ def _two_step(measurement, weight, fitter, search, options):
 
     loose = [_loosened(chain, measurement.wavelength * u.um) for chain in measurement.chains]
     first = _step_of(loose, single, parts, ties, options)
-    outcomes = [_joint(first, weight, fitter, search)]
+    outcome, weighting = _joint(first, weighting, fitter, search)
+    outcomes = [outcome]
     stages.append(_stage("per wavelength, misalignments held", first))
     _copy_values(first.put_back(), measurement.chains)
 
     for title, held in (("global", several), ("per wavelength, global parameters held", single)):
         step = _step_of(measurement.chains, held, parts, ties, options)
         if step.free.size:
-            outcomes.append(_run(step, weight, fitter))
+            outcome, weighting = _run(step, weighting, fitter)
+            outcomes.append(outcome)
         stages.append(_stage(title, step))
         _copy_values(step.put_back(), measurement.chains)
     measurement.parameters = measurement.free.start()
     # the first step that did not arrive spoils those behind it
-    return next((o for o in outcomes if not o["converged"]), outcomes[-1]), stages
+    return next((o for o in outcomes if not o["converged"]), outcomes[-1]), weighting, stages
 
 
 def _step_of(chains, held, parts, ties, options):
@@ -343,23 +380,18 @@ def _stage(title, measurement):
 # ---- the result ------------------------------------------------------------------
 
 
-def _result(measurement, weight, *, settings, fit, stages, cross_validate):
+def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     vector = measurement.vector()
-    held = _at_bounds(measurement.free, vector)
-    whitened = measurement.jacobian(vector) * (1.0 if weight is None else weight)
-    priors = measurement.free.prior_jacobian(vector) * prior_noise(measurement, weight)
-    finding, unscaled = analyse(measurement.free, whitened, held, priors)
-    complete(finding, measurement, vector)
-    residuals = measurement.residuals(vector)
-    freedom = max(measurement.n_data - finding.rank, 1)
-    scale = np.sum(residuals**2) / freedom if weight is None else 1.0
+    residuals, level = measurement.residuals(vector), measurement.weighting.level
+    finding = finding_of(measurement.free, whitened)
+    complete(finding, measurement, vector, whitened, level)
     names = measurement.free.names
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
-        covariance=Covariance.from_canonical(measurement.free, unscaled * scale),
+        covariance=covariance_around(measurement, whitened, level),
         identifiability=finding,
-        at_bound=[names[i] for i in np.flatnonzero(held)],
+        at_bound=[names[i] for i in np.flatnonzero(whitened.held)],
         datasets=[_record(measurement, i, residuals) for i in range(len(measurement.datasets))],
         settings=settings,
         fit=fit,
@@ -368,7 +400,6 @@ def _result(measurement, weight, *, settings, fit, stages, cross_validate):
         measurement=measurement,
         provenance=_provenance(),
     )
-    calibration.covariance = full_covariance(calibration)
     calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
     return calibration.cross_validate() if cross_validate else calibration
 
@@ -395,12 +426,6 @@ def _lack_of_fit(calibration):
 
 def _smooth_null(measurement):
     return noise_from_null_channel(measurement, null_model="smooth")
-
-
-def _at_bounds(free, vector):
-    low, high = free.bounds()
-    near = _AT_BOUND * np.maximum(1.0, np.abs(vector))
-    return (vector - low < near) | (high - vector < near)
 
 
 def _record(measurement, i, residuals):

@@ -11,7 +11,8 @@ parameters (``fix=``) or by a prior.
 
 import numpy as np
 
-from astropolcal.calibration.identifiability import null_space, physical_scale
+from astropolcal.calibration.identifiability import physical_scale
+from astropolcal.calibration.weighting import Weighting, around
 from astropolcal.exceptions import FitError
 
 __all__ = ["describe_gauge", "settle"]
@@ -26,18 +27,22 @@ _LONGEST = 2.0
 _SPOILT = 1e-3
 # a parameter is open if it moves by more than this share along an open direction
 _OPEN = 1e-3
+# what changes the data by less than this (for a degree, micrometre, percent) changes none
+_SILENT = 1e-12
 
 
 def settle(problem, weight, origin):
     """
     Move a solution along the directions that no datum sees, to the minimal gauge.
 
+    Directions that a prior closes are not open.
+
     Parameters
     ----------
     problem : BinProblem
         The bins of the fitted measurement; its values are changed.
-    weight : `~numpy.ndarray` or None
-        Weight of each datum.
+    weight : `~numpy.ndarray`, Weighting or None
+        Weight of each datum, or the noise that the fit assumed.
     origin : `~numpy.ndarray`
         Where the fit started, shape (n_free,).
 
@@ -62,35 +67,58 @@ def settle(problem, weight, origin):
     ['calibration_polarizer.theta', 'hwp.theta', 'derotator.theta']
     """
     measurement = problem.measurement
-    vector, chosen = measurement.vector(), []
-    leaders = _leaders(measurement.free)
+    weighting = weight if isinstance(weight, Weighting) else _weighting(measurement, weight)
+    return settled(problem, weighting, origin)[0]
+
+
+def _weighting(measurement, weight):
+    if weight is None:
+        return Weighting(None, np.full(measurement.n_data, np.nan))
+    return Weighting("given", 1 / np.asarray(weight, dtype=float))
+
+
+def settled(problem, weighting, origin):
+    """Settle; return the open parameters and the linear problem around the new solution."""
+    measurement = problem.measurement
+    vector = measurement.vector()
+    scale, leaders = physical_scale(measurement.free), _leaders(measurement.free)
+    whitened = around(measurement, weighting, vector)
     for _ in range(_ROUNDS):
-        null = null_space(measurement.free, _whitened(measurement, vector, weight))
+        null = whitened.together.null
         if not len(null):
             break
-        chosen = _open(measurement.free, null)
-        step = _step(measurement.free, null, leaders, vector - origin)
-        if np.abs(step[leaders] / physical_scale(measurement.free)[leaders]).max() < _SETTLED:
+        step = _step(null, leaders, scale, vector - origin)
+        if np.abs(step[leaders] / scale[leaders]).max() < _SETTLED:
             break
         moved = _move(problem, vector, step)
         if moved is None:
             break
         vector = moved
+        whitened = around(measurement, weighting, vector)
     measurement.parameters = vector
-    return chosen
+    return open_parameters(measurement.free, whitened), whitened
 
 
-def open_parameters(measurement, weight):
+def open_parameters(free, whitened):
     """Return the parameters common to all wavelengths that data and priors leave open."""
-    vector = measurement.vector()
-    jacobian = np.concatenate(
-        [_whitened(measurement, vector, weight), measurement.free.prior_jacobian(vector)], axis=1
-    )
-    return _open(measurement.free, null_space(measurement.free, jacobian))
+    return _open(free, whitened.together.null)
 
 
-def _whitened(measurement, vector, weight):
-    return measurement.jacobian(vector) * (1.0 if weight is None else weight)
+def hold_silent(measurement, origin):
+    """Put back to the start what ended elsewhere although it changes no datum."""
+    vector, scale = measurement.vector(), physical_scale(measurement.free)
+    slopes = np.abs(measurement.jacobian(vector)).max(axis=1, initial=0.0) * scale
+    still = (slopes < _SILENT) & (vector != origin)
+    for slot, prior in measurement.free.priors:
+        still[slot.slice] &= prior.is_flat
+    predicted = measurement.predict(vector)
+    for i in np.flatnonzero(still):
+        trial = vector.copy()
+        trial[i] = origin[i]
+        if np.abs(measurement.predict(trial) - predicted).max() < _SILENT:
+            vector = trial
+    if still.any():
+        measurement.parameters = vector
 
 
 def _open(free, null):
@@ -105,9 +133,8 @@ def _leaders(free):
     return np.array(single if single else range(free.size), dtype=int)
 
 
-def _step(free, null, leaders, moved):
+def _step(null, leaders, scale, moved):
     """Return the step along the open directions that brings the leaders nearest to home."""
-    scale = physical_scale(free)
     along, *_ = np.linalg.lstsq(null[:, leaders].T, -(moved / scale)[leaders], rcond=1e-6)
     step = along @ null
     longest = np.abs(step).max()
@@ -117,11 +144,11 @@ def _step(free, null, leaders, moved):
 def _move(problem, vector, step):
     """Take the step and let the bins follow; None where that spoils the solution."""
     low, high = problem.measurement.free.bounds()
-    before = problem.costs(vector).sum()
+    before = problem.total(vector)
     trial = np.clip(vector + step, low, high)
-    trial, costs = problem.polish(trial, iterations=8, still_gaining=1 - 1e-12)
+    trial, _ = problem.polish(trial, iterations=8, still_gaining=1 - 1e-12)
     # noise-free data are fitted to rounding: there, a share of nothing is nothing
-    spoilt = costs.sum() > (1 + _SPOILT) * before + 1e-12 * problem.measurement.n_data
+    spoilt = problem.total(trial) > (1 + _SPOILT) * before + 1e-12 * problem.measurement.n_data
     return None if spoilt else trial
 
 
@@ -166,7 +193,7 @@ def describe_gauge(gauge, chosen, free, held):
     if not chosen:
         known = "data and priors determine" if free.priors else "the data determine"
         parts.append(f"{known} every free parameter")
-    elif gauge is None or free.priors:
+    elif gauge is None:
         parts.append(f"none for {', '.join(chosen)}: where the fit ended, an accident of its start")
     else:
         parts.append(f"minimal: of all equal fits, the least change of {', '.join(chosen)}")

@@ -9,18 +9,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.table import QTable
-from scipy import stats
+from scipy.special import fdtrc, gammaincc
 
+from astropolcal.calibration.covariance import prior_noise
 from astropolcal.calibration.noise import data_by_wavelength, noise_from_errors
+from astropolcal.calibration.weighting import weighting_of
 from astropolcal.exceptions import FitError
 
 __all__ = ["LackOfFit", "lack_of_fit"]
 
-_AT_BOUND = 1e-5
 # a singular value below this share of the largest belongs to a null direction
 _RANK = 1e-9
 # fewer degrees of freedom than this give no test
 _LEAST_FREEDOM = 0.5
+# what happens by chance less often than this is no chance
+_UNLIKELY = 0.01
 
 
 @dataclass(frozen=True)
@@ -34,12 +37,16 @@ class LackOfFit:
         Columns ``dataset``, ``wavelength``, ``n``, ``chi2``, ``expected``, ``dof``,
         ``chi2_reduced``, ``dof_noise`` and ``p_value``.
     chi2, expected : float
-        Of all data together, and what it is on average if the model is true.
+        Of all data and priors together, and what it is on average if the model
+        is true.
     p_value : float
         Probability of residuals at least as large, were the model true and the
         noise right.
     words : str
         The verdict in a sentence, and what the noise includes.
+    priors : dict or None
+        ``chi2``, ``expected`` and ``p_value`` of the priors alone; None without
+        priors that are not flat.
 
     Examples
     --------
@@ -54,6 +61,7 @@ class LackOfFit:
     expected: float
     p_value: float
     words: str
+    priors: dict | None = None
 
 
 def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=True):
@@ -69,7 +77,10 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     parameters shared by all wavelengths and a fit whose weights are not those of
     the noise are accounted for. Where the noise is estimated, the ratio follows F;
     where it comes from replicates of the same data, their scatter is taken out of
-    the residuals first (Draper & Smith 1998, Sec. 2.1).
+    the residuals first (Draper & Smith 1998, Sec. 2.1). Priors of a fit are data
+    like any other: a row each of r, :math:`\sigma` and J. So a prior that the data
+    overrule adds to chi-square, one that decides what the data leave open adds
+    nothing, and one that a fit heeds leaves more freedom to the data.
 
     Parameters
     ----------
@@ -120,23 +131,35 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     if hasattr(vector, "measurement"):
         vector, weights, fitted = _of_calibration(measurement, vector)
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    table, whole = _test_by_wavelength(measurement, vector, noise, weights, fitted)
-    chi2, expected, p_value = _together(table, whole, noise.dof)
-    return LackOfFit(table, chi2, expected, p_value, _verdict(chi2, expected, p_value, noise))
+    left, right = _low_rank(measurement, vector, noise.sigma_of_data, weights, fitted)
+    table, whole = _test_by_wavelength(measurement, vector, noise, left, right)
+    priors = _test_of_priors(measurement, vector, left, right)
+    chi2, expected, p_value = _together(table, whole, noise.dof, priors)
+    words = _verdict(chi2, expected, p_value, noise, priors)
+    return LackOfFit(table, chi2, expected, p_value, words, priors)
 
 
 def _of_calibration(measurement, calibration):
     fitted = calibration.measurement is measurement
-    by_errors = fitted and calibration.settings.get("weights") == "errors"
-    return measurement.vector(), 1 / measurement.sigma if by_errors else None, fitted
+    return measurement.vector(), weighting_of(calibration).weight if fitted else None, fitted
 
 
-def _test_by_wavelength(measurement, vector, noise, weights, fitted):
+def _test_of_priors(measurement, vector, left, right):
+    """Return chi-square of the priors that were rows of the fit, its mean and probability."""
+    n = measurement.n_data
+    if len(left) == n:
+        return None
+    chi2 = np.sum(measurement.free.prior_residuals(vector) ** 2)
+    mean, dof = _moments(left[n:], right[n:], 0.0)
+    p = _chi2_above(chi2 / mean * dof, dof) if np.isfinite(dof) else np.nan
+    return {"chi2": float(chi2), "expected": float(mean), "p_value": float(p)}
+
+
+def _test_by_wavelength(measurement, vector, noise, left, right):
     """Return the table of the test, and mean and freedom of the whole chi-square."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
     residuals, sigma = measurement.residuals(vector), noise.sigma_of_data
-    left, right = _low_rank(measurement, vector, sigma, weights, fitted)
-    usable = np.isfinite(sigma)
+    usable = np.isfinite(np.append(sigma, np.ones(len(left) - sigma.size)))
     replicates = noise.method == "replicates"
     chi2, mean, dof = np.full((3, len(rows)), np.nan)
     for i, row in enumerate(rows):
@@ -148,7 +171,7 @@ def _test_by_wavelength(measurement, vector, noise, weights, fitted):
     with np.errstate(invalid="ignore"):
         reduced = chi2 / np.where(mean > _LEAST_FREEDOM, mean, np.nan)
         known = np.isinf(noise.dof)
-        p = np.where(known, stats.chi2.sf(reduced * dof, dof), stats.f.sf(reduced, dof, noise.dof))
+        p = np.where(known, _chi2_above(reduced * dof, dof), fdtrc(dof, noise.dof, reduced))
     table = QTable(
         {
             "dataset": numbers,
@@ -166,22 +189,34 @@ def _test_by_wavelength(measurement, vector, noise, weights, fitted):
 
 
 def _low_rank(measurement, vector, sigma, weights, fitted):
-    """Return P and Q of C = 1 + P Q^T, the covariance of residuals over the noise."""
+    """
+    Return P and Q of C = 1 + P Q^T, the covariance of residuals over the noise.
+
+    One row a datum, and behind them one a prior of the fit.
+    """
     nothing = np.zeros((measurement.n_data, 0))
     if not fitted:
         return nothing, nothing
-    low, high = measurement.free.bounds()
-    near = _AT_BOUND * np.maximum(1.0, np.abs(vector))
-    slope = measurement.jacobian(vector)[(vector - low >= near) & (high - vector >= near)].T
+    free = measurement.free
+    level = prior_noise(measurement, weights)
     weights = np.ones(measurement.n_data) if weights is None else np.asarray(weights, float)
+    weights = np.append(weights, np.full(measurement.n_priors, level))
+    slope = np.hstack([measurement.jacobian(vector), free.prior_jacobian(vector)])
+    slope = slope[~free.at_bounds(vector)].T
     scale = np.sqrt(np.sum((slope * weights[:, None]) ** 2, axis=0))
     slope = slope[:, scale > 0] / scale[scale > 0]
     basis, values, _ = np.linalg.svd(slope * weights[:, None], full_matrices=False)
     basis = basis[:, values > _RANK * values.max(initial=0.0)]
     # in units of the noise the hat matrix is a b^T
-    known = np.where(np.isfinite(sigma), sigma, 1.0)
-    a, b = basis / (weights * known)[:, None], basis * (weights * known)[:, None]
+    known = np.append(np.where(np.isfinite(sigma), sigma, 1.0), np.ones(measurement.n_priors))
+    by_noise = (weights * known)[:, None]
+    a, b = basis / by_noise, basis * by_noise
     return np.hstack([a, b]), np.hstack([a @ (b.T @ b) - b, -a])
+
+
+def _chi2_above(chi2, dof):
+    """Return the probability of a larger chi-square; `scipy.stats` takes long to import."""
+    return gammaincc(dof / 2, np.maximum(chi2, 0) / 2)
 
 
 def _moments(left, right, own):
@@ -195,29 +230,34 @@ def _moments(left, right, own):
     return mean, mean**2 / square
 
 
-def _together(table, whole, dof_noise):
-    """Return chi-square, freedom and probability of all wavelengths together."""
+def _together(table, whole, dof_noise, priors):
+    """Return chi-square, freedom and probability of all wavelengths and priors together."""
     p = np.asarray(table["p_value"])
-    p = p[np.isfinite(p)]
     chi2, mean = float(np.nansum(table["chi2"])), float(np.nansum(table["expected"]))
+    if priors is not None:
+        p = np.append(p, priors["p_value"])
+        chi2, mean = chi2 + priors["chi2"], mean + priors["expected"]
+    p = p[np.isfinite(p)]
     if not p.size:
         return chi2, mean, np.nan
     if np.isinf(dof_noise).all():
         mean, dof = whole
-        return chi2, float(mean), float(stats.chi2.sf(chi2 / mean * dof, dof))
+        return chi2, float(mean), float(_chi2_above(chi2 / mean * dof, dof))
     with np.errstate(divide="ignore"):
         fisher = -2 * np.sum(np.log(p))
-    return chi2, mean, float(stats.chi2.sf(fisher, 2 * p.size))
+    return chi2, mean, float(_chi2_above(fisher, 2 * p.size))
 
 
-def _verdict(chi2, expected, p_value, noise):
+def _verdict(chi2, expected, p_value, noise, priors):
     if not np.isfinite(p_value):
         return f"no test: no degree of freedom is left; noise from {noise.method}"
     ratio = np.sqrt(chi2 / expected) if chi2 > 0 else 0.0
-    if p_value < 0.01:
+    if p_value < _UNLIKELY:
         says = f"the residuals are {ratio:.3g} times the noise: the model misses something"
-    elif p_value > 0.99:
+    elif p_value > 1 - _UNLIKELY:
         says = f"the residuals are {ratio:.3g} times the noise: the noise is overestimated"
     else:
         says = "the residuals agree with the noise"
+    if priors is not None and priors["p_value"] < _UNLIKELY:
+        says += f"; the data disagree with the priors (p = {priors['p_value']:.3g})"
     return f"{says} (p = {p_value:.3g}); noise: {noise.words}"

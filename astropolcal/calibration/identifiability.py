@@ -9,9 +9,16 @@ a pseudo-inverse would return a small and wrong number for the others.
 
 from dataclasses import dataclass, field
 
-import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration._directions import (
+    led,
+    near_null_directions,
+    open_directions,
+    sky_words,
+    step_of,
+)
+from astropolcal.calibration._whitened import Whitened, decompose
 from astropolcal.calibration.harmonics import harmonic_words
 from astropolcal.calibration.mirrors import mirror_solutions
 from astropolcal.calibration.sky import sky_consequences
@@ -25,14 +32,8 @@ __all__ = [
     "physical_scale",
 ]
 
-# singular values below this share of the largest count as zero
-_RANK_TOLERANCE = 1e-9
-# and so do those below this: a rounding error, as the error would be 1e12 degrees
-_NOTHING = 1e-12
-# a parameter that moves by less than this share along a null direction stands still
-_STILL = 1e-5
-# what is worth a word in a null direction, as a share of its largest component
-_WORTH_A_WORD = 0.02
+# a direction that is a parameter of its own is that parameter by all but this
+_OWN = 1e-9
 
 
 @dataclass
@@ -59,6 +60,12 @@ class Identifiability:
         Harmonics that the half-wave-plate angles cannot separate.
     mirrors : list of str
         Discrete mirror solutions within the bounds.
+    near_null : list of dict
+        Directions that are determined so badly that it hardly counts: at the
+        noise of the fit some parameter is uncertain by more than 5 deg, 0.05 mm
+        or 5 %, or the singular value is more than 1e4 times below the largest.
+        ``words``, the ``parameters`` with their change at one standard error,
+        and what that is on ``sky`` for the worst six. Priors count as data here.
 
     Examples
     --------
@@ -76,15 +83,23 @@ class Identifiability:
     directions: list = field(default_factory=list)
     sampling: list = field(default_factory=list)
     mirrors: list = field(default_factory=list)
+    near_null: list = field(default_factory=list)
 
     @property
     def n_free(self):
         """Number of free parameters."""
         return len(self.names)
 
+    @property
+    def silent(self):
+        """Names of the parameters that change no datum; a fit leaves them where they start."""
+        own = np.sum(np.reshape(self.null_vectors, (-1, self.n_free)) ** 2, axis=0)
+        return [self.names[i] for i in np.flatnonzero(own > 1 - _OWN)]
+
     def __str__(self):
         lines = [f"The data determine {self.rank} combinations of {self.n_free} free parameters."]
         lines += [f"  - {direction['words']}" for direction in self.directions]
+        lines += [f"  - badly determined: {direction['words']}" for direction in self.near_null]
         lines += [f"  - {words}" for words in self.sampling]
         lines += [f"  - mirror solution: {words}" for words in self.mirrors]
         return "\n".join(lines)
@@ -117,8 +132,7 @@ def null_space(free, jacobian):
     >>> null_space(free, np.zeros((1, 4))).shape
     (1, 1)
     """
-    _, right, rank = _decompose((jacobian * physical_scale(free)[:, None]).T)
-    return right[rank:]
+    return decompose((jacobian * physical_scale(free)[:, None]).T).null
 
 
 def analyse(free, jacobian, held=None, priors=None):
@@ -156,24 +170,21 @@ def analyse(free, jacobian, held=None, priors=None):
     >>> analyse(free, np.ones((1, 4)))[0].rank
     1
     """
-    held = np.zeros(free.size, dtype=bool) if held is None else held
-    scale = physical_scale(free)
-    scaled = (jacobian * scale[:, None]).T
-    singular, right, rank = _decompose(scaled)
-    null = right[rank:]
-    identifiable = (np.abs(null) < _STILL).all(axis=0) & ~held
-    if priors is not None and priors.size:
-        scaled = np.concatenate([scaled, (priors * scale[:, None]).T])
-    covariance = _covariance(scaled, held, scale)
-    finding = Identifiability(
+    whitened = Whitened(jacobian, physical_scale(free), priors, held)
+    return finding_of(free, whitened), whitened.covariance()
+
+
+def finding_of(free, whitened):
+    """Return what the data alone determine, of a problem that is decomposed once."""
+    found = whitened.data
+    return Identifiability(
         names=free.names,
-        rank=rank,
-        singular_values=singular,
-        null_vectors=null,
-        identifiable=identifiable,
-        directions=_directions(free, null),
+        rank=found.rank,
+        singular_values=found.singular,
+        null_vectors=found.null,
+        identifiable=found.determined & ~whitened.held,
+        directions=open_directions(free, found.null),
     )
-    return finding, covariance
 
 
 def examine(measurement, weights=None):
@@ -185,7 +196,8 @@ def examine(measurement, weights=None):
     measurement : Measurement
         Chains and observations; the current values count, so give plausible ones.
     weights : `~numpy.ndarray`, optional
-        Weight of each datum, shape (n_data,).
+        One over the noise of each datum, shape (n_data,). With it the finding
+        tells also what will be determined badly.
 
     Returns
     -------
@@ -209,13 +221,14 @@ def examine(measurement, weights=None):
     >>> finding.rank, finding.n_free
     (91, 93)
     """
-    vector = measurement.vector()
-    jacobian = measurement.jacobian(vector) * (1.0 if weights is None else weights)
-    finding, _ = analyse(measurement.free, jacobian)
-    return complete(finding, measurement, vector)
+    vector, free = measurement.vector(), measurement.free
+    data = measurement.jacobian(vector) * (1.0 if weights is None else weights)
+    whitened = Whitened(data, physical_scale(free), free.prior_jacobian(vector))
+    level = np.nan if weights is None else 1.0
+    return complete(finding_of(free, whitened), measurement, vector, whitened, level)
 
 
-def complete(finding, measurement, vector):
+def complete(finding, measurement, vector, whitened=None, level=1.0):
     """
     Add to a finding what it means on sky, the sampling and the mirror solutions.
 
@@ -227,6 +240,11 @@ def complete(finding, measurement, vector):
         The measurement.
     vector : `~numpy.ndarray`
         The solution, canonical values, shape (n_free,).
+    whitened : Whitened, optional
+        The problem around the solution. With it the directions are added that
+        are determined badly.
+    level : float
+        Noise of a datum of weight one.
 
     Returns
     -------
@@ -250,13 +268,17 @@ def complete(finding, measurement, vector):
     [1.0, 1.0]
     """
     free = measurement.free
-    scaled = [vector for vector, _ in _reduced(free, finding.null_vectors)]
+    scaled = [direction for direction, _ in led(free, finding.null_vectors)]
     canonical = np.array(scaled).reshape(-1, free.size) * physical_scale(free)
     consequences = sky_consequences(measurement, vector, canonical)
     for direction, sky in zip(finding.directions, consequences, strict=True):
         if sky is not None:
             direction["sky"] = sky
-            direction["words"] += _sky_words(sky)
+            direction["words"] += sky_words(sky)
+    if whitened is not None and np.isfinite(level):
+        finding.near_null = near_null_directions(
+            free, whitened, level, lambda changes: sky_consequences(measurement, vector, changes)
+        )
     angles = {
         round(float(angle), 6)
         for dataset in measurement.datasets
@@ -265,42 +287,6 @@ def complete(finding, measurement, vector):
     finding.sampling = harmonic_words(np.array(sorted(angles)))
     finding.mirrors = mirror_solutions(measurement, vector)
     return finding
-
-
-def _sky_words(sky):
-    turn, gain = sky["aolp_deg"], sky["dolp_percent"]
-    return (
-        f"; on sky this turns the AoLP by {_range(turn)} deg and changes the DoLP by "
-        f"{_range(gain)} % of itself"
-    )
-
-
-def _range(span):
-    low, high = span
-    if max(abs(low), abs(high)) < 0.005:
-        return "less than 0.01"
-    return f"{low:+.2g}" if high - low < 0.005 else f"{low:+.2g} to {high:+.2g}"
-
-
-def _decompose(scaled):
-    """Return all singular values, all right vectors, and the rank."""
-    n_data, n_free = scaled.shape
-    _, singular, right = np.linalg.svd(scaled, full_matrices=n_data < n_free)
-    singular = np.pad(singular, (0, n_free - singular.size))
-    threshold = max(_RANK_TOLERANCE * singular.max(initial=0.0), _NOTHING)
-    return singular, right, int(np.sum(singular > threshold))
-
-
-def _covariance(scaled, held, scale):
-    """Return the covariance for unit noise, NaN for what is held or not determined."""
-    live = np.flatnonzero(~held)
-    out = np.full((scale.size, scale.size), np.nan)
-    if live.size:
-        singular, right, rank = _decompose(scaled[:, live])
-        half = right[:rank] / singular[:rank, None] * scale[live]
-        known = (np.abs(right[rank:]) < _STILL).all(axis=0)
-        out[np.ix_(live[known], live[known])] = (half.T @ half)[np.ix_(known, known)]
-    return out
 
 
 def physical_scale(free):
@@ -325,85 +311,5 @@ def physical_scale(free):
     >>> physical_scale(FreeParameters([optics.WollastonPrism(name="wollaston")], 1)).tolist()
     [0.01]
     """
-    kinds = [_step(slot.unit)[0] for slot in free.slots]
+    kinds = [step_of(slot.unit)[0] for slot in free.slots]
     return np.repeat(kinds, [slot.size for slot in free.slots])
-
-
-def _step(unit):
-    """Return the step of a parameter in canonical units, its size and its unit in words."""
-    if unit is None:
-        return 0.01, 0.01, ""
-    if u.Unit(unit).is_equivalent(u.rad):
-        return np.deg2rad(1.0), 1.0, " deg"
-    return 1.0, 1.0, " um"
-
-
-def _directions(free, null):
-    """Rewrite the null directions so that each is led by one parameter; say them in words."""
-    directions = []
-    for vector, lead in _reduced(free, null):
-        moved = {}
-        for slot in free.slots:
-            part = vector[slot.slice] * _step(slot.unit)[1]
-            if np.abs(vector[slot.slice]).max() > _WORTH_A_WORD:
-                moved[slot.name] = part[0] if slot.size == 1 else part
-        directions.append({"words": _words(free, moved, lead), "parameters": _plain(moved)})
-    return directions
-
-
-def _reduced(free, null):
-    """Yield each null vector, led by a parameter that the others do not move."""
-    if not len(null):
-        return
-    leads = _leads(free, null)
-    for vector, lead in zip(np.linalg.solve(null[:, leads], null), leads, strict=True):
-        yield vector, free.names[lead]
-
-
-def _leads(free, null):
-    """Choose a leading parameter for each null direction, those for all wavelengths first."""
-    order = np.argsort(
-        [slot.per_wavelength for slot in free.slots for _ in range(slot.size)], kind="stable"
-    )
-    columns, leads = null.copy(), []
-    while len(leads) < len(null):
-        size = np.linalg.norm(columns, axis=0)
-        single = size[order[: _n_single(free)]]
-        # the first that moves about as much as any: small changes of the data do not reorder
-        pool = order[: _n_single(free)] if single.size and single.max() > 1e-3 else order
-        lead = next(i for i in pool if size[i] > 0.3 * size[pool].max())
-        direction = columns[:, lead] / size[lead]
-        columns -= np.outer(direction, direction @ columns)
-        leads.append(int(lead))
-    return leads
-
-
-def _n_single(free):
-    return sum(not slot.per_wavelength for slot in free.slots)
-
-
-def _words(free, moved, lead):
-    others = [
-        _change(free, name, value) for name, value in moved.items() if name != lead.split("[")[0]
-    ]
-    stem = lead.split("[")[0]
-    step = _step(free.by_name[stem].unit)
-    size = f"{step[1]:g}{step[2]}"
-    if not others:
-        return f"{lead} changes no datum: it cannot be determined"
-    return f"{lead} by +{size} cannot be told from {', '.join(others)}"
-
-
-def _change(free, name, value):
-    unit = _step(free.by_name[name].unit)[2]
-    if np.ndim(value) == 0:
-        return f"{name} by {value:+.3g}{unit}"
-    low, high = np.min(value), np.max(value)
-    return f"{name} by {low:+.3g} to {high:+.3g}{unit} over the wavelengths"
-
-
-def _plain(moved):
-    return {
-        name: float(value) if np.ndim(value) == 0 else [float(v) for v in value]
-        for name, value in moved.items()
-    }

@@ -7,88 +7,15 @@ what `~astropolcal.calibration.sample` hands to the sampler, and good for any
 other one.
 """
 
-import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration.identifiability import physical_scale
-from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.calibration.weighting import given_noise, noise_of, residual_noise
+from astropolcal.exceptions import ParameterError
 
 __all__ = ["LogPosterior", "residual_noise"]
 
-# singular values below this share of the largest count as zero
-_RANK_TOLERANCE = 1e-9
-
-
-def residual_noise(measurement, vector=None):
-    r"""
-    Return the noise of every datum as the scatter of a fit's residuals.
-
-    One level for each wavelength of each dataset,
-    :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)`, where the leverage
-    :math:`h_i`, the derivative of a fitted to its observed datum, sums up to
-    the number of parameters determined: data that the parameters follow
-    closely scatter less than their noise [1]_.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    vector : array_like, optional
-        Fitted canonical values, by default the measurement's.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_data,).
-
-    Raises
-    ------
-    FitError
-        If at some wavelength no datum is left over by the parameters, or the
-        residuals are zero.
-
-    References
-    ----------
-    .. [1] Hoaglin, D. C. & Welsch, R. E. 1978, "The Hat Matrix in Regression
-       and ANOVA", The American Statistician 32, 17, doi:10.2307/2683469
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.calibration import residual_noise
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> bool(residual_noise(cal.measurement).max() < 0.01)
-    True
-    """
-    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    squares = measurement.residuals(vector) ** 2
-    spare = 1 - _leverage(measurement, vector)
-    sigma = np.empty(measurement.n_data)
-    for dataset, segment in zip(measurement.datasets, measurement.segments, strict=True):
-        for bin_ in np.unique(dataset.bin_of_datum):
-            rows = segment.start + np.flatnonzero(dataset.bin_of_datum == bin_)
-            freedom, total = spare[rows].sum(), squares[rows].sum()
-            if freedom < 1 or not total > 0:
-                raise FitError(
-                    f"{dataset.observations.name}, {measurement.wavelength[bin_] * 1e3:.1f} nm: "
-                    f"{rows.size} data leave {max(freedom, 0):.1f} degrees of freedom and an rms "
-                    f"residual of {np.sqrt(total / rows.size):.3g}, which tell no noise; "
-                    "give noise="
-                )
-            sigma[rows] = np.sqrt(total / freedom)
-    return sigma
-
-
-def _leverage(measurement, vector):
-    """Return the diagonal of the hat matrix, shape (n_data,)."""
-    scaled = measurement.jacobian(vector) * physical_scale(measurement.free)[:, None]
-    _, singular, right = np.linalg.svd(scaled, full_matrices=False)
-    return np.sum(right[singular > _RANK_TOLERANCE * singular[0]] ** 2, axis=0)
+FIT = "fit"
 
 
 class LogPosterior:
@@ -102,9 +29,10 @@ class LogPosterior:
     ----------
     measurement : Measurement
         The measurement; its current values are those of the fit.
-    weights : {None, "errors"}
-        ``"errors"`` takes the table's errors as noise. By default the noise is
-        the scatter of the residuals, see `residual_noise`.
+    weights : {"fit", None, "wavelength", "errors"}, NoiseEstimate or array_like
+        Where the noise comes from, as for `calibrate`. By default it is the
+        one that the fit assumed, so that fit and posterior agree; one level
+        from the residuals of all data if no fit is known.
     noise : float, `~astropy.units.Quantity` or array_like, optional
         Noise to use instead: one value, one a wavelength, or one a datum.
     parameters : sequence of str, optional
@@ -115,7 +43,7 @@ class LogPosterior:
     Raises
     ------
     FitError
-        If there is no noise to be had, see `residual_noise`.
+        If there is no noise to be had, see `noise_of`.
     ParameterError
         If a parameter is unknown, fixed or named twice, or the noise has the
         wrong shape or is not positive.
@@ -135,7 +63,7 @@ class LogPosterior:
     (['hwp.w_sio2', 'hwp.w_mgf2'], True)
     """
 
-    def __init__(self, measurement, weights=None, noise=None, parameters=None):
+    def __init__(self, measurement, weights=FIT, noise=None, parameters=None):
         self.measurement = measurement
         free = measurement.free
         low, high = free.bounds()
@@ -153,7 +81,7 @@ class LogPosterior:
         #: Bounds of what varies, canonical.
         self.low, self.high = low[self.sampled], high[self.sampled]
         #: Noise of each datum, shape (n_data,).
-        self.sigma = _sigma(measurement, self.fitted, weights, noise)
+        self.sigma = _sigma(measurement, weights, noise)
 
     @property
     def centre(self):
@@ -210,8 +138,7 @@ class LogPosterior:
         """Return the log density of the priors for each vector, each prior called once."""
         total = np.zeros(len(vectors))
         for slot, prior in self.measurement.free.priors:
-            density = prior.distribution.logpdf(vectors[:, slot.slice] / prior.factor)
-            total += density.sum(axis=1)
+            total += prior.log_densities(vectors[:, slot.slice]).sum(axis=1)
         return total
 
     def whitened_jacobian(self):
@@ -247,31 +174,10 @@ def _elements(free, parameters):
     return np.array(found)
 
 
-def _sigma(measurement, vector, weights, noise):
-    if weights not in (None, "errors"):
-        raise FitError(f"weights = {weights!r}; allowed are None and 'errors'")
+def _sigma(measurement, weights, noise):
+    """Return the noise of every datum: given, that of the fit, or for a choice of weights."""
     if noise is not None:
-        return _given_noise(measurement, noise)
-    if weights is None:
-        return residual_noise(measurement, vector)
-    bad = ~(np.isfinite(measurement.sigma) & (measurement.sigma > 0))
-    if bad.any():
-        raise FitError(f"weights='errors', but {bad.sum()} of {bad.size} data have no error")
-    return measurement.sigma
-
-
-def _given_noise(measurement, noise):
-    try:
-        noise = u.Quantity(noise).to_value(u.dimensionless_unscaled)
-    except (TypeError, u.UnitConversionError):
-        raise ParameterError(f"noise = {noise!r} is not a number, or has a wrong unit") from None
-    if not np.all(np.isfinite(noise) & (noise > 0)):
-        raise ParameterError(f"noise must be positive and finite; the least is {np.min(noise)}")
-    if noise.shape == measurement.wavelength.shape:
-        return noise[measurement.bins]
-    if noise.shape not in ((), (measurement.n_data,)):
-        raise ParameterError(
-            f"noise of shape {noise.shape}; allowed are one value, {len(measurement.wavelength)} "
-            f"(one a wavelength) or {measurement.n_data} (one a datum)"
-        )
-    return np.broadcast_to(noise, measurement.n_data).astype(float)
+        return given_noise(measurement, noise)
+    if isinstance(weights, str) and weights == FIT:
+        weights = measurement.weighting.choice if measurement.weighting is not None else None
+    return noise_of(measurement, weights).sigma

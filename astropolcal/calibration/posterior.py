@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Samples of a posterior: quantiles, covariance, and whether to believe them."""
 
+from dataclasses import asdict
 from functools import cached_property
 
 import astropy.units as u
@@ -8,89 +9,35 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration._optional import need
+from astropolcal.calibration.convergence import (
+    ENOUGH,
+    Convergence,
+    autocorrelation,
+    autocorrelation_time,
+    autocorrelation_times,
+)
 from astropolcal.calibration.covariance import Covariance
 from astropolcal.exceptions import ParameterError
 
-__all__ = ["ENOUGH", "Posterior", "autocorrelation", "autocorrelation_time"]
+__all__ = ["DRAWS", "ENOUGH", "Posterior", "autocorrelation", "autocorrelation_time"]
 
-#: Autocorrelation times that a chain must be long for its quantiles to be trusted.
-ENOUGH = 50
-# lags are summed up to this many times the result (Sokal's window)
-_WINDOW = 5
+#: Samples that a file keeps of each parameter, by default.
+DRAWS = 4000
 # steps left out at the start, in autocorrelation times
 _BURN_IN = 5
-# chains that agree have a smaller R-hat (Vehtari et al. 2021, doi:10.1214/20-BA1221)
-_R_HAT = 1.01
-_KEYS = ("names", "units", "chain", "log_prob", "acceptance", "fitted", "thin", "seed", "settings")
-
-
-def autocorrelation(chain):
-    """
-    Return the autocorrelation of an ensemble, averaged over its walkers.
-
-    Deviations are taken from the mean of all walkers, so that walkers that
-    stay in different places count as correlated.
-
-    Parameters
-    ----------
-    chain : array_like
-        One parameter, shape (n_steps, n_walkers).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        For lags 0 to n_steps - 1; NaN where nothing moves.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.calibration import autocorrelation
-    >>> float(autocorrelation(np.random.default_rng(1).normal(size=(100, 8)))[0])
-    1.0
-    """
-    chain = np.asarray(chain, dtype=float)
-    deviation = chain - chain.mean()
-    n = len(chain)
-    spectrum = np.fft.rfft(deviation, n=2 * n, axis=0)
-    covariance = np.fft.irfft(np.mean(np.abs(spectrum) ** 2, axis=1), n=2 * n)[:n]
-    flat = np.ptp(chain) <= 1e-14 * np.abs(chain).max(initial=0.0)
-    return np.full(n, np.nan) if flat else covariance / covariance[0]
-
-
-def autocorrelation_time(chain):
-    r"""
-    Return the integrated autocorrelation time of an ensemble, in steps.
-
-    :math:`\tau = 1 + 2\sum_{t=1}^{M}\rho(t)` with the smallest window M that
-    is at least :math:`5\tau` [1]_, [2]_.
-
-    Parameters
-    ----------
-    chain : array_like
-        One parameter, shape (n_steps, n_walkers).
-
-    Returns
-    -------
-    float
-        NaN where nothing moves.
-
-    References
-    ----------
-    .. [1] Sokal, A. 1997, "Monte Carlo Methods in Statistical Mechanics",
-       doi:10.1007/978-1-4899-0319-8_6
-    .. [2] Goodman, J. & Weare, J. 2010, CAMCoS 5, 65, doi:10.2140/camcos.2010.5.65
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.calibration import autocorrelation_time
-    >>> noise = np.random.default_rng(1).normal(size=(5000, 8))
-    >>> round(autocorrelation_time(noise), 1)
-    1.0
-    """
-    time = 2 * np.cumsum(autocorrelation(chain)) - 1
-    wide = np.arange(len(time)) >= _WINDOW * time
-    return float(time[np.argmax(wide)] if wide.any() else time[-1])
+_KEYS = (
+    "names",
+    "units",
+    "chain",
+    "log_prob",
+    "acceptance",
+    "fitted",
+    "thin",
+    "seed",
+    "settings",
+    "burn_in",
+    "convergence",
+)
 
 
 class Posterior:
@@ -116,12 +63,18 @@ class Posterior:
     seed : int, optional
         Seed of the random numbers.
     settings : dict, optional
-        How it was made.
+        How it was made: what was sampled, the noise, the priors.
+    burn_in : int, optional
+        Kept steps to leave out at the start, by default 5 autocorrelation
+        times, at most half of all.
+    convergence : Convergence, optional
+        What the whole run says of itself, where the chain is a part of it
+        behind the burn-in.
 
     Raises
     ------
     ParameterError
-        If the shapes differ.
+        If the shapes differ, or the burn-in leaves less than two steps.
 
     Examples
     --------
@@ -146,6 +99,8 @@ class Posterior:
         thin=1,
         seed=None,
         settings=None,
+        burn_in=None,
+        convergence=None,
     ):
         self.names = list(names)
         self.units = [u.Unit(unit) if unit else None for unit in units]
@@ -156,6 +111,10 @@ class Posterior:
         self.thin = int(thin)
         self.seed = seed
         self.settings = dict(settings or {})
+        self._burn_in, self._convergence = burn_in, convergence
+        self._check()
+
+    def _check(self):
         n = len(self.names)
         if self.chain.ndim != 3 or self.chain.shape[2] != n or len(self.units) != n:
             raise ParameterError(
@@ -169,6 +128,16 @@ class Posterior:
         for key, size in (("acceptance", self.chain.shape[1]), ("fitted", n)):
             if getattr(self, key) is not None and getattr(self, key).shape != (size,):
                 raise ParameterError(f"{key} has shape {getattr(self, key).shape}, not ({size},)")
+        if self._convergence is not None and self._convergence.times.size != n:
+            raise ParameterError(
+                f"convergence of {self._convergence.times.size} parameters in a chain of {n}"
+            )
+        most = len(self.chain) - 2
+        if self._burn_in is not None and not 0 <= self._burn_in <= most:
+            raise ParameterError(
+                f"burn_in = {self._burn_in}; allowed are 0 to {most} of {len(self.chain)} kept "
+                f"steps of {self.thin}"
+            )
 
     def __repr__(self):
         steps, walkers, n = self.chain.shape
@@ -177,80 +146,117 @@ class Posterior:
     def __eq__(self, other):
         if not isinstance(other, Posterior):
             return NotImplemented
-        mine, theirs = self.to_dict(), other.to_dict()
-        return all(_equal(mine[key], theirs[key]) for key in _KEYS)
+        return _equal(self.to_dict(), other.to_dict())
 
     __hash__ = None
 
     # ---- convergence -----------------------------------------------------------
 
+    @property
+    def is_thinned(self):
+        """Whether the chain is a part of a run, its burn-in left out already."""
+        return self._convergence is not None
+
     @cached_property
     def burn_in(self):
-        """Kept steps left out at the start: 5 autocorrelation times, at most half of all."""
-        half = len(self.chain) // 2
-        times = self._times(half)
-        longest = np.nanmax(times) if np.isfinite(times).any() else np.inf
-        return int(min(half, np.ceil(_BURN_IN * longest))) if np.isfinite(longest) else half
+        """Kept steps left out at the start."""
+        if self.is_thinned:
+            return 0
+        return self._usual_burn_in() if self._burn_in is None else int(self._burn_in)
 
-    def _times(self, start):
-        return np.array(
-            [autocorrelation_time(self.chain[start:, :, i]) for i in range(len(self.names))]
-        )
+    def _usual_burn_in(self):
+        """Return 5 autocorrelation times, at most half of all."""
+        half = len(self.chain) // 2
+        times = autocorrelation_times(self.chain[half:])
+        if not np.isfinite(times).any():
+            return half
+        return int(min(half, np.ceil(_BURN_IN * np.nanmax(times))))
+
+    @property
+    def steps(self):
+        """Step of the sampler that each kept step is, counted from 1; shape (n_steps,)."""
+        before = self._convergence.burn_in if self.is_thinned else 0
+        return before + self.thin * np.arange(1, len(self.chain) + 1)
 
     @cached_property
     def autocorrelation_times(self):
         """Integrated autocorrelation time of each parameter, in steps of the sampler."""
-        return self._times(self.burn_in) * self.thin
+        if self.is_thinned:
+            return self._convergence.times
+        return autocorrelation_times(self.chain[self.burn_in :]) * self.thin
+
+    @cached_property
+    def convergence(self):
+        """What the whole run says of itself and of each parameter, a ``Convergence``."""
+        if self.is_thinned:
+            return self._convergence
+        return Convergence.of(
+            self.chain, thin=self.thin, burn_in=self.burn_in, times=self.autocorrelation_times
+        )
+
+    @property
+    def n_steps(self):
+        """Length of the run in steps of the sampler, burn-in included."""
+        return self._convergence.n_steps if self.is_thinned else len(self.chain) * self.thin
 
     @property
     def n_times(self):
-        """Length of the chain in the longest autocorrelation times, 0 where nothing moves."""
+        """Length of the run in the longest autocorrelation times, 0 where nothing moves."""
         times = self.autocorrelation_times
-        if not np.isfinite(times).all():
-            return 0.0
-        return float(len(self.chain) * self.thin / times.max())
+        return float(self.n_steps / times.max()) if np.isfinite(times).all() else 0.0
 
     @property
     def converged(self):
-        """Whether the chain is longer than 50 of its longest autocorrelation times."""
-        return self.n_times >= ENOUGH
+        """
+        Whether to believe the samples.
+
+        The run is longer than 50 of its longest autocorrelation times, R-hat
+        is 1.05 or less, and the effective sample sizes are 400 or more; only
+        the first where arviz-stats is not installed.
+        """
+        return self.convergence.converged
 
     def words(self):
         """
-        Return what the chain says about itself.
+        Return what the run says about itself.
 
         Returns
         -------
         str
-            Length, autocorrelation, acceptance; what to do if it is too short.
+            Length, autocorrelation, agreement of the walkers, acceptance; what
+            to do if it has not converged.
         """
-        steps, walkers, n = self.chain.shape
-        times = self.autocorrelation_times
-        lines = [f"{steps * self.thin} steps of {walkers} walkers in {n} parameters."]
-        if not np.isfinite(times).all():
-            stuck = [name for name, time in zip(self.names, times, strict=True) if np.isnan(time)]
-            lines.append(f"NOT CONVERGED: {', '.join(stuck)} did not move.")
-            return "\n".join(lines)
-        slowest = int(np.argmax(times))
-        lines.append(
-            f"The longest autocorrelation time is {times[slowest]:.0f} steps, of "
-            f"{self.names[slowest]}; the chain is {int(self.n_times)} times as long."
-        )
-        if not self.converged:
+        found, times = self.convergence, self.autocorrelation_times
+        what = "1 parameter" if times.size == 1 else f"{times.size} parameters"
+        lines = [f"{self.n_steps} steps of {self.chain.shape[1]} walkers in {what}."]
+        if np.isfinite(times).all():
+            slowest = int(np.argmax(times))
             lines.append(
-                f"NOT CONVERGED: {ENOUGH} times are needed; run {self._wanted()} steps or more."
+                f"The longest autocorrelation time is {times[slowest]:.0f} steps, of "
+                f"{self.names[slowest]}; the chain is {int(self.n_times)} times as long."
             )
+        lines += [line for line in (found.agreement(),) if line]
+        lines += [f"NOT CONVERGED: {reason}." for reason in found.complaints(self.names)]
         if self.acceptance is not None:
             low, high = self.acceptance.min(), self.acceptance.max()
             lines.append(f"The walkers moved in {low:.0%} to {high:.0%} of the steps.")
-        lines.append(f"The first {self.burn_in * self.thin} steps are left out as burn-in.")
+        lines.append(f"The first {found.burn_in} steps are left out as burn-in.")
         return "\n".join(lines)
 
-    def _wanted(self):
-        """Return how many steps would do, to two digits."""
-        needed = ENOUGH * self.autocorrelation_times.max()
-        step = 10 ** max(int(np.floor(np.log10(needed))) - 1, 0)
-        return int(np.ceil(needed / step) * step)
+    def kept_words(self):
+        """
+        Return how much of the run is in the chain.
+
+        Returns
+        -------
+        str
+        """
+        if not self.is_thinned:
+            return "All steps are kept."
+        return (
+            f"Of {self.convergence.n_draws} samples {self.log_prob.size} are kept, one step in "
+            f"{self.thin}; convergence and quantiles are those of all."
+        )
 
     # ---- numbers -----------------------------------------------------------------
 
@@ -312,7 +318,7 @@ class Posterior:
         i = self.index(name)
         if np.any((np.asarray(q) < 0) | (np.asarray(q) > 1)):
             raise ParameterError(f"q = {q}; allowed are numbers from 0 to 1")
-        value = np.quantile(self.samples()[:, i], q)
+        value = np.quantile(self.chain[self.burn_in :, :, i], q)
         return value if self.units[i] is None else value * self.units[i]
 
     @property
@@ -323,59 +329,103 @@ class Posterior:
 
     def summary(self):
         """
-        Return one row a parameter.
+        Return one row a parameter, worked out from all samples behind the burn-in.
 
         Returns
         -------
         `~astropy.table.QTable`
             ``name``, ``unit``, ``median``, 16 % quantile ``lower``, 84 %
             quantile ``upper``, ``std``, autocorrelation time ``tau`` in steps,
-            rank-normalized split ``r_hat`` over the walkers, and bulk
-            effective sample size ``ess``.
+            rank-normalized split ``r_hat`` over the walkers, and effective
+            sample sizes ``ess_bulk`` and ``ess_tail``.
 
         Raises
         ------
         AstropolcalError
-            If arviz-stats is not installed.
+            If arviz-stats is not installed, unless the posterior knows.
         """
-        stats = need("arviz_stats.base", "the summary of a posterior").array_stats
-        lower, median, upper = np.quantile(self.samples(), [0.16, 0.5, 0.84], axis=0)
-        draws = self.chain[self.burn_in :].transpose(2, 1, 0)
-        return QTable(
-            {
-                "name": self.names,
-                "unit": [str(unit or "") for unit in self.units],
-                "median": median,
-                "lower": lower,
-                "upper": upper,
-                "std": self.samples().std(axis=0, ddof=1),
-                "tau": self.autocorrelation_times,
-                "r_hat": [float(stats.rhat(draw)) for draw in draws],
-                "ess": [float(stats.ess(draw)) for draw in draws],
-            }
-        )
+        if self.convergence.r_hat is None:
+            need("arviz_stats.base", "the summary of a posterior")
+        columns = {"name": self.names, "unit": [str(unit or "") for unit in self.units]}
+        keys = ("median", "lower", "upper", "std", "times", "r_hat", "ess_bulk", "ess_tail")
+        columns |= {key: getattr(self.convergence, key) for key in keys}
+        return QTable({"tau" if key == "times" else key: c for key, c in columns.items()})
+
+    def report(self):
+        """
+        Return what is to be told of the posterior, ready for JSON.
+
+        Returns
+        -------
+        dict
+            ``converged``, ``words``, ``n_steps``, ``n_walkers``, ``burn_in``
+            (in steps), ``n_samples`` (behind the burn-in), ``acceptance``
+            (least and largest), ``seed``, ``settings``, and for each of
+            ``parameters`` its ``unit``, ``fitted`` value, ``median``,
+            ``lower``, ``upper``, ``std``, ``autocorrelation_time``,
+            ``r_hat``, ``ess_bulk`` and ``ess_tail``; not-a-number as None.
+        """
+        found = self.convergence
+        columns = {"fitted": self.fitted, "autocorrelation_time": found.times}
+        keys = ("median", "lower", "upper", "std", "r_hat", "ess_bulk", "ess_tail")
+        columns |= {key: getattr(found, key) for key in keys}
+        return {
+            "converged": self.converged,
+            "words": self.words(),
+            "n_steps": self.n_steps,
+            "n_walkers": self.chain.shape[1],
+            "burn_in": found.burn_in,
+            "n_samples": found.n_draws,
+            "acceptance": _ends(self.acceptance),
+            "seed": self.seed,
+            "settings": dict(self.settings),
+            "parameters": {
+                name: {"unit": str(self.units[i] or "")}
+                | {key: _number(column, i) for key, column in columns.items()}
+                for i, name in enumerate(self.names)
+            },
+        }
 
     # ---- files ----------------------------------------------------------------------
 
-    def thinned(self, step):
+    def thinned(self, step=None, *, draws=DRAWS):
         """
-        Return a posterior with every ``step``-th step, for a smaller file.
+        Return a posterior of fewer samples, as files keep it.
+
+        The burn-in is left out. Convergence, and the quantiles that go with
+        it, stay those of the whole run.
 
         Parameters
         ----------
-        step : int
-            At least 1.
+        step : int, optional
+            Which kept steps stay; by default the least that leaves no more
+            than ``draws`` samples of each parameter.
+        draws : int
+            Number of samples, one step of all walkers at least.
 
         Returns
         -------
         Posterior
+
+        Raises
+        ------
+        ParameterError
+            If no step would be left.
         """
-        if step < 1 or step > len(self.chain):
-            raise ParameterError(f"step = {step}; allowed are 1 to {len(self.chain)}")
-        parts = self.to_dict() | {"thin": self.thin * step}
-        for key in ("chain", "log_prob"):
-            parts[key] = parts[key][step - 1 :: step]
-        return Posterior.from_dict(parts)
+        start, walkers = self.burn_in, self.chain.shape[1]
+        left = len(self.chain) - start
+        if step is None:
+            step = int(np.ceil(left / max(draws // walkers, 1)))
+        if step < 1 or step > left:
+            raise ParameterError(f"step = {step}; allowed are 1 to {left}")
+        rows = slice(start + step - 1, None, step)
+        parts = {"chain": self.chain[rows].copy(), "log_prob": self.log_prob[rows].copy()}
+        parts |= {"thin": self.thin * step, "burn_in": None, "convergence": self.convergence}
+        return Posterior(**(self._parts() | parts))
+
+    def _parts(self):
+        parts = {key: getattr(self, key) for key in _KEYS if key not in ("burn_in", "convergence")}
+        return parts | {"burn_in": self._burn_in, "convergence": self._convergence}
 
     def to_dict(self):
         """
@@ -385,10 +435,12 @@ class Posterior:
         -------
         dict
             Keys ``names, units, chain, log_prob, acceptance, fitted, thin,
-            seed, settings``; units as text, empty where there is none.
+            seed, settings, burn_in, convergence``; units as text, empty where
+            there is none, convergence as a dictionary or None.
         """
-        plain = {key: getattr(self, key) for key in _KEYS}
-        return plain | {"units": [str(unit or "") for unit in self.units]}
+        found = None if self._convergence is None else asdict(self._convergence)
+        units = [str(unit or "") for unit in self.units]
+        return self._parts() | {"units": units, "convergence": found}
 
     @classmethod
     def from_dict(cls, parts):
@@ -412,10 +464,22 @@ class Posterior:
         if set(parts) != set(_KEYS):
             odd = sorted(set(parts) ^ set(_KEYS))
             raise ParameterError(f"posterior with missing or unknown {', '.join(odd)}")
-        return cls(**parts)
+        found = parts["convergence"]
+        return cls(**(parts | {"convergence": None if found is None else Convergence(**found)}))
 
 
 def _equal(a, b):
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return np.array_equal(a, b, equal_nan=True)
     return type(a) is type(b) and a == b
+
+
+def _number(column, i):
+    known = column is not None and np.isfinite(column[i])
+    return float(column[i]) if known else None
+
+
+def _ends(values):
+    return None if values is None else [float(values.min()), float(values.max())]

@@ -15,6 +15,7 @@ from astropolcal.chain import (
 )
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement import FreeParameters
+from astropolcal.optics import COORDINATES
 
 __all__ = [
     "derived_data",
@@ -401,7 +402,9 @@ def derived_sky(
 def _sky_chain(chain):
     """Return the optics from the first on a stage: those before belong to the source."""
     found = leaves(chain)
-    first = next((i for i, leaf in enumerate(found) if leaf.stage), None)
+    first = next(
+        (i for i, leaf in enumerate(found) if leaf.stage not in (None, *COORDINATES)), None
+    )
     if first is None:
         raise ChainError("the chain has no optic on a stage; give the chain of the sky observation")
     return join(found[first:])

@@ -166,8 +166,6 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
     >>> bootstrap(cal, n=10, seed=1)
     <Resampled: 10 bootstrap resamples of 5 derotator blocks, 49 parameters>
     """
-    if block not in BLOCKS:
-        raise FitError(f"block = {block!r}; allowed are {', '.join(BLOCKS)}")
     if n < 2:
         raise FitError(f"n = {n}; a bootstrap needs at least 2 resamples")
     refit = Refit(calibration)
@@ -188,13 +186,23 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
     return _result(calibration, refit, np.array(samples), block, groups, rejected)
 
 
+def labels_of(measurement, block):
+    """Return the number of the block of each datum; datasets have their own blocks."""
+    if block not in BLOCKS:
+        raise FitError(f"block = {block!r}; allowed are {', '.join(BLOCKS)}")
+    if block == "derotator":
+        return leave_out_groups(measurement)
+    sizes = [len(dataset.frames) for dataset in measurement.datasets]
+    first = np.cumsum([0, *sizes[:-1]])
+    parts = zip(first, measurement.datasets, strict=True)
+    return np.concatenate([start + dataset.group_of_datum for start, dataset in parts])
+
+
 def _blocks(measurement, block):
     """Return for each dataset its slice of the data and the block of each datum."""
-    groups = leave_out_groups(measurement) if block == "derotator" else None
-    found = []
+    labels, found = labels_of(measurement, block), []
     for dataset, segment in zip(measurement.datasets, measurement.segments, strict=True):
-        labels = dataset.group_of_datum if groups is None else groups[segment]
-        _, numbers = np.unique(labels, return_inverse=True)
+        _, numbers = np.unique(labels[segment], return_inverse=True)
         if numbers.max() + 1 < _FEWEST_BLOCKS:
             raise FitError(
                 f"{dataset.observations.name} has {numbers.max() + 1} {block} blocks; a bootstrap "

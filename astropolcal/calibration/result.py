@@ -1,14 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""The result of a calibration: chains, errors, accuracy, provenance."""
+"""The result of a calibration: chains, errors, accuracy, posterior, provenance."""
 
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.accuracy import accuracy_table, cross_validated_residuals
-from astropolcal.calibration.target_accuracy import groups_by
+from astropolcal.calibration.groups import groups_by
 from astropolcal.chain import leaves
 from astropolcal.exceptions import CalibrationFileError
 
@@ -82,6 +83,9 @@ class Calibration:
         The fitted model; None after reading from a file.
     provenance : dict
         Software versions and time of the fit.
+    posterior : Posterior or None
+        Samples of the parameters' posterior, where `sample` made some. A file
+        keeps some of them, see `~astropolcal.calibration.Posterior.thinned`.
 
     Examples
     --------
@@ -108,6 +112,7 @@ class Calibration:
     stages: list = field(default_factory=list)
     measurement: object = None
     provenance: dict = field(default_factory=dict)
+    posterior: object = None
 
     @property
     def chain(self):
@@ -140,9 +145,56 @@ class Calibration:
         if self.measurement is None:
             raise CalibrationFileError(
                 "this calibration was read from a file, which holds no observations; "
-                "fit or predict them again with measurement_of(observations)"
+                "with_observations(observations) brings back those it was made from, "
+                "measurement_of(observations) predicts others"
             )
         return self.measurement
+
+    def with_observations(self, observations, positions=None):
+        """
+        Return the calibration together with the data that it was made from.
+
+        Parameters
+        ----------
+        observations : Observations or sequence of Observations
+            All of its datasets, in any order. They are recognized by their
+            content, not by their names.
+        positions : dict or sequence of dict, optional
+            Position of every stage for each of them, see
+            `~astropolcal.measurement.Measurement`; by default as the
+            calibration's instrument reads it, or the columns of the tables.
+
+        Returns
+        -------
+        Calibration
+            With ``measurement``, so that residuals, cross-validation and
+            sampling work as before it was written.
+
+        Raises
+        ------
+        CalibrationFileError
+            If a table is missing or is none of the calibration's, or if the
+            residuals are not those of the fit.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal import Calibration, calibrate, instruments
+        >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+        >>> charis = instruments.get("charis")
+        >>> chain = charis.chain(derotator="linear")
+        >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+        >>> data = simulate(chain, charis.wavelength, frames, seed=2)
+        >>> calibrate(chain, data, instrument="charis").write("with_data.asdf")
+        >>> cal = Calibration.read("with_data.asdf").with_observations(data)
+        >>> cal.residuals.size
+        264
+        """
+        from astropolcal.calibration._reunite import measurement_of_all
+
+        measurement = measurement_of_all(self, observations, positions)
+        records = deepcopy(self.datasets)
+        return replace(self, chains=measurement.chains, measurement=measurement, datasets=records)
 
     def measurement_of(self, observations, dataset=0, positions=None):
         """
@@ -202,16 +254,24 @@ class Calibration:
             Itself.
         """
         live = self._live()
+        self.fit.pop("groups", None)
+        if groups is not None:
+            self.fit["groups"] = groups if isinstance(groups, str) else "given"
         if isinstance(groups, str):
             groups = groups_by(live, groups)
         held_out = cross_validated_residuals(live, live.vector(), self._weights(), groups)
         residuals = live.residuals()
         for i, record in enumerate(self.datasets):
-            record.accuracy = accuracy_table(live, i, residuals, held_out)
+            before, record.accuracy = record.accuracy, accuracy_table(live, i, residuals, held_out)
+            if before is not None and "s_standard" in before.colnames:
+                record.accuracy["s_standard"] = before["s_standard"]
         return self
 
     def _weights(self):
-        return 1 / self.measurement.sigma if self.settings.get("weights") == "errors" else None
+        """Return one over the noise of each datum, None where all weigh the same."""
+        from astropolcal.calibration.weighting import weighting_of
+
+        return None if self.settings.get("weights") is None else weighting_of(self).weight
 
     @property
     def accuracy(self):
@@ -359,7 +419,8 @@ class Calibration:
 
     def __repr__(self):
         names = ", ".join(record.name for record in self.datasets)
+        sampled = "" if self.posterior is None else f", {len(self.posterior.names)} sampled"
         return (
             f"<Calibration of {self.instrument or 'an instrument'} from {names}: "
-            f"{len(self.covariance)} free parameters, rank {self.identifiability.rank}>"
+            f"{len(self.covariance)} free parameters, rank {self.identifiability.rank}{sampled}>"
         )

@@ -12,9 +12,11 @@ import warnings
 import numpy as np
 
 from astropolcal.calibration._checkpoint import Chain
+from astropolcal.calibration._ensemble import Laplace, default_moves, move_names, refuse_biased
 from astropolcal.calibration._optional import need
 from astropolcal.calibration.log_posterior import LogPosterior
 from astropolcal.calibration.posterior import ENOUGH, Posterior
+from astropolcal.calibration.weighting import weighting_of
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, FitError
 
@@ -23,9 +25,7 @@ __all__ = ["sample"]
 __doctest_requires__ = {"sample": ["emcee"]}
 
 _FEWEST_WALKERS = 24
-# widest start in a direction that the data hardly determine, in degree, micrometre or percent
-_WIDEST = 0.3
-_MAX_HALVINGS = 60
+_PARAMETERS_A_STEP_KEPT = 20
 
 
 def sample(
@@ -35,7 +35,8 @@ def sample(
     noise=None,
     n_walkers=None,
     n_steps=5000,
-    thin=1,
+    thin=None,
+    burn_in=None,
     seed=None,
     checkpoint=None,
     checkpoint_every=100,
@@ -53,14 +54,18 @@ def sample(
     parameters : sequence of str, optional
         What varies, see `LogPosterior`; by default all free parameters.
     noise : float, `~astropy.units.Quantity` or array_like, optional
-        Noise of the data, see `LogPosterior`; by default the table's errors if
-        the fit was weighted by them, otherwise the scatter of its residuals.
+        Noise of the data, see `LogPosterior`; by default the noise that the
+        fit assumed.
     n_walkers : int, optional
         At least twice the number of parameters (the default, or 24 if more).
     n_steps : int
         Steps of each walker, in total: a run that resumes does what is left.
-    thin : int
-        Every how many steps one is kept.
+    thin : int, optional
+        Every how many steps one is kept, by default a twentieth of the number
+        of parameters.
+    burn_in : int, optional
+        Steps to leave out at the start; by default 5 autocorrelation times, at
+        most half of all.
     seed : int, optional
         Makes the run repeatable.
     checkpoint : path-like, optional
@@ -74,8 +79,10 @@ def sample(
     progress : bool
         Whether to show a progress bar; it appears on a terminal only.
     moves : object or list, optional
-        Moves of emcee. By default its stretch move for up to 10 parameters,
-        and differential evolution with snooker steps for more.
+        Moves of emcee. By default its stretch move for up to 10 parameters;
+        for more a mixture of preconditioned Crank-Nicolson steps around the
+        fit, which are large where the posterior is nearly normal, and of
+        differential evolution.
 
     Returns
     -------
@@ -84,27 +91,30 @@ def sample(
     Warns
     -----
     AstropolcalWarning
-        If the chain is shorter than 50 autocorrelation times.
+        If the chain is shorter than 50 autocorrelation times, or the walkers
+        do not agree.
 
     Raises
     ------
     AstropolcalError
         If emcee, or h5py for a checkpoint, is not installed.
     FitError
-        If the numbers of walkers or steps make no sense, the walkers find no
-        place to start, or the checkpoint belongs to another run, is in use, or
-        cannot be written.
+        If the numbers of walkers or steps make no sense, a move is known to
+        sample wrongly, the walkers find no place to start, or the checkpoint
+        belongs to another run, is in use, or cannot be written.
     CalibrationFileError
-        If the calibration was read from a file, which holds no data.
+        If the calibration was read from a file, which holds no data, and
+        `~astropolcal.Calibration.with_observations` did not bring them back.
 
     Notes
     -----
     The walkers start in a normal ball around the fit, with the covariance of
-    the data and priors where these determine it, and 0.3 deg, micrometre or
-    percent wide where they do not. Method: Foreman-Mackey et al. (2013),
-    doi:10.1086/670067; moves: Goodman & Weare (2010),
-    doi:10.2140/camcos.2010.5.65, and ter Braak & Vrugt (2008),
-    doi:10.1007/s11222-008-9104-9.
+    the data and priors where these determine it to 5 deg, micrometre or
+    percent, and 0.3 of these wide where they do not. Method: Foreman-Mackey
+    et al. (2013), doi:10.1086/670067; moves: Goodman & Weare (2010),
+    doi:10.2140/camcos.2010.5.65, Nelson et al. (2014),
+    doi:10.1088/0067-0049/210/1/11, and Cotter et al. (2013),
+    doi:10.1214/13-STS421.
 
     Examples
     --------
@@ -125,25 +135,45 @@ def sample(
     """
     emcee = need("emcee", "sampling")
     measurement = calibration._live()
-    weights = None if noise is not None else calibration.settings.get("weights")
-    log_posterior = LogPosterior(measurement, weights, noise, parameters)
+    weights = "given" if noise is not None else weighting_of(calibration).choice
+    log_posterior = LogPosterior(measurement, noise=noise, parameters=parameters)
     n = log_posterior.sampled.size
     n_walkers = max(2 * n, _FEWEST_WALKERS) if n_walkers is None else n_walkers
+    thin = max(n // _PARAMETERS_A_STEP_KEPT, 1) if thin is None else thin
     _check(n, n_walkers, n_steps, thin, checkpoint_every)
-    moves = _default_moves(emcee, n) if moves is None else moves
+    left_out = _kept_burn_in(burn_in, n_steps, thin)
+    laplace = Laplace(log_posterior)
+    moves = default_moves(emcee, laplace) if moves is None else moves
+    refuse_biased(moves, emcee.__version__)
     sampler = emcee.EnsembleSampler(n_walkers, n, log_posterior, moves=moves, vectorize=True)
     chain = Chain((n_steps // thin, n_walkers, n), checkpoint_every)
     description, arrays = _fingerprint(log_posterior, n_walkers, thin, moves, seed)
     with chain.open(checkpoint, description, arrays, resume):
-        _run(emcee, sampler, log_posterior, chain, thin, seed, progress)
-    posterior = _result(log_posterior, chain, thin, seed)
-    if not posterior.converged:
-        warnings.warn(
-            f"the chain is shorter than {ENOUGH} autocorrelation times: {posterior.words()}",
-            AstropolcalWarning,
-            stacklevel=2,
-        )
+        _run(emcee, sampler, laplace, chain, thin, seed, progress)
+    settings = _settings(log_posterior, moves, weights, emcee.__version__)
+    posterior = _result(log_posterior, chain, thin, seed, left_out, settings)
+    _warn(posterior)
     return posterior
+
+
+def _warn(posterior):
+    if posterior.converged:
+        return
+    short = posterior.n_times < ENOUGH
+    problem = f"is shorter than {ENOUGH} autocorrelation times" if short else "has not converged"
+    warnings.warn(f"the chain {problem}: {posterior.words()}", AstropolcalWarning, stacklevel=3)
+
+
+def _kept_burn_in(burn_in, n_steps, thin):
+    """Return the number of kept steps to leave out, None for the usual one."""
+    if burn_in is None:
+        return None
+    most = (n_steps // thin - 2) * thin
+    if not isinstance(burn_in, (int, np.integer)) or not 0 <= burn_in <= most:
+        raise FitError(
+            f"burn_in = {burn_in!r}; {n_steps} steps allow whole numbers from 0 to {most}"
+        )
+    return -(-int(burn_in) // thin)
 
 
 def _check(n, n_walkers, n_steps, thin, every):
@@ -159,18 +189,12 @@ def _check(n, n_walkers, n_steps, thin, every):
         )
 
 
-def _default_moves(emcee, n):
-    if n <= 10:
-        return [(emcee.moves.StretchMove(), 1.0)]
-    return [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
-
-
-def _run(emcee, sampler, log_posterior, chain, thin, seed, progress):
+def _run(emcee, sampler, laplace, chain, thin, seed, progress):
     """Advance the walkers until the chain is full."""
     from tqdm import tqdm
 
     total = len(chain.coords) * thin
-    state = _first_state(emcee, log_posterior, chain, sampler.nwalkers, seed)
+    state = _first_state(emcee, laplace, chain, sampler.nwalkers, seed)
     previous, accepted = state.coords.copy(), chain.accepted.copy()
     done = chain.count * thin
     steps = sampler.sample(state, iterations=total - done, store=False)
@@ -186,41 +210,16 @@ def _run(emcee, sampler, log_posterior, chain, thin, seed, progress):
             bar.update()
 
 
-def _first_state(emcee, log_posterior, chain, n_walkers, seed):
+def _first_state(emcee, laplace, chain, n_walkers, seed):
     if chain.count:
         last = chain.count - 1
         return emcee.State(
             chain.coords[last], log_prob=chain.log_prob[last], random_state=chain.random_state
         )
     start, steps = np.random.SeedSequence(seed).spawn(2)
-    coords = _ball(log_posterior, n_walkers, np.random.default_rng(start))
+    coords = laplace.start(n_walkers, np.random.default_rng(start))
     legacy = np.random.RandomState(np.random.MT19937(steps)).get_state()
-    return emcee.State(coords, log_prob=log_posterior(coords), random_state=legacy)
-
-
-def _ball(log_posterior, n_walkers, rng):
-    """Return where the walkers start, shape (n_walkers, n)."""
-    scale = log_posterior.physical_scale()
-    scaled = log_posterior.whitened_jacobian() * scale[:, None]
-    left, singular, _ = np.linalg.svd(scaled)
-    singular = np.pad(singular, (0, scale.size - singular.size))
-    width = 1 / np.maximum(singular, 1 / _WIDEST)
-    offset = (rng.normal(size=(n_walkers, scale.size)) * width) @ left.T * scale
-    return _possible(log_posterior, offset)
-
-
-def _possible(log_posterior, offset):
-    """Return the centre plus offsets, these mirrored at bounds and halved where impossible."""
-    low, high, centre = log_posterior.low, log_posterior.high, log_posterior.centre
-    outside = (centre + offset < low) | (centre + offset > high)
-    offset = np.where(outside, -offset, offset)
-    for _ in range(_MAX_HALVINGS):
-        coords = np.clip(centre + offset, low, high)
-        impossible = ~np.isfinite(log_posterior(coords))
-        if not impossible.any():
-            return coords
-        offset[impossible] /= 2
-    raise FitError("the walkers find no place to start: the fitted values have no probability")
+    return emcee.State(coords, log_prob=laplace.log_posterior(coords), random_state=legacy)
 
 
 # ---- what a checkpoint must agree with -----------------------------------------------
@@ -242,7 +241,7 @@ def _fingerprint(log_posterior, n_walkers, thin, moves, seed):
         "priors": [[slot.name, *_distribution(prior)] for slot, prior in free.priors],
         "n_walkers": int(n_walkers),
         "thin": int(thin),
-        "moves": _move_names(moves),
+        "moves": move_names(moves),
         "seed": seed,
     }
     arrays = {
@@ -273,13 +272,7 @@ def _distribution(prior):
     return frozen.dist.name, repr(frozen.args), repr(sorted(frozen.kwds.items()))
 
 
-def _move_names(moves):
-    weighted = moves if isinstance(moves, list) else [moves]
-    parts = [move if isinstance(move, tuple) else (move, 1.0) for move in weighted]
-    return [[type(move).__name__, float(weight)] for move, weight in parts]
-
-
-def _result(log_posterior, chain, thin, seed):
+def _result(log_posterior, chain, thin, seed, burn_in, settings):
     kept = chain.count
     return Posterior(
         log_posterior.names,
@@ -290,5 +283,37 @@ def _result(log_posterior, chain, thin, seed):
         fitted=log_posterior.centre / log_posterior.factors,
         thin=thin,
         seed=seed,
-        settings={"observable": log_posterior.measurement.observable.name},
+        settings=settings,
+        burn_in=burn_in,
     )
+
+
+def _settings(log_posterior, moves, weights, version):
+    """Return what was sampled and how, as plain values that a file can hold."""
+    free, sigma = log_posterior.measurement.free, log_posterior.sigma
+    sampled = set(log_posterior.names)
+    return {
+        "observable": log_posterior.measurement.observable.name,
+        "held": [name for name in free.names if name not in sampled],
+        "noise": {
+            "from": weights or "one level",
+            "least": float(sigma.min()),
+            "median": float(np.median(sigma)),
+            "largest": float(sigma.max()),
+        },
+        "priors": [_prior(slot, prior) for slot, prior in free.priors],
+        "moves": move_names(moves),
+        "emcee": version,
+    }
+
+
+def _prior(slot, prior):
+    name, *_ = _distribution(prior)
+    frozen = prior.distribution
+    return {
+        "parameter": slot.name,
+        "unit": str(slot.unit or ""),
+        "distribution": name,
+        "mean": float(frozen.mean()),
+        "std": float(frozen.std()),
+    }

@@ -9,7 +9,8 @@ sky light passes begins with the first optic on a stage.
 
 import numpy as np
 
-from astropolcal.chain import join, leaves
+from astropolcal.chain import join, leaves, stages
+from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 
 __all__ = ["sky_consequences"]
@@ -88,12 +89,14 @@ def _rows(measurement, vector, derotators):
     """Return what the double differences see of q and u, (n_wavelengths, n_data, 2)."""
     chain = measurement.put_back(vector)[0]
     optics = leaves(chain)
-    first = next(i for i, leaf in enumerate(optics) if leaf.stage)
+    first = next(i for i, leaf in enumerate(optics) if leaf.stage not in (None, *COORDINATES))
     sky = join(optics[first:])
     n_angles = max((len(a) for a in derotators.values()), default=1)
     positions = {"hwp": np.tile(_CYCLE, n_angles)}
     for stage, angle in derotators.items():
         positions[stage] = np.repeat(np.resize(angle, n_angles), len(_CYCLE))
+    # where a frame's number is zero, an optic that depends on it does nothing
+    positions |= {stage: np.zeros(1) for stage in stages(sky) if stage in COORDINATES}
     wavelength = measurement.wavelength
     columns = []
     for q, u in ((1.0, 0.0), (0.0, 1.0)):

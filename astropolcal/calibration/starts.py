@@ -32,6 +32,9 @@ class BinProblem:
         The measurement.
     weights : `~numpy.ndarray`, optional
         Weight of each datum, shape (n_data,).
+    noise : float
+        Noise of a datum of weight one, against which priors weigh; zero leaves
+        them out.
 
     Examples
     --------
@@ -48,7 +51,7 @@ class BinProblem:
     (22,)
     """
 
-    def __init__(self, measurement, weights=None):
+    def __init__(self, measurement, weights=None, noise=1.0):
         self.measurement = measurement
         self.weights = np.ones(measurement.n_data) if weights is None else np.asarray(weights)
         self.n_bins = len(measurement.wavelength)
@@ -60,6 +63,16 @@ class BinProblem:
         self.elements = starts[:, None] + np.arange(self.n_bins)
         low, high = measurement.free.bounds()
         self._low, self._high = low[self.elements], high[self.elements]
+        self._noise = noise
+        rows = {slot.name: row for row, slot in enumerate(self.slots)}
+        tight = [(slot, prior) for slot, prior in measurement.free.priors if not prior.is_flat]
+        self._priors = [(rows[slot.name], prior) for slot, prior in tight if slot.name in rows]
+        self._common = [(slot, prior) for slot, prior in tight if slot.name not in rows]
+
+    @property
+    def has_priors(self):
+        """Whether priors that are not flat enter the costs of the bins."""
+        return bool(self._priors)
 
     def residuals(self, vector):
         """Return weighted residuals by bin, zero where a bin has fewer data."""
@@ -67,15 +80,30 @@ class BinProblem:
         return residual[self._data] * self._present
 
     def costs(self, vector):
-        """Return half the sum of squares of each bin, shape (n_bins,)."""
-        return 0.5 * np.sum(self.residuals(vector) ** 2, axis=1)
+        """Return half the sum of squares of each bin, of data and priors, shape (n_bins,)."""
+        costs = 0.5 * np.sum(self.residuals(vector) ** 2, axis=1)
+        for row, prior in self._priors:
+            costs += 0.5 * (self._noise * prior.residual(vector[self.elements[row]])) ** 2
+        return costs
+
+    def total(self, vector):
+        """Return half the sum of squares of all data and priors."""
+        common = [prior.residual(vector[slot.slice]) for slot, prior in self._common]
+        return self.costs(vector).sum() + 0.5 * self._noise**2 * sum(np.sum(r**2) for r in common)
 
     def _normal_equations(self, vector):
         jacobian = self.measurement.jacobian(vector) * self.weights
         blocks = jacobian[self.elements.T[:, :, None], self._data[:, None, :]]
         blocks *= self._present[:, None, :]
         residual = self.residuals(vector)
-        return blocks @ np.swapaxes(blocks, 1, 2), np.einsum("bsd,bd->bs", blocks, residual)
+        normal = blocks @ np.swapaxes(blocks, 1, 2)
+        gradient = np.einsum("bsd,bd->bs", blocks, residual)
+        for row, prior in self._priors:
+            value = vector[self.elements[row]]
+            slope = self._noise * prior.slope(value)
+            normal[:, row, row] += slope**2
+            gradient[:, row] += slope * self._noise * prior.residual(value)
+        return normal, gradient
 
     def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING):
         """

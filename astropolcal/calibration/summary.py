@@ -6,13 +6,17 @@ import textwrap
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration.groups import what_is_left_out
+from astropolcal.calibration.target_accuracy import TARGETS, target_accuracies
+
 __all__ = ["summary", "to_dict"]
 
 _WIDTH = 80
 _N_COLUMNS = 5
+_ACCURACIES = ("s_res", "s_mean", "s_cv", "s_standard")
 
 
-def summary(calibration):
+def summary(calibration, targets=TARGETS):
     """
     Return a calibration as text of at most 80 columns.
 
@@ -20,6 +24,9 @@ def summary(calibration):
     ----------
     calibration : Calibration
         The calibration.
+    targets : sequence of (dolp, aolp)
+        Targets whose accuracy is given, see
+        `~astropolcal.calibration.target_accuracies`.
 
     Returns
     -------
@@ -45,11 +52,15 @@ def summary(calibration):
         _heading(calibration),
         _global_lines(known),
         *(_accuracy_lines(record) for record in calibration.datasets),
+        _accuracy_words(calibration),
+        *(_standard_lines(entry) for entry in calibration.fit.get("standards", [])),
+        _target_lines(calibration, targets),
         _wavelength_lines(calibration, known),
         _goodness_lines(calibration),
         list(_wrap([str(calibration.identifiability)])),
         _gauge_lines(calibration),
         _bound_lines(calibration),
+        _posterior_lines(calibration),
     ]
     return "\n\n".join("\n".join(part) for part in parts if part)
 
@@ -95,25 +106,102 @@ def _global_lines(known):
 
 def _accuracy_lines(record):
     table = record.accuracy
-    lines = [
-        f"Accuracy on {record.name}, in percent of polarization",
-        f"  {'':<10}{'s_res':>10}{'s_mean':>10}{'s_cv':>10}",
-    ]
-    for label, function in (("median", np.median), ("best", np.min), ("worst", np.max)):
-        values = [_of(table[column].value, function) for column in ("s_res", "s_mean", "s_cv")]
-        lines.append(f"  {label:<10}" + "".join(values))
-    lines += [
-        "  s_res: residuals, corrected for the parameters fitted; s_mean: s_res/sqrt(n),",
-        "  the paper's s_rel; s_cv: rms error on derotator angles left out of the fit",
-    ]
     masked = f", {record.n_masked} cells masked" if record.n_masked else ""
-    lines.append(f"  ({record.n_frames} frames x {len(table)} wavelengths{masked})")
-    return lines
+    return [
+        f"Accuracy on {record.name}, in percent of polarization",
+        *_rows({name: _percent(table, name) for name in _ACCURACIES}),
+        f"  ({record.n_frames} frames x {len(table)} wavelengths{masked})",
+    ]
+
+
+def _accuracy_words(calibration):
+    lines = [
+        "  s_res: residuals, corrected for the parameters fitted; s_mean: s_res/sqrt(n), the "
+        "paper's s_rel",
+        f"  s_cv: rms error on {what_is_left_out(calibration)} left out of the fit",
+        "  s_standard: rms error on datasets that the fit never saw"
+        + ("" if calibration.fit.get("standards") else " (none given)"),
+    ]
+    return list(_wrap(lines))
+
+
+def _percent(table, name):
+    # files that were written before a column existed do not have it
+    return table[name].value if name in table.colnames else np.full(len(table), np.nan)
+
+
+def _rows(columns):
+    """Return median, best and worst of each column, under their names."""
+    head = f"  {'':<10}" + "".join(f"{name:>11}" for name in columns)
+    rows = [
+        f"  {label:<10}" + "".join(f" {_of(np.abs(v), function)}" for v in columns.values())
+        for label, function in (("median", np.median), ("best", np.min), ("worst", np.max))
+    ]
+    return [head, *rows]
 
 
 def _of(values, function):
     known = values[np.isfinite(values)]
     return f"{function(known):10.3f}" if known.size else f"{'-':>10}"
+
+
+def _standard_lines(entry):
+    columns = {
+        "s_standard": entry["s_standard_percent"],
+        "|bias|": entry["bias_percent"],
+        "scatter": entry["scatter_percent"],
+        "s_cv": entry["s_cv_percent"],
+        "/ s_cv": entry["chi"],
+    }
+    lines = [
+        f"Prediction of {entry['name']} (not fitted), in percent",
+        *_rows({name: np.array(values, dtype=float) for name, values in columns.items()}),
+        f"  {entry['words']} ({entry['n_frames']} frames x {len(entry['n'])} wavelengths)",
+    ]
+    return list(_wrap(lines))
+
+
+def _target_lines(calibration, targets):
+    """Return a table with one row a target: median and worst of the wavelengths."""
+    tables = target_accuracies(calibration, targets)
+    if not tables:
+        return []
+    meta = tables[0].meta
+    known = [_known_of(key, tables[0][key].value) for key in ("s_rel", "s_abs")]
+    heads = ("s_Q", "s_U", "s_p", "(worst)", "s_chi", "(worst)")
+    lines = [
+        "Accuracy for a target in percent, s_chi in deg, median over the wavelengths",
+        f"  {'DoLP':>6}{'AoLP':>10}" + "".join(f"{name:>10}" for name in heads),
+        *(_target_row(table) for table in tables),
+        f"  from {', '.join(known)}; {meta['words']}",
+    ]
+    if any(table.meta["aolp"] is None for table in tables):
+        lines.append("  AoLP any: at whichever angle the accuracy is worst")
+    return list(_wrap(lines))
+
+
+def _target_row(table):
+    angle = table.meta["aolp"]
+    dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
+    row = f"  {dolp:4.3g} %" + (
+        f"{'any':>10}" if angle is None else f"{angle.to_value(u.deg):10.4g}"
+    )
+    for key in ("s_Q", "s_U", "s_p", "s_chi"):
+        worst = (np.max,) if key in ("s_p", "s_chi") else ()
+        for function in (np.median, *worst):
+            row += f"{_short(table[key].value, function):>10}"
+    return row
+
+
+def _short(values, function):
+    known = values[~np.isnan(values)]
+    return f"{function(known):.2g}" if known.size else "-"
+
+
+def _known_of(key, values):
+    if np.isnan(values).all():
+        return f"{key} unknown"
+    return f"{key} {_short(values, np.median)} % (worst {_short(values, np.max)} %)"
 
 
 def _wavelength_lines(calibration, known):
@@ -168,10 +256,18 @@ def _bound_lines(calibration):
     return list(_wrap([f"At a bound, so without an error: {', '.join(calibration.at_bound)}"]))
 
 
+def _posterior_lines(calibration):
+    if calibration.posterior is None:
+        return []
+    return list(
+        _wrap(["Posterior", *(f"  {s}" for s in calibration.posterior.words().split("\n"))])
+    )
+
+
 # ---- for machines ------------------------------------------------------------------
 
 
-def to_dict(calibration):
+def to_dict(calibration, targets=TARGETS):
     """
     Return a calibration as plain numbers, lists and strings, ready for JSON.
 
@@ -179,13 +275,16 @@ def to_dict(calibration):
     ----------
     calibration : Calibration
         The calibration.
+    targets : sequence of (dolp, aolp)
+        Targets whose accuracy is given, see
+        `~astropolcal.calibration.target_accuracies`.
 
     Returns
     -------
     dict
         Keys ``instrument, observable, fitter, strategy, seconds, n_data,
-        n_free, rank, converged, datasets, parameters, null_directions``;
-        what is not a number is None.
+        n_free, rank, converged, datasets, standards, targets, parameters,
+        null_directions`` and others; what is not a number is None.
 
     Examples
     --------
@@ -215,13 +314,18 @@ def to_dict(calibration):
         "rank": calibration.identifiability.rank,
         "lack_of_fit": _plain(fit.get("lack_of_fit") or []),
         "datasets": [_dataset(record) for record in calibration.datasets],
+        "left_out": what_is_left_out(calibration),
+        "standards": [_standard(entry) for entry in fit.get("standards", [])],
+        "targets": [_target(table) for table in target_accuracies(calibration, targets)],
         "parameters": {
             name: _parameter(entry) for name, entry in calibration.parameter_values().items()
         },
         "null_directions": calibration.identifiability.directions,
+        "near_null_directions": calibration.identifiability.near_null,
         "sampling": list(calibration.identifiability.sampling),
         "mirror_solutions": list(calibration.identifiability.mirrors),
         "at_bound": list(calibration.at_bound),
+        "posterior": calibration.posterior and calibration.posterior.report(),
         "stages": [_plain(stage) for stage in calibration.stages],
         "provenance": dict(calibration.provenance),
     }
@@ -238,7 +342,25 @@ def _dataset(record):
         "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
         "n": _plain(table["n"]),
         "k": _plain(table["k"]),
-        **{f"{key}_percent": _plain(table[key].value) for key in ("s_res", "s_mean", "s_cv")},
+        **{f"{key}_percent": _plain(_percent(table, key)) for key in _ACCURACIES},
+    }
+
+
+def _standard(entry):
+    # nothing is fitted to a standard: with k = 0 its s_res is the error of prediction
+    return _plain(entry) | {"s_res_percent": _plain(entry["s_standard_percent"])}
+
+
+def _target(table):
+    angle = table.meta["aolp"]
+    shares = [key for key in table.colnames if key not in ("wavelength", "s_chi")]
+    return {
+        "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
+        "aolp_deg": None if angle is None else float(angle.to_value(u.deg)),
+        "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
+        **{f"{key}_percent": _plain(table[key].value) for key in shares},
+        "s_chi_deg": _plain(table["s_chi"].value),
+        **{key: table.meta[key] for key in ("column", "missing", "words")},
     }
 
 

@@ -10,28 +10,32 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration.accuracy import (
-    accuracy_table,
-    cross_validated_residuals,
-    leave_out_groups,
-)
+from astropolcal.calibration.accuracy import accuracy_table, cross_validated_residuals
+from astropolcal.calibration.groups import GROUPS, groups_by
+from astropolcal.calibration.standards import refuse_fitted
+from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.optics import LinearPolarizer
 from astropolcal.units import angle_to_rad
 
 __all__ = [
+    "GROUPS",
     "absolute_accuracy",
     "four_accuracies",
     "groups_by",
     "propagate_accuracy",
+    "target_accuracies",
     "target_accuracy",
 ]
 
-GROUPS = ("derotator", "cycle", "dataset")
+#: Degrees and angles of polarization that are reported; an angle of None is any.
+TARGETS = ((1 * u.percent, None), (30 * u.percent, None))
+
 _COLUMNS = ("s_mean", "s_res", "s_cv")
 _CALIBRATIONS = {"polarized": "s_rel", "unpolarized": "s_unpol", "on_sky": "s_sky"}
-_SAME_ANGLE = np.deg2rad(0.5)
-_PLATE_STEPS = np.deg2rad(0.3)
+# where s_Q, s_U, s_p and s_chi are largest: between these angles each rises or falls steadily
+_EXTREMES = (0.0, 22.5, 45.0) * u.deg
 
 
 # ---- a target of any polarization ---------------------------------------------------------
@@ -121,7 +125,9 @@ def propagate_accuracy(dolp, aolp, s_rel, s_abs):
 
 def _fraction(name, value, limit=np.inf):
     number = np.asarray(u.Quantity(value).to_value(u.one), dtype=float)
-    if np.any(number < 0) or np.any(number > limit) or np.any(np.isinf(number)):
+    # an accuracy may be unknown, a target may not
+    unknown = np.isnan(number).any() and np.isfinite(limit)
+    if unknown or np.any(number < 0) or np.any(number > limit) or np.any(np.isinf(number)):
         allowed = "0 to 1 (0 to 100 %)" if np.isfinite(limit) else "numbers from 0"
         raise ParameterError(f"{name} = {value}; allowed are {allowed}")
     return number
@@ -163,7 +169,7 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     --------
     >>> import astropy.units as u
     >>> from astropy.table import QTable
-    >>> from astropolcal.calibration import target_accuracy
+    >>> from astropolcal.calibration.target_accuracy import target_accuracy
     >>> lam = [1.2, 1.6] * u.um
     >>> lamp = QTable({"wavelength": lam, "s_mean": [0.10, 0.05] * u.percent})
     >>> star = QTable({"wavelength": lam, "s_mean": [0.03, 0.02] * u.percent})
@@ -224,111 +230,102 @@ def _words(column, missing):
     return f"by {column}; without the calibration {lacking}: the accuracies are lower limits"
 
 
-# ---- four accuracies ------------------------------------------------------------------------
-
-
-def groups_by(measurement, by="derotator"):
+def target_accuracies(calibration, targets=TARGETS, column="s_mean"):
     """
-    Return the group of each datum for cross-validation.
+    Return the accuracy of a calibration for several targets, per wavelength.
+
+    Which datasets give s_rel, s_unpol and s_sky follows from their sources; several
+    of one kind count by the rms of their accuracies.
 
     Parameters
     ----------
-    measurement : Measurement
-        The measurement.
-    by : {"derotator", "cycle", "dataset"}
-        A group is a derotator angle of a dataset; a cycle of the half-wave
-        plate; or a whole dataset (a night). A cycle is the column ``cycle`` of the
-        frames where there is one; otherwise it ends where a plate angle
-        (of one state of a modulator) comes again or the derotator moves. A
-        datum belongs to the cycle of its plus frame.
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    targets : sequence of (dolp, aolp)
+        Degree and angle of linear polarization of each, as for `target_accuracy`. An
+        angle of None stands for any: the accuracies are then the largest over all
+        angles.
+    column : {"s_mean", "s_res", "s_cv"}
+        Which accuracy of the calibration to take.
 
     Returns
     -------
-    `~numpy.ndarray` of int
-        Shape (n_data,); numbered from 0.
+    list of `~astropy.table.QTable`
+        As `target_accuracy` gives them, one a target, with ``dolp`` and ``aolp`` in the
+        meta; none if no dataset is of a known kind.
 
     Raises
     ------
-    FitError
-        If a group has a single member at each wavelength, or there is one
-        group only, or no such way of grouping.
+    ParameterError
+        If a target is impossible or there is no such column.
 
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.calibration import groups_by
-    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration.target_accuracy import target_accuracies
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 60] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames)
-    >>> measurement = Measurement(charis.chain(), observations)
-    >>> [int(groups_by(measurement, by).max()) for by in ("derotator", "cycle")]
-    [1, 2]
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> (table,) = target_accuracies(cal, [(30 * u.percent, 50 * u.deg)])
+    >>> table.meta["missing"]
+    ['unpolarized', 'on_sky']
     """
-    if by not in GROUPS:
-        raise FitError(f"groups by {by!r}; allowed are {', '.join(GROUPS)}")
-    groups = leave_out_groups(measurement) if by == "derotator" else _groups(measurement, by)
-    names = _members(measurement, groups, by)
-    if len(names) < 2:
-        raise FitError(f"cross-validation by {by}: all data are in one group, {names[0][0]}")
-    for name, count in names:
-        if count < 2:
-            raise FitError(
-                f"cross-validation by {by}: group {name} has a single member; at least 2 data a "
-                "wavelength are needed, group by something else or leave it out"
-            )
-    return groups
-
-
-def _groups(measurement, by):
-    groups, first = [], 0
-    for part in measurement.datasets:
-        number = np.zeros(len(part.frames), dtype=int)
-        if by == "cycle":
-            number = _cycles(part.observations)[part.frames[:, 0]]
-        number = np.unique(number, return_inverse=True)[1]
-        groups.append(first + number[part.group_of_datum])
-        first += int(number.max()) + 1
-    return np.concatenate(groups)
-
-
-def _cycles(observations):
-    """Return the number of the half-wave-plate cycle of every frame."""
-    frames = observations.frames
-    if "cycle" in frames.colnames:
-        return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
-    plate = np.rint(np.mod(observations.position("hwp"), np.pi) / _PLATE_STEPS).astype(int)
-    # 180 deg is 0 deg again
-    plate %= round(np.pi / _PLATE_STEPS)
-    state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
-    moved = np.abs(np.diff(observations.position("derotator"), prepend=0.0)) > _SAME_ANGLE
-    cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
-    for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
-        if i and (moved[i] or key in seen):
-            number, seen = number + 1, set()
-        seen.add(key)
-        cycle[i] = number
-    return cycle
-
-
-def _members(measurement, groups, by):
-    """Return name and largest number of data at one wavelength of every group."""
+    tables = _tables_of_kinds(calibration, column)
     found = []
-    for i, (part, where) in enumerate(zip(measurement.datasets, measurement.segments, strict=True)):
-        angle = np.rad2deg(part.observations.position("derotator"))[part.frames[:, 0]]
-        own, bins = groups[where], measurement.bins[where]
-        for k, label in enumerate(np.unique(own)):
-            rows = own == label
-            what = {
-                "derotator": f"{angle[part.group_of_datum[rows][0]]:g} deg",
-                "cycle": f"number {k}",
-                "dataset": f"number {i}",
-            }[by]
-            count = int(np.bincount(bins[rows]).max())
-            found.append((f"{by} {what} of {part.observations.name}", count))
+    for dolp, aolp in targets:
+        propagate_accuracy(dolp, 0 * u.deg if aolp is None else aolp, 0.0, 0.0)
+        if not tables:
+            continue
+        angles = _EXTREMES if aolp is None else [aolp]
+        each = [target_accuracy(dolp, angle, **tables, column=column) for angle in angles]
+        for key in ("s_Q", "s_U", "s_p", "s_chi"):
+            each[0][key] = np.max([table[key].value for table in each], axis=0) * each[0][key].unit
+        each[0].meta |= {"dolp": dolp, "aolp": aolp}
+        found.append(each[0])
     return found
+
+
+def _kind(source, chain):
+    """Return which of the three calibrations a dataset belongs to, or None."""
+    words = (source or "").lower()
+    if "star" in words or "sky" in words:
+        return "on_sky" if "unpolarized" in words else None
+    if "polarized" in words:
+        return "unpolarized" if "unpolarized" in words else "polarized"
+    # a table that does not say it; a polarizer in front does
+    return "polarized" if isinstance(leaves(chain)[0], LinearPolarizer) else None
+
+
+def _tables_of_kinds(calibration, column):
+    """Return the accuracies of each kind of dataset on the calibration's wavelengths."""
+    grid = calibration.wavelength
+    squares = {}
+    for record, chain in zip(calibration.datasets, calibration.chains, strict=True):
+        kind = _kind(record.source, chain)
+        if kind is None or record.accuracy is None:
+            continue
+        own = record.accuracy["wavelength"]
+        value = _values(kind, record.accuracy, column, own).value
+        row = np.full(grid.size, np.nan)
+        row[np.abs(own[:, None] - grid).argmin(axis=1)] = value**2
+        squares.setdefault(kind, []).append(row)
+    return {
+        kind: QTable({"wavelength": grid, column: np.sqrt(_mean(rows)) * u.percent})
+        for kind, rows in squares.items()
+    }
+
+
+def _mean(rows):
+    """Return the mean of the known values of each column, NaN where there are none."""
+    known = np.isfinite(rows)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(known, rows, 0.0).sum(axis=0) / known.sum(axis=0)
+
+
+# ---- four accuracies ------------------------------------------------------------------------
 
 
 def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
@@ -348,7 +345,8 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     standard : Observations or Measurement, optional
         The dataset the fit never saw: observations with the set-up of
         ``dataset``, or a measurement with a chain of its own, at its current
-        parameters.
+        parameters. By default those that the calibration remembers, see
+        `~astropolcal.calibration.add_standard`.
     dataset : int
         Which dataset of the calibration.
     groups : {"derotator", "cycle", "dataset"} or `~numpy.ndarray`, optional
@@ -384,8 +382,10 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     if groups is not None:
         table = _cross_validated(calibration, dataset, groups)
     result = table["wavelength", "s_res", "s_mean", "s_cv"].copy()
-    name = None
-    result["s_standard"] = np.full(len(result), np.nan) * u.percent
+    record = calibration.datasets[dataset]
+    result["s_standard"] = _remembered(record)
+    known = [s for s in calibration.fit.get("standards", []) if s["source"] == record.source]
+    name = ", ".join(entry["name"] for entry in known) or None
     if standard is not None:
         measurement = _independent(calibration, standard, dataset)
         name = ", ".join(part.observations.name for part in measurement.datasets)
@@ -395,14 +395,19 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     return result
 
 
+def _remembered(record):
+    # files that were written before the column existed do not have it
+    table = record.accuracy
+    unknown = np.full(len(table), np.nan) * u.percent
+    return table["s_standard"] if "s_standard" in table.colnames else unknown
+
+
 def _cross_validated(calibration, dataset, groups):
     # residuals refuses a calibration without data in words of its own
     residuals, live = calibration.residuals, calibration.measurement
     if isinstance(groups, str):
         groups = groups_by(live, groups)
-    by_errors = calibration.settings.get("weights") == "errors"
-    weights = 1 / live.sigma if by_errors else None
-    held_out = cross_validated_residuals(live, live.vector(), weights, groups)
+    held_out = cross_validated_residuals(live, live.vector(), calibration._weights(), groups)
     if np.isnan(held_out).all():
         raise FitError(f"{np.unique(groups).size} groups are too few for cross-validation")
     return accuracy_table(live, dataset, residuals, held_out)
@@ -413,13 +418,8 @@ def _independent(calibration, standard, dataset):
     measurement = standard
     if not hasattr(standard, "datasets"):
         measurement = calibration.measurement_of(standard, dataset)
-    seen = {record.content_hash: record.name for record in calibration.datasets}
     for part in measurement.datasets:
-        if part.observations.content_hash in seen:
-            raise FitError(
-                f"{part.observations.name} is no independent standard: the calibration was fitted "
-                f"to it as {seen[part.observations.content_hash]}"
-            )
+        refuse_fitted(calibration, part.observations)
     return measurement
 
 

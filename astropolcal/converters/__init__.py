@@ -21,7 +21,7 @@ def get_converters():
     --------
     >>> from astropolcal.converters import get_converters
     >>> [converter.tags[0].split("/")[-1] for converter in get_converters()][:2]
-    ['calibration-1.0.0', 'depolarizer-1.0.0']
+    ['calibration-1.0.0', 'beam_gain-1.0.0']
     """
     from astropolcal.converters.calibration import CalibrationConverter
     from astropolcal.converters.optics import OPTIC_MODULES, OpticConverter

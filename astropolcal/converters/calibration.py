@@ -95,7 +95,7 @@ def node_from_calibration(calibration):
 
     check_calibration(calibration)
     node = {
-        "chains": [_chain_node(chain) for chain in calibration.chains],
+        **_chains_and_priors(calibration.chains),
         "wavelength": node_from_value(calibration.wavelength),
         "covariance": _covariance_node(calibration.covariance),
         "identifiability": _identifiability_node(calibration.identifiability),
@@ -106,12 +106,32 @@ def node_from_calibration(calibration):
         "ties": [_tie_node(name, tie) for name, tie in calibration.ties.items()],
         "stages": [_stage_node(stage) for stage in calibration.stages],
         "provenance": plain(calibration.provenance, "provenance"),
+        **_posterior(calibration),
     }
     return node | {
         "checksum": _checksum(node),
         "validity": _validity(calibration),
         "written_with": _versions(),
     }
+
+
+def _chains_and_priors(chains):
+    """Return the chains, and beside them the priors, which an optic's node cannot hold."""
+    from astropolcal.converters.priors import node_from_priors, without_priors
+
+    priors = node_from_priors(chains)
+    chains = [without_priors(chain) for chain in chains] if priors else chains
+    node = {"chains": [_chain_node(chain) for chain in chains]}
+    return node | {"priors": priors} if priors else node
+
+
+def _posterior(calibration):
+    from astropolcal.converters.posterior import check_posterior, node_from_posterior
+
+    if calibration.posterior is None:
+        return {}
+    check_posterior(calibration.posterior, calibration.covariance)
+    return {"posterior": node_from_posterior(calibration.posterior)}
 
 
 def _checksum(node):
@@ -169,7 +189,6 @@ def _covariance_node(covariance):
 
 
 def _identifiability_node(finding):
-    from astropolcal.converters.nodes import plain
 
     return {
         "names": list(finding.names),
@@ -178,20 +197,24 @@ def _identifiability_node(finding):
         # row by row: some versions of asdf cannot read an empty matrix
         "null_vectors": [row.copy() for row in finding.null_vectors],
         "identifiable": finding.identifiable.copy(),
-        "directions": [
-            {
-                "words": str(direction["words"]),
-                **({"sky": plain(direction["sky"], "sky")} if "sky" in direction else {}),
-                # a list, as a mapping would lose the order
-                "parameters": [
-                    {"name": name, "value": plain(value, name)}
-                    for name, value in direction["parameters"].items()
-                ],
-            }
-            for direction in finding.directions
-        ],
+        "directions": [_direction_node(direction) for direction in finding.directions],
+        "near_null": [_direction_node(direction) for direction in finding.near_null],
         "sampling": list(finding.sampling),
         "mirrors": list(finding.mirrors),
+    }
+
+
+def _direction_node(direction):
+    from astropolcal.converters.nodes import plain
+
+    return {
+        "words": str(direction["words"]),
+        **({"sky": plain(direction["sky"], "sky")} if "sky" in direction else {}),
+        # a list, as a mapping would lose the order
+        "parameters": [
+            {"name": name, "value": plain(value, name)}
+            for name, value in direction["parameters"].items()
+        ],
     }
 
 
@@ -270,13 +293,17 @@ def calibration_from_node(node):
     from astropolcal.calibration import Calibration
     from astropolcal.converters.consistency import check_calibration
     from astropolcal.converters.nodes import plain, value_from_node
+    from astropolcal.converters.posterior import check_posterior, posterior_from_node
+    from astropolcal.converters.priors import restore_priors
 
     if _checksum(node) != node["checksum"]:
         raise CalibrationFileError(
             "the content does not match its checksum: it was changed after it was written"
         )
+    chains = [_chain(entry) for entry in node["chains"]]
+    restore_priors(chains, node.get("priors", []))
     calibration = Calibration(
-        chains=[_chain(entry) for entry in node["chains"]],
+        chains=chains,
         wavelength=value_from_node(node["wavelength"]),
         covariance=_covariance(node["covariance"]),
         identifiability=_identifiability(node["identifiability"]),
@@ -287,8 +314,10 @@ def calibration_from_node(node):
         ties={entry["target"]: _tie(entry) for entry in node["ties"]},
         stages=[_stage(entry) for entry in node["stages"]],
         provenance=plain(node["provenance"]),
+        posterior=posterior_from_node(node["posterior"]) if "posterior" in node else None,
     )
     check_calibration(calibration)
+    check_posterior(calibration.posterior, calibration.covariance)
     return calibration
 
 
@@ -321,7 +350,6 @@ def _identifiability(node):
     import numpy as np
 
     from astropolcal.calibration import Identifiability
-    from astropolcal.converters.nodes import plain
 
     names, vectors = list(node["names"]), node["null_vectors"]
     return Identifiability(
@@ -330,17 +358,21 @@ def _identifiability(node):
         singular_values=np.array(node["singular_values"]),
         null_vectors=np.array(vectors) if vectors else np.zeros((0, len(names))),
         identifiable=np.array(node["identifiable"]),
-        directions=[
-            {
-                "words": direction["words"],
-                "parameters": {entry["name"]: entry["value"] for entry in direction["parameters"]},
-                **({"sky": plain(direction["sky"])} if "sky" in direction else {}),
-            }
-            for direction in node["directions"]
-        ],
+        directions=[_direction(entry) for entry in node["directions"]],
+        near_null=[_direction(entry) for entry in node.get("near_null", [])],
         sampling=list(node["sampling"]),
         mirrors=list(node["mirrors"]),
     )
+
+
+def _direction(node):
+    from astropolcal.converters.nodes import plain
+
+    return {
+        "words": node["words"],
+        "parameters": {entry["name"]: entry["value"] for entry in node["parameters"]},
+        **({"sky": plain(node["sky"])} if "sky" in node else {}),
+    }
 
 
 def _dataset(node):

@@ -3,7 +3,8 @@
 One converter for all optics.
 
 An optic is stored as its parameters, each with value, unit, fixed flag and
-both bounds written out, and the settings that rebuild it (name, mount, beam).
+both bounds written out, and the settings that rebuild it (name, mount, beam and
+what else its class has).
 The position of its stage belongs to a frame and is not stored.
 """
 
@@ -12,23 +13,31 @@ import re
 import numpy as np
 from asdf.extension import Converter
 
-from astropolcal.exceptions import CalibrationFileError
+from astropolcal.exceptions import CalibrationFileError, ParameterError
 
 __all__ = ["OPTIC_MODULES", "OpticConverter", "node_from_optic", "optic_from_node", "optic_tag"]
 
 #: Module of `astropolcal.optics` in which each optic is defined. It repeats the
 #: registry, so that ASDF can find a converter without importing the optics.
 OPTIC_MODULES = {
+    "BeamGain": "beamsplitters",
     "Depolarizer": "depolarizers",
     "Diattenuator": "polarizers",
     "DiattenuatorRetarder": "polarizers",
+    "DriftRotator": "modulated",
     "EllipticalRetarder": "retarders",
+    "FluxGain": "modulated",
+    "HarmonicGain": "modulated",
+    "HarmonicRetarder": "modulated",
+    "HarmonicRotator": "modulated",
     "LinearPolarizer": "polarizers",
     "LinearRetarder": "retarders",
     "MuellerElement": "general",
     "ParityFlip": "mirrors",
     "Rotator": "rotators",
+    "StrayLight": "modulated",
     "TwoLayerWaveplate": "retarders",
+    "VectorDiattenuator": "polarizers",
     "WollastonPrism": "beamsplitters",
 }
 
@@ -109,7 +118,8 @@ def node_from_optic(optic):
     Returns
     -------
     dict
-        ``parameters``, and ``name``, ``mount``, ``beam`` where the optic has them.
+        ``parameters``, ``name`` and ``mount`` where they are not None, and the
+        settings of the class, such as ``beam`` or ``harmonic``.
 
     Raises
     ------
@@ -195,8 +205,8 @@ def optic_from_node(name, node):
 
     Raises
     ------
-    ParameterError
-        If the class refuses a value.
+    CalibrationFileError
+        If the class refuses a value or a setting.
 
     Examples
     --------
@@ -210,7 +220,11 @@ def optic_from_node(name, node):
 
     settings = {key: value for key, value in node.items() if key != "parameters"}
     values = {key: _value(entry) for key, entry in node["parameters"].items()}
-    optic = OPTICS[name](**values, **settings)
+    try:
+        optic = OPTICS[name](**values, **settings)
+    except ParameterError as error:
+        label = repr(node.get("name", "without a name"))
+        raise CalibrationFileError(f"optic {label}: {error}") from None
     for key, entry in node["parameters"].items():
         parameter = getattr(optic, key)
         parameter.fixed = entry["fixed"]

@@ -8,6 +8,7 @@ from astropy.modeling import Model
 from astropolcal.chain import leaves, stages
 from astropolcal.exceptions import ObservationError, WavelengthRangeError
 from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 
 __all__ = ["Dataset", "as_pairs"]
@@ -102,11 +103,13 @@ class Dataset:
         self.frames = self._frames_of_data()
         columns = self.frames.T.ravel()
         given = _positions(chain, observations, positions)
-        placed = {stage: angle[columns] for stage, angle in given.items()}
+        placed = {stage: angle[..., columns] for stage, angle in given.items()}
         #: Position of each stage in the frames of each datum, radian,
         #: (frames_per_datum, n_groups).
         self.positions = {
-            stage: angle.reshape(self.frames.T.shape) for stage, angle in placed.items()
+            stage: angle.reshape(self.frames.T.shape)
+            for stage, angle in placed.items()
+            if stage not in COORDINATES
         }
         # where nothing moves all frames are alike, but there are as many
         placed = placed or {"frame": np.zeros(columns.size)}

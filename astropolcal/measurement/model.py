@@ -114,6 +114,8 @@ class Measurement(FittableModel):
         self.sigma = np.concatenate([d.sigma for d in self.datasets])
         #: Wavelength (index on the common grid) of each datum.
         self.bins = np.concatenate([d.bin_of_datum for d in self.datasets])
+        #: Noise that a fit assumed of the data, a `~astropolcal.calibration.Weighting`.
+        self.weighting = None
         self._last = (None, None)
         self._add_parameters()
         super().__init__(name=name)

@@ -21,6 +21,9 @@ from astropolcal.units import canonical_factor, to_unit
 
 __all__ = ["FreeParameters", "Slot", "Tie", "parameter_table"]
 
+# a parameter closer to its bound than this (canonical units) sits at it
+_AT_BOUND = 1e-5
+
 
 @dataclass(frozen=True)
 class Tie:
@@ -198,6 +201,7 @@ class FreeParameters:
             if (prior := self._table[slot.name][0].prior) is not None
         ]
         self._followers = {name: self._follower(name, tie) for name, tie in self.ties.items()}
+        self._bounds = self._limits()
 
     def of_chains(self, chains):
         """Return the same parameters, bound to copies of the chains."""
@@ -282,6 +286,16 @@ class FreeParameters:
 
     def bounds(self):
         """Return lower and upper bounds, shape (n_free,) each."""
+        low, high = self._bounds
+        return low.copy(), high.copy()
+
+    def at_bounds(self, vector):
+        """Return which elements of a vector sit at a bound, or beyond it; shape (n_free,)."""
+        low, high = self._bounds
+        near = _AT_BOUND * np.maximum(1.0, np.abs(vector))
+        return (vector - low < near) | (high - vector < near)
+
+    def _limits(self):
         pairs = [slot.canonical_bounds() for slot in self.slots for _ in range(slot.size)]
         low, high = np.array(pairs, dtype=float).reshape(-1, 2).T.copy()
         for slot, prior in self.priors:
@@ -308,7 +322,7 @@ class FreeParameters:
         float
         """
         vector = np.asarray(vector, dtype=float)
-        low, high = self.bounds()
+        low, high = self._bounds
         if np.any(vector < low) or np.any(vector > high):
             return -np.inf
         return float(sum(prior.log_density(vector[slot.slice]) for slot, prior in self.priors))

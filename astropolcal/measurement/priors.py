@@ -10,6 +10,7 @@ is a bound.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -115,36 +116,68 @@ class BoundPrior:
     factor: float
     mode: float
 
+    @cached_property
+    def _moments(self):
+        """Mean and standard deviation; a frozen distribution works them out at every call."""
+        return float(self.distribution.mean()), float(self.distribution.std())
+
+    @cached_property
+    def _support(self):
+        low, high = self.distribution.support()
+        return low * self.factor, high * self.factor
+
+    @cached_property
+    def _log_peak(self):
+        return float(self.distribution.logpdf(self.mode))
+
     @property
     def is_flat(self):
         """Whether it only bounds, as a uniform prior does."""
         return self.distribution.dist.name == "uniform"
 
+    @property
+    def _is_normal(self):
+        return self.distribution.dist.name == "norm"
+
     def canonical_support(self):
         """Return where the density is not zero, canonical."""
-        low, high = self.distribution.support()
-        return low * self.factor, high * self.factor
+        return self._support
+
+    def log_densities(self, canonical):
+        """Return the log density per declared unit at each value."""
+        canonical = np.asarray(canonical, dtype=float)
+        value = canonical / self.factor
+        if self._is_normal:
+            mean, std = self._moments
+            return self._log_peak - 0.5 * ((value - mean) / std) ** 2
+        if self.is_flat:
+            low, high = self._support
+            inside = (canonical >= low) & (canonical <= high)
+            return np.where(inside, self._log_peak, -np.inf)
+        return self.distribution.logpdf(value)
 
     def log_density(self, canonical):
         """Return the log density per declared unit, summed over the values."""
-        return float(np.sum(self.distribution.logpdf(np.asarray(canonical) / self.factor)))
+        return float(np.sum(self.log_densities(canonical)))
 
     def residual(self, canonical):
         """Return signed residuals whose half square is minus the log density, less its least."""
         value = np.asarray(canonical, dtype=float) / self.factor
-        if self.distribution.dist.name == "norm":
-            return (value - self.distribution.mean()) / self.distribution.std()
-        depth = self.distribution.logpdf(self.mode) - self.distribution.logpdf(value)
+        if self._is_normal:
+            mean, std = self._moments
+            return (value - mean) / std
+        depth = self._log_peak - self.distribution.logpdf(value)
         return np.sign(value - self.mode) * np.sqrt(2 * np.maximum(depth, 0.0))
 
     def slope(self, canonical):
         """Return the derivative of `residual` per canonical unit."""
         canonical = np.asarray(canonical, dtype=float)
-        if self.distribution.dist.name == "norm":
-            return np.full(canonical.shape, 1 / (self.distribution.std() * self.factor))
-        step = _STEP * self.distribution.std() * self.factor
-        low, high = self.canonical_support()
-        up, down = np.minimum(canonical + step, high), np.maximum(canonical - step, low)
+        std = self._moments[1] * self.factor
+        if self._is_normal:
+            return np.full(canonical.shape, 1 / std)
+        low, high = self._support
+        up = np.minimum(canonical + _STEP * std, high)
+        down = np.maximum(canonical - _STEP * std, low)
         return (self.residual(up) - self.residual(down)) / (up - down)
 
 

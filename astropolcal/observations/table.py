@@ -9,15 +9,16 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 from astropy.table import Table
-from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import atomic_path
+from astropolcal.observations.coordinates import clock, frame_coordinate
 from astropolcal.observations.grid import build_grid
 from astropolcal.observations.hashing import hash_columns
 from astropolcal.observations.pairing import pair_frames
 from astropolcal.observations.reading import numeric_column, read_ecsv
 from astropolcal.observations.variances import beam_variances
+from astropolcal.optics import COORDINATES
 from astropolcal.units import angle_to_rad
 
 __all__ = ["Observations"]
@@ -303,17 +304,25 @@ class Observations:
 
     def position(self, column):
         """
-        Return an angle of every frame.
+        Return an angle of every frame, or another quantity that an optic may depend on.
 
         Parameters
         ----------
         column : str
-            A column with the unit of an angle, such as ``"hwp"``.
+            A column with the unit of an angle, such as ``"hwp"``; or one of
+            `~astropolcal.optics.COORDINATES`: ``"sequence"``, how far the run has
+            come, from 0 in the first frame to 1 in the last (by the column ``time``
+            if it gives the time of every frame, else by the order); ``"flux"``, the
+            fluxes of the beams in the unit of the table, 0 where masked;
+            ``"total_flux"``, the sum of both, once for each; ``"previous_flux"``, the
+            fluxes over those of the frame taken before, 1 for the
+            first and where one of the two is masked.
 
         Returns
         -------
         `~numpy.ndarray`
-            Radian, shape (F,).
+            Radian, shape (F,); a number for the sequence; for the fluxes shape
+            (2, B, F), the right beam first.
 
         Raises
         ------
@@ -328,6 +337,8 @@ class Observations:
         [0.0, 0.3927, 0.7854]
         """
         frames = self._grid.frames
+        if column in COORDINATES:
+            return frame_coordinate(self, column)
         if column not in frames.colnames:
             angles = [name for name in frames.colnames if _is_angle(frames[name])]
             raise ObservationError(
@@ -391,7 +402,7 @@ class Observations:
             self.position("hwp") * u.rad,
             self.position("derotator") * u.rad,
             np.asarray(frames["flc_state"]) if "flc_state" in frames.colnames else None,
-            _clock(frames),
+            clock(frames),
             tolerance=tolerance,
             derotator_tolerance=derotator_tolerance,
             share=share,
@@ -611,14 +622,3 @@ def _span(angles):
 
 def _is_angle(column):
     return isinstance(column, u.Quantity) and column.unit.is_equivalent(u.rad)
-
-
-def _clock(frames):
-    """Return the times of the frames as numbers, or None where there are none."""
-    column = frames["time"] if "time" in frames.colnames else None
-    if isinstance(column, Time):
-        column = column.mjd
-    if getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
-        return None
-    times = np.asarray(getattr(column, "value", column), dtype=float)
-    return times if np.isfinite(times).all() else None

@@ -7,28 +7,52 @@ registered in `OPTICS`; a new optic is one class and its entry there, and the
 registry tests then hold it to the laws that all optics obey.
 """
 
-from astropolcal.optics.beamsplitters import WollastonPrism
-from astropolcal.optics.core import Optic, rotation_generator
+from astropolcal.optics.beamsplitters import BeamGain, WollastonPrism
+from astropolcal.optics.core import COORDINATES, Optic, rotation_generator
 from astropolcal.optics.depolarizers import Depolarizer
 from astropolcal.optics.general import MuellerElement
 from astropolcal.optics.mirrors import ParityFlip
-from astropolcal.optics.polarizers import Diattenuator, DiattenuatorRetarder, LinearPolarizer
+from astropolcal.optics.modulated import (
+    DriftRotator,
+    FluxGain,
+    FrameOptic,
+    HarmonicGain,
+    HarmonicRetarder,
+    HarmonicRotator,
+    StrayLight,
+)
+from astropolcal.optics.polarizers import (
+    Diattenuator,
+    DiattenuatorRetarder,
+    LinearPolarizer,
+    VectorDiattenuator,
+)
 from astropolcal.optics.retarders import EllipticalRetarder, LinearRetarder, TwoLayerWaveplate
 from astropolcal.optics.rotators import Rotator
 
 __all__ = [
+    "COORDINATES",
     "OPTICS",
+    "BeamGain",
     "Depolarizer",
     "Diattenuator",
     "DiattenuatorRetarder",
+    "DriftRotator",
     "EllipticalRetarder",
+    "FluxGain",
+    "FrameOptic",
+    "HarmonicGain",
+    "HarmonicRetarder",
+    "HarmonicRotator",
     "LinearPolarizer",
     "LinearRetarder",
     "MuellerElement",
     "Optic",
     "ParityFlip",
     "Rotator",
+    "StrayLight",
     "TwoLayerWaveplate",
+    "VectorDiattenuator",
     "WollastonPrism",
     "rotation_generator",
 ]
@@ -37,16 +61,24 @@ __all__ = [
 OPTICS = {
     cls.__name__: cls
     for cls in (
+        BeamGain,
         Depolarizer,
         Diattenuator,
         DiattenuatorRetarder,
+        DriftRotator,
         EllipticalRetarder,
+        FluxGain,
+        HarmonicGain,
+        HarmonicRetarder,
+        HarmonicRotator,
         LinearPolarizer,
         LinearRetarder,
         MuellerElement,
         ParityFlip,
         Rotator,
+        StrayLight,
         TwoLayerWaveplate,
+        VectorDiattenuator,
         WollastonPrism,
     )
 }

@@ -1,17 +1,42 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Optics that split the light into two beams."""
+"""Optics that split the light into two beams, and that act on the two differently."""
 
+import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.optics.core import Optic, blank
 
-__all__ = ["WollastonPrism"]
+__all__ = ["BeamGain", "WollastonPrism"]
 
 BEAMS = {"right": 1.0, "left": -1.0}
 
 
-class WollastonPrism(Optic):
+class _BeamOptic(Optic):
+    """What acts differently on the two beams, and follows one of them in a chain."""
+
+    depends_on_beam = True
+
+    def __init__(self, *args, beam="right", **kwargs):
+        super().__init__(*args, **kwargs)
+        self.beam = beam
+
+    @property
+    def beam(self):
+        """The beam that goes on in a chain, ``"right"`` or ``"left"``."""
+        return self._beam
+
+    @beam.setter
+    def beam(self, value):
+        if value not in BEAMS:
+            raise ParameterError(f"beam = {value!r}; allowed are {sorted(BEAMS)}")
+        self._beam = value
+
+    def _settings(self):
+        return super()._settings() | {"beam": self.beam}
+
+
+class WollastonPrism(_BeamOptic):
     r"""
     Wollaston prism: two beams of opposite linear polarization.
 
@@ -40,25 +65,9 @@ class WollastonPrism(Optic):
     (0.995, 0.005)
     """
 
+    splits_light = True
+
     efficiency = Parameter(default=1.0, bounds=(0, 1), description="modulation efficiency")
-
-    def __init__(self, *args, beam="right", **kwargs):
-        super().__init__(*args, **kwargs)
-        self.beam = beam
-
-    @property
-    def beam(self):
-        """The beam that goes on in a chain, ``"right"`` or ``"left"``."""
-        return self._beam
-
-    @beam.setter
-    def beam(self, value):
-        if value not in BEAMS:
-            raise ParameterError(f"beam = {value!r}; allowed are {sorted(BEAMS)}")
-        self._beam = value
-
-    def _settings(self):
-        return super()._settings() | {"beam": self.beam}
 
     def _matrix(self, dispersion, efficiency):
         out = blank(efficiency)
@@ -101,3 +110,37 @@ class WollastonPrism(Optic):
         copy = self.copy()
         copy.beam = beam
         return copy
+
+
+class BeamGain(_BeamOptic):
+    r"""
+    Unequal gains of the two beams: :math:`1 + g` for the right, :math:`1 - g` for the left.
+
+    What is left of the flat field, or unequal transmission behind the beam
+    splitter (Patat & Romaniello 2006, doi:10.1086/497581).
+
+    Parameters
+    ----------
+    imbalance : float or array_like
+        Half the relative difference g of the gains.
+    beam : {"right", "left"}
+        The beam that goes on in a chain.
+    theta : `~astropy.units.Quantity`
+        Without consequence here.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import BeamGain
+    >>> float(BeamGain(imbalance=0.01, beam="left").mueller()[0, 0])
+    0.99
+    """
+
+    imbalance = Parameter(default=0.0, bounds=(-0.5, 0.5), description="half the gain difference")
+
+    def _matrix(self, dispersion, imbalance):
+        gain = 1.0 + BEAMS[self._beam] * np.asarray(imbalance)
+        return gain[..., None, None] * np.eye(4)
+
+    def _derivatives(self, dispersion, imbalance):
+        sign = np.full(np.shape(imbalance), BEAMS[self._beam])
+        return (sign[..., None, None] * np.eye(4),)

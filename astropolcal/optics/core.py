@@ -20,9 +20,16 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.mueller.elements import _rotate, _rotation_matrix
 from astropolcal.units import angle_to_rad, canonical_factor, length_to_um, to_unit
 
-__all__ = ["Optic", "rotation_generator"]
+__all__ = ["COORDINATES", "Optic", "rotation_generator"]
 
 LIGHT = ("wavelength", "I", "Q", "U", "V")
+
+#: Positions that differ between wavelengths and beams: the flux of the beam, and that flux
+#: over the one in the frame before.
+FLUXES = ("flux", "total_flux", "previous_flux")
+
+#: Positions that are numbers, not angles: how far the run has come (0 to 1), and the fluxes.
+COORDINATES = ("sequence", *FLUXES)
 
 
 def rotation_generator(matrix):
@@ -137,6 +144,12 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
     standard_broadcasting = False
     #: True for an optic that turns the frame of all that follows.
     rotates_frame = False
+    #: True for an optic that splits the light into two beams.
+    splits_light = False
+    #: True for an optic that acts on the two beams differently; it has a ``beam``.
+    depends_on_beam = False
+    #: True for an optic whose mount may name one of `COORDINATES`, which are not angles.
+    takes_numbers = False
 
     theta = Parameter(
         default=0.0,
@@ -158,8 +171,8 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
         except (TypeError, InputParameterError) as error:
             raise ParameterError(f"{type(self).__name__}: {error}") from None
         self._inputs = self._outputs = LIGHT
+        self._mount, self._position = None, 0.0
         self.mount = mount
-        self._position = 0.0
 
     @classmethod
     def _at_the_door(cls, key, value):
@@ -197,9 +210,19 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
             + (f" {getattr(self, key).unit}" if getattr(self, key).unit else "")
             for key in self.param_names
         )
-        label = f", name={self.name!r}" if self.name else ""
-        mount = f", mount={self.mount!r}" if self.mount else ""
-        return f"<{type(self).__name__}({values}{mount}{label})>"
+        settings = "".join(f", {key}={value!r}" for key, value in self._unlike_default().items())
+        return f"<{type(self).__name__}({values}{settings})>"
+
+    def _unlike_default(self):
+        """Return the settings that are not those of the class, name and mount last."""
+        settings = self._settings()
+        last = {key: settings.pop(key) for key in ("mount", "name")}
+        known = inspect.signature(type(self)).parameters
+        return {
+            key: value
+            for key, value in (settings | last).items()
+            if key not in known or value != known[key].default
+        }
 
     # ---- where the optic stands ------------------------------------------
 
@@ -216,6 +239,13 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
                 f"mount = {value!r} must be None or the name of a stage, with or without "
                 "one leading minus"
             )
+        if stage in COORDINATES and not self.takes_numbers:
+            raise ParameterError(
+                f"{type(self).__name__}: mount = {value!r} is a number, not the angle of a stage"
+            )
+        if (stage in COORDINATES) != (self.stage in COORDINATES):
+            # what was an angle is no number
+            self._position = 0.0
         self._mount = value
 
     @property
@@ -231,11 +261,11 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
     @property
     def position(self):
         """Position of the stage at which this copy of the optic stands."""
-        return self._position * u.rad
+        return self._position * (u.one if self.stage in COORDINATES else u.rad)
 
     @position.setter
     def position(self, value):
-        self._position = finite_angle(value, "position")
+        self._position = finite_position(value, "position", self.stage)
 
     # ---- values on canonical floats ---------------------------------------
 
@@ -347,17 +377,27 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
 
     def _resolve(self, wavelength, position, parameters=None):
         """Bring wavelength, orientation and values to canonical floats."""
+        lam, shift, values = self._read(wavelength, position, parameters)
+        dispersion = None if lam is None else self._dispersion(lam)
+        if lam is None and type(self)._dispersion is not Optic._dispersion:
+            raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
+        return (*self._moved(dispersion, values[0], shift), values[1:])
+
+    def _read(self, wavelength, position, parameters):
         values = self.canonical_values() if parameters is None else parameters
         lam = None if wavelength is None else length_to_um(wavelength)
         if lam is not None and not np.all(lam > 0):
             raise ParameterError(f"wavelength = {wavelength} must be positive")
         self._check_grid(lam, values)
-        turned = self._position if position is None else finite_angle(position, "position")
+        turned = self._position
+        if position is not None:
+            turned = finite_position(position, "position", self.stage)
         check_broadcast(lam, turned)
-        dispersion = None if lam is None else self._dispersion(lam)
-        if lam is None and type(self)._dispersion is not Optic._dispersion:
-            raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
-        return dispersion, values[0] + self.stage_sign * turned, values[1:]
+        return lam, self.stage_sign * turned, values
+
+    def _moved(self, dispersion, angle, shift):
+        """Return what the matrix needs, and the orientation, once the stage has moved."""
+        return dispersion, angle + shift
 
     def _check_grid(self, lam, values):
         for key, value in zip(self.param_names, values, strict=True):
@@ -464,12 +504,13 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
         return {"name": self.name, "mount": self.mount}
 
 
-def finite_angle(value, name):
-    """Return an angle with unit in radian; refuse what is not finite."""
-    angle = angle_to_rad(value, name)
-    if not np.all(np.isfinite(angle)):
+def finite_position(value, name, stage=None):
+    """Return the position of a stage in radian, or as a number; refuse what is not finite."""
+    number = (stage or name) in COORDINATES
+    position = to_unit(value, None, name) if number else angle_to_rad(value, name)
+    if not np.all(np.isfinite(position)):
         raise ParameterError(f"{name} = {value} must be finite")
-    return angle
+    return position
 
 
 def check_broadcast(wavelength, position):

@@ -8,7 +8,7 @@ from astropy.modeling import Parameter
 from astropolcal.mueller.elements import _diattenuator, _diattenuator_retarder
 from astropolcal.optics.core import Optic, blank
 
-__all__ = ["Diattenuator", "DiattenuatorRetarder", "LinearPolarizer"]
+__all__ = ["Diattenuator", "DiattenuatorRetarder", "LinearPolarizer", "VectorDiattenuator"]
 
 # sqrt(1 - eps^2) has no derivative at |eps| = 1: a floor keeps it finite there
 _ROOT_FLOOR = 1e-8
@@ -121,6 +121,68 @@ class DiattenuatorRetarder(Optic):
         root = _transverse(diattenuation)
         _phase_block(to_retardance, -root * s, root * c)
         return _to_diattenuation(diattenuation, c, s), to_retardance
+
+
+class VectorDiattenuator(Optic):
+    r"""
+    Diattenuator of any linear orientation, of unit transmission for unpolarized light.
+
+    With the vector :math:`D = (D_H, D_{45})` of length d, and
+    :math:`t = \sqrt{1 - d^2}`, the first row and column are (1, D) and the block of
+    (Q, U, V) is :math:`t\,\mathbb{1} + D D^T / (1 + t)` (Lu & Chipman 1996,
+    doi:10.1364/JOSAA.13.001106).
+
+    Parameters
+    ----------
+    horizontal, diagonal : float or array_like
+        The components; scalars, or one value a wavelength.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import VectorDiattenuator
+    >>> VectorDiattenuator(horizontal=0.01, diagonal=-0.02).mueller()[0]
+    array([ 1.  ,  0.01, -0.02,  0.  ])
+    """
+
+    horizontal = Parameter(default=0.0, bounds=(-0.7, 0.7), description="component along Q")
+    diagonal = Parameter(default=0.0, bounds=(-0.7, 0.7), description="component along U")
+
+    def _matrix(self, dispersion, horizontal, diagonal):
+        out = blank(horizontal, diagonal)
+        transverse = np.sqrt(1 - horizontal**2 - diagonal**2)
+        share = 1 / (1 + transverse)
+        out[..., 0, 0] = 1.0
+        out[..., 0, 1] = out[..., 1, 0] = horizontal
+        out[..., 0, 2] = out[..., 2, 0] = diagonal
+        out[..., 1, 1] = transverse + share * horizontal**2
+        out[..., 2, 2] = transverse + share * diagonal**2
+        out[..., 1, 2] = out[..., 2, 1] = share * horizontal * diagonal
+        out[..., 3, 3] = transverse
+        return out
+
+    def _derivatives(self, dispersion, horizontal, diagonal):
+        parts = np.broadcast_arrays(
+            np.asarray(horizontal, dtype=float), np.asarray(diagonal, dtype=float)
+        )
+        return tuple(_vector_slope(parts[i], parts[1 - i], i) for i in range(2))
+
+
+def _vector_slope(own, other, i):
+    """Return the derivative to component i (0 along Q, 1 along U) of a diattenuation vector."""
+    out = blank(own)
+    j = 1 - i
+    transverse = np.sqrt(1 - own**2 - other**2)
+    share = 1 / (1 + transverse)
+    fall = -own / transverse
+    rise = -(share**2) * fall
+    out[..., 0, 1 + i] = out[..., 1 + i, 0] = 1.0
+    out[..., 1 + i, 1 + i] = fall + rise * own**2 + 2 * share * own
+    out[..., 1 + j, 1 + j] = fall + rise * other**2
+    out[..., 1, 2] = out[..., 2, 1] = rise * own * other + share * other
+    out[..., 3, 3] = fall
+    return out
 
 
 def _transverse(diattenuation):

@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Figures of a calibration: differences, residuals, accuracy, and parameters.
+Figures of a calibration: differences, residuals, accuracy, parameters, identifiability.
 
 Every function returns a `~matplotlib.figure.Figure` and leaves pyplot alone,
 so that figures can be made in a pipeline without a window system. Matplotlib
@@ -10,6 +10,7 @@ is imported when the first figure is drawn.
 from astropolcal.plotting.accuracy import plot_accuracy
 from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
+from astropolcal.plotting.identifiability import plot_identifiability
 from astropolcal.plotting.parameters import (
     plot_efficiency,
     plot_parameters,
@@ -25,6 +26,7 @@ __all__ = [
     "plot_correlations",
     "plot_double_differences",
     "plot_efficiency",
+    "plot_identifiability",
     "plot_parameters",
     "plot_residuals",
     "plot_retardances",

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from astropolcal.chain import stages
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
+from astropolcal.optics import COORDINATES
 from astropolcal.plotting._style import (
     MINUS,
     clusters,
@@ -105,6 +107,8 @@ class DataGrid:
         per_datum, n = self.part.frames.shape[1], len(angle)
         positions = {stage: np.repeat(p, n) for stage, p in series.positions.items()}
         positions["derotator"] = np.tile(angle, per_datum)
+        # between the data there is neither a time nor a flux: such optics do nothing there
+        positions |= {stage: np.zeros(1) for stage in stages(self.chain) if stage in COORDINATES}
         # the chain's parameters are given on the calibration's own grid of wavelengths
         propagator = Propagator(self.chain, self.calibrated_um, positions)
         right, left = (

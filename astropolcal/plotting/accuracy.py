@@ -4,12 +4,14 @@
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration.groups import what_is_left_out
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
     GREEN,
     MINUS,
+    PURPLE,
     VERMILION,
     canvas,
     heading,
@@ -28,8 +30,10 @@ _CURVES = {
         f"s_res = √(Σr²/(n {MINUS} k)): scatter of one datum about the model",
     ),
     "s_mean": (BLUE, "s", "s_mean = s_res/√n: scatter of the mean of n data (elsewhere s_rel)"),
-    "s_cv": (GREEN, "^", "s_cv: rms error when predicting derotator angles left out of the fit"),
+    "s_cv": (GREEN, "^", "s_cv: rms error when predicting {} left out of the fit"),
 }
+_STANDARD_MARKERS = ("D", "v", "P", "X")
+_STANDARD_STYLES = ("-", "--", ":", "-.")
 _REFERENCE_STYLES = ("--", ":", "-.")
 # a larger ratio between the extremes is drawn on a logarithmic axis
 _LOGARITHMIC_FROM = 6
@@ -37,7 +41,11 @@ _LOGARITHMIC_FROM = 6
 
 def plot_accuracy(calibration, reference=None, *, figure=None):
     """
-    Draw s_res, s_mean and s_cv against wavelength, one panel a dataset.
+    Draw the accuracies of a calibration against wavelength, one panel a dataset.
+
+    These are s_res, s_mean and s_cv, and s_standard for each standard of the dataset's
+    source. Standards of other sources have panels of their own, with the s_cv that they
+    are compared with.
 
     Parameters
     ----------
@@ -60,8 +68,9 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
 
     Notes
     -----
-    Definitions as in `~astropolcal.calibration.accuracy_table`; ``s_mean`` is
-    s_rel of McIntosh et al. (2026, Sec. 2.3).
+    Definitions as in `~astropolcal.calibration.accuracy_table` and
+    `~astropolcal.calibration.standard_accuracy`; ``s_mean`` is s_rel of
+    McIntosh et al. (2026, Sec. 2.3).
 
     Examples
     --------
@@ -78,22 +87,34 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     'accuracy (% of polarization)'
     """
     curves = {label: _reference(label, pair) for label, pair in (reference or {}).items()}
-    records = calibration.datasets
+    records, standards = calibration.datasets, calibration.fit.get("standards", [])
+    sources = {record.source for record in records}
+    others = [entry for entry in standards if entry["source"] not in sources]
+    count = len(records) + len(others)
     with style():
-        figure = canvas(figure, 8.5, 2.2 + 3.6 * len(records))
-        panels = figure.subplots(len(records), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-        for axes, record in zip(panels, records, strict=True):
-            handles = [_draw(axes, record.accuracy, name) for name in _CURVES]
-            handles += _draw_references(axes, curves)
-            name = f"{record.name}: " if len(records) > 1 else ""
+        figure = canvas(figure, 8.5, 2.4 + 3.6 * count)
+        panels = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+        handles = {}
+        for axes, record in zip(panels, records, strict=False):
+            name = f"{record.name}: " if count > 1 else ""
             axes.set_title(name + _counts(record))
+            handles |= _draw_record(axes, record, calibration)
+        looks = _standard_looks(standards)
+        for axes, entries in _placed(panels, records, standards, others):
+            for entry in entries:
+                handles |= _draw_standard(axes, entry, looks[entry["content_hash"]])
+        for axes, entry in zip(panels[len(records) :], others, strict=True):
+            axes.set_title(f"{entry['name']}: n = {_span(entry['n'])} data a wavelength, predicted")
+            handles |= _draw_standard_s_cv(axes, entry)
+        for axes in panels:
+            references = _draw_references(axes, curves)
             axes.set_ylabel("accuracy (% of polarization)")
-        _scale(panels[0], records, curves)
+        _scale(panels[0], _all_values(records, standards, curves))
         wavelength_label(panels[-1])
         heading(
             figure, calibration, "Accuracy of the calibration", [record.name for record in records]
         )
-        legend_outside(figure, handles)
+        legend_outside(figure, [*handles.values(), *references])
     return figure
 
 
@@ -114,15 +135,59 @@ def _reference(label, pair):
     return lam, value
 
 
-def _draw(axes, table, name):
-    color, marker, label = _CURVES[name]
-    value = table[name].to_value(u.percent)
-    if not np.isfinite(value).any():
-        label = f"{name}: not known (too few data or derotator angles)"
-    lam = nanometres(table["wavelength"])
+def _draw_record(axes, record, calibration):
+    """Draw the curves of a dataset; return them by name."""
+    drawn = {}
+    for name, (color, marker, label) in _CURVES.items():
+        values = record.accuracy[name].to_value(u.percent)
+        label = label.format(what_is_left_out(calibration)) if name == "s_cv" else label
+        if not np.isfinite(values).any():
+            label = f"{name}: not known (too few data or groups)"
+        lam = nanometres(record.accuracy["wavelength"])
+        drawn[name] = _line(axes, lam, values, color=color, marker=marker, label=label)
+    return drawn
+
+
+def _line(axes, lam, values, **look):
     order = np.argsort(lam)
-    (line,) = axes.plot(lam[order], value[order], color=color, marker=marker, label=label)
+    (line,) = axes.plot(np.asarray(lam)[order], np.asarray(values)[order], **look)
     return line
+
+
+def _standard_looks(standards):
+    """Return marker and line style of each standard, by its content."""
+    return {
+        entry["content_hash"]: {
+            "marker": _STANDARD_MARKERS[i % len(_STANDARD_MARKERS)],
+            "linestyle": _STANDARD_STYLES[i % len(_STANDARD_STYLES)],
+        }
+        for i, entry in enumerate(standards)
+    }
+
+
+def _placed(panels, records, standards, others):
+    """Yield each panel with the standards that are drawn into it."""
+    for axes, record in zip(panels, records, strict=False):
+        yield axes, [entry for entry in standards if entry["source"] == record.source]
+    for axes, entry in zip(panels[len(records) :], others, strict=True):
+        yield axes, [entry]
+
+
+def _draw_standard(axes, entry, look):
+    label = f"s_standard: rms error when predicting {entry['name']}, which was not fitted"
+    line = _line(
+        axes, entry["wavelength_nm"], entry["s_standard_percent"], color=PURPLE, label=label, **look
+    )
+    return {entry["content_hash"]: line}
+
+
+def _draw_standard_s_cv(axes, entry):
+    """Draw what a standard of another source is compared with."""
+    label = "s_cv of the data that were fitted, for comparison"
+    line = _line(
+        axes, entry["wavelength_nm"], entry["s_cv_percent"], color=GREEN, alpha=0.6, label=label
+    )
+    return {"s_cv for comparison": line}
 
 
 def _draw_references(axes, curves):
@@ -139,15 +204,24 @@ def _draw_references(axes, curves):
 
 
 def _counts(record):
-    n, k = (np.asarray(record.accuracy[key]) for key in ("n", "k"))
-    span = f"{n.min()}" if n.min() == n.max() else f"{n.min()} to {n.max()}"
+    k = np.asarray(record.accuracy["k"])
+    span = _span(record.accuracy["n"])
     return f"n = {span} data a wavelength, k = {k.max()} free parameters"
 
 
-def _scale(axes, records, curves):
-    """Use a logarithmic axis where the values need it, with plain numbers on it."""
+def _span(n):
+    low, high = np.min(n), np.max(n)
+    return f"{low}" if low == high else f"{low} to {high}"
+
+
+def _all_values(records, standards, curves):
     values = [record.accuracy[name].to_value(u.percent) for record in records for name in _CURVES]
-    values = np.concatenate([*values, *(value for _, value in curves.values())])
+    values += [np.array(entry["s_standard_percent"]) for entry in standards]
+    return np.concatenate([*values, *(value for _, value in curves.values())])
+
+
+def _scale(axes, values):
+    """Use a logarithmic axis where the values need it, with plain numbers on it."""
     known = values[np.isfinite(values) & (values > 0)]
     if known.size and known.max() > _LOGARITHMIC_FROM * known.min():
         from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter

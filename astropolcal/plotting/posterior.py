@@ -5,6 +5,7 @@ import numpy as np
 
 from astropolcal.calibration import autocorrelation
 from astropolcal.calibration._optional import need
+from astropolcal.calibration.convergence import ENOUGH
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import BLACK, BLUE, GREY, MINUS, VERMILION, canvas, style
 
@@ -13,10 +14,13 @@ __all__ = ["plot_corner", "plot_traces"]
 __doctest_requires__ = {"plot_corner": ["corner"]}
 
 # more panels than this cannot be read
-_MAX_CORNER = 12
-_MAX_TRACES = 16
-_DRAWN_STEPS = 2000
+MAX_CORNER = 12
+MAX_TRACES = 16
+# points of a walker in a trace, and of all walkers, which become a solid band far earlier
+_DRAWN_STEPS, _DRAWN_POINTS = 2000, 50_000
 _INCH = 2.1
+# behind words that stand on data
+_PAPER = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
 _MARGIN = 1.35
 # a fitted value closer than this to the range of the samples is drawn, in widths of the range
 _NEAR = 0.5
@@ -67,7 +71,7 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
     4
     """
     corner = need("corner", "the corner plot")
-    columns = _columns(posterior, parameters, _MAX_CORNER)
+    columns = _columns(posterior, parameters, MAX_CORNER)
     samples = posterior.samples()[:, columns]
     stuck = [posterior.names[i] for i in columns[np.ptp(samples, axis=0) == 0]]
     if stuck:
@@ -87,7 +91,7 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
             levels=1 - np.exp([-0.5, -2.0, -4.5]),
             fill_contours=True,
             plot_datapoints=False,
-            bins=50,
+            bins=_bins(len(samples)),
             color=BLUE,
             max_n_ticks=4,
             hist_kwargs={"linewidth": 1.5},
@@ -95,6 +99,11 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
         marks = None if marks is None else marks - shifts
         _finish_corner(figure, posterior, columns, samples - shifts, marks)
     return figure
+
+
+def _bins(n_samples):
+    """Return how many bins a side leave enough samples in each to draw contours."""
+    return int(np.clip(np.sqrt(n_samples) / 3, 12, 50))
 
 
 def _corner_canvas(figure, size):
@@ -167,8 +176,13 @@ def _write_correlations(panels, samples):
     for row, values in enumerate(np.corrcoef(samples.T)):
         for column in range(row):
             panels[row, column].annotate(
-                f"r = {values[column]:.4f}", (0.04, 0.96), xycoords="axes fraction", va="top"
-            ).set_fontsize(8.5)
+                f"r = {values[column]:.4f}",
+                (0.04, 0.96),
+                xycoords="axes fraction",
+                va="top",
+                bbox=_PAPER,
+                fontsize=8.5,
+            )
 
 
 def _mark(panels, marks, widths):
@@ -186,11 +200,15 @@ def _mark(panels, marks, widths):
 
 
 def _heading(posterior, marked):
-    steps, walkers, _ = posterior.chain.shape
-    lines = [f"Posterior: {steps * posterior.thin} steps of {walkers} walkers"]
+    walkers = posterior.chain.shape[1]
+    lines = [f"Posterior: {posterior.n_steps} steps of {walkers} walkers"]
     lines.append(f"{int(posterior.n_times)} times the longest autocorrelation time τ")
-    if not posterior.converged:
+    if posterior.n_times < ENOUGH:
         lines.append("(CHAIN TOO SHORT)")
+    elif not posterior.converged:
+        lines.append("(NOT CONVERGED)")
+    if posterior.is_thinned:
+        lines.append(f"drawn: {posterior.log_prob.size} of {posterior.convergence.n_draws} samples")
     if marked:
         lines.append("orange: fitted values")
     return "\n".join(lines)
@@ -199,6 +217,9 @@ def _heading(posterior, marked):
 def plot_traces(posterior, parameters=None, *, figure=None):
     r"""
     Draw the walkers against steps, and the autocorrelation, one row a parameter.
+
+    Of a posterior that is thinned the autocorrelation is not known; instead
+    of it the samples are counted, with their quantiles 0.16, 0.5 and 0.84.
 
     Parameters
     ----------
@@ -228,30 +249,72 @@ def plot_traces(posterior, parameters=None, *, figure=None):
     >>> plot_traces(Posterior(["hwp.theta"], [u.deg], chain, chain[..., 0])).axes[0].get_ylabel()
     'hwp\ntheta (deg)'
     """
-    columns = _columns(posterior, parameters, _MAX_TRACES)
+    columns = _columns(posterior, parameters, MAX_TRACES)
+    beside = _histogram if posterior.is_thinned else _correlation
     with style():
-        figure = canvas(figure, 10, 1.4 + 1.7 * len(columns))
-        panels = figure.subplots(len(columns), 2, sharex="col", squeeze=False, width_ratios=(2, 1))
-        for (trace, correlation), column in zip(panels, columns, strict=True):
+        figure = canvas(figure, 10, 1.6 + 1.7 * len(columns))
+        panels = figure.subplots(len(columns), 2, squeeze=False, width_ratios=(2, 1))
+        for (trace, right), column in zip(panels, columns, strict=True):
             _trace(trace, posterior, column)
-            _correlation(correlation, posterior, column)
-        panels[0, 0].set_title("walkers (grey: burn-in, left out)")
-        panels[0, 1].set_title("autocorrelation")
-        panels[-1, 0].set_xlabel("step")
-        panels[-1, 1].set_xlabel("lag (steps)")
+            beside(right, posterior, column)
+        _name_columns(panels, posterior)
         figure.suptitle(_heading(posterior, marked=False))
     return figure
 
 
+def _name_columns(panels, posterior):
+    """Name both columns, and give the panels of each one scale where they have one."""
+    burn_in = "burn-in left out" if posterior.is_thinned else "grey: burn-in, left out"
+    _join(panels[:, 0], f"walkers, and their median in black ({burn_in})", "step")
+    if posterior.is_thinned:
+        panels[0, 1].set_title("samples and their quantiles")
+    else:
+        _join(panels[:, 1], "autocorrelation", "lag (steps)")
+
+
+def _join(panels, title, label):
+    panels[0].set_title(title)
+    panels[-1].set_xlabel(label)
+    for axes in panels[:-1]:
+        axes.sharex(panels[-1])
+        axes.tick_params(labelbottom=False)
+
+
 def _trace(axes, posterior, column):
-    steps = np.arange(1, len(posterior.chain) + 1) * posterior.thin
-    every = max(len(steps) // _DRAWN_STEPS, 1)
-    axes.plot(
-        steps[::every], posterior.chain[::every, :, column], color=BLUE, alpha=0.25, linewidth=0.5
-    )
-    axes.axvspan(0, posterior.burn_in * posterior.thin, color=GREY, alpha=0.25, linewidth=0)
+    chain, steps = posterior.chain[:, :, column], posterior.steps
+    every = max(len(chain) // _DRAWN_STEPS, chain.size // _DRAWN_POINTS, 1)
+    axes.plot(steps[::every], chain[::every], color=BLUE, alpha=0.25, linewidth=0.5)
+    axes.plot(steps[::every], np.median(chain[::every], axis=1), color=BLACK, linewidth=1.0)
+    if posterior.burn_in:
+        axes.axvspan(0, posterior.burn_in * posterior.thin, color=GREY, alpha=0.25, linewidth=0)
     axes.margins(x=0)
     axes.set_ylabel(_label(posterior, column), fontsize=9.5)
+
+
+def _histogram(axes, posterior, column):
+    """Count the samples sideways, on the scale of the trace beside it."""
+    values = posterior.chain[:, :, column].ravel()
+    axes.hist(values, bins=40, orientation="horizontal", color=BLUE, alpha=0.5)
+    found = posterior.convergence
+    for key, dashes in (("lower", "--"), ("median", "-"), ("upper", "--")):
+        axes.axhline(getattr(found, key)[column], color=BLACK, linewidth=1.0, linestyle=dashes)
+    axes.set_xticks([])
+    axes.tick_params(labelleft=False)
+    axes.grid(False)
+    _write_time(axes, posterior, column)
+
+
+def _write_time(axes, posterior, column):
+    time = posterior.autocorrelation_times[column]
+    if np.isfinite(time):
+        axes.annotate(
+            f"τ = {time:.0f}",
+            (0.97, 0.9),
+            xycoords="axes fraction",
+            ha="right",
+            va="top",
+            bbox=_PAPER,
+        )
 
 
 def _correlation(axes, posterior, column):
@@ -264,6 +327,4 @@ def _correlation(axes, posterior, column):
     axes.axhline(0, color=BLACK, linewidth=0.7)
     if np.isfinite(time):
         axes.axvline(time, color=VERMILION, linewidth=1.2)
-        axes.annotate(
-            f"τ = {time:.0f}", (0.97, 0.88), xycoords="axes fraction", ha="right", va="top"
-        )
+    _write_time(axes, posterior, column)

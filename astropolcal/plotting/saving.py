@@ -1,10 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """All figures of a calibration as files."""
 
+import warnings
 from pathlib import Path
+
+import numpy as np
 
 from astropolcal.exceptions import (
     AstropolcalError,
+    AstropolcalWarning,
     CalibrationFileError,
     ChainError,
     ObservationError,
@@ -13,12 +17,14 @@ from astropolcal.files import atomic_path
 from astropolcal.plotting.accuracy import plot_accuracy
 from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
+from astropolcal.plotting.identifiability import plot_identifiability
 from astropolcal.plotting.parameters import (
     other_parameters,
     plot_efficiency,
     plot_parameters,
     plot_retardances,
 )
+from astropolcal.plotting.posterior import MAX_CORNER, MAX_TRACES, plot_corner, plot_traces
 from astropolcal.plotting.residuals import plot_residuals
 
 __all__ = ["save_all"]
@@ -34,6 +40,10 @@ def save_all(calibration, folder):
     (when it was read from a file), are left out. Each file appears complete
     or not at all; existing ones are replaced.
 
+    Where the calibration has a posterior, ``corner.png`` shows the parameters
+    common to all wavelengths, and ``traces.png`` these and, as far as there is
+    room, those of the longest autocorrelation times.
+
     Parameters
     ----------
     calibration : Calibration
@@ -46,8 +56,16 @@ def save_all(calibration, folder):
     list of `~pathlib.Path`
         The files: of ``double_differences.png`` (``double_differences_2.png``
         for the second dataset, and so on), ``residuals.png``,
-        ``accuracy.png``, ``retardances.png``, ``efficiency.png`` and
-        ``other_parameters.png`` those that could be drawn.
+        ``accuracy.png``, ``retardances.png``, ``efficiency.png``,
+        ``correlations.png``, ``identifiability.png``,
+        ``other_parameters.png``, ``traces.png`` and ``corner.png`` those that
+        could be drawn.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If a figure of the posterior cannot be drawn, for instance as corner is
+        not installed.
 
     Raises
     ------
@@ -68,7 +86,7 @@ def save_all(calibration, folder):
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     [path.name for path in save_all(cal, folder)][:3]
-    ['double_differences.png', 'residuals.png', 'accuracy.png']
+    ['double_differences.png', 'residuals.png', 'identifiability.png']
     """
     folder = Path(folder)
     try:
@@ -82,7 +100,38 @@ def save_all(calibration, folder):
         except (ChainError, CalibrationFileError, ObservationError):
             continue
         paths.append(_save(figure, folder / f"{name}.png"))
+    if calibration.posterior is not None:
+        paths += _save_posterior(calibration.posterior, folder)
     return paths
+
+
+def _save_posterior(posterior, folder):
+    paths = []
+    for name, draw, most in (
+        ("traces", plot_traces, MAX_TRACES),
+        ("corner", plot_corner, MAX_CORNER),
+    ):
+        path = folder / f"{name}.png"
+        try:
+            figure = draw(posterior, _drawn(posterior, most, fill=draw is plot_traces))
+        except AstropolcalError as error:
+            warnings.warn(f"{path} is not drawn: {error}", AstropolcalWarning, stacklevel=3)
+            continue
+        paths.append(_save(figure, path))
+    return paths
+
+
+def _drawn(posterior, most, fill):
+    """Return what is common to all wavelengths, then the slowest of the others where wanted."""
+    names = posterior.names
+    if len(names) <= most:
+        return names
+    common = [name for name in names if not name.endswith("]")][:most]
+    times = posterior.autocorrelation_times
+    # what does not move comes first
+    order = np.argsort(-np.where(np.isnan(times), np.inf, times), kind="stable")
+    others = [names[i] for i in order if names[i] not in common]
+    return common + others[: most - len(common)] if fill or not common else common
 
 
 def _figures(calibration):
@@ -91,6 +140,7 @@ def _figures(calibration):
         name = "double_differences" + (f"_{i + 1}" if i else "")
         yield name, lambda i=i: plot_double_differences(calibration, dataset=i)
     yield "residuals", lambda: plot_residuals(calibration)
+    yield "identifiability", lambda: plot_identifiability(calibration)
     yield "accuracy", lambda: plot_accuracy(calibration)
     yield "retardances", lambda: plot_retardances(calibration)
     yield "efficiency", lambda: plot_efficiency(calibration)

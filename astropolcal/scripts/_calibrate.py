@@ -3,6 +3,10 @@
 
 from pathlib import Path
 
+import astropy.units as u
+import numpy as np
+
+from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
 from astropolcal.scripts._common import check_outputs, edit_chains, read_datasets, write_json
 
 _EPILOG = """\
@@ -11,6 +15,8 @@ examples:
   astropolcal calibrate run.ecsv -o cal.asdf     one dataset, kept as a file
   astropolcal calibrate a.ecsv b.ecsv --plots p  two datasets that share optics
   astropolcal calibrate run.ecsv --fix hwp.theta=0 --fix derotator.theta=0
+  astropolcal calibrate run.ecsv --standard other.ecsv --groups cycle
+  astropolcal calibrate run.ecsv --target 5,30   for 5 % at 30 deg
 """
 
 
@@ -30,6 +36,7 @@ def add_parser(commands):
     parser.add_argument("-o", "--output", metavar="CAL.asdf", help="write the calibration here")
     parser.add_argument("--instrument", metavar="NAME", help="default: as the tables say")
     _add_model_options(parser)
+    _add_accuracy_options(parser)
     parser.add_argument("--plots", metavar="DIR", help="save the figures in this folder")
     parser.add_argument(
         "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
@@ -66,9 +73,10 @@ def _add_model_options(parser):
     )
     parser.add_argument(
         "--weights",
-        choices=("none", "errors"),
+        choices=("none", "wavelength", "errors"),
         default="none",
-        help="equal weights (default), or one over the tables' errors",
+        help="equal weights (default), one over the residuals' scatter at each wavelength, or one "
+        "over the tables' errors",
     )
     parser.add_argument(
         "--fix",
@@ -107,33 +115,125 @@ def _add_model_options(parser):
     )
 
 
+def _add_accuracy_options(parser):
+    """Add what says how the accuracy is judged."""
+    parser.add_argument(
+        "--standard",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="table that is predicted, not fitted; its errors are s_standard",
+    )
+    parser.add_argument(
+        "--groups",
+        choices=("derotator", "cycle", "dataset"),
+        help="what cross-validation leaves out: derotator angles (default, where there are "
+        "three), cycles of the half-wave plate, or whole datasets",
+    )
+    parser.add_argument(
+        "--target",
+        action="append",
+        default=[],
+        metavar="DOLP[,AOLP]",
+        help="target whose accuracy is given, in percent and degree (default: 1 and 30, any angle)",
+    )
+
+
 def run(arguments):
     """Calibrate, print the summary and write what was asked for."""
     from astropolcal import instruments
-    from astropolcal.calibration import calibrate
+    from astropolcal.calibration import calibrate, summary
+    from astropolcal.calibration.standards import add_standard
+    from astropolcal.calibration.target_accuracy import TARGETS
     from astropolcal.observations import get_observable
 
     say = _silent if arguments.quiet or arguments.json == "-" else print
     check_outputs(arguments.output, arguments.json)
     get_observable(arguments.observable)
+    targets = [_target(text) for text in arguments.target] or TARGETS
     files = arguments.files or [_example(say)]
-    datasets = read_datasets(files)
+    datasets, standards = read_datasets(files), read_datasets(arguments.standard)
+    _check_standards(arguments.standard, standards, files, datasets)
+    tables, n = [*datasets, *standards], len(datasets)
     instrument = instruments.get(arguments.instrument or _stated(datasets))
-    chains = instrument.chains_for(datasets, derotator=arguments.derotator, bounds=arguments.bounds)
+    options = {"derotator": arguments.derotator, "bounds": arguments.bounds}
+    chains = instrument.chains_for(datasets, **options)
+    # each on its own wavelengths
+    chains += [instrument.chains_for([table], **options)[0] for table in standards]
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix", "prior")}
     chains = edit_chains(chains, **edits)
+    positions = [instrument.positions(*pair) for pair in zip(tables, chains, strict=True)]
     calibration = calibrate(
-        chains,
+        chains[:n],
         datasets,
         strategy=arguments.strategy,
         observable=arguments.observable,
         weights=None if arguments.weights == "none" else arguments.weights,
-        positions=[instrument.positions(*pair) for pair in zip(datasets, chains, strict=True)],
+        positions=positions[:n],
         gauge=None if arguments.gauge == "none" else arguments.gauge,
+        fix=_held(arguments, chains[:n]),
         instrument=instrument.name,
+        cross_validate=arguments.groups is None,
     )
-    say(calibration.summary())
-    _write(calibration, arguments, say)
+    if arguments.groups:
+        calibration.cross_validate(arguments.groups)
+        calibration.fit["groups"] = arguments.groups
+    for item in list(zip(chains, tables, positions, strict=True))[n:]:
+        add_standard(calibration, *item)
+    # written first: whoever reads the summary may go away
+    written = _write(calibration, arguments, targets)
+    say(summary(calibration, targets))
+    if written:
+        say("\nWritten: " + "\n         ".join(written))
+
+
+def _check_standards(paths, standards, files, datasets):
+    """Refuse a standard that is fitted, before it is."""
+    for path, standard in zip(paths, standards, strict=True):
+        for file, dataset in zip(files, datasets, strict=True):
+            if standard.content_hash == dataset.content_hash:
+                raise AstropolcalError(
+                    f"--standard {path} is no independent standard: it is fitted as {file}"
+                )
+
+
+def _held(arguments, chains):
+    """Return the parameters that were fixed by name, as the gauge is to name them."""
+    from astropolcal.measurement import parameter_table
+
+    names = {text.partition("=")[0] for text in arguments.fix}
+    loose = {text.partition("=")[0] for text in arguments.prior}
+    known = parameter_table(chains)
+    held = [name for name in known if _named(name, names) and not _named(name, loose)]
+    return dict.fromkeys(held) or None
+
+
+def _named(name, names):
+    return name in names or name.partition(".")[0] in names
+
+
+def _target(text):
+    """Return degree and angle of polarization of DOLP[,AOLP]."""
+    dolp, comma, aolp = text.partition(",")
+    return (
+        _quantity(text, dolp, u.percent, 0, 100),
+        _quantity(text, aolp, u.deg, -360, 360) if comma else None,
+    )
+
+
+def _quantity(text, part, unit, low, high):
+    """Return a number with or without unit, in this one."""
+    try:
+        value = u.Quantity(part)
+        value = value.value * unit if value.unit == u.one else value.to(unit)
+    except (TypeError, ValueError, u.UnitsError):
+        value = np.nan * unit
+    if not low <= value.value <= high:
+        raise ParameterError(
+            f"--target {text}: {part!r} is not allowed; it is {low} to {high} {unit}, "
+            "such as 1 or 30,45 or 5%,-20deg"
+        )
+    return value
 
 
 def _silent(*_):
@@ -154,8 +254,6 @@ def _example(say):
 
 def _stated(datasets):
     """Return the instrument that the first table names."""
-    from astropolcal.exceptions import InstrumentError
-
     stated = datasets[0].instrument
     if stated is None:
         raise InstrumentError(
@@ -164,7 +262,7 @@ def _stated(datasets):
     return stated
 
 
-def _write(calibration, arguments, say):
+def _write(calibration, arguments, targets):
     written = []
     if arguments.output:
         calibration.write(arguments.output, overwrite=True)
@@ -174,8 +272,9 @@ def _write(calibration, arguments, say):
 
         written += [str(path) for path in save_all(calibration, arguments.plots)]
     if arguments.json:
-        write_json(calibration.to_dict(), arguments.json)
+        from astropolcal.calibration import to_dict
+
+        write_json(to_dict(calibration, targets), arguments.json)
         if arguments.json != "-":
             written.append(arguments.json)
-    if written:
-        say("\nWritten: " + "\n         ".join(written))
+    return written

@@ -5,13 +5,16 @@ import astropy.units as u
 import numpy as np
 import pytest
 
+from astropolcal import optics
 from astropolcal.calibration import (
     accuracy_table,
     calibrate,
     cross_validated_residuals,
     leave_out_groups,
 )
-from astropolcal.measurement import Measurement
+from astropolcal.chain import insert_optic
+from astropolcal.exceptions import FitError
+from astropolcal.measurement import Measurement, Normal
 from astropolcal.observations import Observations
 
 LAM = [1.2, 1.6, 2.2] * u.um
@@ -41,7 +44,9 @@ def test_accuracies_by_hand(measurement):
     s_res = 100 * np.sqrt(32 * 0.01**2 / (32 - 5))
     np.testing.assert_allclose(table["s_res"].to_value(u.percent), [0, s_res, 0])
     np.testing.assert_allclose(table["s_mean"].to_value(u.percent), [0, s_res / np.sqrt(32), 0])
-    assert np.isnan(table["s_cv"]).all()
+    for column in ("s_cv", "s_standard"):
+        assert np.isnan(table[column]).all()
+        assert table[column].unit == u.percent
     assert u.allclose(table["wavelength"], LAM)
 
 
@@ -176,6 +181,76 @@ def test_groups_may_be_given(measurement):
     held_out = cross_validated_residuals(measurement, measurement.vector(), groups=groups)
     assert np.isfinite(held_out).all()
     assert np.abs(held_out).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("groups", "message"),
+    [
+        (np.zeros(95), r"groups of shape \(95,\); allowed is \(96,\), one a datum"),
+        (np.arange(96).clip(0, 50), "group 0 has a single member; at least 2 data"),
+    ],
+)
+def test_impossible_groups_are_refused(measurement, groups, message):
+    with pytest.raises(FitError, match=message):
+        cross_validated_residuals(measurement, measurement.vector(), groups=groups)
+
+
+@pytest.fixture(scope="module")
+def two_sources(make, chain):
+    """The lamp at eight derotator angles, and through a retarding window at one."""
+    window = optics.LinearRetarder(
+        retardance=[10, 12, 14] * u.deg,
+        theta=20 * u.deg,
+        name="window",
+    )
+    through = insert_optic(chain, window, before="hwp")
+    chains = [chain, through]
+    data = [
+        make.observe(chain, None, LAM, seed=1),
+        make.observe(through, make.frames([70] * u.deg), LAM, seed=2),
+    ]
+    return Measurement(chains, data)
+
+
+def test_what_only_the_left_out_data_determine_is_not_predicted(two_sources):
+    """A fit without them keeps the value that they gave: that would be no prediction."""
+    m = two_sources
+    held_out = cross_validated_residuals(m, m.vector())
+    lamp, window = m.segments
+    assert np.isfinite(held_out[lamp]).all()
+    assert np.isnan(held_out[window]).all()
+
+
+def test_groups_that_nothing_else_determines_are_refused(two_sources):
+    groups = np.zeros(two_sources.n_data)
+    groups[two_sources.segments[1]] = 1
+    message = r"without group 1.0 \(12 data\) the others do not determine window.retardance"
+    with pytest.raises(FitError, match=message):
+        cross_validated_residuals(two_sources, two_sources.vector(), groups=groups)
+
+
+def test_a_prior_determines_too(make, two_sources):
+    chains = [c.copy() for c in two_sources.chains]
+    chains[1]["window"].retardance.prior = Normal(12 * u.deg, 5 * u.deg)
+    data = [part.observations for part in two_sources.datasets]
+    m = Measurement(chains, data)
+    held_out = cross_validated_residuals(m, m.vector())
+    assert np.isfinite(held_out).all()
+    # predicted with 12 deg at all wavelengths, where the truth is 10, 12 and 14
+    window = m.segments[1]
+    rms = [np.sqrt(np.mean(held_out[window][m.bins[window] == i] ** 2)) for i in range(3)]
+    assert rms[0] > 5 * rms[1]
+    assert rms[2] > 5 * rms[1]
+
+
+def test_directions_that_no_datum_sees_do_not_spoil_predictions(make):
+    """With free gauge angles nothing determines them, and predictions do not depend on them."""
+    free = make.chain("elliptical", wavelength=LAM, fixed=False)
+    truth = make.truth(free)
+    m = Measurement(truth, make.observe(truth, make.frames([45, 60, 80, 100] * u.deg), LAM, seed=1))
+    held_out = cross_validated_residuals(m, m.vector())
+    assert np.isfinite(held_out).all()
+    assert np.abs(held_out).max() < 0.02
 
 
 def test_weights_are_used(make, chain, measurement):

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from astropolcal import Calibration, calibrate, optics
-from astropolcal.calibration import Covariance, DatasetRecord
+from astropolcal.calibration import Covariance, DatasetRecord, Posterior
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import calibration_from_node, node_from_calibration
 from astropolcal.exceptions import CalibrationFileError
-from astropolcal.measurement import Tie
+from astropolcal.measurement import Normal, Tie, Uniform
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um
@@ -41,15 +41,19 @@ def make_chain(flip=False):
     return join(train)
 
 
-def make_calibration(**options):
-    """Calibrate two nights, with and without a flip, in two steps, with a tie."""
-    chains = [make_chain(), make_chain(flip=True)]
+def make_nights():
+    """Observations of two nights, without and with a flip."""
     frames = half_wave_plate_cycles(derotator=[45, 60, 80, 100] * u.deg)
     metas = ({"date": "2025-05-01", "instrument": "bench"}, {"date": "2025-10-02", "n": 3})
-    nights = [
-        simulate(chains[i], WAVELENGTH, frames, seed=i, meta=metas[i], name=f"night{i}")
+    return [
+        simulate(make_chain(flip=i), WAVELENGTH, frames, seed=i, meta=metas[i], name=f"night{i}")
         for i in range(2)
     ]
+
+
+def make_calibration(**options):
+    """Calibrate two nights in two steps, with a tie."""
+    chains, nights = [make_chain(), make_chain(flip=True)], make_nights()
     options = {
         "strategy": "two-step",
         "ties": {"derotator.theta": Tie("hwp.theta", 0.5, 0.1 * u.deg)},
@@ -61,6 +65,30 @@ def make_calibration(**options):
 @pytest.fixture(scope="module")
 def calibration():
     return make_calibration()
+
+
+def make_posterior(calibration, n_steps=900, **options):
+    """Samples about the fit, of two parameters and one of three values of a third."""
+    names = ["polarizer.theta", "hwp.w_sio2", "derotator.retardance[1]"]
+    places = [calibration.covariance.names.index(name) for name in names]
+    units = [calibration.covariance.units[i] for i in places]
+    chain = (
+        np.random.default_rng(3).normal(size=(n_steps, 8, 3)) * calibration.covariance.stds[places]
+    )
+    options = {
+        "acceptance": np.linspace(0.2, 0.3, 8),
+        "fitted": np.zeros(3),
+        "thin": 2,
+        "seed": 5,
+        "settings": {"noise": {"from": "given", "least": 1e-5}, "moves": [["DEMove", 0.8]]},
+    } | options
+    return Posterior(names, units, chain, -0.5 * np.sum(chain**2, axis=2), **options)
+
+
+@pytest.fixture(scope="module")
+def sampled(calibration):
+    """The calibration with a posterior."""
+    return dataclasses.replace(calibration, posterior=make_posterior(calibration))
 
 
 @pytest.fixture
@@ -145,7 +173,7 @@ def test_arrays_and_tables_come_back(calibration, path):
         assert new.content_hash == old.content_hash
         assert new.accuracy.colnames == old.accuracy.colnames
         for name in old.accuracy.colnames:
-            assert np.array_equal(new.accuracy[name], old.accuracy[name])
+            np.testing.assert_array_equal(new.accuracy[name], old.accuracy[name])
             assert getattr(new.accuracy[name], "unit", None) == old.accuracy[name].unit
     assert again.measurement is None
     with pytest.raises(CalibrationFileError, match="holds no observations"):
@@ -198,10 +226,14 @@ def test_file_of_a_file_is_the_same(calibration, content, path):
     assert path.read_bytes() == content
 
 
-def test_no_field_is_forgotten(calibration):
+def test_no_field_is_forgotten(calibration, sampled):
     fields = {field.name for field in dataclasses.fields(Calibration)} - {"measurement"}
-    node = node_from_calibration(calibration)
+    node = node_from_calibration(sampled)
     message = "write and read every field in converters/calibration.py, and bump the schema"
+    posterior = set(sampled.posterior.to_dict()) - {"burn_in"}
+    assert set(node["posterior"]) == posterior | {"converged", "words", "kept"}, message
+    known = {field.name for field in dataclasses.fields(sampled.posterior.convergence)}
+    assert set(node["posterior"]["convergence"]) == known, message
     assert set(node) - {"checksum", "validity", "written_with"} == fields, message
     record = {field.name for field in dataclasses.fields(DatasetRecord)}
     assert set(node["datasets"][0]) == record, message
@@ -213,6 +245,288 @@ def test_no_field_is_forgotten(calibration):
     known = set(vars(calibration.covariance)) - {"null"} | {"open"}
     assert set(node["covariance"]) == known, message
     assert set(node["stages"][0]) == set(calibration.stages[0]), message
+
+
+# ---- the posterior -------------------------------------------------------------------
+
+
+def test_posterior_comes_back_thinned(sampled, path):
+    sampled.write(path)
+    again = Calibration.read(path)
+    assert_same(sampled, again)
+    assert again.posterior == sampled.posterior.thinned()
+    assert again.posterior.log_prob.size < 4000 < sampled.posterior.log_prob.size
+    assert again.posterior.report() == sampled.posterior.report()
+    assert repr(again).endswith("10 free parameters, rank 10, 3 sampled>")
+
+
+def test_summaries_mention_the_posterior(calibration, sampled):
+    assert sampled.to_dict()["posterior"] == sampled.posterior.report()
+    first = sampled.posterior.words().splitlines()[0]
+    assert first in sampled.summary()
+    assert calibration.to_dict()["posterior"] is None
+    assert "walkers" not in calibration.summary()
+
+
+def test_file_with_a_posterior_is_the_same_again(sampled, path):
+    sampled.write(path)
+    content = path.read_bytes()
+    Calibration.read(path).write(path, overwrite=True)
+    assert path.read_bytes() == content
+
+
+def test_file_keeps_as_many_samples_as_it_is_told(sampled, path):
+    told = dataclasses.replace(sampled, posterior=sampled.posterior.thinned(draws=10**6))
+    told.write(path)
+    again = Calibration.read(path).posterior
+    assert again == told.posterior
+    assert again.log_prob.size > 4000
+
+
+def test_posterior_says_in_the_file_what_it_is(sampled, path):
+    sampled.write(path)
+    with asdf.open(path, _force_raw_types=True) as file:
+        node = file["calibration"]["posterior"]
+        assert node["words"] == sampled.posterior.words()
+        assert node["kept"].startswith("Of 7152 samples 3576 are kept, one step in 4;")
+        assert node["converged"] is True
+        assert node["units"] == ["deg", "mm", "deg"]
+        assert node["thin"] == sampled.posterior.thinned().thin
+
+
+def test_posterior_of_a_number_and_without_anything_optional_comes_back(calibration, path):
+    chain = 0.9 + 0.01 * np.random.default_rng(1).normal(size=(2, 4, 1))
+    posterior = Posterior(["wollaston.efficiency[0]"], [None], chain, chain[..., 0])
+    dataclasses.replace(calibration, posterior=posterior).write(path)
+    again = Calibration.read(path).posterior
+    assert again == posterior.thinned()
+    assert again.units == [None]
+    assert again.acceptance is None
+
+
+def test_file_without_a_posterior_reads_as_before(content, path):
+    assert b"posterior" not in content
+    assert b"priors" not in content
+    path.write_bytes(content)
+    again = Calibration.read(path)
+    assert again.posterior is None
+    assert repr(again).endswith("10 free parameters, rank 10>")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"names": ["polarizer.theta", "hwp.colour", "hwp.theta"]}, "posterior of 'hwp.colour'"),
+        ({"names": ["hwp.theta", "hwp.w_sio2", "hwp.theta"]}, "a parameter is named twice"),
+        ({"units": ["deg", "um", "deg"]}, "posterior of hwp.w_sio2 is in um, allowed is mm"),
+        ({"chain": np.full((900, 8, 3), np.nan)}, "samples must be finite"),
+        ({"log_prob": np.full((900, 8), -np.inf)}, "log_prob must be finite"),
+        ({"settings": {"by": len}}, "posterior.settings.by is a builtin_function_or_method"),
+    ],
+)
+def test_inconsistent_posterior_is_not_written(sampled, path, change, message):
+    parts = sampled.posterior.to_dict() | change
+    with np.errstate(invalid="ignore"):
+        changed = dataclasses.replace(sampled, posterior=Posterior.from_dict(parts))
+        assert_not_written(changed, path, message)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"    converged: true", b"    converged: false", "checksum"),
+        (b"seed: 5", b"seed: 6", "checksum"),
+        (b"seed: 5", b"seed: five", "invalid at .*posterior.seed"),
+        (b"    log_prob:", b"    log_porb:", "invalid at .*posterior"),
+        (b"    words: '1800", b"    sworn: '1800", "invalid at .*posterior"),
+        (b"    words: '1800", b"    words: '1900", "checksum"),
+        (b"    thin: ", b"    thin: -", "invalid at .*posterior.thin"),
+        (b"n_draws: ", b"n_draws: -", "invalid at .*n_draws"),
+        (b"r_hat: !core/ndarray", b"r_hat: !core/quantity", "unknown kind"),
+    ],
+)
+def test_changed_posterior_is_refused(sampled, path, old, new, message):
+    sampled.write(path)
+    assert_refused(path, replaced(path.read_bytes(), old, new), message)
+
+
+def test_changed_sample_is_refused(sampled, path):
+    sampled.write(path)
+    content = bytearray(path.read_bytes())
+    place = content.index(sampled.posterior.thinned().chain.tobytes())
+    content[place + 100] ^= 1
+    assert_refused(path, bytes(content), "checksum")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"names": ["polarizer.theta", "hwp.w_sio2"]}, "posterior: chain of 2 names and 3 units"),
+        ({"names": ["polarizer.theta", "hwp.w_sio2", "x"]}, "posterior of 'x', which is no free"),
+        ({"log_prob": np.zeros((2, 2))}, r"posterior: log_prob has shape \(2, 2\)"),
+        ({"acceptance": np.zeros(2)}, r"posterior: acceptance has shape \(2,\)"),
+    ],
+)
+def test_inconsistent_posterior_with_a_right_checksum(sampled, change, message):
+    from astropolcal.converters.calibration import _checksum
+
+    node = node_from_calibration(sampled)
+    node["posterior"] |= change
+    node["checksum"] = _checksum(node)
+    with pytest.raises(CalibrationFileError, match=message):
+        calibration_from_node(node)
+
+
+# ---- priors --------------------------------------------------------------------------
+
+
+def with_priors(**priors):
+    """A calibration of one night with priors on what is named ``optic__parameter``."""
+    chain = make_chain()
+    for name, prior in priors.items():
+        optic, key = name.split("__")
+        getattr(chain[optic], key).prior = prior
+    return calibrate(chain, make_nights()[0], cross_validate=False)
+
+
+def test_priors_come_back(path):
+    from scipy.stats import truncnorm
+
+    truncated = truncnorm(-5, 0, loc=1, scale=0.03)
+    calibration = with_priors(
+        hwp__theta=Normal(0 * u.deg, 6 * u.arcmin),
+        hwp__w_sio2=Uniform(1.6 * u.mm, 1.7 * u.mm),
+        wollaston__efficiency=truncated,
+    )
+    calibration.write(path)
+    again = Calibration.read(path)
+    assert_same(calibration, again)
+    assert again.chain["hwp"].theta.prior == Normal(0 * u.deg, 6 * u.arcmin)
+    assert again.chain["hwp"].w_sio2.prior == Uniform(1.6 * u.mm, 1.7 * u.mm)
+    prior = again.chain["wollaston"].efficiency.prior
+    assert prior.logpdf(0.98) == truncated.logpdf(0.98)
+    # writing leaves the calibration as it is
+    assert calibration.chain["hwp"].theta.prior == Normal(0 * u.deg, 6 * u.arcmin)
+    again.write(path, overwrite=True)
+    assert_same(calibration, Calibration.read(path))
+
+
+def test_priors_act_after_reading(path):
+    night = make_nights()[0]
+    calibration = with_priors(hwp__theta=Normal(0.2 * u.deg, 0.1 * u.deg))
+    calibration.write(path)
+    again = Calibration.read(path).with_observations(night)
+    old, new = calibration.measurement, again.measurement
+    assert new.n_priors == old.n_priors == 1
+    vector = old.vector() + 1e-4
+    assert new.log_prior(vector) == old.log_prior(vector)
+
+
+def test_prior_without_unit_comes_back(path):
+    calibration = with_priors(wollaston__efficiency=Normal(0.98, 0.01))
+    calibration.write(path)
+    assert Calibration.read(path).chain["wollaston"].efficiency.prior == Normal(0.98, 0.01)
+
+
+def test_prior_of_something_else_is_not_written(calibration, path):
+    changed = dataclasses.replace(calibration, chains=[c.copy() for c in calibration.chains])
+    changed.chains[0]["hwp"].w_sio2.prior = lambda value: -(value**2)
+    assert_not_written(changed, path, "prior of hwp.w_sio2 is a function")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"parameter": "hwp.colour"}, "prior of 'hwp.colour', which no chain has"),
+        ({"distribution": "os"}, "no continuous distribution 'os'"),
+        ({"distribution": "poisson"}, "no continuous distribution 'poisson'"),
+        ({"args": [1.0] * 9}, "prior of hwp.theta: "),
+    ],
+)
+def test_prior_of_an_unknown_kind_is_refused(change, message):
+    from scipy.stats import norm
+
+    from astropolcal.converters.calibration import _checksum
+
+    node = node_from_calibration(with_priors(hwp__theta=norm(0, 0.1)))
+    node["priors"][0] |= change
+    node["checksum"] = _checksum(node)
+    with pytest.raises(CalibrationFileError, match=message):
+        calibration_from_node(node)
+
+
+# ---- with the observations again --------------------------------------------------------
+
+
+def test_observations_are_brought_back(calibration, content, path):
+    path.write_bytes(content)
+    again = Calibration.read(path).with_observations(make_nights()[::-1])
+    np.testing.assert_allclose(again.residuals, calibration.residuals, rtol=0, atol=1e-12)
+    assert again.measurement.free.names == calibration.measurement.free.names
+    assert [d.observations.name for d in again.measurement.datasets] == ["night0", "night1"]
+    before = [record.accuracy["s_cv"].copy() for record in again.datasets]
+    again.cross_validate()
+    for record, old in zip(again.datasets, before, strict=True):
+        np.testing.assert_allclose(record.accuracy["s_cv"], old, rtol=1e-4)
+    again.write(path, overwrite=True)
+    assert_same(again, Calibration.read(path))
+
+
+@pytest.mark.parametrize("weights", [None, "wavelength", "errors", 0.003, [0.002, 0.003, 0.004]])
+def test_noise_of_the_fit_is_brought_back(path, weights):
+    from astropolcal.calibration.weighting import weighting_of
+
+    night = make_nights()[0]
+    calibration = calibrate(make_chain(), night, weights=weights, cross_validate=False)
+    calibration.write(path)
+    again = Calibration.read(path).with_observations(night)
+    old, new = weighting_of(calibration), weighting_of(again)
+    assert new.choice == old.choice
+    # noise from residuals is found again, to the thousandth at which its rounds end
+    np.testing.assert_allclose(new.sigma, old.sigma, rtol=3e-3)
+
+
+def test_reading_again_does_not_change_what_was_read(content, path):
+    path.write_bytes(content)
+    alone = Calibration.read(path)
+    again = alone.with_observations(make_nights())
+    again.datasets[0].accuracy["s_cv"] = 1 * u.percent
+    again.chain["hwp"].w_sio2 = 1 * u.mm
+    assert_same(alone, Calibration.read(path))
+    assert alone.measurement is None
+
+
+def test_observations_of_another_content(calibration):
+    frames = half_wave_plate_cycles(derotator=[45, 60] * u.deg)
+    other = simulate(make_chain(), WAVELENGTH, frames, seed=9, name="other")
+    message = (
+        rf"other: the calibration was not made from this table, whose content hash is "
+        rf"{other.content_hash[:12]}; it was made from night0 \([0-9a-f]{{12}}\), night1"
+    )
+    with pytest.raises(CalibrationFileError, match=message):
+        calibration.with_observations([*make_nights(), other])
+
+
+def test_observations_that_are_missing(calibration):
+    message = r"also made from night1 \(content hash [0-9a-f]{12}\): give that table"
+    with pytest.raises(CalibrationFileError, match=message):
+        calibration.with_observations(make_nights()[0])
+
+
+def test_stages_elsewhere_than_the_columns_say(path):
+    """Positions that a table does not hold must be given again."""
+    night = make_nights()[0]
+    positions = {
+        "hwp": night.position("hwp"),
+        "derotator": night.position("derotator") + np.deg2rad(3),
+    }
+    calibrate(make_chain(), night, positions=[positions], cross_validate=False).write(path)
+    again = Calibration.read(path)
+    with pytest.raises(CalibrationFileError, match=r"night0: the residuals are not those .*posit"):
+        again.with_observations(night)
+    assert again.with_observations(night, positions).residuals.size == 48
+    with pytest.raises(CalibrationFileError, match="2 positions for 1 tables"):
+        again.with_observations(night, [positions] * 2)
 
 
 def test_file_says_for_what_it_holds(content):

@@ -255,7 +255,7 @@ def test_joint_fit_is_at_least_as_good_as_two_steps(few, calibrated):
     ("options", "words"),
     [
         ({"strategy": "three-step"}, "strategy = 'three-step'; allowed are joint, two-step"),
-        ({"weights": "none"}, "weights = 'none'; allowed are None and 'errors'"),
+        ({"weights": "none"}, "weights = 'none'; allowed are None, 'wavelength', 'errors'"),
     ],
 )
 def test_unknown_choice_is_refused(few, options, words):

@@ -4,10 +4,13 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, TRFLSQFitter
 
-from astropolcal import Calibration, calibrate, instruments
+from astropolcal import Calibration, calibrate, instruments, optics
+from astropolcal.calibration import BinProblem, describe_gauge
+from astropolcal.calibration.gauge import hold_silent
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.measurement import Normal
+from astropolcal.measurement import Measurement, Normal
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
@@ -127,7 +130,129 @@ def test_a_prior_competes_with_the_data_by_their_errors(observations):
     assert np.abs(expected - value).max() > 0.2 * std
     np.testing.assert_allclose(known["value"], expected, atol=0.02 * std)
     np.testing.assert_allclose(known["std"], np.sqrt(np.diag(posterior)), rtol=0.01)
-    assert "none for calibration_polarizer.theta" in pulled.settings["gauge"]
+    # a prior on something else leaves the choice of a gauge where it is
+    gauge = "prior on wollaston.efficiency; minimal: of all equal fits, the least change of "
+    assert pulled.settings["gauge"].startswith(gauge + "calibration_polarizer.theta, hwp.theta")
+    np.testing.assert_allclose(_angles(pulled), _angles(free), atol=5e-3)
+
+
+def test_directions_that_priors_leave_open_are_settled(observations):
+    """A prior on one of three angles closes one direction of two; the derotator goes home."""
+    found = []
+    for derotator in (0.0, 0.4):
+        chain = _chain()
+        chain["hwp"].theta.prior = Normal(0.2 * u.deg, 0.05 * u.deg)
+        chain["derotator"].diagonal = np.full(4, -4.0 + 5 * derotator) * u.deg
+        cal = _fit(chain, observations)
+        assert cal.settings["gauge"] == (
+            "prior on hwp.theta; minimal: of all equal fits, the least change of derotator.theta"
+        )
+        assert _angles(cal)[2] == pytest.approx(0.0, abs=1e-3)
+        assert _angles(cal)[1] == pytest.approx(0.2, abs=1e-3)
+        known = cal.parameter_values()
+        assert known["hwp.theta"]["std"] == pytest.approx(0.05, rel=0.02)
+        assert np.isfinite(known["calibration_polarizer.theta"]["std"])
+        assert np.isnan(known["derotator.theta"]["std"])
+        found.append(cal)
+    np.testing.assert_allclose(_angles(found[0]), _angles(found[1]), atol=2e-3)
+    accident = _fit(_chain(), observations, gauge=None)
+    assert np.abs(_angles(accident)[2]) > 1e-2
+
+
+def test_settling_does_not_leave_the_priors(observations):
+    """The sum of squares with priors is what the gauge must not spoil."""
+    chain = _chain()
+    chain["hwp"].theta.prior = Normal(0.2 * u.deg, 0.05 * u.deg)
+    chain["wollaston"].efficiency.prior = Normal(0.97, 0.003)
+    totals = []
+    for gauge in ("minimal", None):
+        cal = _fit(chain, observations, gauge=gauge)
+        live = cal.measurement
+        problem = BinProblem(live, None, live.weighting.level)
+        totals.append(problem.total(live.vector()))
+    assert totals[0] == pytest.approx(totals[1], rel=1e-3)
+
+
+def test_describe_gauge_names_priors_and_choice(observations):
+    chain = _chain()
+    chain["hwp"].theta.prior = Normal(0 * u.deg, 1 * u.deg)
+    free = Measurement(chain, observations).free
+    words = describe_gauge(None, ["derotator.theta"], free, ["hwp.w_sio2"])
+    assert words == (
+        "held: hwp.w_sio2; prior on hwp.theta; none for derotator.theta: where the fit ended, an "
+        "accident of its start"
+    )
+
+
+# --- what moves no datum --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fitter", [TRFLSQFitter, LevMarLSQFitter, DogBoxLSQFitter])
+@pytest.mark.parametrize("gauge", ["minimal", None])
+def test_what_moves_no_datum_stays_at_its_start(observations, fitter, gauge):
+    """One wavelength without data: its four parameters, and nothing else, keep their values."""
+    mask = np.zeros((observations.n_frames, 4), dtype=bool)
+    mask[:, 1] = True
+    masked, chain = observations.with_mask(mask, "test"), _chain()
+    start = Measurement(chain, masked).vector()
+    cal = _fit(chain, masked, fitter=fitter(), gauge=gauge)
+    silent = ["horizontal", "diagonal", "circular"]
+    silent = [f"derotator.{key}[1]" for key in silent] + ["wollaston.efficiency[1]"]
+    assert cal.identifiability.silent == silent
+    rows = [cal.covariance.names.index(name) for name in silent]
+    np.testing.assert_array_equal(cal.measurement.vector()[rows], start[rows])
+    assert np.isnan(cal.covariance.stds[rows]).all()
+    assert not cal.at_bound
+    for name in silent:
+        words = f"{name} changes no datum: it cannot be determined and keeps its start value"
+        assert words in str(cal.identifiability)
+
+
+def test_what_drifted_without_a_datum_is_brought_back(observations):
+    """As a fitter would leave it that walks along what changes nothing, to a bound."""
+    mask = np.zeros((observations.n_frames, 4), dtype=bool)
+    mask[:, 1] = True
+    live = Measurement(_chain(), observations.with_mask(mask, "test"))
+    origin, slot = live.vector(), live.free.by_name["wollaston.efficiency"].slice
+    drifted = origin.copy()
+    drifted[slot] = [0.9, 1.0, 0.91, 0.92]
+    live.parameters = drifted
+    hold_silent(live, origin)
+    np.testing.assert_array_equal(live.vector()[slot], [0.9, origin[slot][1], 0.91, 0.92])
+
+
+def test_what_is_silent_at_the_start_only_is_fitted():
+    """Without retardance an axis changes nothing; the fit finds both."""
+    chain = (
+        optics.LinearPolarizer(theta=20 * u.deg, name="polarizer")
+        | optics.LinearRetarder(
+            retardance=0 * u.deg, theta=10 * u.deg, name="window", fixed={"theta": False}
+        )
+        | optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
+        | optics.WollastonPrism(efficiency=0.9, name="wollaston")
+    )
+    truth = chain.copy()
+    truth["window"].retardance, truth["window"].theta = 40 * u.deg, 14 * u.deg
+    frames = half_wave_plate_cycles(derotator=[45] * u.deg)
+    data = simulate(truth, WAVELENGTH, frames, flux=1e8, seed=4)
+    chain["hwp"].retardance.fixed = chain["wollaston"].efficiency.fixed = True
+    cal = _fit(chain, data)
+    assert cal.identifiability.silent == []
+    assert cal.chain["window"].theta.value != 10
+
+
+def test_a_prior_speaks_for_what_is_silent(observations):
+    """It then stands where its prior has it."""
+    mask = np.zeros((observations.n_frames, 4), dtype=bool)
+    mask[:, 1] = True
+    chain = _chain()
+    chain["wollaston"].efficiency.prior = Normal(0.95, 0.02)
+    cal = _fit(chain, observations.with_mask(mask, "test"))
+    known = cal.parameter_values()["wollaston.efficiency"]
+    assert known["value"][1] == pytest.approx(0.95, abs=1e-6)
+    assert known["std"][1] == pytest.approx(0.02, rel=1e-3)
+    assert "wollaston.efficiency[1]" in cal.identifiability.silent
+    assert "only its prior tells it" in str(cal.identifiability)
 
 
 def test_without_a_choice_there_is_no_gauge(observations):

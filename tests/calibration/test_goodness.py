@@ -16,7 +16,7 @@ from astropolcal.calibration import (
 )
 from astropolcal.chain import join
 from astropolcal.exceptions import FitError
-from astropolcal.measurement import Measurement
+from astropolcal.measurement import Measurement, Normal
 from astropolcal.simulation import simulate
 
 LAM = [1.2, 1.6, 2.2] * u.um
@@ -205,6 +205,113 @@ def test_wrong_model_is_found_by_replicates(make):
     cal = calibrate(make.chain(wavelength=LAM), data, cross_validate=False)
     test = lack_of_fit(cal.measurement, cal, noise_from_replicates(cal.measurement))
     assert test.p_value < 1e-12
+
+
+# --- priors --------------------------------------------------------------------------
+
+
+def with_priors(chain, **priors):
+    chain = chain.copy()
+    for name, prior in priors.items():
+        optic, key = name.split("__")
+        getattr(chain[optic], key).prior = prior
+    return chain
+
+
+def fit_with_priors(measurement, vector, weights, level, steps=5):
+    """Gauss-Newton on data and priors."""
+    free = measurement.free
+    for _ in range(steps):
+        slope = np.hstack(
+            [measurement.jacobian(vector) * weights, free.prior_jacobian(vector) * level]
+        )
+        residual = np.append(
+            weights * measurement.residuals(vector), -level * free.prior_residuals(vector)
+        )
+        vector = vector + np.linalg.lstsq(slope.T, residual, rcond=None)[0]
+    return vector
+
+
+def test_probabilities_are_uniform_with_priors_that_are_true(chain, measurement):
+    """Monte Carlo, 200 runs: truths drawn from the priors, which are as narrow as the data."""
+    data = measurement.datasets[0].observations
+    priors = {"wollaston__efficiency": Normal(0.95, 1e-4)}
+    priors["calibration_polarizer__theta"] = Normal(90 * u.deg, 0.01 * u.deg)
+    m, rng = Measurement(with_priors(chain, **priors), data), np.random.default_rng(2)
+    centre, slot = m.vector(), m.free.by_name["wollaston.efficiency"].slice
+    total, alone, of_priors = [], [], []
+    for _ in range(200):
+        truth = centre.copy()
+        truth[slot] = rng.normal(0.95, 1e-4, 3)
+        truth[m.free.by_name["calibration_polarizer.theta"].start] = rng.normal(
+            np.deg2rad(90), np.deg2rad(0.01)
+        )
+        m.observed = m.predict(truth) + rng.normal(0, m.sigma)
+        test = lack_of_fit(m, fit_with_priors(m, truth, 1 / m.sigma, 1.0), weights=1 / m.sigma)
+        total.append(test.p_value)
+        alone.append(test.table["p_value"][1])
+        of_priors.append(test.priors["p_value"])
+    # four priors are four data more
+    assert test.expected == pytest.approx(m.n_data + 4 - m.free.size)
+    assert 0.5 < test.priors["expected"] < 3.5
+    for p in (total, alone, of_priors):
+        assert uniform(p) > 0.01
+
+
+def test_a_narrow_prior_leaves_its_freedom_to_the_data(chain, measurement):
+    """As if the parameter were fixed; and a broad one as if it were not there."""
+    data = measurement.datasets[0].observations
+    start = measurement.free.by_name["calibration_polarizer.theta"].start
+    value = np.rad2deg(measurement.vector()[start]) * u.deg
+    for std, taken in ((1e-7, 0), (30, 1)):
+        prior = {"calibration_polarizer__theta": Normal(value, std * u.deg)}
+        m = Measurement(with_priors(chain, **prior), data)
+        test = lack_of_fit(m, weights=1 / m.sigma)
+        of_data = sum(test.table["expected"])
+        assert of_data == pytest.approx(m.n_data - (m.free.size - 1) - taken, abs=1e-3)
+        # what a narrow prior loses the data gain, so that all together stays the same
+        assert of_data + test.priors["expected"] == pytest.approx(test.expected)
+        assert test.expected == pytest.approx(m.n_data + 1 - m.free.size)
+
+
+def test_a_prior_that_only_chooses_the_gauge_adds_nothing(make):
+    truth = make.truth(make.chain("elliptical", fixed=False, wavelength=LAM))
+    priors = {f"{name}__theta": Normal(0 * u.deg, 1 * u.deg) for name in ("hwp", "derotator")}
+    data = make.observe(truth, wavelength=LAM, seed=1)
+    plain, gauged = (
+        calibrate(c, data, weights="errors", search=False, cross_validate=False)
+        for c in (truth, with_priors(truth, **priors))
+    )
+    tests = [lack_of_fit(cal.measurement, cal) for cal in (plain, gauged)]
+    assert tests[1].expected == pytest.approx(tests[0].expected, abs=0.02)
+    assert tests[1].chi2 == pytest.approx(tests[0].chi2, rel=1e-2)
+    assert tests[0].priors is None
+    assert tests[1].priors["expected"] < 0.02
+
+
+def test_a_wrong_prior_is_found(make, chain):
+    """Known noise and the null channel alike: the data overrule the prior, and the words say so."""
+    data = make.observe(chain, wavelength=LAM, seed=1)
+    wrong = with_priors(chain, calibration_polarizer__theta=Normal(89 * u.deg, 0.1 * u.deg))
+    cal = calibrate(wrong, data, weights="errors", search=False, cross_validate=False)
+    m = cal.measurement
+    for noise in (noise_from_errors(m), noise_from_null_channel(m, null_model="smooth")):
+        test = lack_of_fit(m, cal, noise)
+        assert test.priors["p_value"] < 1e-6
+        assert test.p_value < 1e-6
+        assert "the data disagree with the priors" in test.words
+    found = cal.fit["lack_of_fit"][0]["words"]
+    assert "the data disagree with the priors" in found
+
+
+def test_new_data_do_not_count_the_priors(make, chain):
+    """They are no part of what is predicted."""
+    wrong = with_priors(chain, calibration_polarizer__theta=Normal(89 * u.deg, 0.1 * u.deg))
+    data = make.observe(chain, wavelength=LAM, seed=1)
+    cal = calibrate(wrong, data, weights="errors", search=False, cross_validate=False)
+    test = lack_of_fit(cal.measurement_of(make.observe(chain, wavelength=LAM, seed=2)), cal)
+    assert test.priors is None
+    assert test.expected == 96
 
 
 # --- what cannot be tested ----------------------------------------------------------

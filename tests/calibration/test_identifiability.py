@@ -7,6 +7,8 @@ The gauge freedoms at one wavelength follow from the Mueller algebra: (i) the
 retardance and a common rotation of polarizer and half-wave plate.
 """
 
+import re
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -14,9 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astropolcal import optics
-from astropolcal.calibration import analyse, calibrate
+from astropolcal.calibration import analyse, calibrate, examine, sky_consequences
+from astropolcal.calibration._directions import near_null_directions
+from astropolcal.calibration._whitened import Whitened
 from astropolcal.calibration.identifiability import physical_scale
-from astropolcal.measurement import FreeParameters, Measurement
+from astropolcal.measurement import FreeParameters, Measurement, Normal
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 FRAMES = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)
@@ -78,9 +82,10 @@ def test_double_difference_does_not_see_a_plate_that_does_nothing():
     finding, _ = finding_of(Measurement(chain, data))
     assert finding.rank == 0
     assert {d["words"] for d in finding.directions} == {
-        "polarizer.theta changes no datum: it cannot be determined",
-        "wollaston.theta changes no datum: it cannot be determined",
+        "polarizer.theta changes no datum: it cannot be determined and keeps its start value",
+        "wollaston.theta changes no datum: it cannot be determined and keeps its start value",
     }
+    assert finding.silent == ["polarizer.theta", "wollaston.theta"]
 
 
 def test_one_wavelength_has_rank_six_of_eight(make):
@@ -258,3 +263,154 @@ def test_no_information_at_all():
     finding, covariance = analyse(free, np.zeros((1, 4)))
     assert finding.rank == 0
     assert np.isnan(covariance).all()
+
+
+# --- determined, but badly ------------------------------------------------------------------
+
+
+def faint(make, flux, fixed=True, **options):
+    """An elliptical derotator at three angles, with as much or little light as is asked for."""
+    lam = [1.2, 1.6, 2.0, 2.2] * u.um
+    chain = make.truth(make.chain("elliptical", fixed=fixed, wavelength=lam))
+    frames = half_wave_plate_cycles(derotator=[45, 90, 120] * u.deg)
+    data = make.observe(chain, frames, lam, seed=1, flux=flux)
+    for name, prior in options.items():
+        getattr(chain["derotator"], name).prior = prior
+    return calibrate(chain, data, weights="errors", search=False, cross_validate=False)
+
+
+def test_what_is_uncertain_by_many_degrees_is_named(make):
+    """Little light makes the rank no smaller: the words say what the noise does to a parameter."""
+    cal = faint(make, 1e3)
+    finding = cal.identifiability
+    assert finding.rank == finding.n_free
+    assert finding.directions == []
+    worst = finding.near_null[0]
+    names = [name for name in worst["parameters"] if name.startswith("derotator")]
+    assert names
+    assert re.match(
+        r"derotator\.\w+\[0\] is uncertain by \d+ deg at the noise of this fit", worst["words"]
+    )
+    assert " deg of AoLP and " in worst["words"]
+    said = float(worst["words"].split("uncertain by ")[1].split(" deg")[0])
+    lead = worst["words"].split(" is uncertain")[0]
+    # one direction is a part of the whole error
+    std = cal.covariance.std(lead).to_value(u.deg)
+    assert 0.4 * std < said < 1.05 * std
+    assert f"badly determined: {worst['words']}" in str(finding)
+    assert max(map(abs, worst["parameters"][lead[:-3]])) == pytest.approx(said, rel=0.06)
+
+
+def test_the_effect_on_sky_is_that_of_one_standard_error(make):
+    """Each direction is moved by hand, and the change of the AoLP worked out anew."""
+    cal = faint(make, 1e3)
+    live, scale = cal.measurement, physical_scale(cal.measurement.free)
+    for direction in cal.identifiability.near_null[:2]:
+        change = np.zeros(live.free.size)
+        for slot in live.free.slots:
+            if slot.name in direction["parameters"]:
+                size = 0.01 if slot.unit is None else 1.0
+                change[slot.slice] = np.array(direction["parameters"][slot.name]) / size
+        (sky,) = sky_consequences(live, live.vector(), (change * scale)[None])
+        # what moves least is left out
+        for key in ("aolp_deg", "dolp_percent"):
+            limit = 0.05 * np.abs(direction["sky"][key]).max() + 0.05
+            np.testing.assert_allclose(sky[key], direction["sky"][key], atol=limit)
+
+
+def test_it_is_known_before_the_data_are_taken(make):
+    """From the noise to be expected; without it there is no size of any error."""
+    live = faint(make, 1e3).measurement
+    found = examine(live, 1 / live.sigma).near_null
+    assert [d["words"] for d in found] == [
+        d["words"] for d in faint(make, 1e3).identifiability.near_null
+    ]
+    assert examine(live).near_null == []
+
+
+def test_enough_light_leaves_nothing_badly_determined(make):
+    assert faint(make, 1e8).identifiability.near_null == []
+    assert "badly determined" not in str(faint(make, 1e8).identifiability)
+
+
+def test_a_prior_is_a_remedy(make):
+    """Priors count as data where it is asked what is uncertain."""
+    before = faint(make, 1e3).identifiability.near_null
+    priors = {key: Normal(0 * u.deg, 1 * u.deg) for key in ("diagonal", "circular")}
+    after = faint(make, 1e3, **priors).identifiability.near_null
+    leads = {d["words"].split("[")[0] for d in before}
+    assert leads & {"derotator.diagonal", "derotator.circular"}
+    left = {d["words"].split("[")[0] for d in after}
+    assert not left & {"derotator.diagonal", "derotator.circular"}
+
+
+def test_open_directions_are_not_badly_determined_ones(make):
+    finding = faint(make, 1e8, fixed=False).identifiability
+    assert len(finding.directions) == 2
+    assert finding.near_null == []
+
+
+def test_a_bad_condition_is_named_whatever_the_noise():
+    """Two angles of which the data see the sum a million times better than the difference."""
+    chain = angles_chain()
+    free = FreeParameters([chain], 1)
+    jacobian = np.array([[1.0, 1e-6], [1.0, -1e-6]]) / np.deg2rad(1.0) * 1e9
+    whitened = Whitened(jacobian, physical_scale(free))
+    (found,) = near_null_directions(free, whitened, 1.0, lambda changes: [None] * len(changes))
+    assert "(condition 1e+06)" in found["words"]
+    assert "sky" not in found
+    values = list(found["parameters"].values())
+    assert values[0] == pytest.approx(-values[1])
+
+
+def test_one_parameter_at_many_wavelengths_is_one_sentence():
+    """All wavelengths uncertain together, as where a direction common to all is."""
+    chain = optics.LinearRetarder(retardance=[1, 2, 3] * u.deg, name="x")
+    free = FreeParameters([chain], 3)
+    common = np.ones((3, 1)) / np.sqrt(3)
+    others = np.linalg.svd(np.ones((1, 3)))[2][1:].T
+    jacobian = np.hstack([common / 20, others]) / np.deg2rad(1.0)
+    (found,) = near_null_directions(
+        free, Whitened(jacobian, physical_scale(free)), 1.0, lambda c: [None] * len(c)
+    )
+    assert found["words"] == (
+        "x.retardance is uncertain by 12 to 12 deg at 3 wavelengths together at the noise of this "
+        "fit"
+    )
+
+
+# --- one decomposition for all ----------------------------------------------------------------
+
+
+@given(
+    n_data=st.integers(3, 12),
+    n_priors=st.integers(0, 3),
+    held=st.lists(st.booleans(), min_size=5, max_size=5),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_problem_decomposed_once_is_that_of_the_normal_equations(n_data, n_priors, held, seed):
+    """Covariance, leverage and freedom against plain inverses."""
+    rng, held = np.random.default_rng(seed), np.array(held)
+    data, priors = rng.normal(size=(5, n_data)), rng.normal(size=(5, n_priors))
+    scale = rng.uniform(0.1, 10, 5)
+    found = Whitened(data, scale, priors if n_priors else None, held)
+    live = np.flatnonzero(~held)
+    normal = (data @ data.T + priors @ priors.T)[np.ix_(live, live)]
+    if live.size and np.linalg.cond(normal) > 1e8:
+        return
+    inverse = np.linalg.inv(normal) if live.size else np.zeros((0, 0))
+    np.testing.assert_allclose(
+        found.covariance()[np.ix_(live, live)], inverse, rtol=1e-6, atol=1e-9
+    )
+    assert np.isnan(found.covariance()[held]).all()
+    hat = data[live].T @ inverse @ data[live]
+    np.testing.assert_allclose(found.leverage, np.diag(hat), atol=1e-6)
+    assert found.n_taken == pytest.approx(np.trace(hat), abs=1e-6)
+    assert found.data.rank == np.linalg.matrix_rank(data)
+
+
+def test_without_priors_and_bounds_there_is_one_decomposition(make):
+    measurement = Measurement(make.chain(), make.observe(make.chain(), seed=1))
+    vector = measurement.vector()
+    found = Whitened(measurement.jacobian(vector), physical_scale(measurement.free))
+    assert found.data is found.together is found.errors

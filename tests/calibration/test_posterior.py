@@ -11,6 +11,8 @@ from astropolcal.calibration import Posterior, autocorrelation, autocorrelation_
 from astropolcal.exceptions import AstropolcalError, ParameterError
 
 NAMES, UNITS = ["hwp.theta", "wollaston.efficiency[0]"], [u.deg, None]
+CONVERGENCE = {"n_steps": 100, "burn_in": 10, "n_draws": 90}
+CONVERGENCE |= {key: [1.0] for key in ("times", "median", "lower", "upper", "std")}
 
 
 def correlated(rho, n_steps=20000, n_walkers=8, seed=1):
@@ -108,7 +110,8 @@ def test_summary(posterior):
     assert table["tau"] == pytest.approx([4.0, 4.0], rel=0.15)
     assert table["r_hat"] == pytest.approx([1.0, 1.0], abs=0.01)
     # 8 walkers of 4000 steps
-    assert table["ess"] == pytest.approx([8000, 8000], rel=0.2)
+    assert table["ess_bulk"] == pytest.approx([8000, 8000], rel=0.2)
+    assert (table["ess_tail"] > 4000).all()
     assert (table["lower"] < table["median"]).all()
     assert (table["median"] < table["upper"]).all()
     assert table["std"] == pytest.approx([0.1, 0.01], rel=0.05)
@@ -122,10 +125,10 @@ def test_r_hat_of_walkers_that_stay_apart():
     assert (table["r_hat"] > 1.5).all()
 
 
-def test_summary_without_arviz(posterior, monkeypatch):
+def test_summary_without_arviz(monkeypatch):
     monkeypatch.setitem(sys.modules, "arviz_stats.base", None)
     with pytest.raises(AstropolcalError, match=r"arviz-stats, .*pip install astropolcal\[mcmc\]"):
-        posterior.summary()
+        make_posterior().summary()
 
 
 # --- words --------------------------------------------------------------------------------
@@ -156,11 +159,155 @@ def test_words_of_a_chain_that_does_not_move():
 
 
 def test_times_are_in_steps_of_the_sampler(posterior):
-    thinned = posterior.thinned(2)
-    assert thinned.thin == 2
-    assert thinned.autocorrelation_times == pytest.approx(posterior.autocorrelation_times, rel=0.2)
-    assert thinned.n_times == pytest.approx(posterior.n_times, rel=0.2)
-    np.testing.assert_array_equal(thinned.chain, posterior.chain[1::2])
+    parts = {"thin": 2, "chain": posterior.chain[1::2], "log_prob": posterior.log_prob[1::2]}
+    every_second = Posterior.from_dict(posterior.to_dict() | parts)
+    times = posterior.autocorrelation_times
+    assert every_second.autocorrelation_times == pytest.approx(times, rel=0.2)
+    assert every_second.n_times == pytest.approx(posterior.n_times, rel=0.2)
+    assert every_second.steps[[0, -1]].tolist() == [2, 4000]
+
+
+def test_long_chain_of_walkers_that_do_not_agree_has_not_converged():
+    pytest.importorskip("arviz_stats")
+    apart = make_posterior(0.1, 4000)
+    # small against the width, so that the autocorrelation time hardly shows it
+    chain = apart.chain + 0.04 * np.array([0, 0, 0, 0, 0, 0, 0, 5.0])[:, None]
+    found = Posterior(NAMES, UNITS, chain, apart.log_prob, thin=1000)
+    found.autocorrelation_times = np.array([10.0, 10.0])
+    assert found.n_times > 50
+    assert not found.converged
+    assert "NOT CONVERGED: R-hat of " in found.words()
+    assert "1.05 is the most for walkers that agree" in found.words()
+
+
+def test_few_samples_have_not_converged():
+    """Four walkers of 60 autocorrelation times are 240 samples."""
+    pytest.importorskip("arviz_stats")
+    pair = [correlated(0.5, 200, 4, seed) for seed in (1, 2)]
+    few = Posterior(NAMES, UNITS, np.stack(pair, axis=2), pair[0])
+    assert few.n_times > 50
+    assert not few.converged
+    assert "has an effective sample size (bulk) of " in few.words()
+
+
+def test_converged_without_arviz_is_a_matter_of_length(monkeypatch):
+    monkeypatch.setitem(sys.modules, "arviz_stats.base", None)
+    found = make_posterior()
+    assert found.converged
+    assert found.convergence.r_hat is None
+    assert found.report()["parameters"]["hwp.theta"]["r_hat"] is None
+    assert Posterior.from_dict(found.thinned().to_dict()) == found.thinned()
+
+
+@pytest.mark.parametrize("n_steps", [2, 3])
+def test_hardly_any_steps_have_not_converged(n_steps):
+    found = make_posterior(0.1, n_steps)
+    assert not found.converged
+    assert "NOT CONVERGED" in found.words()
+
+
+# --- burn-in ------------------------------------------------------------------------------
+
+
+def test_burn_in_that_is_given(posterior):
+    given = Posterior.from_dict(posterior.to_dict() | {"burn_in": 1000})
+    assert given.burn_in == given.convergence.burn_in == 1000
+    assert len(given.samples()) == 8 * 3000
+    assert "The first 1000 steps are left out" in given.words()
+    assert given != posterior
+
+
+@pytest.mark.parametrize("burn_in", [-1, 3999, 5000])
+def test_bad_burn_in(posterior, burn_in):
+    with pytest.raises(ParameterError, match="allowed are 0 to 3998 of 4000 kept steps"):
+        Posterior.from_dict(posterior.to_dict() | {"burn_in": burn_in})
+
+
+# --- thinned, for files -------------------------------------------------------------------
+
+
+def test_thinned_posterior_keeps_what_the_run_says(posterior):
+    thinned = posterior.thinned()
+    start = posterior.burn_in
+    assert thinned.log_prob.size <= 4000
+    assert thinned.is_thinned
+    assert thinned.burn_in == 0
+    np.testing.assert_array_equal(thinned.chain, posterior.chain[start + 7 :: 8])
+    for key in ("converged", "n_steps", "n_times"):
+        assert getattr(thinned, key) == getattr(posterior, key)
+    assert thinned.convergence is posterior.convergence
+    assert (thinned.summary() == posterior.summary()).all()
+    assert thinned.report() == posterior.report()
+
+
+def test_thinned_posterior_says_what_is_left(posterior):
+    thinned = posterior.thinned()
+    assert thinned.words() == posterior.words()
+    n, kept = 8 * (4000 - posterior.burn_in), thinned.log_prob.size
+    assert thinned.kept_words() == (
+        f"Of {n} samples {kept} are kept, one step in 8; convergence and quantiles are those of "
+        "all."
+    )
+    assert posterior.kept_words() == "All steps are kept."
+
+
+def test_steps_of_a_thinned_posterior_are_those_of_the_run(posterior):
+    thinned = posterior.thinned(5)
+    assert thinned.steps[0] == posterior.burn_in + 5
+    np.testing.assert_array_equal(thinned.chain, posterior.chain[thinned.steps - 1])
+
+
+def test_thinned_again_is_the_same(posterior):
+    once = posterior.thinned()
+    assert once.thinned() == once
+    assert once.thinned(2).thin == 2 * once.thin
+    assert once.thinned(2).convergence is posterior.convergence
+
+
+@pytest.mark.parametrize(("draws", "kept"), [(8, 8), (3, 8), (100, 88), (10**9, None)])
+def test_size_of_a_thinned_posterior(posterior, draws, kept):
+    found = posterior.thinned(draws=draws).log_prob.size
+    assert found == (kept or 8 * (4000 - posterior.burn_in))
+
+
+def test_quantiles_of_a_thinned_posterior_are_about_the_same(posterior):
+    name = "hwp.theta"
+    found = posterior.thinned().quantile(name, 0.5) - posterior.quantile(name, 0.5)
+    assert abs(found.to_value(u.deg)) < 0.1 * 4 / 4000**0.5
+
+
+# --- for machines -------------------------------------------------------------------------
+
+
+def test_report_is_json(posterior):
+    import json
+
+    pytest.importorskip("arviz_stats")
+    report = json.loads(json.dumps(posterior.report(), allow_nan=False))
+    assert report["converged"] is True
+    assert report["words"] == posterior.words()
+    assert report["acceptance"] == [0.5, 0.5]
+    assert report["n_samples"] == len(posterior.samples())
+    entry = report["parameters"]["hwp.theta"]
+    assert entry["unit"] == "deg"
+    assert entry["fitted"] == 2.0
+    assert entry["lower"] < entry["median"] < entry["upper"]
+    assert entry["median"] == pytest.approx(posterior.quantile("hwp.theta", 0.5).value)
+    assert entry["r_hat"] < 1.05
+    assert min(entry["ess_bulk"], entry["ess_tail"]) > 400
+
+
+def test_report_of_what_does_not_move_has_no_numbers_that_are_none():
+    chain = np.zeros((100, 8, 2))
+    chain[..., 1] = correlated(0.1, 100)
+    report = Posterior(NAMES, UNITS, chain, chain[..., 0]).report()
+    assert not report["converged"]
+    assert report["acceptance"] is None
+    stuck, moves = report["parameters"].values()
+    assert stuck["autocorrelation_time"] is None
+    assert stuck["r_hat"] is None
+    assert stuck["median"] == 0.0
+    assert moves["autocorrelation_time"] > 0
 
 
 # --- to and from a dictionary -------------------------------------------------------------
@@ -171,6 +318,16 @@ def test_round_trip(posterior):
     assert again == posterior
     assert again.units == UNITS
     assert repr(again) == "<Posterior of 2 parameters: 4000 steps of 8 walkers>"
+
+
+def test_round_trip_of_a_thinned_posterior(posterior):
+    thinned = posterior.thinned()
+    again = Posterior.from_dict(thinned.to_dict())
+    assert again == thinned
+    assert again != posterior
+    other = thinned.to_dict()
+    other["convergence"]["median"] = other["convergence"]["median"] + 1e-15
+    assert Posterior.from_dict(other) != thinned
 
 
 @pytest.mark.parametrize("change", [{"seed": 2}, {"fitted": None}, {"units": ["rad", ""]}])
@@ -189,6 +346,8 @@ def test_posteriors_that_differ(posterior, change):
         ({"acceptance": [0.5]}, r"acceptance has shape \(1,\), not \(8,\)"),
         ({"fitted": [0.5]}, r"fitted has shape \(1,\), not \(2,\)"),
         ({"color": "red"}, "missing or unknown color"),
+        ({"convergence": CONVERGENCE}, "convergence of 1 parameters in a chain of 2"),
+        ({"convergence": CONVERGENCE | {"std": [1.0, 2.0]}}, "one value a parameter is allowed"),
     ],
 )
 def test_bad_parts(posterior, change, message):
@@ -198,7 +357,7 @@ def test_bad_parts(posterior, change, message):
 
 @pytest.mark.parametrize("step", [0, 4001])
 def test_bad_thinning(posterior, step):
-    with pytest.raises(ParameterError, match="allowed are 1 to 4000"):
+    with pytest.raises(ParameterError, match=f"allowed are 1 to {4000 - posterior.burn_in}"):
         posterior.thinned(step)
 
 

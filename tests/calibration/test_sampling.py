@@ -196,7 +196,7 @@ def test_no_noise_without_residuals():
         ({"noise": [0.1] * 3}, ParameterError, r"shape \(3,\); allowed are one value, 2"),
         ({"noise": 1 * u.m}, ParameterError, "wrong unit"),
         ({"noise": "much"}, ParameterError, "not a number"),
-        ({"weights": "equal"}, FitError, "allowed are None and 'errors'"),
+        ({"weights": "equal"}, FitError, "allowed are None, 'wavelength', 'errors'"),
     ],
 )
 def test_bad_log_posterior(small, options, error, message):

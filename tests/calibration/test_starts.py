@@ -4,10 +4,11 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from astropolcal import optics
 from astropolcal.calibration import BinProblem, calibrate, search_branches
-from astropolcal.measurement import Measurement
+from astropolcal.measurement import Measurement, Normal
 
 N_BINS = 22
 
@@ -231,3 +232,71 @@ def test_scan_runs_along_the_main_retardance(make, build, expected):
     )
     problem = problem_of(chain, make.observe(chain, wavelength=lam, seed=1))
     assert [problem.slots[row].name for row, *_ in problem.main_retardances()] == expected
+
+
+# --- priors -------------------------------------------------------------------------------------
+
+
+def with_prior(make, prior, seed=3):
+    """A linear derotator near 100 deg at all wavelengths, and a prior on its retardance."""
+    start = make.chain()
+    truth = start.copy()
+    truth["derotator"].retardance = np.linspace(80, 110, N_BINS) * u.deg
+    start["derotator"].retardance.prior = prior
+    return start, truth, make.observe(truth, seed=seed)
+
+
+@pytest.mark.parametrize("weights", [None, "wavelength", "errors"])
+@pytest.mark.parametrize("mean", [95, -265])
+def test_prior_decides_between_equal_branches(make, weights, mean):
+    """A retardance of d and of d - 360 deg are the same optic; a broad prior knows which it is."""
+    start, truth, data = with_prior(make, Normal(mean * u.deg, 60 * u.deg))
+    start["derotator"].retardance = np.full(N_BINS, -300.0 if mean > 0 else 300.0) * u.deg
+    cal = calibrate(start, data, weights=weights, cross_validate=False)
+    expected = truth["derotator"].retardance.value + (0 if mean > 0 else -360)
+    np.testing.assert_allclose(cal.chain["derotator"].retardance.value, expected, atol=0.3)
+
+
+def test_prior_does_not_overrule_the_data(make):
+    """Far from the truth, but narrow against a turn only."""
+    start, truth, data = with_prior(make, Normal(250 * u.deg, 40 * u.deg))
+    cal = calibrate(start, data, cross_validate=False)
+    found, true = (c["derotator"].retardance.value for c in (cal.chain, truth))
+    error = (found - true + 180) % 360 - 180
+    assert np.abs(error).max() < 0.3
+
+
+def test_costs_with_priors_add_up_to_the_whole(make):
+    start, _, data = with_prior(make, Normal(95 * u.deg, 5 * u.deg))
+    start["calibration_polarizer"].theta.prior = Normal(88 * u.deg, 0.5 * u.deg)
+    live = Measurement(start, data)
+    problem = BinProblem(live, None, 0.01)
+    vector = live.vector()
+    data_part = np.sum(live.residuals(vector) ** 2)
+    prior_part = 1e-4 * live.free.prior_residuals(vector) ** 2
+    assert problem.has_priors
+    assert problem.total(vector) == pytest.approx(0.5 * (data_part + prior_part.sum()))
+    assert problem.costs(vector).sum() == pytest.approx(0.5 * (data_part + prior_part[1:].sum()))
+    assert BinProblem(live, None, 0.0).total(vector) == pytest.approx(0.5 * data_part)
+
+
+def test_polish_with_priors_reaches_the_minimum_of_both(make):
+    """Against scipy, bin by bin, with a prior as strong as the data."""
+    start, _, data = with_prior(make, Normal(60 * u.deg, 0.2 * u.deg))
+    start["derotator"].retardance = np.full(N_BINS, 90.0) * u.deg
+    live = Measurement(start, data)
+    problem = BinProblem(live, None, 0.02)
+    vector, costs = problem.polish(live.vector(), iterations=60, still_gaining=1 - 1e-12)
+
+    def residuals(values, element):
+        trial = vector.copy()
+        trial[element] = values
+        rows = live.bins == element[0] - problem.elements[0, 0]
+        prior = (values[0] - np.deg2rad(60)) / np.deg2rad(0.2)
+        return np.append((live.predict(trial) - live.observed)[rows], 0.02 * prior)
+
+    for i in (0, 10, 21):
+        element = problem.elements[:, i]
+        best = least_squares(residuals, vector[element], args=(element,), xtol=1e-12)
+        assert costs[i] == pytest.approx(best.cost, rel=1e-6)
+        np.testing.assert_allclose(vector[element], best.x, atol=1e-6)

@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The accuracies of the paper by hand, their limits, and four of them side by side."""
 
+from types import SimpleNamespace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -19,6 +21,9 @@ from astropolcal.calibration import (
     propagate_accuracy,
     target_accuracy,
 )
+from astropolcal.calibration.groups import GROUPS
+from astropolcal.calibration.standards import add_standard
+from astropolcal.calibration.target_accuracy import target_accuracies
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import get_observable
@@ -182,6 +187,108 @@ def test_paper_range_for_a_target_of_1_percent(charis_data, shared_data):
     assert 2.3 < table["s_chi"].to_value(u.deg).max() < 3.8
 
 
+@pytest.mark.parametrize(("s_p", "s_chi"), [(0.02, 0.5), (0.12, 3.2)])
+def test_printed_ranges_of_the_paper_belong_together(shared_data, s_p, s_chi):
+    """
+    Published: s_p from 0.02 to 0.12 % and s_chi from 0.5 to 3.2 deg, 1 % at 50 deg (Sec. 7.2).
+
+    s_sky is not published. The s_abs that gives the printed s_p, within its rounding and
+    with the published s_rel of some wavelength, must give the printed s_chi within its own.
+    """
+    fits = Table.read(shared_data / "reference" / "charis_published_fits.ecsv")
+    s_rel = np.array(fits["s_rel_elliptical_dataset3"]) * u.percent
+
+    def at(s_abs):
+        return propagate_accuracy(1 * u.percent, 50 * u.deg, s_rel, s_abs * u.percent)
+
+    low, high = np.zeros(len(s_rel)), np.zeros(len(s_rel))
+    for edge, target in ((low, s_p - 0.005), (high, s_p + 0.005)):
+        inside = np.zeros(len(s_rel)), np.full(len(s_rel), 1.0)
+        for _ in range(40):
+            middle = (inside[0] + inside[1]) / 2
+            above = percent(at(middle)["s_p"]) > target
+            inside = np.where(above, inside[0], middle), np.where(above, middle, inside[1])
+        edge[:] = at(inside[0])["s_chi"].to_value(u.deg)
+    fits = (low < s_chi + 0.05) & (high > s_chi - 0.05)
+    assert fits.any()
+    # the largest errors are those of the J band, as the paper says
+    if s_p == 0.12:
+        assert (np.flatnonzero(fits) < 5).all()
+
+
+# --- targets of a calibration ----------------------------------------------------------
+
+
+def _calibration(tables, chains, wavelength=LAM):
+    """What the accuracies of a calibration are made of: sources, tables and chains."""
+    records = [SimpleNamespace(source=source, accuracy=table) for source, table in tables]
+    return SimpleNamespace(datasets=records, chains=chains, wavelength=wavelength)
+
+
+SOURCES = {
+    "polarized": "polarized",
+    "unpolarized": "unpolarized",
+    "unpolarized standard star": "on_sky",
+    "Unpolarized, on sky": "on_sky",
+}
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_kind_of_calibration_follows_from_the_source(chain, source):
+    cal = _calibration([(source, accuracy(1, 2, 3))], [chain])
+    (table,) = target_accuracies(cal, [(0.1, 15 * u.deg)])
+    kind = SOURCES[source]
+    assert table.meta["missing"] == [k for k in ("polarized", "unpolarized", "on_sky") if k != kind]
+    expected = target_accuracy(0.1, 15 * u.deg, **{kind: accuracy(1, 2, 3)})
+    for column in expected.colnames:
+        np.testing.assert_array_equal(table[column], expected[column])
+
+
+def test_a_source_that_is_not_stated_is_told_by_its_polarizer(chain):
+    known = _calibration([(None, accuracy(1, 2, 3))], [chain])
+    assert "polarized" not in target_accuracies(known)[0].meta["missing"]
+    for source, train in (
+        (None, chain["hwp"]),
+        ("polarized standard star", chain),
+        ("moon on sky", chain),
+    ):
+        assert target_accuracies(_calibration([(source, accuracy(1, 2, 3))], [train])) == []
+
+
+def test_default_targets_are_the_paper_s_at_any_angle(chain):
+    tables = [("polarized", accuracy(1, 2, 3)), ("unpolarized", accuracy(0.3, 0.04, 0.5)),
+              ("unpolarized standard star", accuracy(0.4, 0.03, 1.2))]  # fmt: skip
+    cal = _calibration(tables, [chain] * 3)
+    found = target_accuracies(cal)
+    assert [table.meta["dolp"] for table in found] == [1 * u.percent, 30 * u.percent]
+    for table in found:
+        np.testing.assert_allclose(percent(table["s_abs"]), [0.5, 0.05, 1.3])
+        each = [
+            propagate_accuracy(table.meta["dolp"], angle * u.deg, table["s_rel"], table["s_abs"])
+            for angle in np.linspace(-90, 90, 721)
+        ]
+        for key in ("s_Q", "s_U", "s_p", "s_chi"):
+            worst = np.max([one[key].value for one in each], axis=0)
+            np.testing.assert_allclose(table[key].value, worst, rtol=1e-12)
+
+
+def test_several_calibrations_of_a_kind_count_by_their_rms(chain):
+    first, second = accuracy(3, 2, np.nan), accuracy(4, wavelength=LAM[:1])
+    cal = _calibration([("polarized", first), ("polarized", second)], [chain] * 2)
+    (table,) = target_accuracies(cal, [(1.0, 0 * u.deg)])
+    np.testing.assert_allclose(percent(table["s_rel"]), [np.sqrt(12.5), 2, np.nan])
+    assert np.isnan(table["s_p"][2])
+
+
+def test_impossible_targets_of_a_calibration_are_refused(chain):
+    cal = _calibration([("polarized", accuracy(1, 2, 3))], [chain])
+    for target in ((2.0, None), (np.nan, None), (0.5, 1 * u.um)):
+        with pytest.raises(ParameterError):
+            target_accuracies(cal, [target])
+    with pytest.raises(ParameterError, match="no column 's_rms'"):
+        target_accuracies(cal, column="s_rms")
+
+
 def _scatter_of_star(observations):
     pairs = observations.pairs()
     fluxes = (
@@ -257,6 +364,37 @@ def test_group_with_a_single_member_is_named(make, chain, measurement):
         groups_by(few, "cycle")
 
 
+def test_night_with_a_single_member_is_named(make, chain, measurement):
+    night = measurement.datasets[0].observations
+    pair = night.pairs()[0]
+    short = night.select(pair)
+    both = Measurement(chain, [night, make.observe(chain, wavelength=LAM, seed=2).select(pair)])
+    with pytest.raises(FitError, match="group dataset number 1 of simulated has a single member"):
+        groups_by(both, "dataset")
+    with pytest.raises(FitError, match="all data are in one group"):
+        groups_by(Measurement(chain, short), "dataset")
+
+
+@pytest.mark.parametrize("by", GROUPS)
+def test_calibration_refuses_groups_with_a_single_member(make, chain, measurement, by):
+    night = measurement.datasets[0].observations
+    other = make.observe(chain, wavelength=LAM, seed=2)
+    cal = calibrate(chain, [night, other.select(other.pairs()[0])], cross_validate=False)
+    with pytest.raises(FitError, match=f"cross-validation by {by}: group .* has a single member"):
+        cal.cross_validate(by)
+
+
+def test_nights_predict_each_other(make, chain, measurement):
+    nights = [measurement.datasets[0].observations, make.observe(chain, wavelength=LAM, seed=2)]
+    cal = calibrate(chain, nights, cross_validate=False).cross_validate("dataset")
+    for i, other in ((0, 1), (1, 0)):
+        alone = calibrate(chain, nights[other], cross_validate=False)
+        residuals = alone.measurement_of(nights[i]).residuals()
+        rms = [np.sqrt(np.mean(residuals[cal.measurement.bins[:96] == b] ** 2)) for b in range(3)]
+        found = percent(cal.datasets[i].accuracy["s_cv"])
+        np.testing.assert_allclose(found, 100 * np.array(rms), rtol=1e-4)
+
+
 def test_one_group_and_unknown_groups_are_refused(measurement):
     with pytest.raises(FitError, match="all data are in one group, dataset number 0"):
         groups_by(measurement, "dataset")
@@ -302,6 +440,17 @@ def test_standard_may_be_a_measurement_at_some_wavelengths(make, chain, calibrat
     found = percent(four_accuracies(calibrated, m)["s_standard"])
     assert np.isfinite(found[:2]).all()
     assert np.isnan(found[2])
+
+
+def test_standards_that_the_calibration_remembers_are_the_default(make, chain, measurement):
+    cal = calibrate(chain, measurement.datasets[0].observations)
+    table = add_standard(cal, chain, make.observe(chain, wavelength=LAM, seed=8, name="other"))
+    found = four_accuracies(cal)
+    np.testing.assert_allclose(found["s_standard"], table["s_standard"])
+    assert found.meta["standard"] == "other"
+    # a table from before the column existed
+    cal.datasets[0].accuracy.remove_column("s_standard")
+    assert np.isnan(four_accuracies(cal)["s_standard"]).all()
 
 
 def test_standard_that_was_fitted_is_refused(measurement, calibrated):

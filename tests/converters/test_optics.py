@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astropolcal import optics
-from astropolcal.chain import leaves
+from astropolcal.chain import at_positions, leaves
 from astropolcal.converters.optics import (
     OPTIC_MODULES,
     OpticConverter,
@@ -26,6 +26,14 @@ from astropolcal.optics import OPTICS
 NAMES = sorted(OPTICS)
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 some_bounds = st.tuples(st.none() | numbers, st.none() | numbers)
+# strategies of the settings that some optics have
+SETTINGS = {
+    "beam": st.sampled_from(["right", "left"]),
+    "differential": st.booleans(),
+    "harmonic": st.sampled_from([1, 2, 4]),
+    "power": st.sampled_from([1, -1]),
+    "reference": st.floats(min_value=0, exclude_min=True, allow_infinity=False),
+}
 
 
 def written(thing):
@@ -52,6 +60,8 @@ def assert_same(optic, again):
     """Compare all of two optics, values to the last bit."""
     assert type(again) is type(optic)
     assert again._settings() == optic._settings()
+    kinds = [[type(x) for x in one._settings().values()] for one in (again, optic)]
+    assert kinds[0] == kinds[1]
     assert again.param_names == optic.param_names
     for key in optic.param_names:
         old, new = getattr(optic, key), getattr(again, key)
@@ -69,7 +79,7 @@ def an_optic(draw, name):
     cls = OPTICS[name]
     n = draw(st.integers(1, 5))
     value = numbers | st.lists(numbers, min_size=n, max_size=n)
-    extra = {"beam": draw(st.sampled_from(["right", "left"]))} if name == "WollastonPrism" else {}
+    extra = {key: draw(SETTINGS[key]) for key in cls()._settings() if key not in ("name", "mount")}
     optic = cls(
         name=draw(st.none() | st.text(max_size=8)),
         mount=draw(st.sampled_from([None, "hwp", "-altitude", "nul l"])),
@@ -160,6 +170,12 @@ def test_position_of_a_frame_is_not_stored():
     assert "position" not in node_from_optic(optic)
 
 
+@pytest.mark.parametrize("mount", ["sequence", "-sequence", "flux", "previous_flux"])
+@pytest.mark.parametrize("name", ["DriftRotator", "FluxGain"])
+def test_mount_that_is_a_number_survives(name, mount):
+    assert round_trip(OPTICS[name](mount=mount)).mount == mount
+
+
 # ---- chains ------------------------------------------------------------------------
 
 
@@ -169,8 +185,15 @@ def make_chain():
             theta=90 * u.deg, name="polarizer", fixed={"theta": False}, bounds={"theta": (0, None)}
         )
         | optics.TwoLayerWaveplate(mount="hwp", name="hwp", bounds={"w_sio2": (None, 2.0)})
+        | optics.HarmonicRetarder(cosine=[1, 2, 3] * u.deg, harmonic=4, mount="hwp", name="tilt")
         | optics.EllipticalRetarder(horizontal=[1, 2, 3] * u.deg, name="derotator")
         | optics.WollastonPrism(efficiency=[0.9, 0.95, 1.0], beam="left", name="wollaston")
+        | optics.HarmonicGain(
+            sine=0.1, harmonic=2, differential=True, beam="left", mount="-hwp", name="wander"
+        )
+        | optics.FluxGain(
+            left=0.1, power=-1, reference=2e4, beam="left", mount="previous_flux", name="lag"
+        )
     )
 
 
@@ -183,8 +206,9 @@ def test_chain_survives_with_all_constraints():
 
 def test_chain_gives_the_same_light():
     wavelength = [1.2, 1.6, 2.0] * u.um
-    expected = make_chain()(wavelength, 1.0, 0.3, 0.2, 0.1)
-    found = round_trip(make_chain())(wavelength, 1.0, 0.3, 0.2, 0.1)
+    where = {"hwp": 20 * u.deg, "previous_flux": 1.5}
+    expected = at_positions(make_chain(), **where)(wavelength, 1.0, 0.3, 0.2, 0.1)
+    found = at_positions(round_trip(make_chain()), **where)(wavelength, 1.0, 0.3, 0.2, 0.1)
     for one, other in zip(expected, found, strict=True):
         assert np.array_equal(one, other)
 
@@ -277,6 +301,57 @@ def test_schema_refuses(old, new):
     read(content)
     with pytest.raises(ValidationError):
         read(content.replace(old.encode(), new.encode()))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("harmonic: 2", "harmonic: 3"),
+        ("harmonic: 2", "harmonic: two"),
+        ("harmonic: 2", "harmonic: 2.5"),
+        ("harmonic: 2", "harmonic: true"),
+        ("harmonic: 2", "harmony: 2"),
+        ("differential: true", "differential: 1"),
+        ("differential: true", "differential: 'true'"),
+        ("power: -1", "power: 0"),
+        ("power: -1", "power: -2"),
+        ("power: -1", "power: true"),
+        ("reference: 250.0", "reference: 0.0"),
+        ("reference: 250.0", "reference: -250.0"),
+        ("reference: 250.0", "reference: much"),
+        ("reference: 250.0", "preference: 250.0"),
+        ("beam: left", "beam: upper"),
+    ],
+)
+def test_schema_refuses_settings(old, new):
+    gains = [
+        optics.HarmonicGain(harmonic=2, differential=True, mount="hwp", name="wander"),
+        optics.FluxGain(power=-1, reference=250, beam="left", mount="flux", name="bend"),
+    ]
+    content = next(file for file in map(written, gains) if old.encode() in file)
+    assert content.count(old.encode()) == 1
+    read(content)
+    with pytest.raises(ValidationError):
+        read(content.replace(old.encode(), new.encode()))
+
+
+@pytest.mark.parametrize(
+    ("optic", "changed", "message"),
+    [
+        (optics.FluxGain(name="bend"), {"reference": np.inf}, r"reference = inf must be one pos"),
+        (optics.FluxGain(name="bend"), {"power": 3}, r"power = 3; allowed are 1, -1"),
+        (optics.HarmonicGain(name="bend"), {"harmonic": 3}, r"harmonic = 3; allowed are 1, 2, 4"),
+        (optics.HarmonicGain(name="bend"), {"differential": 0}, r"differential = 0; allowed are"),
+        (optics.HarmonicGain(name="bend"), {"mount": "flux"}, r"mount = 'flux' is a number"),
+        (optics.BeamGain(name="bend"), {"beam": "up"}, r"beam = 'up'; allowed are"),
+        (optics.BeamGain(name="bend"), {"mount": "--hwp"}, r"mount = '--hwp' must be None or"),
+        (optics.BeamGain(name="bend"), {"harmonic": 1}, r"'harmonic'"),
+    ],
+)
+def test_setting_that_the_class_refuses(optic, changed, message):
+    node = node_from_optic(optic) | changed
+    with pytest.raises(CalibrationFileError, match=rf"optic 'bend': .*{message}"):
+        optic_from_node(type(optic).__name__, node)
 
 
 @pytest.mark.parametrize(

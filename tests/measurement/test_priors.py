@@ -49,6 +49,33 @@ def test_half_square_of_the_residual_is_minus_the_log_density(distribution):
     assert np.all(np.diff(prior.residual(x)) > 0)
 
 
+@pytest.mark.parametrize(
+    "distribution", [*DISTRIBUTIONS, stats.uniform(0.1, 0.5)], ids=lambda d: d.dist.name
+)
+@pytest.mark.parametrize("unit", [None, u.deg])
+def test_log_densities_are_those_of_scipy(distribution, unit):
+    """For rows of values at once, outside of the support too."""
+    prior = bind_prior(distribution, "x.y", unit, (None, None))
+    values = np.linspace(-3, 3, 12).reshape(4, 3)
+    expected = distribution.logpdf(values)
+    np.testing.assert_allclose(prior.log_densities(values * prior.factor), expected, atol=1e-9)
+    inside = distribution.ppf([0.2, 0.7])
+    found = prior.log_density(inside * prior.factor)
+    assert found == pytest.approx(distribution.logpdf(inside).sum())
+
+
+def test_bounds_are_told_for_a_whole_vector():
+    """Elements at a bound, of the parameter or of a prior that is flat."""
+    free = FreeParameters([_chain(wollaston__efficiency=Uniform(0.9, 0.99))], 2)
+    vector = free.start()
+    where = free.by_name["wollaston.efficiency"].slice
+    vector[where] = [0.95, 0.99]
+    assert free.at_bounds(vector)[where].tolist() == [False, True]
+    low, _ = free.bounds()
+    low[:] = 7
+    assert free.bounds()[0].max() < 7
+
+
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS, ids=lambda d: d.dist.name)
 def test_slope_is_the_derivative_of_the_residual(distribution):
     prior = bind_prior(distribution, "x.y", u.deg, (None, None))

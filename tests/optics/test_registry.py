@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from astropolcal import mueller, optics
 from astropolcal.exceptions import ParameterError
-from astropolcal.optics import OPTICS, Optic
+from astropolcal.optics import COORDINATES, OPTICS, FrameOptic, Optic
 from astropolcal.units import canonical_factor, canonical_unit
 
 WAVELENGTH = [1.2, 1.6, 2.1] * u.um
@@ -29,6 +29,10 @@ SIGNED = st.floats(-1, 1)
 SMOOTH = st.floats(-0.95, 0.95)
 DEGREES = st.floats(-360, 360)
 ANGLE = st.floats(-180, 180)
+SMALL = st.floats(-30, 30)
+GAIN = st.floats(-0.4, 0.4)
+# two components of a diattenuation below one
+COMPONENT = st.floats(-0.7, 0.7)
 OTHER_UNITS = {u.rad: (u.deg, u.rad, u.arcmin), u.um: (u.mm, u.um, u.nm)}
 # small enough for the five-point rule, large enough for rounding
 STEP = {u.rad: 1e-3, u.um: 1e-2, u.dimensionless_unscaled: 1e-4}
@@ -68,6 +72,37 @@ def wollaston(beam):
     )
 
 
+def vector_diattenuator(horizontal, diagonal):
+    angle = np.arctan2(diagonal, horizontal) / 2 * u.rad
+    return mueller.rotate(mueller.diattenuator(np.hypot(diagonal, horizontal)), angle)
+
+
+def gained(gain):
+    return np.asarray(gain)[..., None, None] * np.eye(4)
+
+
+def stray(share):
+    return np.eye(4) + np.asarray(share)[..., None, None] * np.diag([1.0, 0, 0, 0])
+
+
+def wave(n, x, cosine, sine):
+    return cosine * np.cos(n * x) + sine * np.sin(n * x)
+
+
+def harmonic_rotator(n):
+    return lambda x, **amplitudes: mueller.rotation_matrix(wave(n, x, **amplitudes))
+
+
+def harmonic_retarder(n):
+    return lambda x, **amplitudes: mueller.rotate(
+        mueller.linear_retarder(wave(n, x, **amplitudes)), x
+    )
+
+
+def harmonic_gain(n, sign=1):
+    return lambda x, **amplitudes: gained(1 + sign * u.Quantity(wave(n, x, **amplitudes)).value)
+
+
 @dataclass(frozen=True)
 class Case:
     """
@@ -75,9 +110,11 @@ class Case:
 
     ``values``: strategy of physical parameter values within the bounds, as
     floats in the declared units; ``expected``: the Mueller matrix of these
-    values (as quantities), by the functions of `astropolcal.mueller`;
-    ``smooth``: strategy where the derivatives are finite; ``settings``: further
-    arguments of the class.
+    values (as quantities), by the functions of `astropolcal.mueller`; of a
+    `FrameOptic` its first argument is the position; ``smooth``: strategy where
+    the derivatives are finite; ``settings``: further arguments of the class;
+    ``mount``: the name of a stage, or one of `COORDINATES`; ``position``:
+    strategy of positions of that mount, in degree or as numbers.
     """
 
     optic: type
@@ -85,19 +122,42 @@ class Case:
     expected: object
     smooth: st.SearchStrategy | None = None
     settings: dict = field(default_factory=dict)
+    mount: str = "stage"
+    position: st.SearchStrategy = ANGLE
 
     @property
     def differentiable(self):
         return self.values if self.smooth is None else self.smooth
 
+    @property
+    def per_frame(self):
+        return issubclass(self.optic, FrameOptic)
 
-def case(optic, expected, smooth=None, settings=None, **values):
+    @property
+    def placed(self):
+        """Strategy of positions with their unit, None where they only turn the optic."""
+        unit = u.one if self.mount in COORDINATES else u.deg
+        return self.position.map(lambda x: x * unit) if self.per_frame else st.none()
+
+
+def case(optic, expected, smooth=None, settings=None, mount="stage", position=ANGLE, **values):
     strategy = st.fixed_dictionaries(values)
     steep = None if smooth is None else st.fixed_dictionaries(values | smooth)
-    return Case(optic, strategy, expected, steep, settings or {})
+    return Case(optic, strategy, expected, steep, settings or {}, mount, position)
 
 
 CASES = {
+    "BeamGain": case(
+        optics.BeamGain,
+        lambda imbalance: gained(1 + imbalance),
+        imbalance=GAIN,
+    ),
+    "BeamGain, left": case(
+        optics.BeamGain,
+        lambda imbalance: gained(1 - imbalance),
+        settings={"beam": "left"},
+        imbalance=GAIN,
+    ),
     "Depolarizer": Case(
         optics.Depolarizer,
         depolarization(),
@@ -118,12 +178,86 @@ CASES = {
         diattenuation=SIGNED,
         retardance=DEGREES,
     ),
+    "DriftRotator": case(
+        optics.DriftRotator,
+        lambda x, rate: mueller.rotation_matrix(rate * x),
+        mount="sequence",
+        position=FRACTION,
+        rate=SMALL,
+    ),
     "EllipticalRetarder": case(
         optics.EllipticalRetarder,
         mueller.elliptical_retarder,
         horizontal=DEGREES,
         diagonal=DEGREES,
         circular=DEGREES,
+    ),
+    "FluxGain": case(
+        optics.FluxGain,
+        lambda x, right, left: gained(1 + right * x),
+        mount="flux",
+        position=st.floats(0, 1.9),
+        right=GAIN,
+        left=GAIN,
+    ),
+    "FluxGain, left": case(
+        optics.FluxGain,
+        lambda x, right, left: gained(1 + left * x / 3e4),
+        settings={"beam": "left", "reference": 3e4},
+        mount="flux",
+        position=st.floats(0, 6e4),
+        right=GAIN,
+        left=GAIN,
+    ),
+    "FluxGain, reciprocal": case(
+        optics.FluxGain,
+        lambda x, right, left: gained(1 + left * 2 / x),
+        settings={"beam": "left", "power": -1, "reference": 2.0},
+        mount="previous_flux",
+        position=st.floats(1, 9),
+        right=GAIN,
+        left=GAIN,
+    ),
+    "StrayLight": case(
+        optics.StrayLight,
+        lambda x, amount: stray(amount * 3e4 / x),
+        settings={"reference": 3e4},
+        mount="total_flux",
+        position=st.floats(1e3, 6e4),
+        amount=st.floats(0, 0.5),
+    ),
+    "HarmonicGain": case(optics.HarmonicGain, harmonic_gain(1), cosine=GAIN, sine=GAIN),
+    "HarmonicGain, left": case(
+        optics.HarmonicGain,
+        harmonic_gain(2),
+        settings={"beam": "left", "harmonic": 2},
+        cosine=GAIN,
+        sine=GAIN,
+    ),
+    "HarmonicGain, differential": case(
+        optics.HarmonicGain,
+        harmonic_gain(4, sign=-1),
+        settings={"beam": "left", "harmonic": 4, "differential": True},
+        cosine=GAIN,
+        sine=GAIN,
+    ),
+    "HarmonicRetarder": case(
+        optics.HarmonicRetarder, harmonic_retarder(1), cosine=SMALL, sine=SMALL
+    ),
+    "HarmonicRetarder, tilt": case(
+        optics.HarmonicRetarder,
+        harmonic_retarder(2),
+        settings={"harmonic": 2},
+        cosine=SMALL,
+        sine=SMALL,
+    ),
+    "HarmonicRotator": case(optics.HarmonicRotator, harmonic_rotator(1), cosine=SMALL, sine=SMALL),
+    "HarmonicRotator, 4": case(
+        optics.HarmonicRotator,
+        harmonic_rotator(4),
+        settings={"harmonic": 4},
+        cosine=SMALL,
+        sine=SMALL,
     ),
     "LinearPolarizer": case(optics.LinearPolarizer, mueller.linear_polarizer),
     "LinearRetarder": case(optics.LinearRetarder, mueller.linear_retarder, retardance=DEGREES),
@@ -144,6 +278,13 @@ CASES = {
         w_sio2=st.floats(0, 3),
         w_mgf2=st.floats(0, 3),
     ),
+    "VectorDiattenuator": case(
+        optics.VectorDiattenuator,
+        vector_diattenuator,
+        smooth={"horizontal": st.floats(-0.65, 0.65), "diagonal": st.floats(-0.65, 0.65)},
+        horizontal=COMPONENT,
+        diagonal=COMPONENT,
+    ),
     "WollastonPrism": case(optics.WollastonPrism, wollaston("right"), efficiency=FRACTION),
     "WollastonPrism, left": case(
         optics.WollastonPrism, wollaston("left"), settings={"beam": "left"}, efficiency=FRACTION
@@ -156,6 +297,9 @@ HOW = (
 )
 
 every = pytest.mark.parametrize("label", CASES)
+FRAME_OPTICS = [label for label, case_ in CASES.items() if case_.per_frame]
+each_frame_optic = pytest.mark.parametrize("label", FRAME_OPTICS)
+each_that_turns = pytest.mark.parametrize("label", sorted(set(CASES) - set(FRAME_OPTICS)))
 
 
 def unit_of(optic, key):
@@ -171,9 +315,19 @@ def with_units(cls, values):
     }
 
 
-def build(label, values, **kwargs):
-    cls = CASES[label].optic
-    return cls(**with_units(cls, values), **(CASES[label].settings | kwargs))
+def build(label, values, position=None, **kwargs):
+    case_ = CASES[label]
+    if position is not None:
+        kwargs = {"mount": case_.mount} | kwargs
+    optic = case_.optic(**with_units(case_.optic, values), **(case_.settings | kwargs))
+    if position is not None:
+        optic.position = position
+    return optic
+
+
+def expected_matrix(label, values, position=None):
+    where = () if position is None else (position,)
+    return CASES[label].expected(*where, **with_units(CASES[label].optic, values))
 
 
 def draw_per_wavelength(data, strategy):
@@ -218,7 +372,7 @@ def _defined_optics():
     while pending:
         cls = pending.pop()
         pending.extend(cls.__subclasses__())
-        if cls.__module__.startswith("astropolcal.") and cls is not Optic:
+        if cls.__module__.startswith("astropolcal.") and not inspect.isabstract(cls):
             found.add(cls)
     return found
 
@@ -266,7 +420,8 @@ def test_only_theta_is_not_the_optics_own(name):
 @given(data=st.data())
 @settings(max_examples=40)
 def test_mueller_matrix_is_physical(label, data):
-    optic = build(label, data.draw(CASES[label].values), theta=data.draw(ANGLE) * u.deg)
+    values, position = data.draw(CASES[label].values), data.draw(CASES[label].placed)
+    optic = build(label, values, position, theta=data.draw(ANGLE) * u.deg)
     assert np.all(mueller.is_physical(optic.mueller(WAVELENGTH)))
 
 
@@ -274,9 +429,9 @@ def test_mueller_matrix_is_physical(label, data):
 @given(data=st.data())
 @settings(max_examples=40)
 def test_mueller_matrix_is_that_of_the_mueller_functions(label, data):
-    values = data.draw(CASES[label].values)
-    expected = CASES[label].expected(**with_units(CASES[label].optic, values))
-    found = build(label, values).mueller(WAVELENGTH)
+    values, position = data.draw(CASES[label].values), data.draw(CASES[label].placed)
+    expected = expected_matrix(label, values, position)
+    found = build(label, values, position).mueller(WAVELENGTH)
     np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=0, atol=2e-13)
 
 
@@ -285,9 +440,11 @@ def test_mueller_matrix_is_that_of_the_mueller_functions(label, data):
 @settings(max_examples=25)
 def test_one_value_a_wavelength_is_the_stack_of_the_scalars(label, data):
     values = draw_per_wavelength(data, CASES[label].values)
-    together = build(label, values).mueller(WAVELENGTH)
+    position = data.draw(CASES[label].placed)
+    together = build(label, values, position).mueller(WAVELENGTH)
     for i, wavelength in enumerate(WAVELENGTH):
-        alone = build(label, {key: value[i] for key, value in values.items()}).mueller(wavelength)
+        one = {key: value[i] for key, value in values.items()}
+        alone = build(label, one, position).mueller(wavelength)
         row = together[i] if together.ndim == 3 else together
         np.testing.assert_allclose(row, alone, rtol=0, atol=1e-14)
 
@@ -296,9 +453,9 @@ def test_one_value_a_wavelength_is_the_stack_of_the_scalars(label, data):
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=25)
 def test_orientation_turns_the_matrix(label, data, angle):
-    values = data.draw(CASES[label].values)
-    turned = build(label, values, theta=angle * u.deg).mueller(WAVELENGTH)
-    straight = build(label, values).mueller(WAVELENGTH)
+    values, position = data.draw(CASES[label].values), data.draw(CASES[label].placed)
+    turned = build(label, values, position, theta=angle * u.deg).mueller(WAVELENGTH)
+    straight = build(label, values, position).mueller(WAVELENGTH)
     if CASES[label].optic.rotates_frame:
         expected = mueller.rotation_matrix(angle * u.deg) @ straight
     else:
@@ -306,7 +463,7 @@ def test_orientation_turns_the_matrix(label, data, angle):
     np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-13)
 
 
-@every
+@each_that_turns
 @given(data=st.data(), theta=st.floats(-90, 90), position=st.floats(-90, 90))
 @settings(max_examples=25)
 def test_position_adds_to_theta(label, data, theta, position):
@@ -322,12 +479,38 @@ def test_position_adds_to_theta(label, data, theta, position):
         np.testing.assert_array_equal(optic.mueller(WAVELENGTH), given_)
 
 
+@each_frame_optic
+@given(data=st.data(), theta=ANGLE)
+@settings(max_examples=25)
+def test_position_is_the_coordinate(label, data, theta):
+    values = draw_smooth(data, label)
+    positions = u.Quantity([data.draw(CASES[label].placed) for _ in range(4)])
+    optic = build(label, values, positions[0], theta=theta * u.deg)
+    together = np.broadcast_to(optic.mueller(WAVELENGTH, positions[:, None]), (4, 3, 4, 4))
+    # on a mount with a minus, the opposite position is the same
+    other = build(label, values, -positions[0], theta=theta * u.deg, mount=f"-{CASES[label].mount}")
+    for position, matrix in zip(positions, together, strict=True):
+        optic.position, other.position = position, -position
+        alone = np.broadcast_to(optic.mueller(WAVELENGTH), matrix.shape)
+        np.testing.assert_allclose(matrix, alone, rtol=0, atol=1e-14)
+        np.testing.assert_array_equal(optic.mueller(WAVELENGTH), other.mueller(WAVELENGTH))
+
+
+@each_frame_optic
+@given(data=st.data(), theta=ANGLE)
+@settings(max_examples=10)
+def test_without_amplitude_a_frame_optic_is_the_identity(label, data, theta):
+    optic = build(label, {}, data.draw(CASES[label].placed), theta=theta * u.deg)
+    assert not any(getattr(optic, key).value for key in optic.own_names)
+    np.testing.assert_allclose(optic.mueller(), np.eye(4), rtol=0, atol=1e-15)
+
+
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=25)
 def test_light_is_matrix_times_stokes(label, data, angle):
     values = draw_smooth(data, label)
-    optic = build(label, values, theta=angle * u.deg)
+    optic = build(label, values, data.draw(CASES[label].placed), theta=angle * u.deg)
     light = data.draw(st.lists(st.floats(-3, 3), min_size=4, max_size=4))
     light = np.repeat(np.array(light)[:, None], WAVELENGTH.size, axis=1)
     through = optic(WAVELENGTH, *light)
@@ -341,7 +524,7 @@ def test_light_is_matrix_times_stokes(label, data, angle):
 @settings(max_examples=10)
 def test_light_of_many_frames(label, data, seed):
     light = np.random.default_rng(seed).normal(size=(4, 5, WAVELENGTH.size))
-    optic = build(label, draw_smooth(data, label))
+    optic = build(label, draw_smooth(data, label), data.draw(CASES[label].placed))
     through = np.array(optic(WAVELENGTH, *light)[1:])
     np.testing.assert_allclose(through, apply(optic.mueller(WAVELENGTH), light), atol=1e-12)
 
@@ -349,7 +532,7 @@ def test_light_of_many_frames(label, data, seed):
 # --- derivatives ------------------------------------------------------------------
 
 
-def differences(optic, key):
+def differences(optic, key, position=None):
     """Five-point derivative of the Mueller matrix, per canonical unit."""
     unit = optic._declared(key).unit
     step = STEP[canonical_unit(unit)]
@@ -357,7 +540,7 @@ def differences(optic, key):
 
     def matrix(shift):
         moved = (value + shift * step / canonical_factor(unit)) * (unit or 1)
-        return optic.with_parameters(**{key: moved}).mueller(WAVELENGTH)
+        return optic.with_parameters(**{key: moved}).mueller(WAVELENGTH, position)
 
     return (8 * (matrix(1) - matrix(-1)) - (matrix(2) - matrix(-2))) / (12 * step)
 
@@ -366,7 +549,8 @@ def differences(optic, key):
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=12)
 def test_derivatives_against_differences(label, data, angle):
-    optic = build(label, draw_smooth(data, label), theta=angle * u.deg)
+    values, position = draw_smooth(data, label), data.draw(CASES[label].placed)
+    optic = build(label, values, position, theta=angle * u.deg)
     derivatives = optic.mueller_derivatives(WAVELENGTH)
     assert list(derivatives) == list(optic.param_names)
     for key, derivative in derivatives.items():
@@ -383,10 +567,24 @@ def test_derivatives_against_differences(label, data, angle):
 @given(data=st.data())
 @settings(max_examples=8)
 def test_derivative_to_theta_may_vary_with_wavelength(label, data):
-    values = data.draw(CASES[label].differentiable)
-    optic = build(label, values, theta=[-20, 3, 50] * u.deg)
+    values, position = data.draw(CASES[label].differentiable), data.draw(CASES[label].placed)
+    optic = build(label, values, position, theta=[-20, 3, 50] * u.deg)
     found = optic.mueller_derivatives(WAVELENGTH)["theta"].to_value(1 / u.rad)
     np.testing.assert_allclose(found, differences(optic, "theta"), rtol=0, atol=1e-7)
+
+
+@each_frame_optic
+@given(data=st.data())
+@settings(max_examples=8)
+def test_derivatives_at_several_positions(label, data):
+    optic = build(label, draw_smooth(data, label), data.draw(CASES[label].placed))
+    positions = u.Quantity([data.draw(CASES[label].placed) for _ in range(4)])[:, None]
+    for key, derivative in optic.mueller_derivatives(WAVELENGTH, positions).items():
+        found = derivative.to_value(canonical_unit(unit_of(optic, key)) ** -1)
+        expected = differences(optic, key, positions)
+        assert len(expected) == 4
+        found = np.broadcast_to(found, expected.shape)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
 # --- units ------------------------------------------------------------------------
@@ -397,7 +595,8 @@ def test_derivative_to_theta_may_vary_with_wavelength(label, data):
 @settings(max_examples=10)
 def test_any_unit_gives_the_same_optic(label, data, angle):
     values = data.draw(CASES[label].values) | {"theta": angle}
-    optic = build(label, values)
+    position = data.draw(CASES[label].placed)
+    optic = build(label, values, position)
     quantities = {key: getattr(optic, key).value * unit_of(optic, key) for key in values}
     for i, wavelength in enumerate((WAVELENGTH.to(u.nm), WAVELENGTH.to(u.mm), WAVELENGTH)):
         others = {
@@ -405,6 +604,8 @@ def test_any_unit_gives_the_same_optic(label, data, angle):
             for key, value in quantities.items()
         }
         other = CASES[label].optic(**others, **CASES[label].settings)
+        if position is not None:
+            other.mount, other.position = CASES[label].mount, position
         assert [getattr(other, k).unit for k in values] == [getattr(optic, k).unit for k in values]
         np.testing.assert_allclose(
             other.mueller(wavelength), optic.mueller(WAVELENGTH), rtol=0, atol=1e-11
@@ -516,8 +717,8 @@ def test_assignment_keeps_the_declared_unit(label, data):
 
 def marked(label, values):
     """An optic in which everything that a copy must keep is unlike the default."""
-    optic = build(label, values, name="it", mount="-stage")
-    optic.position = 12 * u.deg
+    optic = build(label, values, name="it", mount=f"-{CASES[label].mount}")
+    optic.position = 0.7 * optic.position.unit
     optic.theta.fixed, optic.theta.bounds = False, (-5, 5)
     for key in optic.own_names:
         getattr(optic, key).fixed = True
@@ -545,10 +746,11 @@ def test_copy_is_equal_and_independent(label, data):
     before = optic.mueller(WAVELENGTH)
     assert state(copy) == state(optic)
     np.testing.assert_array_equal(copy.mueller(WAVELENGTH), before)
-    copy.position, copy.mount, copy.theta.fixed = 50 * u.deg, None, True
+    copy.position, copy.mount, copy.theta.fixed = 0.1 * copy.position.unit, None, True
     copy.theta = 3 * u.deg
     np.testing.assert_array_equal(optic.mueller(WAVELENGTH), before)
-    assert (optic.mount, optic.theta.fixed, optic.theta.value) == ("-stage", False, 0)
+    mount = f"-{CASES[label].mount}"
+    assert (optic.mount, optic.theta.fixed, optic.theta.value) == (mount, False, 0)
 
 
 @every
@@ -559,6 +761,7 @@ def test_with_parameters_changes_only_the_values(label, data):
     values = draw_per_wavelength(data, CASES[label].values) | {"theta": np.array([1.0, 2.0, 3.0])}
     other = optic.with_parameters(**with_units(CASES[label].optic, values))
     assert state(other) == state(optic)
+    assert CASES[label].settings.items() <= other._settings().items()
     for key, value in values.items():
         np.testing.assert_array_equal(getattr(other, key).value, value)
         assert np.shape(getattr(optic, key).value) == ()
@@ -595,6 +798,7 @@ def test_repr_names_class_values_mount_and_name(label):
     text = repr(optic)
     assert text.startswith(f"<{type(optic).__name__}(theta=0. deg")
     assert all(f"{key}=" in text for key in optic.param_names)
+    assert all(f", {key}={value!r}" in text for key, value in CASES[label].settings.items())
     assert text.endswith("mount='-stage', name='it')>")
 
 

@@ -91,6 +91,59 @@ def test_fit_that_did_not_converge_is_marked(elliptical):
     assert "NOT CONVERGED" not in plot_accuracy(elliptical).get_suptitle()
 
 
+def _standard(name, source, factor=3.0, wavelength=(1200.0, 1600.0, 2200.0)):
+    """What a calibration remembers of a standard, see add_standard."""
+    n = len(wavelength)
+    return {
+        "name": name,
+        "source": source,
+        "content_hash": name,
+        "wavelength_nm": list(wavelength),
+        "n": [12] * n,
+        "s_standard_percent": [0.1 * factor] * n,
+        "s_cv_percent": [0.1] * n,
+    }
+
+
+def test_standards_are_drawn_into_the_panel_of_their_source(several):
+    sources = [record.source for record in several.datasets]
+    entries = [_standard("july", sources[0]), _standard("august", sources[0], 5.0, (1600.0,))]
+    with_standards = replace(several, fit=several.fit | {"standards": entries})
+    figure = plot_accuracy(with_standards)
+    assert len(figure.axes) == 2
+    drawn = [line for line in figure.axes[0].lines if "s_standard" in line.get_label()]
+    assert [line.get_label().split("predicting ")[1].split(",")[0] for line in drawn] == [
+        "july",
+        "august",
+    ]
+    np.testing.assert_allclose(drawn[0].get_ydata(), 0.3)
+    np.testing.assert_allclose(drawn[1].get_xdata(), [1600])
+    assert drawn[0].get_marker() != drawn[1].get_marker()
+    assert drawn[0].get_linestyle() != drawn[1].get_linestyle()
+    low, high = figure.axes[0].get_ylim()
+    assert low < 0.3 < 0.5 < high
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert len(texts) == 5
+    assert "not fitted" in texts[-1]
+
+
+def test_standard_of_another_source_has_its_own_panel(elliptical):
+    star = _standard("star", "unpolarized standard star")
+    figure = plot_accuracy(replace(elliptical, fit=elliptical.fit | {"standards": [star]}))
+    first, second = figure.axes
+    assert list(lines(first)) == ["s_res", "s_mean", "s_cv"]
+    assert "star: n = 12 data a wavelength, predicted" in second.get_title()
+    drawn = {line.get_label().split(" ")[0].rstrip(":"): line for line in second.lines}
+    assert list(drawn) == ["s_standard", "s_cv"]
+    np.testing.assert_allclose(drawn["s_cv"].get_ydata(), 0.1)
+
+
+def test_legend_says_what_was_left_out(elliptical):
+    cycles = replace(elliptical, fit=elliptical.fit | {"groups": "cycle"})
+    texts = [text.get_text() for text in plot_accuracy(cycles).legends[0].get_texts()]
+    assert "half-wave-plate cycles left out" in texts[2]
+
+
 @pytest.mark.parametrize(
     "curve",
     [

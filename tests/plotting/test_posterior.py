@@ -153,7 +153,10 @@ def test_missing_corner(posterior, monkeypatch):
 def test_traces_show_all_walkers(posterior, tmp_path):
     figure = rendered(plot_traces(posterior), tmp_path)
     traces, correlations = figure.axes[::2], figure.axes[1::2]
-    assert [len(axes.lines) for axes in traces] == [8, 8, 8]
+    # eight walkers and their median
+    assert [len(axes.lines) for axes in traces] == [9, 9, 9]
+    middle = np.median(posterior.chain[:, :, 0], axis=1)
+    np.testing.assert_array_equal(traces[0].lines[-1].get_ydata(), middle)
     assert traces[2].get_ylabel() == "calibration_polarizer\ntheta (deg)"
     assert all(texts(axes) == ["τ = 1"] for axes in correlations)
     assert correlations[0].lines[0].get_ydata()[0] == 1.0
@@ -165,6 +168,46 @@ def test_long_traces_are_thinned_and_steps_are_those_of_the_sampler():
     steps = axes.lines[0].get_xdata()
     assert len(steps) <= 4500
     assert steps[-1] > 26000
+
+
+def test_traces_of_many_walkers_do_not_draw_every_step():
+    chain = np.random.default_rng(1).normal(size=(900, 186, 1))
+    (axes, _) = plot_traces(Posterior(["hwp.theta"], [u.deg], chain, chain[..., 0])).axes
+    assert len(axes.lines) == 187
+    assert len(axes.lines[0].get_xdata()) == 300
+
+
+def test_traces_of_a_thinned_posterior(posterior, tmp_path):
+    """Steps are those of the run; samples are counted instead of correlated."""
+    thinned = posterior.thinned(10)
+    figure = rendered(plot_traces(thinned, NAMES[:2]), tmp_path)
+    assert "1500 steps of 8 walkers" in figure.get_suptitle()
+    n = thinned.convergence.n_draws
+    assert f"drawn: {thinned.log_prob.size} of {n} samples" in figure.get_suptitle()
+    traces, counts = figure.axes[::2], figure.axes[1::2]
+    assert traces[0].lines[0].get_xdata().tolist() == thinned.steps.tolist()
+    assert "burn-in left out" in traces[0].get_title()
+    assert [sum(bar.get_width() for bar in axes.patches) for axes in counts] == [
+        thinned.log_prob.size
+    ] * 2
+    median = posterior.quantile(NAMES[0], 0.5).value
+    assert counts[0].lines[1].get_ydata() == pytest.approx([median] * 2)
+    assert texts(counts[0]) == ["τ = 1"]
+
+
+def test_corner_of_a_thinned_posterior(posterior):
+    pytest.importorskip("corner")
+    figure = plot_corner(posterior.thinned())
+    assert "1500 steps of 8 walkers" in figure.get_suptitle()
+    assert "drawn: " in figure.get_suptitle()
+
+
+def test_figures_of_walkers_that_do_not_agree_say_so(posterior):
+    pytest.importorskip("arviz_stats")
+    parts = posterior.thinned().to_dict()
+    parts["convergence"]["r_hat"] = [1.3, 1.0, 1.0]
+    apart = Posterior.from_dict(parts)
+    assert "(NOT CONVERGED)" in plot_traces(apart, NAMES[:1]).get_suptitle()
 
 
 def test_traces_of_what_does_not_move(posterior, tmp_path):

@@ -12,7 +12,8 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.calibration import Posterior
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.plotting import (
     plot_accuracy,
     plot_double_differences,
@@ -43,6 +44,7 @@ def test_writes_every_figure_as_png(elliptical, tmp_path):
     assert names(paths) == [
         "double_differences.png",
         "residuals.png",
+        "identifiability.png",
         "accuracy.png",
         "retardances.png",
         "efficiency.png",
@@ -64,7 +66,13 @@ def test_each_dataset_has_its_double_differences(several, tmp_path):
 
 def test_calibration_without_data_gets_the_other_figures(elliptical, tmp_path):
     paths = save_all(replace(elliptical, measurement=None), tmp_path)
-    assert names(paths) == ["accuracy.png", "retardances.png", "efficiency.png", "correlations.png"]
+    assert names(paths) == [
+        "identifiability.png",
+        "accuracy.png",
+        "retardances.png",
+        "efficiency.png",
+        "correlations.png",
+    ]
 
 
 def test_dataset_without_a_datum_is_left_out(several, tmp_path):
@@ -80,7 +88,96 @@ def test_dataset_without_a_datum_is_left_out(several, tmp_path):
 
 @pytest.mark.parametrize("name", ["masked", "undetermined", "single_angle"])
 def test_every_kind_of_calibration_is_drawn(name, request, tmp_path):
-    assert len(save_all(request.getfixturevalue(name), tmp_path)) == 6
+    assert len(save_all(request.getfixturevalue(name), tmp_path)) == 7
+
+
+def with_posterior(calibration, names=None, seed=1):
+    """The calibration with samples of what is named, by default of all that is free."""
+    covariance = calibration.covariance
+    names = covariance.names if names is None else names
+    units = [covariance.units[covariance.names.index(name)] for name in names]
+    chain = np.random.default_rng(seed).normal(size=(120, 40, len(names)))
+    # every other one is slow
+    for i in range(len(names)):
+        chain[:, :, i] = np.cumsum(chain[:, :, i], axis=0) if i % 2 else chain[:, :, i]
+    return replace(calibration, posterior=Posterior(names, units, chain, chain[..., 0]))
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What the figures of a posterior were asked to show."""
+    pytest.importorskip("corner")
+    from astropolcal.plotting import saving
+
+    shown = {}
+
+    def remember(draw):
+        def remembering(posterior, parameters):
+            shown[draw.__name__] = parameters
+            return Figure(figsize=(2, 2))
+
+        return remembering
+
+    for draw in (saving.plot_traces, saving.plot_corner):
+        monkeypatch.setattr(saving, draw.__name__, remember(draw))
+    return shown
+
+
+def test_posterior_is_drawn(elliptical, tmp_path):
+    pytest.importorskip("corner")
+    sampled = with_posterior(elliptical, ["hwp.w_sio2", "hwp.w_mgf2", "wollaston.efficiency[0]"])
+    found = names(save_all(sampled, tmp_path))
+    assert found[-2:] == ["traces.png", "corner.png"]
+    assert imread(tmp_path / "corner.png").shape[0] > 600
+    stored = replace(sampled, posterior=sampled.posterior.thinned(), measurement=None)
+    assert names(save_all(stored, tmp_path))[-2:] == ["traces.png", "corner.png"]
+
+
+def test_few_parameters_are_all_drawn(elliptical, tmp_path, drawn):
+    sampled = with_posterior(elliptical, elliptical.covariance.names[:12])
+    save_all(sampled, tmp_path)
+    assert drawn["plot_traces"] == drawn["plot_corner"] == sampled.posterior.names
+
+
+def test_of_many_parameters_the_common_and_the_slowest_are_drawn(elliptical, tmp_path, drawn):
+    sampled = with_posterior(elliptical)
+    posterior = sampled.posterior
+    common = [name for name in posterior.names if not name.endswith("]")]
+    assert 0 < len(common) < 12 < len(posterior.names) - len(common)
+    save_all(sampled, tmp_path)
+    assert drawn["plot_corner"] == common
+    assert drawn["plot_traces"][: len(common)] == common
+    others = drawn["plot_traces"][len(common) :]
+    assert len(others) + len(common) == 16
+    times = dict(zip(posterior.names, posterior.autocorrelation_times, strict=True))
+    assert [times[name] for name in others] == sorted((times[n] for n in others), reverse=True)
+    left_out = set(posterior.names) - set(common) - set(others)
+    assert max(times[name] for name in left_out) <= times[others[-1]]
+
+
+def test_of_many_parameters_without_common_ones_the_slowest_are_drawn(elliptical, tmp_path, drawn):
+    sampled = with_posterior(elliptical, [n for n in elliptical.covariance.names if "[" in n])
+    save_all(sampled, tmp_path)
+    assert len(drawn["plot_corner"]) == 12
+    assert drawn["plot_corner"] == drawn["plot_traces"][:12]
+
+
+def test_without_corner_the_other_figures_are_drawn(elliptical, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "corner", None)
+    sampled = with_posterior(elliptical, ["hwp.w_sio2"])
+    message = r"corner\.png is not drawn: the corner plot needs the package corner, .*pip install"
+    with pytest.warns(AstropolcalWarning, match=message):
+        found = names(save_all(sampled, tmp_path))
+    assert found[-1] == "traces.png"
+    assert not (tmp_path / "corner.png").exists()
+
+
+def test_parameter_that_does_not_move_costs_the_corner_plot(elliptical, tmp_path):
+    pytest.importorskip("corner")
+    stuck = with_posterior(elliptical, ["hwp.w_sio2", "hwp.w_mgf2"])
+    stuck.posterior.chain[:, :, 0] = 1.65
+    with pytest.warns(AstropolcalWarning, match=r"corner\.png is not drawn: .* did not move"):
+        assert names(save_all(stuck, tmp_path))[-1] == "traces.png"
 
 
 def test_existing_files_are_replaced(elliptical, tmp_path):

@@ -1,0 +1,196 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Directions in the space of the parameters, in words."""
+
+import astropy.units as u
+import numpy as np
+
+# what is worth a word in a direction, as a share of its largest component
+_WORTH_A_WORD = 0.02
+# where a parameter is that uncertain, an error is no help: degree, micrometre, percent
+LARGE = {" deg": 5.0, " um": 50.0, "": 0.05}
+# and where the data hold one direction so much better than another
+_CONDITION = 1e4
+# changes on sky that are not worth a number, degree and percent
+_NOTHING_ON_SKY = 0.005
+# what of a near-null direction is worth a word, as a share of what moves most
+_PART = 0.1
+# the sky is worked out for so many near-null directions, the worst
+_ON_SKY = 6
+
+
+def step_of(unit):
+    """Return the step of a parameter in canonical units, its size and its unit in words."""
+    if unit is None:
+        return 0.01, 0.01, ""
+    if u.Unit(unit).is_equivalent(u.rad):
+        return np.deg2rad(1.0), 1.0, " deg"
+    return 1.0, 1.0, " um"
+
+
+# ---- open directions ----------------------------------------------------------------------
+
+
+def open_directions(free, null):
+    """Rewrite open directions so that each is led by one parameter; say them in words."""
+    directions = []
+    for vector, lead in led(free, null):
+        moved = _moved(free, vector)
+        directions.append({"words": _open_words(free, moved, lead), "parameters": plain(moved)})
+    return directions
+
+
+def _moved(free, vector):
+    """Return what a direction changes, by parameter, in degree, micrometre or 1."""
+    moved, worth = {}, _WORTH_A_WORD * min(1.0, np.abs(vector).max(initial=0.0))
+    for slot in free.slots:
+        part = vector[slot.slice]
+        if np.abs(part).max() > worth:
+            size = step_of(slot.unit)[1]
+            moved[slot.name] = part[0] * size if slot.size == 1 else part * size
+    return moved
+
+
+def led(free, null):
+    """Yield each open direction, led by a parameter that the others do not move."""
+    if not len(null):
+        return
+    leads = _leads(free, null)
+    for vector, lead in zip(np.linalg.solve(null[:, leads], null), leads, strict=True):
+        yield vector, free.names[lead]
+
+
+def _leads(free, null):
+    """Choose a leading parameter for each open direction, those for all wavelengths first."""
+    order = np.argsort(
+        [slot.per_wavelength for slot in free.slots for _ in range(slot.size)], kind="stable"
+    )
+    n_single = sum(not slot.per_wavelength for slot in free.slots)
+    columns, leads = null.copy(), []
+    while len(leads) < len(null):
+        size = np.linalg.norm(columns, axis=0)
+        single = size[order[:n_single]]
+        # the first that moves about as much as any: small changes of the data do not reorder
+        pool = order[:n_single] if single.size and single.max() > 1e-3 else order
+        lead = next(i for i in pool if size[i] > 0.3 * size[pool].max())
+        direction = columns[:, lead] / size[lead]
+        columns -= np.outer(direction, direction @ columns)
+        leads.append(int(lead))
+    return leads
+
+
+def _open_words(free, moved, lead):
+    stem = lead.split("[")[0]
+    others = [_change(free, name, value) for name, value in moved.items() if name != stem]
+    step = step_of(free.by_name[stem].unit)
+    if not others:
+        with_prior = any(slot.name == stem and not prior.is_flat for slot, prior in free.priors)
+        known = "by them, only its prior tells it" if with_prior else "and keeps its start value"
+        return f"{lead} changes no datum: it cannot be determined {known}"
+    return f"{lead} by +{step[1]:g}{step[2]} cannot be told from {', '.join(others)}"
+
+
+def _change(free, name, value):
+    unit = step_of(free.by_name[name].unit)[2]
+    # adding zero turns -0.0 into 0.0
+    value = np.round(value, 9) + 0.0
+    if np.ndim(value) == 0:
+        return f"{name} by {value:+.3g}{unit}"
+    low, high = np.min(value), np.max(value)
+    return f"{name} by {low:+.3g} to {high:+.3g}{unit} over the wavelengths"
+
+
+def plain(moved):
+    """Return changes by parameter as floats and lists."""
+    return {
+        name: float(value) if np.ndim(value) == 0 else [float(v) for v in value]
+        for name, value in moved.items()
+    }
+
+
+def sky_words(sky):
+    """Say what a direction does on sky."""
+    turn, gain = sky["aolp_deg"], sky["dolp_percent"]
+    return (
+        f"; on sky this turns the AoLP by {_range(turn)} deg and changes the DoLP by "
+        f"{_range(gain)} % of itself"
+    )
+
+
+def _range(span):
+    low, high = span
+    if max(abs(low), abs(high)) < _NOTHING_ON_SKY:
+        return "less than 0.01"
+    return f"{low:+.2g}" if high - low < _NOTHING_ON_SKY else f"{low:+.2g} to {high:+.2g}"
+
+
+# ---- near-null directions -----------------------------------------------------------------
+
+
+def near_null_directions(free, whitened, level, sky_of):
+    """
+    Say what data and priors determine so badly that it hardly counts as determined.
+
+    Of the principal directions of the errors those along which some parameter
+    is uncertain by more than `LARGE`, or whose singular value is 1e4 times
+    smaller than the largest. ``sky_of`` returns what canonical changes do on sky.
+    """
+    found = whitened.errors
+    singular, errors = found.singular[: found.rank], whitened.factor() * level
+    condition = found.singular[:1] / singular
+    times_large = np.abs(errors) / _large(free)
+    bad = (times_large > 1).any(axis=1) | (condition > _CONDITION)
+    leads = np.argmax(times_large, axis=1) if len(errors) else np.zeros(0, dtype=int)
+    errors = errors * np.sign(errors[np.arange(len(errors)), leads])[:, None]
+    worst = [i for i in np.argsort(singular, kind="stable") if bad[i]]
+    skies = _skies(errors[worst] * whitened.scale, sky_of)
+    return [
+        _near_null(free, errors[i], times_large[i], condition[i], sky)
+        for i, sky in zip(worst, skies, strict=True)
+    ]
+
+
+def _large(free):
+    """Return `LARGE` of each element in steps, shape (n_free,)."""
+    kinds = [step_of(slot.unit)[1:] for slot in free.slots]
+    return np.repeat(
+        [LARGE[unit] / size for size, unit in kinds], [slot.size for slot in free.slots]
+    )
+
+
+def _skies(changes, sky_of):
+    some = sky_of(changes[:_ON_SKY]) if len(changes) else []
+    return some + [None] * (len(changes) - len(some))
+
+
+def _near_null(free, error, times_large, condition, sky):
+    """Return one direction: words, what it changes at one standard error, and on sky."""
+    lead = int(np.argmax(times_large))
+    words = f"{_uncertain(free, free.names[lead], error)} at the noise of this fit"
+    stem = free.names[lead].split("[")[0]
+    much = np.where(times_large > _PART * times_large[lead], error, 0.0)
+    others = [
+        _change(free, name, value) for name, value in _moved(free, much).items() if name != stem
+    ]
+    if others:
+        words += f", together with {', '.join(others)}"
+    if condition > _CONDITION:
+        words += f" (condition {condition:.1g})"
+    found = {"words": words, "parameters": plain(_moved(free, error))}
+    if sky is not None:
+        turn, gain = (max(map(abs, sky[key])) for key in ("aolp_deg", "dolp_percent"))
+        found["words"] += f"; on sky that is {turn:.2g} deg of AoLP and {gain:.2g} % of the DoLP"
+        found["sky"] = sky
+    return found
+
+
+def _uncertain(free, name, error):
+    slot = free.by_name[name.split("[")[0]]
+    _, size, unit = step_of(slot.unit)
+    part = np.abs(error[slot.slice]) * size
+    much = part[part > 0.5 * part.max()]
+    if much.size == 1:
+        return f"{name} is uncertain by {much[0]:.2g}{unit}"
+    return (
+        f"{slot.name} is uncertain by {much.min():.2g} to {much.max():.2g}{unit} at "
+        f"{much.size} wavelengths together"
+    )

@@ -1,0 +1,115 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Quantities of a frame, other than angles, on which an optic may depend."""
+
+import numpy as np
+from astropy.time import Time
+
+from astropolcal.exceptions import ObservationError
+from astropolcal.optics import COORDINATES
+
+__all__ = ["clock", "frame_coordinate"]
+
+
+def frame_coordinate(observations, name):
+    r"""
+    Return how far the run has come, or the fluxes of the beams, in every frame.
+
+    Parameters
+    ----------
+    observations : Observations
+        The dataset.
+    name : {"sequence", "flux", "total_flux", "previous_flux"}
+        ``"sequence"`` runs from 0 in the first frame to 1 in the last, by the
+        column ``time`` if it gives the time of every frame (see `clock`), else
+        by the order of the frames; it is 0 where all are at one time.
+
+        ``"flux"`` is the flux of each beam in the unit of the table, 0 where it
+        is masked.
+
+        ``"total_flux"`` is the sum of both beams, once for each of them.
+
+        ``"previous_flux"`` is the flux of a beam over the one of the same beam and
+        wavelength in the frame taken before. It is 1 for the first frame and
+        where one of the two is masked.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (F,) for the sequence, (2, B, F) for the fluxes, the right beam first.
+
+    Raises
+    ------
+    ObservationError
+        If the name is another.
+
+    Notes
+    -----
+    Persistence adds a share p of the frame before to a frame. It multiplies the
+    flux by :math:`1 + p\,F_\mathrm{before}/F_\mathrm{now}`, which is
+    `~astropolcal.optics.FluxGain` with ``power=-1`` and ``mount="previous_flux"``.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import Observations, example_table
+    >>> from astropolcal.observations.coordinates import frame_coordinate
+    >>> frame_coordinate(Observations.from_table(example_table()), "sequence").tolist()
+    [0.0, 0.3333333333333333, 0.6666666666666666, 1.0]
+    """
+    if name not in COORDINATES:
+        raise ObservationError(
+            f"{observations.name}: no coordinate {name!r}; allowed are {', '.join(COORDINATES)}"
+        )
+    time = _time_or_order(observations)
+    if name == "sequence":
+        passed = time - time.min()
+        return passed / passed.max() if passed.max() > 0 else passed
+    fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
+    if name == "flux":
+        return np.where(observations.mask.T, 0.0, fluxes)
+    if name == "total_flux":
+        total = np.where(observations.mask.T, 0.0, fluxes.sum(axis=0))
+        return np.stack([total, total])
+    order = np.argsort(time, kind="stable")
+    ratio = np.ones_like(fluxes)
+    ratio[..., order[1:]] = fluxes[..., order[1:]] / fluxes[..., order[:-1]]
+    return np.where(np.isnan(ratio), 1.0, ratio)
+
+
+def clock(frames):
+    """
+    Return the times of frames as numbers.
+
+    Parameters
+    ----------
+    frames : `~astropy.table.Table`
+        One row a frame.
+
+    Returns
+    -------
+    `~numpy.ndarray` or None
+        Shape (F,), in days or in the unit of the column; None if there is no
+        column ``time``, it holds neither times nor numbers, or one is unknown.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal.observations.coordinates import clock
+    >>> clock(QTable({"time": [0, 30, 65] * u.s})).tolist()
+    [0.0, 30.0, 65.0]
+    >>> clock(QTable({"hwp": [0, 45] * u.deg})) is None
+    True
+    """
+    column = frames["time"] if "time" in frames.colnames else None
+    column = column.mjd if isinstance(column, Time) else column
+    if getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
+        return None
+    known = ~np.asarray(getattr(column, "mask", False))
+    plain = getattr(column, "unmasked", column)
+    times = np.asarray(getattr(plain, "value", plain), dtype=float)
+    return times if np.all(known & np.isfinite(times)) else None
+
+
+def _time_or_order(observations):
+    times = clock(observations.frames)
+    return np.arange(observations.n_frames, dtype=float) if times is None else times

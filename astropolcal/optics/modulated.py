@@ -1,0 +1,456 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Optics whose Mueller matrix changes from frame to frame.
+
+Their ``mount`` names what the matrix depends on: the angle of a stage
+(``"hwp"``), how far the run has come (``"sequence"``, 0 to 1), the flux of
+the beam (``"flux"``), or that flux over the one in the frame before
+(``"previous_flux"``). At zero parameters each is the identity, so that it adds
+to a chain one way in which a real instrument departs from an ideal one.
+"""
+
+import astropy.units as u
+import numpy as np
+from astropy.modeling import Parameter
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.mueller.elements import _linear_retarder
+from astropolcal.optics.beamsplitters import BEAMS, _BeamOptic
+from astropolcal.optics.core import Optic, blank
+from astropolcal.optics.retarders import _linear_slope
+from astropolcal.units import to_unit
+
+__all__ = [
+    "DriftRotator",
+    "FluxGain",
+    "FrameOptic",
+    "HarmonicGain",
+    "HarmonicRetarder",
+    "HarmonicRotator",
+    "StrayLight",
+]
+
+_IDENTITY = np.eye(4)
+
+
+class FrameOptic(Optic):
+    """
+    An optic whose matrix depends on the position of its mount.
+
+    A subclass gives ``_matrix(coordinate, *values)`` and ``_derivatives``. The
+    coordinate is the position of the mount (radian or a number, with the sign
+    of the mount); values and coordinate broadcast against each other. Without a
+    mount the coordinate is zero.
+
+    See Also
+    --------
+    COORDINATES : the positions that are numbers.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import FrameOptic, HarmonicGain
+    >>> issubclass(HarmonicGain, FrameOptic)
+    True
+    """
+
+    #: Whether the optic also turns with its mount.
+    turns = False
+    takes_numbers = True
+
+    def _resolve(self, wavelength, position, parameters=None):
+        _, shift, values = self._read(wavelength, position, parameters)
+        return (*self._moved(0.0, values[0], shift), values[1:])
+
+    def _moved(self, coordinate, angle, shift):
+        return coordinate + shift, angle + shift if self.turns else angle
+
+
+def _one_of(allowed, value, name):
+    """Return a whole number of those allowed, or raise."""
+    if isinstance(value, bool | np.bool_) or not np.isscalar(value) or value not in allowed:
+        raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(map(str, allowed))}")
+    return int(value)
+
+
+class _Harmonic(FrameOptic):
+    """What varies as cosine cos(n x) + sine sin(n x) with the position x of the mount."""
+
+    takes_numbers = False
+
+    def __init__(self, *args, harmonic=1, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.harmonic = harmonic
+
+    @property
+    def harmonic(self):
+        """Number of periods in a turn of the mount: 1, 2 or 4."""
+        return self._harmonic
+
+    @harmonic.setter
+    def harmonic(self, value):
+        self._harmonic = _one_of((1, 2, 4), value, f"{type(self).__name__}.harmonic")
+
+    def _settings(self):
+        return super()._settings() | {"harmonic": self.harmonic}
+
+    def _waves(self, coordinate):
+        phase = self._harmonic * np.asarray(coordinate)
+        return np.cos(phase), np.sin(phase)
+
+    def _sum(self, coordinate, cosine, sine):
+        c, s = self._waves(coordinate)
+        return cosine * c + sine * s
+
+
+class HarmonicRotator(_Harmonic):
+    r"""
+    Rotator of the polarization by an angle that varies with the position of a stage.
+
+    :math:`T(\delta)` with :math:`\delta = a\cos nx + b\sin nx`. One in front of an
+    optic and its inverse (both parameters of opposite sign) behind it add
+    :math:`\delta` to the orientation of that optic, the error of the encoder of
+    its stage: n = 1 for a scale that is not centred, n = 2 for one that is not
+    round. All three need the same ``mount``, with the same sign.
+
+    Parameters
+    ----------
+    cosine, sine : `~astropy.units.Quantity`
+        Amplitudes a and b, angles; scalars, or one value a wavelength.
+    harmonic : {1, 2, 4}
+        Periods n in a turn of the mount.
+    theta : `~astropy.units.Quantity`
+        Without consequence here.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import HarmonicRotator
+    >>> error = HarmonicRotator(cosine=0.5 * u.deg, mount="hwp", name="hwp_encoder")
+    >>> float(error.mueller(position=180 * u.deg)[1, 2].round(5))
+    -0.01745
+    """
+
+    cosine = Parameter(default=0.0, unit=u.deg, bounds=(-30, 30), description="cosine amplitude")
+    sine = Parameter(default=0.0, unit=u.deg, bounds=(-30, 30), description="sine amplitude")
+
+    def _matrix(self, coordinate, cosine, sine):
+        return _turned(self._sum(coordinate, cosine, sine))
+
+    def _derivatives(self, coordinate, cosine, sine):
+        slope = _turned_slope(self._sum(coordinate, cosine, sine))
+        return tuple(_times(wave, slope) for wave in self._waves(coordinate))
+
+
+class DriftRotator(FrameOptic):
+    r"""
+    Rotator of the polarization by an angle that grows through the run.
+
+    :math:`T(r x)` with x from 0 in the first to 1 in the last frame: a source
+    or polarizer whose orientation drifts. As behind a `Rotator`, the angle of
+    linear polarization is less by :math:`r x`.
+
+    Parameters
+    ----------
+    rate : `~astropy.units.Quantity`
+        Angle r over the run, or per radian of a stage.
+    theta : `~astropy.units.Quantity`
+        Without consequence here.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import DriftRotator
+    >>> drift = DriftRotator(rate=0.2 * u.deg, mount="sequence", name="drift")
+    >>> float(drift.mueller(position=0.5)[1, 2].round(5))
+    0.00349
+    """
+
+    rate = Parameter(default=0.0, unit=u.deg, bounds=(-30, 30), description="angle over the run")
+
+    def _matrix(self, coordinate, rate):
+        return _turned(rate * np.asarray(coordinate))
+
+    def _derivatives(self, coordinate, rate):
+        return (_times(coordinate, _turned_slope(rate * np.asarray(coordinate))),)
+
+
+class HarmonicRetarder(_Harmonic):
+    r"""
+    Linear retarder that turns with its mount and whose retardance varies with it.
+
+    Retardance :math:`a\cos nx + b\sin nx`: what a tilted plate adds to its own
+    (n = 2; Patanchon et al. 2023, arXiv:2308.00967).
+
+    Parameters
+    ----------
+    cosine, sine : `~astropy.units.Quantity`
+        Amplitudes a and b; scalars, or one value a wavelength.
+    harmonic : {1, 2, 4}
+        Periods n in a turn of the mount.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axis on the mount.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import HarmonicRetarder
+    >>> tilt = HarmonicRetarder(cosine=2 * u.deg, harmonic=2, mount="hwp", name="hwp_tilt")
+    >>> float(tilt.mueller(position=90 * u.deg)[2, 3].round(4))
+    0.0349
+    """
+
+    turns = True
+
+    cosine = Parameter(default=0.0, unit=u.deg, bounds=(-90, 90), description="cosine amplitude")
+    sine = Parameter(default=0.0, unit=u.deg, bounds=(-90, 90), description="sine amplitude")
+
+    def _matrix(self, coordinate, cosine, sine):
+        return _linear_retarder(self._sum(coordinate, cosine, sine))
+
+    def _derivatives(self, coordinate, cosine, sine):
+        slope = _linear_slope(self._sum(coordinate, cosine, sine))
+        return tuple(_times(wave, slope) for wave in self._waves(coordinate))
+
+
+class HarmonicGain(_BeamOptic, _Harmonic):
+    r"""
+    Transmission of the beams that varies with the position of a stage.
+
+    :math:`1 \pm (a\cos nx + b\sin nx)`: dust or a wedge that turns with the
+    plate. Both beams alike, or (``differential``) with opposite signs, as where
+    the beams wander over a detector that is not flat (Tinyanont et al. 2019,
+    arXiv:1908.10409).
+
+    Parameters
+    ----------
+    cosine, sine : float or array_like
+        Amplitudes a and b; scalars, or one value a wavelength.
+    harmonic : {1, 2, 4}
+        Periods n in a turn of the mount.
+    differential : bool
+        Whether the left beam changes with the opposite sign.
+    beam : {"right", "left"}
+        The beam that goes on in a chain.
+    theta : `~astropy.units.Quantity`
+        Without consequence here.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import HarmonicGain
+    >>> dust = HarmonicGain(sine=0.01, mount="hwp", name="hwp_transmission")
+    >>> float(dust.mueller(position=90 * u.deg)[0, 0])
+    1.01
+    """
+
+    cosine = Parameter(default=0.0, bounds=(-0.4, 0.4), description="cosine amplitude")
+    sine = Parameter(default=0.0, bounds=(-0.4, 0.4), description="sine amplitude")
+
+    def __init__(self, *args, differential=False, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.differential = differential
+
+    @property
+    def differential(self):
+        """Whether the left beam changes with the opposite sign."""
+        return self._differential
+
+    @differential.setter
+    def differential(self, value):
+        if not isinstance(value, bool | np.bool_):
+            raise ParameterError(
+                f"HarmonicGain.differential = {value!r}; allowed are True and False"
+            )
+        self._differential = bool(value)
+
+    @property
+    def depends_on_beam(self):
+        """True where the left beam changes with the opposite sign."""
+        return self._differential
+
+    def _settings(self):
+        return super()._settings() | {"differential": self.differential}
+
+    @property
+    def _sign(self):
+        return BEAMS[self._beam] if self._differential else 1.0
+
+    def _matrix(self, coordinate, cosine, sine):
+        return _scaled(1.0 + self._sign * self._sum(coordinate, cosine, sine))
+
+    def _derivatives(self, coordinate, cosine, sine):
+        shape = np.broadcast_shapes(*(np.shape(x) for x in (coordinate, cosine, sine)))
+        return tuple(
+            _scaled(np.broadcast_to(self._sign * wave, shape)) for wave in self._waves(coordinate)
+        )
+
+
+class FluxGain(_BeamOptic, FrameOptic):
+    r"""
+    Gain of each beam that depends on its flux.
+
+    :math:`1 + k (F/F_0)^m`, with the coefficient k of the beam and its flux F in
+    the table (``mount="flux"``). With m = 1 a detector that is not linear. With
+    ``mount="previous_flux"``, F is the flux over that of the frame before, and
+    m = -1 is persistence, a share :math:`k F_0` of it. Where F = 0 the gain is one.
+
+    Parameters
+    ----------
+    right, left : float or array_like
+        Coefficient k of each beam; scalars, or one value a wavelength.
+    power : {1, -1}
+        Exponent m.
+    reference : float
+        :math:`F_0`, in the unit of the tables.
+    beam : {"right", "left"}
+        The beam that goes on in a chain.
+    theta : `~astropy.units.Quantity`
+        Without consequence here.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import FluxGain
+    >>> bend = FluxGain(right=-0.01, left=-0.01, reference=1e7, mount="flux", name="nonlinearity")
+    >>> float(bend.mueller(position=5e6)[0, 0])
+    0.995
+    """
+
+    right = Parameter(default=0.0, bounds=(-0.5, 0.5), description="coefficient of the right beam")
+    left = Parameter(default=0.0, bounds=(-0.5, 0.5), description="coefficient of the left beam")
+
+    def __init__(self, *args, power=1, reference=1.0, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.power = power
+        self.reference = reference
+
+    @property
+    def power(self):
+        """Exponent of the flux, 1 or -1."""
+        return self._power
+
+    @power.setter
+    def power(self, value):
+        self._power = _one_of((1, -1), value, "FluxGain.power")
+
+    @property
+    def reference(self):
+        """Flux at which the gain is one plus the coefficient."""
+        return self._reference
+
+    @reference.setter
+    def reference(self, value):
+        self._reference = _positive(value, "FluxGain.reference")
+
+    def _settings(self):
+        return super()._settings() | {"power": self.power, "reference": self.reference}
+
+    def _level(self, coordinate):
+        relative = np.asarray(coordinate) / self._reference
+        if self._power == 1:
+            return relative
+        # where there is no flux, there is none to add to
+        return np.divide(1.0, relative, out=np.zeros_like(relative), where=relative != 0)
+
+    def _matrix(self, coordinate, right, left):
+        own = right if self._beam == "right" else left
+        return _scaled(1.0 + own * self._level(coordinate))
+
+    def _derivatives(self, coordinate, right, left):
+        shape = np.broadcast_shapes(*(np.shape(x) for x in (coordinate, right, left)))
+        slope = _scaled(np.broadcast_to(self._level(coordinate), shape))
+        none = np.zeros_like(slope)
+        return (slope, none) if self._beam == "right" else (none, slope)
+
+
+class StrayLight(FrameOptic):
+    r"""
+    Unpolarized light that is added in front of the beam splitter, whatever the source does.
+
+    :math:`I' = I\,(1 + b F_0/F)` with F the sum of both beams in the table
+    (``mount="total_flux"``), so that a constant flux :math:`b F_0` is added to
+    each frame: background, stray light, ghosts (Patat & Romaniello 2006,
+    doi:10.1086/497581). Where F = 0 nothing is added.
+
+    Parameters
+    ----------
+    amount : float or array_like
+        Added flux b over :math:`F_0`; scalar, or one value a wavelength.
+    reference : float
+        :math:`F_0`, in the unit of the tables.
+    theta : `~astropy.units.Quantity`
+        Without consequence here.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import StrayLight
+    >>> ghost = StrayLight(amount=0.01, reference=1e6, mount="total_flux", name="ghost")
+    >>> float(ghost.mueller(position=5e5)[0, 0])
+    1.02
+    """
+
+    amount = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added flux over the reference")
+
+    def __init__(self, *args, reference=1.0, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.reference = reference
+
+    @property
+    def reference(self):
+        """Flux of which the amount is a share."""
+        return self._reference
+
+    @reference.setter
+    def reference(self, value):
+        self._reference = _positive(value, "StrayLight.reference")
+
+    def _settings(self):
+        return super()._settings() | {"reference": self.reference}
+
+    def _share(self, coordinate):
+        flux = np.asarray(coordinate, dtype=float)
+        return np.divide(self._reference, flux, out=np.zeros_like(flux), where=flux != 0)
+
+    def _matrix(self, coordinate, amount):
+        out = blank(coordinate, amount)
+        out[...] = _IDENTITY
+        out[..., 0, 0] += amount * self._share(coordinate)
+        return out
+
+    def _derivatives(self, coordinate, amount):
+        out = blank(coordinate, amount)
+        out[..., 0, 0] = self._share(coordinate)
+        return (out,)
+
+
+def _positive(value, name):
+    number = to_unit(value, None, name)
+    if number.ndim or not (np.isfinite(number) and number > 0):
+        raise ParameterError(f"{name} = {value!r} must be one positive number")
+    return float(number)
+
+
+def _scaled(gain):
+    return np.asarray(gain)[..., None, None] * _IDENTITY
+
+
+def _times(factor, matrix):
+    return np.asarray(factor)[..., None, None] * matrix
+
+
+def _turned(angle):
+    """Return T(angle)."""
+    out = blank(angle)
+    out[..., 0, 0] = out[..., 3, 3] = 1.0
+    out[..., 1, 1] = out[..., 2, 2] = np.cos(2 * angle)
+    out[..., 1, 2] = np.sin(2 * angle)
+    out[..., 2, 1] = -out[..., 1, 2]
+    return out
+
+
+def _turned_slope(angle):
+    """Return the derivative of T(angle)."""
+    out = blank(angle)
+    out[..., 1, 1] = out[..., 2, 2] = -2 * np.sin(2 * angle)
+    out[..., 1, 2] = 2 * np.cos(2 * angle)
+    out[..., 2, 1] = -out[..., 1, 2]
+    return out

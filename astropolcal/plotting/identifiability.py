@@ -1,0 +1,378 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What the data determine, what they leave open, and what they hardly determine."""
+
+import textwrap
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.calibration.harmonics import _POOR, SETS, harmonic_conditions
+from astropolcal.exceptions import ParameterError
+from astropolcal.plotting._style import BLACK, BLUE, GREY, ORANGE, VERMILION, canvas, heading, style
+from astropolcal.plotting.correlations import _groups
+from astropolcal.units import angle_to_rad
+
+__all__ = ["plot_identifiability"]
+
+_WIDTH = 11.0
+_SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+_INFINITE = "\N{INFINITY}"
+# singular values below this share of the largest count as zero
+_OPEN_BELOW = 1e-9
+# loadings are written into cells from this on, and in white from that
+_WRITTEN, _PALE = 0.02, 0.6
+# a singular value and an error belong together if they agree to this share
+_SAME = 0.05
+# a condition number is 1 or more
+_LEFT = 0.8
+# what is named of a direction, as a share of its length, and at most so many
+_WORTH_A_WORD, _MOST_NAMES = 0.15, 3
+# directions are the same if the cosine between them is larger; so many near-null ones are shown
+_ALIKE, _MOST_NEAR_NULL = 0.9, 6
+_COLUMNS = 125
+
+
+@dataclass
+class _Row:
+    """One direction: its name, its loadings (length 1), and what it is in words."""
+
+    name: str
+    loadings: np.ndarray
+    words: str
+
+
+def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
+    r"""
+    Draw what the data determine, and along which directions they determine little.
+
+    (a) The singular values of the whitened derivative of the data, with parameters in
+    steps of a degree, a micrometre or a percent; those below the threshold of the
+    rank are open directions. On the right stands the standard error along each
+    direction. (b) What takes part in each open direction and in the most
+    weakly determined ones; a direction has length 1, and parameters given
+    per wavelength are summed in squares. (c) How well the half-wave-plate angles tell
+    harmonics apart.
+
+    Parameters
+    ----------
+    calibration : Calibration or Identifiability
+        What was found. A calibration that was read from a file has no angles, and an
+        `~astropolcal.calibration.Identifiability` alone has no errors: panels
+        then show what there is.
+    weakest : int
+        How many of the determined directions to show, those with the largest errors; more
+        where more are called near null.
+    hwp : `~astropy.units.Quantity`, optional
+        Half-wave-plate angles; by default those of the calibration's data.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If there is no free parameter, or the angles or the number are not possible.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.plotting.identifiability import plot_identifiability
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> plot_identifiability(cal).axes[0].get_title()
+    '(a) 49 of 49 combinations determined, none open'
+    """
+    finding = getattr(calibration, "identifiability", calibration)
+    if not finding.n_free:
+        raise ParameterError("no free parameter, so nothing to identify")
+    if weakest < 0:
+        raise ParameterError(f"weakest = {weakest}; allowed are numbers from 0")
+    known = _errors(calibration)
+    weak = _weak_rows(finding, known, weakest)
+    rows = [*_open_rows(finding), *weak]
+    angles = _angles(calibration, hwp)
+    words = _wrapped(rows)
+    heights = (3.4, 0.9 + 0.42 * max(len(rows), 1), 0.15 + 0.165 * len(words))
+    with style():
+        figure = canvas(figure, _WIDTH, sum(heights) + 1.6)
+        grid = figure.add_gridspec(3, 2, height_ratios=heights, width_ratios=(3, 2))
+        _draw_values(figure.add_subplot(grid[0, 0]), finding, known, len(weak))
+        _draw_conditions(figure.add_subplot(grid[0, 1]), finding, angles)
+        _draw_loadings(figure, figure.add_subplot(grid[1, :]), finding, rows)
+        _write_words(figure.add_subplot(grid[2, :]), words)
+        if hasattr(calibration, "datasets"):
+            names = [record.name for record in calibration.datasets]
+            heading(figure, calibration, "What the data determine", names)
+        else:
+            figure.suptitle("What the data determine")
+    return figure
+
+
+# ---- the directions ------------------------------------------------------------------------
+
+
+def _errors(calibration):
+    """Return steps, directions and standard errors, the largest last; None without a covariance."""
+    covariance = getattr(calibration, "covariance", None)
+    if covariance is None:
+        return None
+    axes = covariance._axes()
+    order = np.argsort(axes.sigmas, kind="stable")
+    order = order[axes.sigmas[order] > 0]
+    return covariance, axes.known[order], axes.sigmas[order]
+
+
+def _open_rows(finding):
+    """Return the open directions in the order, and led by the parameter, of their words."""
+    null = np.asarray(finding.null_vectors).reshape(-1, finding.n_free)
+    words = [direction["words"] for direction in finding.directions]
+    leads = [text.split(" ", 1)[0] for text in words]
+    if len(words) == len(null) and set(leads) <= set(finding.names):
+        at = [finding.names.index(lead) for lead in leads]
+        null = np.linalg.solve(null[:, at], null) if len(null) else null
+    else:
+        words = [""] * len(null)
+    return [
+        _Row(f"open {i + 1}", vector / np.linalg.norm(vector), text)
+        for i, (vector, text) in enumerate(zip(null, words, strict=True))
+    ]
+
+
+def _weak_rows(finding, known, count):
+    """Return the determined directions with the largest errors, the largest first."""
+    if known is None:
+        return []
+    covariance, vectors, sigmas = known
+    near_null = list(getattr(finding, "near_null", []))
+    count = max(count, min(len(near_null), _MOST_NEAR_NULL))
+    rows = []
+    for vector, sigma in list(zip(vectors, sigmas, strict=True))[::-1][:count]:
+        vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
+        words = _near_null_words(near_null, finding.names, covariance.units, vector)
+        name = f"{'near null' if words else 'weak'} {len(rows) + 1}"
+        words = words or _weak_words(finding.names, covariance.units, vector, sigma)
+        rows.append(_Row(name, vector, words))
+    return rows
+
+
+def _near_null_words(near_null, names, units, vector):
+    """Return the words of the near-null direction that this is, or none."""
+    places = _places(names)
+    for direction in near_null:
+        change = np.zeros(len(names))
+        for name, value in direction["parameters"].items():
+            at = [names.index(name)] if name in names else places[name]
+            change[at] = np.asarray(value) / (0.01 if units[at[0]] is None else 1.0)
+        if abs(change @ vector) > _ALIKE * np.linalg.norm(change):
+            return direction["words"]
+    return ""
+
+
+def _weak_words(names, units, vector, sigma):
+    """Say what a step of one standard error along a direction changes."""
+    parts = []
+    for stem, places in _places(names).items():
+        part = vector[places]
+        share = np.linalg.norm(part)
+        if share > _WORTH_A_WORD:
+            unit = _step_unit(units[places[0]])
+            typical = sigma * (part[0] if len(part) == 1 else share / np.sqrt(len(part)))
+            over = f" (rms of {len(part)} wavelengths)" if len(part) > 1 else ""
+            size = f"{typical:+.2g}" if len(part) == 1 else f"{typical:.2g}"
+            parts.append((share, f"{stem} by {size} {unit}{over}"))
+    parts.sort(reverse=True)
+    return f"1{_SIGMA} changes " + ", ".join(text for _, text in parts[:_MOST_NAMES])
+
+
+def _step_unit(unit):
+    if unit is None:
+        return "%"
+    return "deg" if u.Unit(unit).is_equivalent(u.deg) else "µm"
+
+
+def _places(names):
+    """Return ``optic.parameter`` with the places of its elements, in their order."""
+    places = {}
+    for i, name in enumerate(names):
+        places.setdefault(name.split("[")[0], []).append(i)
+    return places
+
+
+# ---- (a) singular values ---------------------------------------------------------------------
+
+
+def _draw_values(axes, finding, known, n_weak):
+    values, rank = np.asarray(finding.singular_values), finding.rank
+    index = np.arange(1, len(values) + 1)
+    n_open = len(values) - rank
+    largest = values.max(initial=0.0) or 1.0
+    threshold = _threshold(values, rank, largest)
+    is_weak = _is_weak(values[:rank], known, n_weak)
+    axes.set_yscale("log")
+    kinds = ((~is_weak, "o", BLUE, "determined"), (is_weak, "s", ORANGE, "called weak in (b)"))
+    for which, marker, color, label in kinds:
+        if which.any():
+            axes.plot(index[:rank][which], values[:rank][which], marker, color=color, label=label)
+    if n_open:
+        # at their true values, a rounding error, they would press all others together
+        label = f"{n_open} open: {_rounding(values[rank:])}"
+        axes.plot(index[rank:], np.full(n_open, threshold / 30), "v", color=VERMILION, label=label)
+        axes.axhline(threshold, color=BLACK, linestyle="--", linewidth=1, label="limit of the rank")
+    open_words = f"{n_open} open" if n_open else "none open"
+    axes.set_title(f"(a) {rank} of {finding.n_free} combinations determined, {open_words}")
+    axes.set(xlabel="direction, the best determined first", ylabel="singular value (1/step)")
+    axes.set_xlim(0, len(values) + 1)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    low = threshold / 300 if n_open else values[rank - 1] / 3
+    axes.set_ylim(low, largest * 3)
+    axes.legend(loc="center left" if n_open else "lower left")
+    if known is not None and len(known[2]):
+        _add_error_axis(axes, known[2].min() * largest, threshold if n_open else low)
+
+
+def _is_weak(values, known, count):
+    """Mark the singular values that belong to the directions with the largest errors."""
+    marked = np.zeros(len(values), dtype=bool)
+    if known is None or not count or not len(values):
+        return marked
+    sigmas = known[2]
+    for expected in sigmas.min() * values.max() / sigmas[-count:]:
+        nearest = np.argmin(np.abs(np.log(values / expected)))
+        # with priors or bounds the errors may have directions of their own
+        marked[nearest] |= abs(np.log(values[nearest] / expected)) < _SAME
+    return marked
+
+
+def _threshold(values, rank, largest):
+    """Return the limit of the rank, between the values that it parts."""
+    low = values[rank] if rank < len(values) else 0.0
+    high = values[rank - 1] if rank else largest
+    return float(np.clip(_OPEN_BELOW * largest, low, high)) or 1e-12
+
+
+def _rounding(values):
+    return f"at most {values.max():.1g}" if values.max() > 0 else "exactly zero"
+
+
+def _add_error_axis(axes, noise, lowest):
+    """Show on the right the standard error along a determined direction: noise over its value."""
+
+    def convert(value):
+        return noise / np.maximum(value, 1e-300)
+
+    right = axes.secondary_yaxis("right", functions=(convert, convert))
+    first, last = (np.log10(convert(value)) for value in (axes.get_ylim()[1], lowest))
+    # none at the open directions, which have no error
+    decades = np.arange(np.ceil(first), np.floor(last) + 1)
+    right.set_yticks(10.0**decades)
+    right.minorticks_off()
+    right.set_ylabel("standard error (deg, µm or %)")
+
+
+# ---- (b) loadings ---------------------------------------------------------------------------
+
+
+def _draw_loadings(figure, axes, finding, rows):
+    title = "(b) parameters that take part in each direction; (n): norm over n wavelengths"
+    axes.set_title(title, loc="left")
+    if not rows:
+        _say(axes, "no open direction; errors are not known")
+        return
+    places = _places(finding.names)
+    table = np.array([[_loading(row.loadings[at]) for at in places.values()] for row in rows])
+    image = axes.imshow(np.abs(table), cmap="Blues", vmin=0, vmax=1, aspect="auto")
+    axes.grid(False)
+    labels = [f"{n} ({count})" if count > 1 else n for n, count in _groups(finding.names)]
+    axes.set_xticks(
+        range(len(labels)), labels, rotation=30, ha="right", rotation_mode="anchor", fontsize=9.5
+    )
+    axes.set_yticks(range(len(rows)), [row.name for row in rows])
+    axes.tick_params(length=0)
+    for i, j in zip(*np.nonzero(np.abs(table) > _WRITTEN), strict=True):
+        single = len(list(places.values())[j]) == 1
+        text = f"{table[i, j]:+.2f}" if single else f"{table[i, j]:.2f}"
+        color = "white" if abs(table[i, j]) > _PALE else "black"
+        axes.text(j, i, text.replace("-", "\N{MINUS SIGN}"), color=color, ha="center", va="center")
+    n_open = sum(row.name.startswith("open") for row in rows)
+    if 0 < n_open < len(rows):
+        axes.axhline(n_open - 0.5, color=BLACK, linewidth=1)
+    figure.colorbar(image, ax=axes, pad=0.01, label="|loading|")
+
+
+def _loading(part):
+    """Return the signed component of a single parameter, the norm of one given per wavelength."""
+    return part[0] if len(part) == 1 else np.linalg.norm(part)
+
+
+def _wrapped(rows):
+    lines = []
+    for row in (r for r in rows if r.words):
+        text = f"{row.name}: {row.words}"
+        lines += textwrap.wrap(text, _COLUMNS, subsequent_indent="     ")
+    return lines
+
+
+def _write_words(axes, lines):
+    axes.axis("off")
+    text = "\n".join(lines)
+    axes.text(
+        0, 1, text, transform=axes.transAxes, va="top", ha="left", fontsize=9, linespacing=1.3
+    )
+
+
+# ---- (c) half-wave-plate angles ---------------------------------------------------------------
+
+
+def _angles(calibration, hwp):
+    """Return the different half-wave-plate angles in radian, or None where not known."""
+    if hwp is not None:
+        return np.unique(np.round(np.atleast_1d(angle_to_rad(hwp, "hwp")), 6))
+    measurement = getattr(calibration, "measurement", None)
+    if measurement is None:
+        return None
+    angles = [dataset.observations.position("hwp") for dataset in measurement.datasets]
+    return np.unique(np.round(np.concatenate(angles), 6))
+
+
+def _draw_conditions(axes, finding, angles):
+    axes.set_title("(c) half-wave-plate angles")
+    if angles is None:
+        lines = [line for text in finding.sampling for line in textwrap.wrap(text, 40)]
+        _say(axes, "\n".join(lines) or "half-wave-plate angles are not known")
+        return
+    found = harmonic_conditions(angles)
+    values = np.array([found[harmonics] for harmonics, _ in SETS])
+    top = 10 * max(values[np.isfinite(values)].max(initial=_POOR), _POOR)
+    for i, value in enumerate(values):
+        poor = not value <= _POOR
+        look = {"color": VERMILION, "hatch": "//"} if poor else {"color": BLUE}
+        length = min(value, top)
+        axes.barh(i, length - _LEFT, left=_LEFT, edgecolor="white", height=0.55, **look)
+        text = f" {value:.2g}" if np.isfinite(value) else f" {_INFINITE}: too few angles"
+        inside = not np.isfinite(value)
+        axes.text(
+            1.1 if inside else length, i, text, va="center", ha="left",
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1} if inside else None,
+        )  # fmt: skip
+    axes.axvline(_POOR, color=BLACK, linestyle="--", linewidth=1)
+    axes.text(_POOR, -0.62, " poor beyond", ha="left", va="center", fontsize=9.5, color=GREY)
+    axes.set(xscale="log", xlim=(_LEFT, top * 8), ylim=(len(values) - 0.5, -0.9))
+    names = ["harmonics " + ", ".join(map(str, harmonics)) for harmonics, _ in SETS]
+    axes.set_yticks(range(len(SETS)), names)
+    axes.set_xlabel(f"condition number ({len(angles)} angles)")
+    axes.grid(False, axis="y")
+
+
+def _say(axes, text):
+    """Write a sentence where there is nothing to draw."""
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=9)

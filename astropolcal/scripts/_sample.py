@@ -1,0 +1,176 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""``astropolcal sample``: samples of the posterior of a calibration's parameters."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from astropolcal.exceptions import AstropolcalError
+from astropolcal.scripts._common import check_outputs, read_datasets, write_json
+
+_EPILOG = """\
+examples:
+  astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
+  astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2
+  astropolcal sample cal.asdf run.ecsv --checkpoint run.h5 --resume -o sampled.asdf
+
+The files are the tables that the calibration was made from, all of them. Which
+parameters vary, their bounds and their priors are those of the calibration.
+"""
+_COLUMNS = ("median", "lower", "upper", "fitted")
+
+
+def add_parser(commands):
+    """Add the subcommand to what ``add_subparsers`` returned."""
+    parser = commands.add_parser(
+        "sample",
+        help="sample the posterior of a calibration's parameters",
+        description="Sample the posterior of a calibration's parameters with an ensemble of\n"
+        "walkers, and keep the samples with the calibration.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("calibration", metavar="CAL.asdf", help="calibration file")
+    parser.add_argument(
+        "files", nargs="+", metavar="FILE", help="the tables that it was made from (ECSV)"
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="OUT.asdf", help="write the calibration with samples here"
+    )
+    _add_run_options(parser)
+    parser.add_argument("--plots", metavar="DIR", help="save the figures in this folder")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.set_defaults(run=run)
+
+
+def _add_run_options(parser):
+    """Add what says what is sampled, and how long."""
+    parser.add_argument(
+        "--parameters",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help="what varies, such as hwp.w_sio2; the rest is held at its fitted values (default: "
+        "all free parameters)",
+    )
+    parser.add_argument(
+        "--walkers", type=int, metavar="N", help="default: twice the parameters, at least 24"
+    )
+    parser.add_argument("--steps", type=int, default=5000, metavar="N", help="default: %(default)s")
+    parser.add_argument(
+        "--burn",
+        type=_burn_in,
+        default=None,
+        metavar="N|auto",
+        help="steps to leave out at the start (default: auto, 5 autocorrelation times)",
+    )
+    parser.add_argument("--seed", type=int, metavar="N", help="makes the run repeatable")
+    parser.add_argument(
+        "--checkpoint", metavar="FILE.h5", help="write the steps here while the run lasts"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the checkpoint, if there is one"
+    )
+
+
+def _burn_in(text):
+    """Return a number of steps; None for ``auto``."""
+    if text == "auto":
+        return None
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor auto") from None
+
+
+def run(arguments):
+    """Sample, print what came out and write what was asked for."""
+    from astropolcal.calibration import Calibration
+
+    quiet = arguments.quiet or arguments.json == "-"
+    say = (lambda *_: None) if quiet else print
+    check_outputs(arguments.output, arguments.json, arguments.checkpoint)
+    _check_options(arguments)
+    calibration = Calibration.read(arguments.calibration)
+    calibration = calibration.with_observations(read_datasets(arguments.files))
+    calibration.posterior = _sample(calibration, arguments)
+    # first the files: a reader of our words may have gone in the meantime
+    written = _write(calibration, arguments)
+    say(_words(calibration.posterior))
+    if written:
+        say("\nWritten: " + "\n         ".join(written))
+
+
+def _check_options(arguments):
+    """Raise before the long work is done."""
+    if arguments.plots and Path(arguments.plots).is_file():
+        raise AstropolcalError(f"{arguments.plots}: is a file, not a folder")
+    if arguments.resume and not arguments.checkpoint:
+        raise AstropolcalError("--resume needs --checkpoint FILE.h5")
+    if arguments.seed is not None and arguments.seed < 0:
+        raise AstropolcalError(f"--seed {arguments.seed}: allowed are whole numbers from 0 up")
+    if arguments.checkpoint and Path(arguments.checkpoint).exists() and not arguments.resume:
+        raise AstropolcalError(
+            f"{arguments.checkpoint}: exists already; --resume goes on from it, or remove it"
+        )
+
+
+def _sample(calibration, arguments):
+    from astropolcal.calibration import sample
+
+    try:
+        return sample(
+            calibration,
+            parameters=arguments.parameters,
+            n_walkers=arguments.walkers,
+            n_steps=arguments.steps,
+            burn_in=arguments.burn,
+            seed=arguments.seed,
+            checkpoint=arguments.checkpoint,
+            progress=not arguments.quiet,
+        )
+    except KeyboardInterrupt:
+        if arguments.checkpoint and Path(arguments.checkpoint).exists():
+            print(
+                f"astropolcal: the steps so far are in {arguments.checkpoint}; the same command "
+                "with --resume goes on",
+                file=sys.stderr,
+            )
+        raise
+
+
+def _words(posterior):
+    """Return the run in words, and what is common to all wavelengths as a table."""
+    parameters = posterior.report()["parameters"]
+    common = {name: entry for name, entry in parameters.items() if not name.endswith("]")}
+    shown = common or parameters
+    width = max(map(len, shown)) + 2
+    lines = [posterior.words(), "", "".join(f"{text:>13}" for text in _COLUMNS).rjust(width + 52)]
+    for name, entry in shown.items():
+        numbers = "".join(f"{entry[key]:13.5f}" for key in _COLUMNS)
+        lines.append(f"{name:<{width}}{numbers} {entry['unit']}".rstrip())
+    lines.append("median, and the 68 % interval from lower to upper")
+    rest = len(parameters) - len(shown)
+    if rest:
+        lines.append(f"{rest} values given per wavelength are in the file and in the JSON")
+    return "\n".join(lines)
+
+
+def _write(calibration, arguments):
+    """Write what was asked for; return the names of the files."""
+    written = []
+    if arguments.output:
+        calibration.write(arguments.output, overwrite=True)
+        written.append(arguments.output)
+    if arguments.plots:
+        from astropolcal.plotting import save_all
+
+        written += [str(path) for path in save_all(calibration, arguments.plots)]
+    if arguments.json:
+        write_json(calibration.to_dict(), arguments.json)
+        if arguments.json != "-":
+            written.append(arguments.json)
+    return written

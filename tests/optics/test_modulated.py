@@ -1,0 +1,239 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Optics that change from frame to frame: what their mounts and settings may be."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.modeling import Parameter
+from hypothesis import given
+from hypothesis import strategies as st
+
+from astropolcal import mueller, optics
+from astropolcal.chain import system_mueller
+from astropolcal.exceptions import ParameterError
+from astropolcal.mueller.elements import _diattenuator
+from astropolcal.optics import (
+    COORDINATES,
+    OPTICS,
+    DriftRotator,
+    FluxGain,
+    FrameOptic,
+    HarmonicGain,
+    HarmonicRetarder,
+    HarmonicRotator,
+)
+from astropolcal.propagation import Propagator
+
+HARMONIC = [HarmonicGain, HarmonicRetarder, HarmonicRotator]
+ANGLE = st.floats(-180, 180).map(lambda x: x * u.deg)
+
+# --- mounts ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", OPTICS)
+@pytest.mark.parametrize("coordinate", COORDINATES)
+@pytest.mark.parametrize("sign", ["", "-"])
+def test_only_some_optics_stand_on_numbers(name, coordinate, sign):
+    mount = sign + coordinate
+    if name in ("DriftRotator", "FluxGain", "StrayLight"):
+        optic = OPTICS[name](mount=mount)
+        assert optic.position.unit == u.one
+        assert (optic.stage, optic.stage_sign) == (coordinate, -1.0 if sign else 1.0)
+    else:
+        with pytest.raises(ParameterError, match=f"{name}: mount = '{mount}' is a number, not"):
+            OPTICS[name](mount=mount)
+
+
+@pytest.mark.parametrize("coordinate", COORDINATES)
+def test_number_and_angle_are_not_exchanged(coordinate):
+    number = DriftRotator(mount=coordinate)
+    angle = HarmonicRotator(mount="hwp")
+    for set_position in (
+        lambda value: setattr(number, "position", value),
+        lambda value: number.mueller(position=value),
+    ):
+        with pytest.raises(ParameterError, match="position has unit deg, which is not conv"):
+            set_position(5 * u.deg)
+        with pytest.raises(ParameterError, match=r"position = .* must be finite"):
+            set_position([0.5, np.nan])
+    for set_position in (
+        lambda value: setattr(angle, "position", value),
+        lambda value: angle.mueller(position=value),
+    ):
+        with pytest.raises(ParameterError, match=r"position = 0.5 needs a unit such as rad"):
+            set_position(0.5)
+    number.position = 50 * u.percent
+    assert number.position == 0.5
+
+
+def test_position_does_not_outlive_its_kind_of_mount():
+    optic = DriftRotator(rate=10 * u.deg, mount="hwp")
+    optic.position = 90 * u.deg
+    optic.mount = "derotator"
+    assert optic.position == np.pi / 2 * u.rad
+    optic.mount = "sequence"
+    assert optic.position == 0
+
+
+def test_fluxes_have_no_other_unit():
+    with pytest.raises(ParameterError, match="position has unit adu, which is not convertible"):
+        FluxGain(mount="flux").position = 5 * u.adu
+
+
+@pytest.mark.parametrize("optic", [FluxGain(right=0.1), DriftRotator(rate=9 * u.deg)])
+def test_without_mount_there_is_no_effect(optic):
+    np.testing.assert_array_equal(optic.mueller(), np.eye(4))
+
+
+def test_base_is_abstract():
+    with pytest.raises(TypeError, match="abstract"):
+        FrameOptic()
+
+
+# --- settings --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cls", HARMONIC)
+@pytest.mark.parametrize("harmonic", [0, 3, -1, 1.5, "2", True, None, [1], np.array([1, 2])])
+def test_unknown_harmonic_is_refused(cls, harmonic):
+    message = rf"{cls.__name__}.harmonic = .*; allowed are 1, 2, 4"
+    with pytest.raises(ParameterError, match=message):
+        cls(harmonic=harmonic)
+    optic = cls(harmonic=2)
+    with pytest.raises(ParameterError, match=message):
+        optic.harmonic = harmonic
+    assert optic.harmonic == 2
+
+
+@pytest.mark.parametrize("power", [0, 2, -2, "1", True, None])
+def test_unknown_power_is_refused(power):
+    with pytest.raises(ParameterError, match=r"FluxGain.power = .*; allowed are 1, -1"):
+        FluxGain(power=power)
+
+
+@pytest.mark.parametrize("reference", [0, -1, np.nan, np.inf, [1.0], "many", 5 * u.adu])
+def test_reference_is_a_positive_number(reference):
+    with pytest.raises(ParameterError, match=r"FluxGain.reference"):
+        FluxGain(reference=reference)
+
+
+@pytest.mark.parametrize("differential", ["no", 1, None])
+def test_differential_is_true_or_false(differential):
+    with pytest.raises(ParameterError, match=r"HarmonicGain.differential = .* True and False"):
+        HarmonicGain(differential=differential)
+
+
+@pytest.mark.parametrize("cls", [FluxGain, HarmonicGain, optics.BeamGain])
+def test_unknown_beam_is_refused(cls):
+    with pytest.raises(ParameterError, match=r"allowed are \['left', 'right'\]"):
+        cls(beam="up")
+
+
+def test_numbers_of_numpy_become_plain():
+    flux = FluxGain(power=np.int64(-1), reference=np.float32(0.5))
+    wave = HarmonicGain(harmonic=np.int8(2), differential=np.True_)
+    kinds = [type(x) for x in (flux.power, flux.reference, wave.harmonic, wave.differential)]
+    assert kinds == [int, float, int, bool]
+
+
+def test_repr_has_what_is_unlike_the_default():
+    assert "harmonic" not in repr(HarmonicGain(mount="hwp"))
+    text = repr(HarmonicGain(harmonic=2, differential=True, beam="left", mount="hwp", name="it"))
+    assert text == (
+        "<HarmonicGain(theta=0. deg, cosine=0., sine=0., harmonic=2, beam='left', "
+        "differential=True, mount='hwp', name='it')>"
+    )
+
+
+# --- an optic of one's own -------------------------------------------------------------------
+
+
+class Dusty(FrameOptic):
+    """Diattenuator that grows with the position, with an axis that stands still."""
+
+    slope = Parameter(default=0.0, bounds=(-0.3, 0.3), description="diattenuation a radian")
+
+    def _matrix(self, coordinate, slope):
+        return _diattenuator(slope * np.asarray(coordinate))
+
+    def _derivatives(self, coordinate, slope):
+        step = 1e-6
+        ends = [self._matrix(coordinate, slope + sign * step) for sign in (1, -1)]
+        return ((ends[0] - ends[1]) / (2 * step),)
+
+
+@given(position=st.floats(-170, 170), theta=ANGLE, slope=st.floats(-0.3, 0.3))
+def test_frame_optic_stands_still_unless_it_says_otherwise(position, theta, slope):
+    optic = Dusty(slope=slope, theta=theta, mount="-hwp", name="dusty")
+    epsilon = -slope * np.radians(position)
+    expected = mueller.rotate(mueller.diattenuator(epsilon), theta)
+    found = optic.mueller(position=position * u.deg)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(system_mueller(optic, positions={"hwp": position * u.deg}), found)
+    chain = optic | optics.WollastonPrism(name="wollaston")
+    right, left = Propagator(chain, [1.6], {"hwp": np.radians([position])}).fluxes()
+    np.testing.assert_allclose((right - left) / (right + left), expected[1, 0], atol=1e-14)
+
+
+# --- what they are for -----------------------------------------------------------------------
+
+
+@given(position=ANGLE, cosine=st.floats(-5, 5), sine=st.floats(-5, 5), retardance=ANGLE)
+@pytest.mark.parametrize("harmonic", [1, 2, 4])
+@pytest.mark.parametrize("sign", ["", "-"])
+def test_rotators_around_a_plate_are_the_error_of_its_encoder(
+    sign, harmonic, position, cosine, sine, retardance
+):
+    def error(factor, name):
+        amplitudes = {"cosine": factor * cosine * u.deg, "sine": factor * sine * u.deg}
+        return HarmonicRotator(**amplitudes, harmonic=harmonic, mount=f"{sign}hwp", name=name)
+
+    plate = optics.LinearRetarder(retardance=retardance, mount=f"{sign}hwp", name="hwp")
+    chain = error(1, "before") | plate | error(-1, "behind")
+    x = (-1 if sign else 1) * position
+    off = (cosine * np.cos(harmonic * x) + sine * np.sin(harmonic * x)) * u.deg
+    expected = mueller.rotate(mueller.linear_retarder(retardance), x + off)
+    found = system_mueller(chain, positions={"hwp": position})
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+def test_drift_in_front_turns_the_source():
+    chain = optics.LinearPolarizer(name="polarizer") | DriftRotator(
+        rate=-20 * u.deg, mount="sequence", name="drift"
+    )
+    light = system_mueller(chain, positions={"sequence": [0, 0.5, 1]}) @ [1, 0, 0, 0]
+    # T(-20 deg) turns the light by +20 deg
+    angle = np.degrees(np.arctan2(light[:, 2], light[:, 1])) / 2
+    np.testing.assert_allclose(angle, [0, 10, 20], atol=1e-12)
+
+
+def test_persistence_adds_a_share_of_the_frame_before():
+    flux = np.array([5.0, 20.0, 8.0, 40.0])
+    share = 0.03
+    gain = FluxGain(right=share, power=-1, mount="previous_flux")
+    found = flux[1:] * gain.mueller(position=flux[1:] / flux[:-1])[:, 0, 0]
+    np.testing.assert_allclose(found, flux[1:] + share * flux[:-1], rtol=1e-14)
+
+
+def test_background_adds_a_constant():
+    flux = np.array([5.0, 20.0, 8e4])
+    gain = FluxGain(left=0.02, beam="left", power=-1, reference=100.0, mount="flux")
+    found = flux * gain.mueller(position=flux)[:, 0, 0]
+    np.testing.assert_allclose(found, flux + 2.0, rtol=1e-14)
+    assert gain.mueller(position=0.0)[0, 0] == 1
+
+
+def test_gain_does_not_polarize():
+    light = HarmonicGain(cosine=0.3)(1.6 * u.um, 2, 1, -0.5, 0.25)[1:]
+    np.testing.assert_allclose(light, 1.3 * np.array([2, 1, -0.5, 0.25]), rtol=1e-15)
+
+
+def test_differential_gain_keeps_the_sum_of_equal_beams():
+    both = [
+        HarmonicGain(sine=0.1, differential=True, beam=beam, mount="hwp").mueller(
+            position=[10, 50, 200] * u.deg
+        )
+        for beam in ("right", "left")
+    ]
+    np.testing.assert_allclose(sum(both), np.broadcast_to(2 * np.eye(4), (3, 4, 4)), atol=1e-15)
+    assert np.abs(both[0] - both[1]).max() > 0.1

@@ -1,0 +1,247 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""How ``astropolcal calibrate`` judges the accuracy: standards, groups, targets, gauge."""
+
+import json
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import Calibration, Observations, calibrate, instruments
+from astropolcal.calibration.groups import GROUPS
+from astropolcal.calibration.standards import standard_accuracy
+from astropolcal.calibration.target_accuracy import target_accuracies
+from astropolcal.scripts._calibrate import _target
+from astropolcal.scripts.main import build_parser, main
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+CHARIS = instruments.get("charis")
+WAVELENGTH = CHARIS.wavelength[[9, 12, 16]]
+HELD = ["--fix", "hwp.theta=0", "--fix", "derotator.theta"]
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory):
+    """Tables of two polarized nights and an unpolarized one, of the same optics."""
+    folder = tmp_path_factory.mktemp("tables")
+    meta = CHARIS.published_meta() | {"yjh50_dichroic": "out"}
+    frames = half_wave_plate_cycles(derotator=[50, 50, 62.5, 80, 100] * u.deg)
+    paths = {}
+    for i, (name, source) in enumerate(
+        {"first": "polarized", "second": "polarized", "dark": "unpolarized"}.items()
+    ):
+        chain = CHARIS.chain(source, ["nbs"], wavelength=WAVELENGTH)
+        if source == "unpolarized":
+            chain["fold_mirror"].diattenuation = np.full(3, 0.01)
+        paths[name] = folder / f"{name}.ecsv"
+        data = simulate(chain, WAVELENGTH, frames, seed=i, meta=meta | {"source": source})
+        data.write(paths[name])
+    return paths
+
+
+def run(tmp_path, *arguments):
+    out = tmp_path / "out.json"
+    assert main(["calibrate", "-q", "--json", str(out), *map(str, arguments)]) == 0
+    return json.loads(out.read_text())
+
+
+def complaint(capsys, *arguments):
+    try:
+        status = main(["calibrate", *map(str, arguments)])
+    except SystemExit as stop:
+        status = stop.code
+    captured = capsys.readouterr()
+    assert status == 2
+    assert "Traceback" not in captured.err
+    (line,) = [line for line in captured.err.splitlines() if "error" in line]
+    return line
+
+
+# ---- standards ------------------------------------------------------------------------
+
+
+def test_a_standard_is_predicted_and_not_fitted(tables, tmp_path):
+    alone = run(tmp_path, tables["first"])
+    with_standard = run(tmp_path, tables["first"], "--standard", tables["second"])
+    assert alone["standards"] == []
+    for name, known in alone["parameters"].items():
+        assert with_standard["parameters"][name]["value"] == known["value"]
+    assert with_standard["n_data"] == alone["n_data"]
+    (entry,) = with_standard["standards"]
+    assert (entry["name"], entry["source"]) == ("second", "polarized")
+    assert entry["n"] == [20, 20, 20]
+    np.testing.assert_allclose(entry["wavelength_nm"], WAVELENGTH.to_value(u.nm), rtol=1e-6)
+    for key in ("s_standard_percent", "s_res_percent", "bias_percent", "s_cv_percent", "chi"):
+        assert len(entry[key]) == 3
+    # photon noise and the same optics
+    assert 0.5 < np.median(entry["chi"]) < 2
+    np.testing.assert_allclose(
+        with_standard["datasets"][0]["s_standard_percent"], entry["s_standard_percent"]
+    )
+
+
+def test_the_command_predicts_what_the_function_predicts(tables, tmp_path):
+    (entry,) = run(tmp_path, tables["first"], "--standard", tables["second"])["standards"]
+    first, second = (Observations.read(tables[name]) for name in ("first", "second"))
+    cal = calibrate(CHARIS.chains_for([first]), first)
+    table = standard_accuracy(cal, *CHARIS.chains_for([second]), second)
+    found = table["s_standard"].to_value(u.percent)
+    np.testing.assert_allclose(entry["s_standard_percent"], found, rtol=1e-4)
+
+
+def test_several_standards_and_optics_of_their_own(tables, tmp_path, capsys):
+    files = [tables["first"], "--standard", tables["second"], "--standard", tables["dark"]]
+    assert "dark: nothing determines fold_mirror.diattenuation" in complaint(capsys, *files)
+    summary = run(tmp_path, *files, "--fix", "fold_mirror.diattenuation=0.01")
+    assert [entry["name"] for entry in summary["standards"]] == ["second", "dark"]
+    assert summary["standards"][1]["not_calibrated"] == ["fold_mirror"]
+    # it is no part of the fit, and not of its gauge
+    assert "fold_mirror" not in summary["gauge"]
+    assert not any(name.startswith("fold_mirror") for name in summary["parameters"])
+    wrong = run(tmp_path, *files, "--fix", "fold_mirror.diattenuation=0.02")["standards"][1]
+    right = summary["standards"][1]
+    assert np.median(wrong["s_standard_percent"]) > 5 * np.median(right["s_standard_percent"])
+
+
+def test_summary_file_and_info_know_the_standard(tables, tmp_path, capsys):
+    cal = tmp_path / "cal.asdf"
+    arguments = [tables["first"], "--standard", tables["second"], "-o", cal, "--plots", tmp_path]
+    assert main(["calibrate", *map(str, arguments)]) == 0
+    text = capsys.readouterr().out
+    assert "Prediction of second (not fitted), in percent" in text
+    assert max(len(line) for line in text.splitlines() if str(tmp_path) not in line) <= 80
+    assert (tmp_path / "accuracy.png").is_file()
+    assert main(["info", str(cal)]) == 0
+    assert "Prediction of second (not fitted), in percent" in capsys.readouterr().out
+    assert Calibration.read(cal).fit["standards"][0]["name"] == "second"
+
+
+def test_a_fitted_table_is_no_standard(tables, capsys):
+    line = complaint(capsys, tables["first"], "--standard", tables["first"])
+    assert "is no independent standard: it is fitted as" in line
+    line = complaint(capsys, tables["first"], *["--standard", tables["second"]] * 2)
+    assert "holds the same frames as" in line
+    assert "no such file" in complaint(capsys, tables["first"], "--standard", "nowhere.ecsv")
+
+
+def test_a_standard_at_other_wavelengths_is_refused(tables, tmp_path, capsys):
+    lam = CHARIS.wavelength[[9, 13]]
+    chain = CHARIS.chain("polarized", ["nbs"], wavelength=lam)
+    frames = half_wave_plate_cycles(derotator=[50, 80] * u.deg)
+    path = tmp_path / "other.ecsv"
+    simulate(chain, lam, frames, seed=1, meta=CHARIS.published_meta()).write(path)
+    line = complaint(capsys, tables["first"], "--standard", path)
+    assert "other: 1 of 2 wavelengths, such as 1804.702 nm, are none of the calibration's 3" in line
+
+
+# ---- groups ----------------------------------------------------------------------------
+
+
+def test_cross_validation_leaves_out_what_is_asked_for(tables, tmp_path, capsys):
+    assert build_parser().parse_args(["calibrate"]).groups is None
+    usual = run(tmp_path, tables["first"])
+    found = {by: run(tmp_path, tables["first"], "--groups", by) for by in ("derotator", "cycle")}
+    assert usual["left_out"] == found["derotator"]["left_out"] == "derotator angles"
+    assert found["cycle"]["left_out"] == "half-wave-plate cycles"
+    s_cv = {by: summary["datasets"][0]["s_cv_percent"] for by, summary in found.items()}
+    assert s_cv["derotator"] == usual["datasets"][0]["s_cv_percent"]
+    # the two cycles at 50 deg predict each other
+    assert not np.allclose(s_cv["cycle"], s_cv["derotator"], rtol=1e-3)
+    assert main(["calibrate", str(tables["first"]), "--groups", "cycle"]) == 0
+    assert "s_cv: rms error on half-wave-plate cycles left out" in capsys.readouterr().out
+
+
+def test_whole_datasets_may_be_left_out(tables, tmp_path, capsys):
+    both = run(tmp_path, tables["first"], tables["second"], "--groups", "dataset")
+    assert both["left_out"] == "datasets"
+    assert all(np.isfinite(d["s_cv_percent"]).all() for d in both["datasets"])
+    line = complaint(capsys, tables["first"], "--groups", "dataset")
+    assert "cross-validation by dataset: all data are in one group" in line
+    # without the dark nothing tells the mirror, without the lamp not the polarizer
+    line = complaint(capsys, tables["first"], tables["dark"], "--groups", "dataset")
+    assert "the others do not determine" in line
+
+
+def test_groups_with_a_single_member_are_named(tables, tmp_path, capsys):
+    data = Observations.read(tables["first"])
+    pairs = data.pairs()
+    keep = np.concatenate([pairs[:13].ravel(), pairs[16:].ravel()])
+    path = tmp_path / "few.ecsv"
+    data.select(keep).write(path)
+    for by, what in (("derotator", "derotator 80 deg"), ("cycle", "cycle number 3")):
+        line = complaint(capsys, path, "--groups", by)
+        assert f"cross-validation by {by}: group {what} of few has a single member" in line
+
+
+def test_choices_are_those_of_the_function(capsys):
+    line = complaint(capsys, "--groups", "moon")
+    assert all(repr(name) in line for name in GROUPS)
+
+
+# ---- targets ---------------------------------------------------------------------------
+
+
+def test_targets_by_default_and_by_choice(tables, tmp_path, capsys):
+    usual = run(tmp_path, tables["first"], tables["dark"])["targets"]
+    assert [(t["dolp_percent"], t["aolp_deg"]) for t in usual] == [(1.0, None), (30.0, None)]
+    assert usual[0]["missing"] == ["on_sky"]
+    files = [tables["first"], tables["dark"], "-o", tmp_path / "cal.asdf"]
+    chosen = run(tmp_path, *files, "--target", "5%,20", "--target", "2")["targets"]
+    assert [(t["dolp_percent"], t["aolp_deg"]) for t in chosen] == [(5.0, 20.0), (2.0, None)]
+    cal = Calibration.read(tmp_path / "cal.asdf")
+    (table,) = target_accuracies(cal, [(5 * u.percent, 20 * u.deg)])
+    for key in ("s_rel", "s_unpol", "s_abs", "s_Q", "s_U", "s_p"):
+        np.testing.assert_allclose(chosen[0][f"{key}_percent"], table[key].value)
+    np.testing.assert_allclose(chosen[0]["s_chi_deg"], table["s_chi"].value)
+    assert chosen[0]["s_sky_percent"] == [None] * 3
+    assert main(["calibrate", str(tables["first"]), "--target", "5%,20"]) == 0
+    text = capsys.readouterr().out
+    row = next(line for line in text.splitlines() if line.split()[:3] == ["5", "%", "20"])
+    assert len(row.split()) == 9
+    assert "lower limits" in " ".join(text.split())
+
+
+@pytest.mark.parametrize(
+    ("text", "dolp", "aolp"),
+    [
+        ("1", 1, None),
+        ("30%", 30, None),
+        ("0.5,-20", 0.5, -20),
+        ("100 %,0.5rad", 100, 28.64788976),
+        ("0,0deg", 0, 0),
+    ],
+)
+def test_spelling_of_targets(text, dolp, aolp):
+    found = _target(text)
+    assert found[0].to_value(u.percent) == pytest.approx(dolp)
+    assert found[1] is None if aolp is None else found[1].to_value(u.deg) == pytest.approx(aolp)
+
+
+@pytest.mark.parametrize("text", ["", "x", "101", "-1", "nan", "1,", "1,x", "1,2,3", "1um", "1,5%"])
+def test_impossible_targets_get_one_line(tables, capsys, text):
+    line = complaint(capsys, tables["first"], f"--target={text}")
+    assert f"--target {text}" in line
+    assert "such as 1 or 30,45" in line
+
+
+# ---- gauge -----------------------------------------------------------------------------
+
+
+def test_what_is_fixed_is_named_in_the_gauge(tables, tmp_path):
+    summary = run(tmp_path, tables["first"], *HELD)
+    assert summary["gauge"] == (
+        "held: hwp.theta, derotator.theta; the data determine every free parameter"
+    )
+    assert summary["parameters"]["hwp.theta"]["value"] == 0
+    usual = run(tmp_path, tables["first"])["gauge"]
+    assert usual.startswith("minimal")
+    # an optic's name stands for all of its parameters
+    whole = run(tmp_path, tables["first"], "--fix", "hwp")["gauge"]
+    assert whole.startswith("held: hwp.theta, hwp.w_sio2, hwp.w_mgf2; ")
+
+
+def test_a_prior_on_what_was_fixed_frees_it_again(tables, tmp_path):
+    both = ["--fix", "hwp.theta", "--prior", "hwp.theta=0+-0.1deg", "--fix", "derotator.theta"]
+    summary = run(tmp_path, tables["first"], *both)
+    assert summary["gauge"].startswith("held: derotator.theta; prior on hwp.theta")
+    assert not summary["parameters"]["hwp.theta"]["fixed"]
