@@ -1,0 +1,981 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Sealed challenges, which ask whether the diagnosis is right where the truth is known.
+
+A challenge is a simulated calibration of an instrument with a random effect in
+it, or none, or one that no library holds. The diagnosis sees the data and the
+nominal chains; the key stays sealed until it has answered. Many of them give
+recall, false alarms, errors of the sizes, and the gap that is left, against the
+signal-to-noise ratio of the effect.
+"""
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+from tqdm import tqdm
+
+from astropolcal import instruments
+from astropolcal.chain import leaves
+from astropolcal.exceptions import AstropolcalError, GapError
+from astropolcal.gap.attribution import scan
+from astropolcal.gap.channels import Channels
+from astropolcal.gap.diagnosis import diagnose
+from astropolcal.gap.effects import EFFECTS, Context, get_effect
+from astropolcal.gap.model import Model, _canonical
+from astropolcal.gap.problem import GapProblem, law_basis
+from astropolcal.gap.shrinkage import frame_groups, held_out
+from astropolcal.observations import Observations
+from astropolcal.propagation import Propagator
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+from astropolcal.units import canonical_factor
+
+__all__ = [
+    "KINDS",
+    "ChallengeResult",
+    "Key",
+    "Setup",
+    "make_challenge",
+    "run_challenge",
+]
+
+#: Kinds of challenges, and how often each is drawn where nothing else is asked for.
+KINDS = {
+    "single": 0.45,
+    "none": 0.15,
+    "pair": 0.12,
+    "absorbed": 0.07,
+    "unlisted": 0.08,
+    "withheld": 0.08,
+}
+#: An effect that explains this share of the evidence cannot be told from the true one.
+ENOUGH = 0.95
+# what the library may explain of an effect that it is not to know
+_UNKNOWN = 0.3
+# an effect that lifts chi-square by less than this at its usual size is absorbed
+_INVISIBLE = 0.5
+_WEAKEST = 3.0
+_REFIT_FROM = 0.5
+_TRIES = 40
+# a size counts as measured where its error is below this share of its prior
+_MEASURED = 0.3
+
+
+@dataclass(frozen=True)
+class Setup:
+    """
+    What is simulated.
+
+    Parameters
+    ----------
+    instrument : str
+        Name of the instrument.
+    options : dict
+        Passed to its ``chain``: the nominal model.
+    n_wavelengths, n_derotator : int
+        Numbers of wavelengths and of derotator angles; at each of these one
+        cycle of the half-wave plate.
+    flux : float
+        Median flux that enters, in electrons per wavelength and frame.
+    read_noise : float
+        Per beam and frame, in electrons.
+    drift, flicker : float
+        Drift of the lamp through the run and its flicker from frame to frame,
+        relative; every challenge draws between none and twice this.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.challenge import Setup
+    >>> Setup(n_derotator=4).n_wavelengths
+    8
+    """
+
+    instrument: str = "charis"
+    options: dict = field(default_factory=lambda: {"derotator": "linear"})
+    n_wavelengths: int = 8
+    n_derotator: int = 8
+    flux: float = 1e7
+    read_noise: float = 100.0
+    drift: float = 0.02
+    flicker: float = 0.003
+
+    def __post_init__(self):
+        for key in ("n_wavelengths", "n_derotator"):
+            if getattr(self, key) < 3:
+                raise GapError(f"{key} = {getattr(self, key)}; allowed are whole numbers from 3 up")
+
+    @property
+    def wavelength(self):
+        """Wavelengths, evenly in the logarithm over the range of the instrument."""
+        usual = instruments.get(self.instrument).wavelength
+        return np.geomspace(usual.min(), usual.max(), self.n_wavelengths)
+
+    def chains(self):
+        """Return the nominal chain of each internal source, at its starting values."""
+        instrument = instruments.get(self.instrument)
+        return [
+            instrument.chain(source, wavelength=self.wavelength, **self.options)
+            for source in instrument.sources
+        ]
+
+    def frames(self):
+        """Return the frames of one dataset."""
+        turn = np.linspace(45, 132.5, self.n_derotator) * u.deg
+        return half_wave_plate_cycles(derotator=turn)
+
+
+@dataclass
+class Key:
+    """
+    The truth of a challenge, to be opened after the answer.
+
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    effects : list of str
+        What the data hold and the nominal model lacks.
+    snr : list of float
+        Square root of the chi-square that each effect adds after the nominal
+        model is fitted again.
+    alternatives : list of dict
+        Share of that chi-square which other effects explain, one dict an effect.
+    values : list of dict
+        True values of the parameters of each effect, canonical.
+    chains : list
+        The true chains.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.challenge import Key
+    >>> key = Key("single", ["beam_gain"], [9.0], [{"background": 0.97}], [{}])
+    >>> sorted(key.accepted[0])
+    ['background', 'beam_gain']
+    """
+
+    kind: str
+    effects: list
+    snr: list
+    alternatives: list
+    values: list
+    chains: list = field(default_factory=list, repr=False)
+
+    @property
+    def accepted(self):
+        """The right names for each effect: itself, and what cannot be told from it."""
+        return [
+            {name, *(other for other, share in shares.items() if share >= ENOUGH)}
+            for name, shares in zip(self.effects, self.alternatives, strict=True)
+        ]
+
+    @property
+    def library(self):
+        """Names of the effects that the diagnosis may ask."""
+        gone = set().union(*self.accepted) if self.kind == "withheld" else set()
+        return [name for name in EFFECTS if name not in gone]
+
+
+# ---- a challenge is made ---------------------------------------------------------------------
+
+
+def make_challenge(seed, *, kind="single", effect=None, snr=30.0, setup=None):
+    """
+    Make a sealed challenge.
+
+    Parameters
+    ----------
+    seed : int or `~numpy.random.SeedSequence`
+        Seed of everything that is random.
+    kind : str
+        ``"single"``: an effect of the library. ``"none"``: no effect. ``"pair"``:
+        two effects. ``"absorbed"``: an effect that the nominal parameters take
+        up. ``"unlisted"``: an effect that is in no library. ``"withheld"``: an
+        effect that is to be taken out of the library that is asked.
+    effect : str, optional
+        The effect; by default one is drawn.
+    snr : float
+        Signal-to-noise ratio of each effect, after the nominal model is fitted
+        again. An effect that cannot be so large is as large as it can.
+    setup : Setup, optional
+        What is simulated.
+
+    Returns
+    -------
+    observations : list of Observations
+        The datasets.
+    chains : list
+        Their nominal chains, at starting values that are not the truth.
+    key : Key
+
+    Raises
+    ------
+    GapError
+        If the kind or the effect is unknown, or no effect fits the kind.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.challenge import Setup, make_challenge
+    >>> small = Setup(n_wavelengths=5, n_derotator=3)
+    >>> data, chains, key = make_challenge(1, effect="beam_gain", snr=20, setup=small)
+    >>> [observations.n_frames for observations in data], round(key.snr[0])
+    ([24, 24], 20)
+    """
+    if kind not in KINDS:
+        raise GapError(f"kind = {kind!r}; allowed are {', '.join(KINDS)}")
+    if not (np.isfinite(snr) and snr > 0):
+        raise GapError(f"snr = {snr}; it must be finite and positive")
+    bench = _Bench(Setup() if setup is None else setup, np.random.default_rng(seed))
+    planted = [] if kind == "none" else _plant(bench, kind, effect, snr)
+    key = Key(
+        kind,
+        [one.name for one in planted],
+        [one.snr for one in planted],
+        [one.shares for one in planted],
+        [one.values for one in planted],
+    )
+    fluxes, key.chains = bench.expose(planted)
+    return bench.record(fluxes), bench.setup.chains(), key
+
+
+@dataclass
+class _Planted:
+    """An effect of a certain size, and what it does to the data."""
+
+    name: str
+    draw: object
+    size: float = 1.0
+    snr: float = 0.0
+    shares: dict = field(default_factory=dict)
+    values: dict = field(default_factory=dict)
+
+
+class _Bench:
+    """A true instrument, its lamps, and the nominal problem at the truth."""
+
+    def __init__(self, setup, rng):
+        self.setup, self.rng = setup, rng
+        self.wavelength = setup.wavelength
+        self.chains = _varied(setup.chains(), self.wavelength.to_value(u.um), rng)
+        instrument = instruments.get(setup.instrument)
+        slope = law_basis(self.wavelength.to_value(u.um), 2) @ (1, *rng.normal(0, 0.2, 2))
+        flux = setup.flux * np.clip(slope, 0.3, 3.0)
+        self.clean = [
+            simulate(
+                chain,
+                self.wavelength,
+                setup.frames(),
+                flux=flux,
+                lamp=self._lamp(len(setup.frames())),
+                noise=False,
+                name=source,
+                meta={"instrument": instrument.name, "source": source},
+            )
+            for chain, source in zip(self.chains, instrument.sources, strict=True)
+        ]
+        middle = [np.median(o.flux_right + o.flux_left) / 2 for o in self.clean]
+        self.context = Context(self.wavelength.to_value(u.um), float(np.median(middle)))
+        noisy = self.record(
+            [self.fluxes(c, o) for c, o in zip(self.chains, self.clean, strict=True)]
+        )
+        self.problem = GapProblem(self.chains, noisy)
+        self.problem.settle_noise(self.problem.start)
+
+    def _lamp(self, n_frames):
+        x = np.linspace(-1, 1, n_frames)
+        drift = np.polynomial.legendre.legval(x, [0, *self.rng.normal(0, 1, 3) / (1, 2, 3)])
+        flicker = self.rng.normal(0, self.rng.uniform(0, 2 * self.setup.flicker), n_frames)
+        return np.exp(self.rng.uniform(0, 2 * self.setup.drift) * drift + flicker)
+
+    def fluxes(self, chain, clean, positions=()):
+        """Return the fluxes of both beams for unit lamps, (2, W, F)."""
+        given = {leaf.stage: clean.position(leaf.stage) for leaf in leaves(chain) if leaf.stage}
+        sweep = Propagator(chain, self.context.wavelength, given | dict(positions)).forward()
+        return np.stack(sweep.fluxes)
+
+    def expose(self, planted):
+        """Return the fluxes of all datasets with the effects, and the chains that gave them."""
+        chains, bend = [chain.copy() for chain in self.chains], None
+        for one in planted:
+            if isinstance(one.draw, _Unlisted):
+                bend = one
+                continue
+            chains = one.draw.chains(chains, one.size)
+        if bend is not None:
+            return bend.draw.fluxes(self, bend.size), chains
+        return [self.fluxes(c, o) for c, o in zip(chains, self.clean, strict=True)], chains
+
+    def record(self, fluxes):
+        """Return observations with photon noise."""
+        found = []
+        for clean, ideal, one in zip(self.clean, self.chains, fluxes, strict=True):
+            lamp = (clean.flux_right + clean.flux_left).T / self.fluxes(ideal, clean).sum(axis=0)
+            table = clean.to_table()
+            for beam, flux in zip(("right", "left"), (one * lamp).clip(0.0), strict=True):
+                # rows are frame by frame
+                electrons = flux.T.ravel()
+                read = self.setup.read_noise
+                drawn = self.rng.poisson(electrons) + self.rng.normal(0, read, electrons.shape)
+                table[f"flux_{beam}"] = drawn * u.adu
+                table[f"flux_{beam}_err"] = np.sqrt(electrons + read**2) * u.adu
+            found.append(Observations.from_table(table, name=clean.name))
+        return found
+
+    def signal(self, planted):
+        """Return the nominal model fitted to noiseless data with an effect."""
+        for channel, flux in zip(self.problem.channels, self.expose([planted])[0], strict=True):
+            lit = np.maximum(flux, 1e-9)
+            channel.observed = Channels.predicted(SimpleNamespace(fluxes=lit))
+        return Model(self.problem, self.problem.fit(self.problem.start))
+
+    def shares(self, model):
+        """Return the share of the chi-square that each effect of the library explains."""
+        smooth = [effect for effect in EFFECTS.values() if effect.kind != "discrete"]
+        found = {}
+        for score in scan(model, smooth):
+            share = score.statistic / model.fit.chi2
+            if share > _REFIT_FROM:
+                share = 1 - model.with_effect(score.effect).fit.chi2 / model.fit.chi2
+            found[score.effect.name] = round(float(share), 4)
+        return found
+
+
+def _varied(chains, wavelength, rng):
+    """Return the chains with other values of all free parameters, the same in all chains."""
+    known = {}
+    for chain in chains:
+        for leaf in leaves(chain):
+            for key in leaf.param_names:
+                if not getattr(leaf, key).fixed:
+                    name = f"{leaf.name}.{key}"
+                    if name not in known:
+                        known[name] = _vary(leaf, key, wavelength, rng, known)
+                    setattr(leaf, key, known[name])
+    return chains
+
+
+def _vary(leaf, key, wavelength, rng, known):
+    parameter = getattr(leaf, key)
+    unit = u.dimensionless_unscaled if parameter.unit is None else parameter.unit
+    value = np.array(parameter.value, dtype=float)
+    if unit.is_equivalent(u.m):
+        # two layers that compensate each other are cut together
+        common = known.setdefault(f"{leaf.name} thickness", rng.normal(0, 0.01))
+        return value * (1 + common + rng.normal(0, 5e-4)) * unit
+    angle = unit.is_equivalent(u.deg)
+    if not value.ndim:
+        return (value * unit) + (rng.normal(0, 0.3) * u.deg if angle else rng.normal(0, 0.003))
+    law = law_basis(wavelength, 2) @ (rng.normal(0, 1, 3) / (1, 2, 3))
+    law = law + rng.normal(0, 0.2, value.shape)
+    new = value * unit + (2 * u.deg if angle else 0.005) * law
+    low, high = (
+        np.inf * s if b is None else b for s, b in zip((-1, 1), parameter.bounds, strict=True)
+    )
+    margin = 0.0 if angle else 0.002
+    return np.clip(new.to_value(unit), low + margin, high - margin) * unit
+
+
+# ---- effects of random size --------------------------------------------------------------------
+
+
+class _Drawn:
+    """An effect of the library with random laws, to be scaled."""
+
+    def __init__(self, effect, bench):
+        self.effect, self.context = effect, bench.context
+        rng = bench.rng
+        edit = effect.edit([chain.copy() for chain in bench.chains], self.context)
+        self.laws = {p.name: _law(p, _size(edit.chains, p.name), rng) for p in edit.parameters}
+        sizes = [_canonical(p.limit) / np.abs(self.laws[p.name]).max() for p in edit.parameters]
+        #: The largest size within the effect's limits.
+        self.largest = 0.9 * min(sizes) if sizes else 1.0
+
+    def chains(self, chains, size):
+        """Return the chains with the effect at a size."""
+        edit = self.effect.edit(chains, self.context)
+        for name, value in self.values(size).items():
+            _put(edit.chains, name, value)
+            for target, tie in edit.ties.items():
+                if tie.source == name:
+                    _put(edit.chains, target, tie.factor * value)
+        return edit.chains
+
+    def values(self, size):
+        """Return the canonical values of the parameters at a size."""
+        return {name: _neutral(name) + size * law for name, law in self.laws.items()}
+
+
+def _law(parameter, n, rng):
+    """Return a random law, in canonical units and of the parameter's usual size."""
+    scale = _canonical(parameter.scale)
+    if n == 1:
+        return scale * rng.normal()
+    k = n if parameter.basis is None else parameter.basis.shape[1]
+    if n == k and k > 3:
+        # a resonance anywhere
+        at, width = rng.uniform(0, n), rng.uniform(0.5, 0.3 * n)
+        return scale * rng.normal() / (1 + ((np.arange(n) - at) / width) ** 2)
+    basis = np.eye(n) if parameter.basis is None else parameter.basis
+    law = basis @ (rng.normal(0, 1, k) / (1 + np.arange(k)))
+    if _neutral(parameter.name):
+        # no optic gives more polarization than there is
+        law = -(law - law.min() + 0.3 * (np.ptp(law) + 0.1))
+    return scale * law
+
+
+def _neutral(name):
+    return 1.0 if name.split(".")[1].startswith("retained") else 0.0
+
+
+def _carriers(chains, name):
+    """Return the optics that have a parameter, and its key."""
+    optic, key = name.split(".")
+    return [leaf for chain in chains for leaf in leaves(chain) if leaf.name == optic], key
+
+
+def _size(chains, name):
+    found, key = _carriers(chains, name)
+    return np.size(getattr(found[0], key).value)
+
+
+def _put(chains, name, value):
+    found, key = _carriers(chains, name)
+    for leaf in found:
+        parameter = getattr(leaf, key)
+        unit = 1 if parameter.unit is None else parameter.unit
+        factor = 1.0 if parameter.unit is None else canonical_factor(unit)
+        setattr(leaf, key, np.broadcast_to(value / factor, parameter.shape) * unit)
+
+
+class _Unlisted:
+    """An effect that no physical library holds: a pattern in the order of the frames."""
+
+    names = ("hysteresis", "jitter", "beam_flicker", "polarization_flicker")
+    largest = 500.0
+
+    def __init__(self, name, bench):
+        self.name = name
+        self.noise = [bench.rng.normal(0, 1, o.n_frames) for o in bench.clean]
+
+    def fluxes(self, bench, size):
+        """Return the fluxes of all datasets."""
+        found = []
+        for chain, clean, noise in zip(bench.chains, bench.clean, self.noise, strict=True):
+            moved, gain = self._pattern(clean, noise, size)
+            ideal = bench.fluxes(chain, clean, moved)
+            found.append(ideal * np.stack([1 + gain, 1 - gain])[:, None, :])
+        return found
+
+    def _pattern(self, clean, noise, size):
+        plate, turn = clean.position("hwp"), clean.position("derotator")
+        angle, still = size * np.deg2rad(0.05), np.zeros(len(plate))
+        if self.name == "hysteresis":
+            way = np.sign(np.diff(plate, prepend=plate[0]))
+            return {"hwp": plate + angle * way * np.abs(noise)}, still
+        if self.name == "jitter":
+            return {"hwp": plate + angle * noise}, still
+        if self.name == "beam_flicker":
+            return {}, 1e-3 * size * noise
+        return {"derotator": turn + angle * noise}, still
+
+
+def _plant(bench, kind, name, snr):
+    """Return the effects of a challenge, at their sizes."""
+    if kind == "pair":
+        return _pair(bench, name, snr)
+    for _ in range(_TRIES):
+        one = _candidate(bench, kind, name)
+        if one is None:
+            break
+        model = _scale(bench, one, kind, snr)
+        if _fits(bench, one, model, kind, snr):
+            return [one]
+    what = kind if name is None else f"{kind} with {name!r}"
+    raise GapError(f"no effect found for a challenge of kind {what}")
+
+
+def _candidate(bench, kind, name):
+    if kind == "unlisted":
+        chosen = str(bench.rng.choice(_Unlisted.names)) if name is None else name
+        if chosen not in _Unlisted.names:
+            raise GapError(f"no unlisted effect {chosen!r}; there are {_Unlisted.names}")
+        return _Planted(f"unlisted_{chosen}", _Unlisted(chosen, bench))
+    fitting = [
+        effect
+        for effect in (EFFECTS.values() if name is None else [get_effect(name)])
+        if effect.kind != "discrete" and effect.applies(bench.chains)
+    ]
+    if not fitting:
+        return None
+    effect = fitting[bench.rng.integers(len(fitting))]
+    return _Planted(effect.name, _Drawn(effect, bench))
+
+
+def _scale(bench, one, kind, snr):
+    """Scale an effect until it stands out by this much; return the model without it."""
+    model = bench.signal(one)
+    one.snr = float(np.sqrt(model.fit.chi2))
+    if kind == "absorbed":
+        return model
+    for _ in range(8):
+        if one.snr <= 0 or abs(one.snr / snr - 1) < 0.02:
+            break
+        # a step too far may reach another branch of the nominal model
+        wanted = min(one.size * np.clip(snr / one.snr, 0.02, 20), one.draw.largest)
+        if wanted == one.size:
+            break
+        one.size = wanted
+        model = bench.signal(one)
+        one.snr = float(np.sqrt(model.fit.chi2))
+    return model
+
+
+def _fits(bench, one, model, kind, snr):
+    """Fill in what the effect amounts to; return whether it is of the kind."""
+    if kind != "unlisted":
+        one.values = one.draw.values(one.size)
+    if kind == "absorbed":
+        return one.snr < _INVISIBLE
+    dark = min(flux.min() for flux in bench.expose([one])[0]) <= 0
+    if not _WEAKEST <= one.snr < 1.1 * snr or dark or not model.fit.converged:
+        return False
+    one.shares = bench.shares(model)
+    # where it does not explain itself, the nominal model went to another branch
+    if kind != "unlisted" and one.shares.get(one.name, 0.0) < ENOUGH:
+        return False
+    if kind == "single":
+        return True
+    others = [
+        share
+        for name, share in one.shares.items()
+        if kind == "unlisted" or (name != one.name and share < ENOUGH)
+    ]
+    return max(others, default=0.0) < _UNKNOWN
+
+
+def _pair(bench, name, snr):
+    """Return two effects that the data can tell from each other."""
+    for _ in range(_TRIES):
+        first = _plant(bench, "single", name, snr)[0]
+        second = _plant(bench, "single", None, snr)[0]
+        apart = first.shares.get(second.name, 0) < 0.5 and second.shares.get(first.name, 0) < 0.5
+        if first.name != second.name and apart and min(first.snr, second.snr) > 0.7 * snr:
+            return [first, second]
+    raise GapError("no two effects found that can be told from each other")
+
+
+# ---- a challenge is answered and scored ------------------------------------------------------
+
+
+def _answer(observations, chains, key):
+    """Diagnose blind, then open the key; return a record."""
+    record = {"kind": key.kind, "effects": key.effects, "snr": key.snr}
+    record["alternatives"] = [
+        {name: share for name, share in shares.items() if share >= _UNKNOWN}
+        for shares in key.alternatives
+    ]
+    try:
+        diagnosis = diagnose(chains, observations, effects=key.library)
+    except AstropolcalError as error:
+        return record | {"verdict": "error", "right": False, "error": str(error), "causes": []}
+    groups = [[cause.name, *cause.aliases] for cause in diagnosis.causes]
+    record |= {
+        "verdict": diagnosis.verdict,
+        "causes": groups,
+        "explained": [round(cause.explained, 4) for cause in diagnosis.causes],
+        "remainder_p_value": diagnosis.remainder_p_value,
+        "right": _is_right(key, diagnosis.verdict, groups),
+        "seconds": round(diagnosis.seconds, 2),
+    }
+    if key.kind in ("single", "pair"):
+        record |= _sizes_and_shrinkage(observations, key, diagnosis)
+    return record
+
+
+def _is_right(key, verdict, groups):
+    if key.kind in ("none", "absorbed"):
+        return verdict == "none"
+    if key.kind in ("unlisted", "withheld"):
+        return verdict == "unexplained"
+    if verdict != "effect":
+        return False
+    if key.kind == "pair":
+        named = {name for group in groups for name in group}
+        return all(names & named for names in key.accepted)
+    return bool(key.accepted[0] & set(groups[0])) if groups else False
+
+
+def _sizes_and_shrinkage(observations, key, diagnosis):
+    """Return the pulls of the sizes, and how far the gap shrank, against an oracle."""
+    oracle = diagnosis.nominal
+    for name in key.effects:
+        oracle = oracle.with_effect(get_effect(name))
+    last = held_out(oracle, frame_groups(observations))
+    before, after = diagnosis.held_out[0], diagnosis.held_out[-1]
+    found = [name for name in key.effects if name in diagnosis.improved.added]
+    return {
+        "gap_percent": [one.percent for one in (before, after, last)],
+        "gap_chi2": [one.chi2 for one in (before, after, last)],
+        "pulls": _pulls(diagnosis.improved, key, found),
+    }
+
+
+def _pulls(model, key, names):
+    """Return fitted less true coefficients by their errors, where the data determine them."""
+    if not names:
+        return []
+    errors, found = model.problem.errors(model.fit.coefficients), []
+    for name in names:
+        values = key.values[key.effects.index(name)]
+        for parameter in model.added[name]:
+            where = model.problem.slices[parameter.name]
+            true = np.atleast_1d(values[parameter.name])
+            if parameter.basis is not None:
+                true = np.linalg.lstsq(parameter.basis, true, rcond=None)[0]
+            measured = errors[where] < _MEASURED * _canonical(parameter.limit) / 2
+            pull = (model.fit.coefficients[where] - true) / errors[where]
+            found += [round(float(p), 4) for p in pull[measured]]
+    return found
+
+
+def _run_one(index, settings):
+    """Make, answer and score the challenge of that number."""
+    seed = np.random.SeedSequence(settings["seed"], spawn_key=(index,))
+    choice, making = (np.random.default_rng(s) for s in seed.spawn(2))
+    kinds = settings["kinds"]
+    weights = np.array([KINDS[kind] for kind in kinds])
+    kind = str(choice.choice(kinds, p=weights / weights.sum()))
+    low, high = settings["snr"]
+    snr = float(np.exp(choice.uniform(np.log(low), np.log(high))))
+    setup = Setup(**settings["setup"])
+    try:
+        sealed = make_challenge(making, kind=kind, snr=snr, setup=setup)
+    except AstropolcalError as error:
+        return {"index": index, "kind": kind, "verdict": "not made", "error": str(error)}
+    return {"index": index, "target": snr, **_answer(*sealed)}
+
+
+def run_challenge(
+    n,
+    seed=0,
+    *,
+    snr=(8.0, 300.0),
+    kinds=tuple(KINDS),
+    setup=None,
+    client=None,
+    checkpoint=None,
+    progress=False,
+):
+    """
+    Make challenges, diagnose each blind, and score the answers.
+
+    Parameters
+    ----------
+    n : int
+        How many.
+    seed : int
+        Challenge number i of a seed is always the same.
+    snr : (float, float)
+        Range of the signal-to-noise ratio, drawn evenly in its logarithm.
+    kinds : sequence of str
+        Of `KINDS`, drawn with the frequencies given there.
+    setup : Setup, optional
+        What is simulated.
+    client : optional
+        A ``dask.distributed.Client``, or an executor of `concurrent.futures`;
+        by default they run here, one after the other.
+    checkpoint : path-like, optional
+        File to which each record is appended as a line of JSON. A run with the
+        same settings goes on from it.
+    progress : bool
+        Whether to show a bar on a terminal.
+
+    Returns
+    -------
+    ChallengeResult
+
+    Raises
+    ------
+    GapError
+        If a number or kind is not allowed, or the checkpoint is of other settings.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.challenge import Setup, run_challenge
+    >>> small = Setup(n_wavelengths=5, n_derotator=3)
+    >>> run_challenge(1, seed=2, kinds=["single"], snr=(60, 60), setup=small).rate("single")[0]
+    1.0
+    """
+    settings = _settings(n, seed, snr, kinds, Setup() if setup is None else setup)
+    records = _journal(checkpoint, settings)
+    todo = [i for i in range(n) if i not in records]
+    # disable=None shows the bar on a terminal only
+    hidden = None if progress else True
+    with tqdm(total=n, initial=n - len(todo), desc="challenges", disable=hidden) as bar:
+        for record in _outcomes(todo, settings, client):
+            records[record["index"]] = record
+            _append(checkpoint, record)
+            bar.update()
+    return ChallengeResult([records[i] for i in range(n)], settings)
+
+
+def _settings(n, seed, snr, kinds, setup):
+    for name, value in (("n", n), ("seed", seed)):
+        if not isinstance(value, (int, np.integer)) or value < (name == "n"):
+            raise GapError(f"{name} = {value!r}; allowed are whole numbers from {int(name == 'n')}")
+    unknown = [kind for kind in kinds if kind not in KINDS]
+    if unknown or not len(kinds):
+        raise GapError(f"kinds = {list(kinds)}; allowed are {', '.join(KINDS)}")
+    low, high = (float(x) for x in snr)
+    if not (0 < low <= high < np.inf):
+        raise GapError(f"snr = {snr}; allowed are two positive numbers, the lower first")
+    return {"seed": int(seed), "snr": [low, high], "kinds": list(kinds), "setup": asdict(setup)}
+
+
+def _outcomes(todo, settings, client):
+    """Yield records as they are ready."""
+    if client is None:
+        for index in todo:
+            yield _run_one(index, settings)
+        return
+    futures = [client.submit(_run_one, index, settings) for index in todo]
+    if type(client).__module__.startswith("distributed"):
+        from distributed import as_completed
+    else:
+        from concurrent.futures import as_completed
+    for future in as_completed(futures):
+        yield future.result()
+
+
+def _journal(path, settings):
+    """Return the records of a checkpoint; the first line of the file holds the settings."""
+    if path is None:
+        return {}
+    path = Path(path)
+    if not path.exists() or not path.stat().st_size:
+        _append(path, {"settings": settings})
+        return {}
+    text = path.read_bytes()
+    whole = text[: text.rfind(b"\n") + 1]
+    try:
+        first, *others = [json.loads(line) for line in whole.splitlines()]
+        known, records = first["settings"], {record["index"]: record for record in others}
+    except (ValueError, KeyError, TypeError):
+        raise GapError(f"{path}: is no checkpoint of challenges") from None
+    wrong = [key for key in settings if known.get(key) != settings[key]]
+    if wrong:
+        raise GapError(f"{path}: is of other settings ({', '.join(wrong)}); remove it")
+    # a run that was killed may have left half a line
+    os.truncate(path, len(whole))
+    return records
+
+
+def _append(path, content):
+    if path is None:
+        return
+    try:
+        with open(path, "ab") as stream:
+            stream.write((json.dumps(content) + "\n").encode())
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError as problem:
+        raise GapError(f"{path}: cannot be written: {problem.strerror}") from problem
+
+
+# ---- what came out ---------------------------------------------------------------------------
+
+
+class ChallengeResult:
+    """
+    Outcome of many challenges.
+
+    Parameters
+    ----------
+    records : list of dict
+        One a challenge.
+    settings : dict
+        Seed, range of the signal-to-noise ratio, kinds and set-up.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.challenge import ChallengeResult
+    >>> record = {"kind": "none", "verdict": "none", "right": True, "snr": [], "index": 0}
+    >>> ChallengeResult([record], {}).rate("none")[0]
+    1.0
+    """
+
+    def __init__(self, records, settings):
+        self.records, self.settings = list(records), dict(settings)
+
+    def of(self, *kinds, least=0.0, below=np.inf):
+        """Return the records of some kinds whose weakest effect is in a range of SNR."""
+        answered = [r for r in self.records if r["kind"] in kinds and "right" in r]
+        return [r for r in answered if not r["snr"] or least <= min(r["snr"]) < below]
+
+    def rate(self, *kinds, least=0.0, below=np.inf):
+        """
+        Return the share of right answers.
+
+        Parameters
+        ----------
+        *kinds : str
+            Of `KINDS`.
+        least, below : float
+            Range of the signal-to-noise ratio of the weakest effect.
+
+        Returns
+        -------
+        rate, low, high : float
+            With the interval of Wilson (1927) at 68 %; NaN where there are none.
+        count : int
+        """
+        right = [record["right"] for record in self.of(*kinds, least=least, below=below)]
+        return (*_wilson(sum(right), len(right)), len(right))
+
+    def pulls(self, least=8.0):
+        """Return fitted less true coefficients over their errors, shape (n,)."""
+        parts = [record.get("pulls", []) for record in self.of("single", "pair", least=least)]
+        return np.array([pull for part in parts for pull in part])
+
+    def shrinkage_ratio(self, least=8.0):
+        """Return how far the held-out mean squares shrink, over how far with the true effects."""
+        scored = self.of("single", "pair", least=least)
+        gaps = [r["gap_percent"] for r in scored if "gap_percent" in r]
+        if not gaps:
+            return np.nan
+        before, after, oracle = np.square(np.array(gaps)).T
+        return float(np.sum(1 - after / before) / np.sum(1 - oracle / before))
+
+    @property
+    def failures(self):
+        """Records whose answer was wrong."""
+        return [record for record in self.records if record.get("right") is False]
+
+    @property
+    def table(self):
+        """One row a challenge."""
+        rows = [record for record in self.records if "right" in record]
+        table = QTable()
+        table["index"] = [r["index"] for r in rows]
+        table["kind"] = [r["kind"] for r in rows]
+        table["effect"] = [" + ".join(r["effects"]) for r in rows]
+        table["snr"] = [min(r["snr"], default=0.0) for r in rows]
+        table["verdict"] = [r["verdict"] for r in rows]
+        table["answer"] = [" + ".join("|".join(g) for g in r["causes"]) for r in rows]
+        table["right"] = [r["right"] for r in rows]
+        gaps = [r.get("gap_percent", [np.nan] * 3) for r in rows]
+        for i, name in enumerate(("gap_before", "gap_after", "gap_oracle")):
+            table[name] = np.array([gap[i] for gap in gaps]) * u.percent
+        return table
+
+    def summary(self):
+        """Return rates (value, low, high, n) by name, and other numbers."""
+        pulls = self.pulls()
+        inside = int(np.sum(np.abs(pulls) < 1))
+        rates = {
+            "recall": self.rate("single", least=8),
+            "recall of pairs": self.rate("pair", least=30),
+            "unexplained of unknown": self.rate("unlisted", "withheld", least=20),
+            "quiet on clean": self.rate("none"),
+            "quiet on absorbed": self.rate("absorbed"),
+            "coverage of sizes": (*_wilson(inside, len(pulls)), len(pulls)),
+        }
+        ratio = self.shrinkage_ratio()
+        return {
+            "rates": {
+                name: dict(zip(("value", "low", "high", "n"), rate, strict=True))
+                for name, rate in rates.items()
+                if rate[-1]
+            },
+            "shrinkage over oracle": ratio if np.isfinite(ratio) else None,
+        }
+
+    def to_dict(self):
+        """Return settings, summary and records as a dictionary that JSON takes."""
+        return {"settings": self.settings, "summary": self.summary(), "challenges": self.records}
+
+    def words(self):
+        """Return the summary as lines of text."""
+        summary = self.summary()
+        lines = [f"{len(self.records)} challenges, {len(self.failures)} wrong answers"]
+        for name, rate in summary["rates"].items():
+            value, low, high = (100 * rate[key] for key in ("value", "low", "high"))
+            lines.append(f"{name:<24}{value:6.1f} % ({low:.1f} to {high:.1f}; {rate['n']})")
+        if summary["shrinkage over oracle"] is not None:
+            lines.append(
+                f"{'shrinkage over oracle':<24}{100 * summary['shrinkage over oracle']:6.1f} %"
+            )
+        return "\n".join(lines)
+
+    def plot(self, figure=None, bins=6):
+        """
+        Draw the share of right answers against the signal-to-noise ratio.
+
+        Parameters
+        ----------
+        figure : `~matplotlib.figure.Figure`, optional
+            An empty figure to draw into.
+        bins : int
+            Number of bins, evenly in the logarithm.
+
+        Returns
+        -------
+        `~matplotlib.figure.Figure`
+            Points with the interval of Wilson (1927) at 68 %.
+        """
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(7.5, 5), layout="constrained") if figure is None else figure
+        axes = figure.subplots()
+        edges = np.geomspace(*self.settings["snr"], bins + 1)
+        # a size is reached within two percent
+        edges[[0, -1]] *= 0.95, 1.05
+        for i, curve in enumerate(_CURVES):
+            self._draw(axes, edges, 1 + 0.04 * (i - 1), *curve)
+        quiet = self.rate("none", "absorbed")
+        if quiet[3]:
+            label = f"nothing to be found, and nothing said ({quiet[3]})"
+            axes.axhline(100 * quiet[0], color="0.45", linestyle="--", label=label)
+            axes.axhspan(100 * quiet[1], 100 * quiet[2], color="0.45", alpha=0.15, linewidth=0)
+        axes.set(xscale="log", xlim=edges[[0, -1]], ylim=(-4, 104), ylabel="right answers (%)")
+        axes.set_xlabel("signal-to-noise ratio of the weakest effect")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.grid(color="0.88", linewidth=0.7)
+        figure.legend(loc="outside lower center", ncols=1, frameon=False)
+        figure.suptitle(f"{len(self.records)} sealed challenges, 68 % binomial intervals")
+        return figure
+
+    def _draw(self, axes, edges, shift, label, kinds, color, marker):
+        pairs = pairwise(edges)
+        rates = np.array([self.rate(*kinds, least=low, below=high) for low, high in pairs])
+        seen = rates[:, 3] > 0
+        if not seen.any():
+            return
+        middle = shift * np.sqrt(edges[:-1] * edges[1:])[seen]
+        value, low, high = 100 * rates[seen, :3].T
+        bars = [np.maximum(value - low, 0), np.maximum(high - value, 0)]
+        label = f"{label} ({int(rates[:, 3].sum())})"
+        axes.errorbar(middle, value, bars, color=color, marker=marker, capsize=2.5, label=label)
+
+
+# Okabe & Ito (2008), distinct for all kinds of colour vision
+_CURVES = (
+    ("one effect, named first or in the first group", ("single",), "#0072B2", "o"),
+    ("two effects, both named", ("pair",), "#D55E00", "s"),
+    ("effect that no library holds, called unexplained", ("unlisted", "withheld"), "#009E73", "^"),
+)
+
+
+def _wilson(right, n, z=1.0):
+    """Return a share and its interval; Wilson (1927, doi:10.1080/01621459.1927.10502953)."""
+    if not n:
+        return np.nan, np.nan, np.nan
+    p = right / n
+    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    return p, max(middle - half, 0.0), min(middle + half, 1.0)

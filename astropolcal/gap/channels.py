@@ -1,0 +1,238 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+The two channels in which a model is compared with every frame.
+
+Double differences throw away what the optics behind the half-wave plate and
+the detector leave in the data. Two numbers a frame and wavelength keep nearly
+all of it: the difference normalized by the frame's own sum, which knows no
+lamp, and the logarithm of the sum, compared up to the brightness of the lamp.
+The lamp is common to all wavelengths of a frame: its drift is a smooth curve
+through the run and its flicker a random shift of all wavelengths of a frame
+together, so that neither counts as a gap.
+"""
+
+import numpy as np
+
+__all__ = ["CHANNELS", "Channels"]
+
+#: Names of the channels, in the order of the first axis of all arrays.
+CHANNELS = ("difference", "sum")
+_LARGEST_DEGREE = 6
+_LARGEST_COLOR = 2
+
+
+class Channels:
+    """
+    Both channels of one dataset, whitened by their noise.
+
+    Parameters
+    ----------
+    dataset : `~astropolcal.measurement.Dataset`
+        A dataset with one frame a datum.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.channels import Channels
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 90] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> measurement = Measurement(charis.chain(), observations,
+    ...                           observable="normalized_single_difference")
+    >>> Channels(measurement.datasets[0]).observed.shape
+    (2, 22, 16)
+    """
+
+    def __init__(self, dataset):
+        obs = dataset.observations
+        right, left = obs.flux_right.T, obs.flux_left.T
+        var_right, var_left, cov = obs.variance_right.T, obs.variance_left.T, obs.covariance.T
+        total = right + left
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self.observed = np.stack([(right - left) / total, np.log(total)])
+            to_right, to_left = 2 * left / total**2, -2 * right / total**2
+            self.variance = np.stack(
+                [
+                    to_right**2 * var_right + to_left**2 * var_left + 2 * cov * to_right * to_left,
+                    (var_right + var_left + 2 * cov) / total**2,
+                ]
+            )
+        self.valid = dataset.valid & np.isfinite(self.observed).all(axis=0)
+        self.observed = np.where(self.valid, self.observed, 0.0)
+        self.sequence = obs.position("sequence")
+        self._whitening = None
+
+    @property
+    def shape(self):
+        """Number of channels, wavelengths and frames."""
+        return self.observed.shape
+
+    # ---- the model ---------------------------------------------------------------------
+
+    @staticmethod
+    def predicted(sweep):
+        """Return what a forward sweep predicts of both channels, shape (2, W, F)."""
+        right, left = sweep.fluxes
+        total = right + left
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.stack([(right - left) / total, np.log(total)])
+
+    @staticmethod
+    def slopes(sweep):
+        """Return the derivative of each channel to the two fluxes."""
+        right, left = sweep.fluxes
+        total = right + left
+        return (2 * left / total**2, -2 * right / total**2), (1 / total, 1 / total)
+
+    # ---- noise and lamp -----------------------------------------------------------------
+
+    def set_noise(self, sigma, residual, saturating):
+        """
+        Set the noise of both channels, and fit the lamp.
+
+        Parameters
+        ----------
+        sigma : `~numpy.ndarray`
+            Standard deviation of every datum, shape (2, W, F).
+        residual : `~numpy.ndarray`
+            Observed minus predicted, shape (2, W, F): its sums tell how the lamp
+            drifts and flickers.
+        saturating : `~numpy.ndarray`
+            What optics could do to the sum of a frame, columns (F, k); it is
+            taken away before the flicker is measured, lest a missing optic be
+            taken for a restless lamp.
+        """
+        weight = np.where(self.valid, 1 / sigma, 0.0)
+        self.sigma = sigma
+        self.lamp = _Lamp(residual[1], weight[1], self.sequence, saturating)
+        self._whitening = weight, self.lamp.shrink(weight[1])
+        self._nuisance = _orthonormal(self._sum_whitened(self.lamp.design(self.valid)))
+
+    def whiten(self, array):
+        """
+        Divide by the noise and take the lamp out.
+
+        Parameters
+        ----------
+        array : `~numpy.ndarray`
+            Residuals or derivatives, shape (..., 2, W, F).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Of the same shape; what is left has unit noise.
+        """
+        weight, _ = self._whitening
+        out = np.empty(array.shape)
+        out[..., 0, :, :] = array[..., 0, :, :] * weight[0]
+        sums = self._sum_whitened(array[..., 1, :, :])
+        flat = sums.reshape(*sums.shape[:-2], -1)
+        flat = flat - (flat @ self._nuisance) @ self._nuisance.T
+        out[..., 1, :, :] = flat.reshape(sums.shape)
+        return out
+
+    def _sum_whitened(self, array):
+        weight, (direction, shrink) = self._whitening[0][1], self._whitening[1]
+        scaled = array * weight
+        common = np.einsum("...wf,wf->...f", scaled, direction)
+        return scaled - direction * (shrink * common)[..., None, :]
+
+    @property
+    def n_nuisance(self):
+        """Number of numbers that describe the lamp."""
+        return self._nuisance.shape[1]
+
+
+class _Lamp:
+    """Brightness of the lamp: a scale a wavelength, a drift common to all, and flicker."""
+
+    def __init__(self, residual, weight, sequence, saturating):
+        centred = residual - _mean(residual, weight, axis=1)[:, None]
+        common = _mean(centred, weight, axis=0)
+        var = 1 / np.maximum((weight**2).sum(axis=0), 1e-300)
+        seen = (weight > 0).any(axis=0)
+        self.sequence = 2 * sequence - 1
+        self.degree = _best_degree(self.sequence, common, seen, saturating)
+        left, freedom = _left_over(self._curve(self.degree), saturating, common, seen)
+        scatter = left @ left / freedom if freedom > 0 else 0.0
+        #: Standard deviation of the flicker, in the logarithm of the flux.
+        self.flicker = float(np.sqrt(max(scatter - np.mean(var[seen]), 0.0)))
+        self.color = self._best_color(centred - common, weight)
+
+    def _curve(self, degree):
+        return np.polynomial.legendre.legvander(self.sequence, degree)
+
+    def _best_color(self, residual, weight):
+        """Return the degree of a drift of its own for each wavelength, 0 for none."""
+        best, degree, n = np.inf, 0, (weight > 0).sum()
+        for trial in range(_LARGEST_COLOR + 1):
+            curve = self._curve(trial)
+            rss = sum(
+                _residual_square(curve * w[:, None], r * w)
+                for r, w in zip(residual, weight, strict=True)
+            )
+            score = rss + len(weight) * (trial + 1) * np.log(max(n, 2))
+            if score < best:
+                best, degree = score, trial
+        return degree
+
+    def shrink(self, weight):
+        """Return, for each frame, the direction of the flicker and how much it is shrunk."""
+        norm = np.sqrt((weight**2).sum(axis=0))
+        direction = weight / np.where(norm > 0, norm, 1.0)
+        return direction, 1 - 1 / np.sqrt(1 + (self.flicker * norm) ** 2)
+
+    def design(self, valid):
+        """Return the columns of the lamp, shape (k, W, F)."""
+        n = len(valid)
+        curve = self._curve(max(self.degree, self.color)).T
+        own = np.eye(n)[:, None, :, None] * curve[None, : self.color + 1, None, :]
+        common = np.broadcast_to(
+            curve[self.color + 1 : self.degree + 1, None],
+            (max(self.degree - self.color, 0), *valid.shape),
+        )
+        return np.concatenate([own.reshape(-1, *valid.shape), common]) * valid
+
+
+def _mean(values, weight, axis):
+    norm = (weight**2).sum(axis=axis)
+    return (values * weight**2).sum(axis=axis) / np.where(norm > 0, norm, 1.0)
+
+
+def _residual_square(columns, values):
+    solution = np.linalg.lstsq(columns, values, rcond=None)[0]
+    left = values - columns @ solution
+    return left @ left
+
+
+def _left_over(curve, saturating, values, seen):
+    columns = np.concatenate([curve, saturating], axis=1)[seen]
+    solution, _, rank, _ = np.linalg.lstsq(columns, values[seen], rcond=1e-9)
+    left = values[seen] - columns @ solution
+    return left, int(seen.sum()) - int(rank)
+
+
+def _best_degree(sequence, values, seen, saturating):
+    """Return the degree of the drift by the Bayesian information criterion."""
+    best, degree, n = np.inf, 0, int(seen.sum())
+    for trial in range(_LARGEST_DEGREE + 1):
+        curve = np.polynomial.legendre.legvander(sequence, trial)
+        left, freedom = _left_over(curve, saturating, values, seen)
+        if freedom < 3:
+            break
+        score = n * np.log(max(left @ left / n, 1e-24)) + (n - freedom) * np.log(n)
+        if score < best:
+            best, degree = score, trial
+    return degree
+
+
+def _orthonormal(columns):
+    """Return an orthonormal basis of the columns, shape (n, rank)."""
+    flat = columns.reshape(len(columns), -1).T
+    norms = np.linalg.norm(flat, axis=0)
+    flat = flat[:, norms > 0] / norms[norms > 0]
+    u, s, _ = np.linalg.svd(flat, full_matrices=False)
+    return u[:, s > 1e-9 * s.max(initial=0.0)]

@@ -1,0 +1,380 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Diagnosis of the gap between a model and an instrument.
+
+`diagnose` fits the nominal model, measures the gap, asks the library of effects
+which of them the data miss, checks the answer on frames that were left out, and
+says what stays unexplained.
+"""
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import stats
+
+from astropolcal.calibration import Calibration
+from astropolcal.exceptions import GapError
+from astropolcal.gap.attribution import ALPHA, Candidate, Score, choose, freed, scan
+from astropolcal.gap.effects import EFFECTS, get_effect
+from astropolcal.gap.model import Model, nominal_calibration, nominal_model
+from astropolcal.gap.shrinkage import frame_groups, held_out
+
+__all__ = ["Cause", "Diagnosis", "diagnose"]
+
+_MOST_CAUSES = 6
+# an effect that explains less of a significant gap than this is no cause of it
+_LEAST_SHARE = 0.05
+# above this mean square the residuals are no noise, and held-out frames have the last word
+_STRUCTURED = 1.5
+# discrete alternatives are tried where double differences are off by more than this
+_WRONG_SIGN = 0.02
+_REMAINDER = 1e-4
+
+
+@dataclass
+class Cause:
+    """
+    One effect that the model lacked, with what cannot be told from it.
+
+    Parameters
+    ----------
+    effect : Effect
+        The effect.
+    aliases : list of str
+        Effects that explain the data nearly as well.
+    p_value : float
+        Of the scan, corrected for the number of effects.
+    explained : float
+        Share of the gap (excess of chi-square over the noise) that it explains.
+    before, after : HeldOut or None
+        Prediction errors on left-out frames without and with it.
+    physical : bool
+        Whether its fitted size is a possible one.
+    evidence : float
+        Lowering of chi-square over the remaining scatter, less the cost of the parameters.
+
+    Examples
+    --------
+    >>> from astropolcal.gap import Cause
+    >>> from astropolcal.gap.effects import get_effect
+    >>> Cause(get_effect("beam_gain"), [], 1e-9, 0.9).name
+    'beam_gain'
+    """
+
+    effect: object
+    aliases: list
+    p_value: float
+    explained: float
+    before: object = None
+    after: object = None
+    physical: bool = True
+    evidence: float = 0.0
+
+    @property
+    def name(self):
+        """Name of the effect."""
+        return self.effect.name
+
+
+@dataclass
+class Diagnosis:
+    """
+    What `diagnose` found.
+
+    Parameters
+    ----------
+    verdict : {"effect", "none", "unexplained"}
+        Whether an effect of the library explains the gap, there is none, or it
+        is real and stays unexplained.
+    nominal, improved : Model
+        The model before, and with all causes in it.
+    causes : list of Cause
+        Largest first.
+    scores : list of Score
+        The scan at the nominal model.
+    held_out : list of HeldOut
+        Prediction errors before and after.
+    gap_p_value : float
+        Probability of the nominal residuals by noise alone.
+    remainder_p_value : float
+        The same for the improved model.
+    seconds : float
+        Time spent.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> observations = simulate(chain, charis.wavelength, frames, seed=1)
+    >>> diagnose(chain, observations).verdict
+    'none'
+    """
+
+    verdict: str
+    nominal: Model
+    improved: Model
+    causes: list
+    scores: list
+    held_out: list
+    gap_p_value: float
+    remainder_p_value: float
+    seconds: float = 0.0
+    settings: dict = field(default_factory=dict)
+
+    @property
+    def noise_floor_percent(self):
+        """Noise of a normalized single difference, root mean square, in percent."""
+        parts = [c.sigma[0][c.valid] for c in self.nominal.problem.channels]
+        return 100 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+
+    @property
+    def gap_before_percent(self):
+        """Gap of the nominal model on left-out frames, in percent."""
+        return self.held_out[0].percent
+
+    @property
+    def gap_after_percent(self):
+        """Gap of the improved model on left-out frames, in percent."""
+        return self.held_out[-1].percent
+
+    @property
+    def chains(self):
+        """The improved chains, with fitted values."""
+        return self.improved.chains
+
+    def __repr__(self):
+        names = ", ".join(cause.name for cause in self.causes) or "no cause"
+        return (
+            f"<Diagnosis: {self.verdict} ({names}); gap {self.gap_before_percent:.3g} % -> "
+            f"{self.gap_after_percent:.3g} %>"
+        )
+
+
+def diagnose(
+    calibration, observations, *, effects="all", alpha=ALPHA, cross_validate=True, progress=None
+):
+    """
+    Diagnose the gap between a model and measurements.
+
+    Parameters
+    ----------
+    calibration : Calibration, `~astropy.modeling.CompoundModel` or sequence of them
+        The nominal model: a calibration, or the chain of each dataset, which is
+        then calibrated.
+    observations : Observations or sequence of Observations
+        The datasets, used together.
+    effects : "all" or sequence of str or Effect
+        The library to ask.
+    alpha : float
+        False discovery rate.
+    cross_validate : bool
+        Whether to check on left-out frames; without it the gaps are those of
+        the fit itself.
+    progress : callable, optional
+        Called with a line on what is done next.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    GapError
+        If the nominal fit does not converge, there are too few groups of frames
+        to leave out, or an effect is unknown.
+
+    Examples
+    --------
+    A chain that lacks the unequal gains of the beams:
+
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.optics import BeamGain
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear", wavelength=[1200, 1600, 2000] * u.nm)
+    >>> truth = chain | BeamGain(imbalance=0.02, name="flat")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 70, 95, 120] * u.deg)
+    >>> observations = simulate(truth, [1200, 1600, 2000] * u.nm, frames, seed=1)
+    >>> diagnose(chain, observations).causes[0].name
+    'beam_gain'
+    """
+    started = time.perf_counter()
+    say = progress or (lambda line: None)
+    observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
+    library = _library(effects)
+    groups = frame_groups(observations) if cross_validate else None
+    _check_instruments(observations)
+    say("fitting the nominal model")
+    nominal, causes = _start(calibration, observations, library, alpha, say)
+    base = causes[-1].model if causes else nominal
+    say("scanning the effects")
+    smooth = [effect for effect in library if effect.kind != "discrete"]
+    scores = scan(base, smooth)
+    selected, improved, history = _select(base, scores, smooth, alpha, groups, say)
+    return _conclude(nominal, improved, causes, selected, scores, history, alpha, started)
+
+
+def _library(effects):
+    if isinstance(effects, str) and effects == "all":
+        return list(EFFECTS.values())
+    names = [effects] if isinstance(effects, str) else list(effects)
+    if not names:
+        raise GapError("no effects to ask for; give names, or 'all'")
+    return [get_effect(name) for name in names]
+
+
+def _check_instruments(observations):
+    named = {o.instrument for o in observations if o.instrument is not None}
+    if len({name.lower() for name in named}) > 1:
+        raise GapError(f"the datasets are of different instruments: {', '.join(sorted(named))}")
+
+
+# ---- the nominal model and discrete alternatives ------------------------------------------
+
+
+def _start(calibration, observations, library, alpha, say):
+    """Return the nominal model, and the discrete alternative that beats it, if any."""
+    given = calibration if isinstance(calibration, Calibration) else None
+    chains = calibration.chains if given else calibration
+    chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
+    if len(chains) != len(observations):
+        raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    given = nominal_calibration(chains, observations) if given is None else given
+    if _misfit(given) < _WRONG_SIGN:
+        return nominal_model(chains, observations, calibration=given), []
+    found = []
+    for effect in (e for e in library if e.kind == "discrete" and e.applies(chains)):
+        say(f"trying: {effect.title}")
+        other = nominal_calibration(effect.edit(chains, None).chains, observations)
+        found.append((_misfit(other), effect, other))
+    return _best_alternative(chains, observations, given, found)
+
+
+def _misfit(calibration):
+    """Return the root mean square residual of the double differences, in polarization."""
+    return float(np.sqrt(np.mean(np.square(calibration.measurement.residuals()))))
+
+
+def _best_alternative(chains, observations, given, found):
+    """Return the nominal model, and the alternative that fits far better, with its aliases."""
+    found.sort(key=lambda item: item[0])
+    if not found or found[0][0] > 0.5 * _misfit(given):
+        return nominal_model(chains, observations, calibration=given), []
+    least, effect, calibration = found[0]
+    model = nominal_model(calibration.chains, observations, calibration=calibration)
+    # one that fits badly need not converge to be left behind
+    nominal = nominal_model(chains, observations, calibration=given, like=model, fit=False)
+    score = Score(effect, nominal.fit.chi2 - model.fit.chi2, 1, None, 1.0, 0.0)
+    top = Candidate(score, model, score.statistic, score.statistic, True)
+    model.added[effect.name] = []
+    top.aliases = [
+        Candidate(Score(e, 0.0, 1, None, 1.0), None, 0.0, 0.0, True)
+        for misfit, e, _ in found[1:]
+        if misfit < 1.1 * least
+    ]
+    return nominal, [top]
+
+
+def _mean_square(model):
+    return model.fit.chi2 / max(model.problem.n_data - model.problem.size, 1)
+
+
+# ---- selection -------------------------------------------------------------------------------
+
+
+def _select(base, scores, smooth, alpha, groups, say):
+    """Add effects one by one; return candidates, the last model and its held-out errors."""
+    model, selected = base, []
+    history = [_errors(base, groups)]
+    while len(selected) < _MOST_CAUSES:
+        candidate = choose(model, scores, alpha=alpha)
+        if candidate is None or not _worthy(model, candidate):
+            break
+        candidate = freed(model, candidate)
+        say(f"left-out frames with: {candidate.score.effect.title}")
+        errors = _errors(candidate.model, groups)
+        if not _holds(errors, history[-1], _mean_square(candidate.model)):
+            break
+        selected.append(candidate)
+        history.append(errors)
+        model = candidate.model
+        scores = scan(model, smooth)
+    return selected, model, history
+
+
+def _worthy(model, candidate):
+    """Whether a candidate explains enough of what is left, or all that is to be explained."""
+    excess = model.fit.chi2 - (model.problem.n_data - model.problem.size)
+    lowered = model.fit.chi2 - candidate.model.fit.chi2
+    left = _p_value(candidate.model)
+    return left > _REMAINDER or lowered > _LEAST_SHARE * max(excess, 1e-300)
+
+
+def _holds(errors, before, scatter):
+    if errors is None:
+        return True
+    # among pure noise the scan is to be trusted, unless left-out frames speak against it
+    return errors.better_than(before) > (-2 if scatter < _STRUCTURED else 1)
+
+
+def _errors(model, groups):
+    return None if groups is None else held_out(model, groups)
+
+
+def _p_value(model):
+    """Return the probability of the residuals by noise alone."""
+    tangent = model.problem.tangent(model.fit.coefficients)
+    return float(stats.chi2.sf(model.fit.chi2, model.degrees_of_freedom(tangent)))
+
+
+# ---- conclusion --------------------------------------------------------------------------------
+
+
+def _conclude(nominal, improved, causes, selected, scores, history, alpha, started):
+    chosen = [*causes, *selected]
+    total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
+    total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
+    before, found = nominal, []
+    errors = [None] * len(causes) + history[1:]
+    previous = [None] * len(causes) + history[:-1]
+    for candidate, after, earlier in zip(chosen, errors, previous, strict=True):
+        share = (before.fit.chi2 - candidate.model.fit.chi2) / total
+        found.append(
+            Cause(
+                effect=candidate.score.effect,
+                aliases=[alias.name for alias in candidate.aliases],
+                p_value=candidate.score.p_value,
+                explained=float(share),
+                before=earlier,
+                after=after,
+                physical=candidate.physical,
+                evidence=float(candidate.evidence),
+            )
+        )
+        before = candidate.model
+    gap_p, left_p = _p_value(nominal), _p_value(improved)
+    explained = sum(cause.explained for cause in found)
+    if found and (explained > 0.5 or left_p > _REMAINDER):
+        verdict = "effect"
+    else:
+        verdict = "unexplained" if left_p < _REMAINDER else "none"
+    return Diagnosis(
+        verdict=verdict,
+        nominal=nominal,
+        improved=improved,
+        causes=found,
+        scores=scores,
+        held_out=[h for h in history if h is not None],
+        gap_p_value=gap_p,
+        remainder_p_value=left_p,
+        seconds=time.perf_counter() - started,
+        settings={"alpha": alpha},
+    )

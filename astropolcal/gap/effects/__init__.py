@@ -1,0 +1,164 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+The library of effects that a model of a polarimeter may lack.
+
+One class each, registered in `EFFECTS`; `register_effect` adds your own.
+"""
+
+import difflib
+
+from astropolcal.exceptions import GapError
+from astropolcal.gap.effects import derotator, detector, discrete, held, plate, relay, source
+from astropolcal.gap.effects.base import (
+    KINDS,
+    Context,
+    Edit,
+    Effect,
+    EffectParameter,
+    Insertion,
+    Roles,
+)
+from astropolcal.gap.effects.check import check_against, check_declared
+
+__all__ = [
+    "EFFECTS",
+    "KINDS",
+    "Context",
+    "Edit",
+    "Effect",
+    "EffectParameter",
+    "Insertion",
+    "Roles",
+    "check_effect",
+    "get_effect",
+    "register_effect",
+]
+
+#: Every effect by name.
+EFFECTS = {}
+
+
+def register_effect(effect):
+    """
+    Add an effect to the library.
+
+    Parameters
+    ----------
+    effect : Effect or type
+        An effect, or its class.
+
+    Returns
+    -------
+    Effect or type
+        The same, so that it serves as a decorator.
+
+    Raises
+    ------
+    GapError
+        If an effect of that name is there already, it lacks an attribute, or it
+        is of no known kind.
+
+    See Also
+    --------
+    check_effect : tests derivatives and laws on chains and data.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import EFFECTS, register_effect
+    >>> from astropolcal.gap.effects.relay import Fringes
+    >>> thick = register_effect(Fringes(15.0))
+    >>> "fringes_15_um" in EFFECTS
+    True
+    >>> removed = EFFECTS.pop("fringes_15_um")
+    """
+    one = effect() if isinstance(effect, type) else effect
+    check_declared(one)
+    if one.name in EFFECTS:
+        raise _taken(one.name)
+    EFFECTS[one.name] = one
+    return effect
+
+
+def _taken(name):
+    return GapError(f"an effect {name!r} is registered already; give yours another name")
+
+
+def check_effect(effect, chains, observations):
+    """
+    Check on chains and data that an effect does what a diagnosis relies on.
+
+    It has all its attributes and a name of its own; it leaves the chains given
+    as they are; at zero the edited chains predict the same fluxes; the names of
+    its parameters are new, and its parameters are free; and the analytic
+    derivative of both channels to each of them is that of central differences.
+
+    Parameters
+    ----------
+    effect : Effect or type
+        An effect, or its class; registered or not.
+    chains : sequence
+        The nominal chain of each dataset.
+    observations : sequence of Observations
+        The datasets; simulated ones will do.
+
+    Raises
+    ------
+    GapError
+        If one of this is not so; the message names what, where, and by how much.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import check_effect
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> check_effect("hwp_tilt", [charis.chain()], [observations])
+    """
+    one = effect() if isinstance(effect, type) else get_effect(effect)
+    check_declared(one)
+    if one.name in EFFECTS and type(EFFECTS[one.name]) is not type(one):
+        raise _taken(one.name)
+    check_against(one, chains, observations)
+
+
+def get_effect(name):
+    """
+    Return the effect of that name.
+
+    Parameters
+    ----------
+    name : str or Effect
+        An `Effect` is returned as it is.
+
+    Returns
+    -------
+    Effect
+
+    Raises
+    ------
+    GapError
+        If there is none; the message names the nearest.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("beam_gain").title
+    'unequal gains of the two beams (flat field)'
+    """
+    if isinstance(name, Effect):
+        return name
+    if name in EFFECTS:
+        return EFFECTS[name]
+    near = difflib.get_close_matches(str(name), EFFECTS, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise GapError(f"no effect {name!r}; there are {', '.join(EFFECTS)}{hint}")
+
+
+for _module in (plate, derotator, relay, source, detector, held, discrete):
+    for _name in _module.__all__:
+        register_effect(getattr(_module, _name))
+for _thickness in (4.0, 12.0):
+    register_effect(relay.Fringes(_thickness))

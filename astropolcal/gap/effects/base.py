@@ -1,0 +1,342 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What an unmodelled effect is: an edit of the chains, with parameters and their laws.
+
+An effect adds an optic, frees a parameter, or exchanges one optic for another.
+At zero parameters the edited chains are the old ones, so that derivatives at
+zero tell what the effect would do to the data; fitted, the edited chains are
+ordinary chains again.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import optics
+from astropolcal.chain import insert_optic, leaves
+from astropolcal.gap.problem import law_basis
+from astropolcal.measurement import Tie
+
+__all__ = ["KINDS", "Context", "Edit", "Effect", "EffectParameter", "Insertion", "Roles"]
+
+#: What an effect may be.
+KINDS = ("optic", "parameter", "bound", "detector", "source", "discrete")
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """
+    A parameter that an effect adds.
+
+    Parameters
+    ----------
+    name : str
+        ``"optic.parameter"``.
+    scale : `~astropy.units.Quantity` or float
+        Size to expect: the standard deviation of its prior.
+    limit : `~astropy.units.Quantity` or float
+        Largest size that is physical.
+    basis : `~numpy.ndarray` or None
+        Law in wavelength, shape (W, k); None for a single number.
+    neutral : `~astropy.units.Quantity` or float, optional
+        Value from which the size counts; by default 1 for a share that is
+        retained and 0 for everything else.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.gap.effects import EffectParameter
+    >>> EffectParameter("static_retarder.circular", 1 * u.deg, 30 * u.deg, None).name
+    'static_retarder.circular'
+    """
+
+    name: str
+    scale: object
+    limit: object
+    basis: np.ndarray | None = None
+    neutral: object = None
+
+
+@dataclass(frozen=True)
+class Edit:
+    """
+    Chains with an effect in them.
+
+    Parameters
+    ----------
+    chains : list
+        One a dataset.
+    parameters : list of EffectParameter
+        What the effect adds.
+    ties : dict of str to Tie
+        Parameters that follow others.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import Edit
+    >>> Edit([], []).ties
+    {}
+    """
+
+    chains: list
+    parameters: list
+    ties: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Context:
+    """
+    What an effect may know of the data.
+
+    Parameters
+    ----------
+    wavelength : `~numpy.ndarray`
+        Common grid in micrometre, shape (W,).
+    flux : float
+        Median flux of a beam, in the tables' unit.
+    degree : int or None
+        Degree of the laws in wavelength, None for one value a wavelength, or
+        "default" for that of each effect.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.gap.effects import Context
+    >>> Context(np.array([1.2, 1.6])).basis(1).shape
+    (2, 2)
+    """
+
+    wavelength: np.ndarray
+    flux: float = 1.0
+    degree: object = "default"
+
+    def basis(self, degree, constant=True):
+        """Return the law's basis; without its constant where that is known already."""
+        wanted = degree if self.degree == "default" else self.degree
+        found = law_basis(self.wavelength, wanted)
+        if constant:
+            return found
+        if wanted is None:
+            # one value a wavelength, less their mean
+            n = len(found)
+            return np.linalg.svd(found - 1 / n)[0][:, : n - 1]
+        return found[:, 1:]
+
+
+class Roles:
+    """
+    The optics of a chain by what they are for.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import Roles
+    >>> roles = Roles(instruments.get("charis").chain())
+    >>> roles.plate.name, roles.derotator.name, roles.splitter.name
+    ('hwp', 'derotator', 'wollaston')
+    """
+
+    def __init__(self, chain):
+        self.leaves = leaves(chain)
+        self.polarizer = self._first(lambda o: isinstance(o, optics.LinearPolarizer))
+        self.mirror = self._mirror()
+        self.plate = self._first(lambda o: o.stage == "hwp" and _retards(o))
+        self.derotator = self._first(lambda o: o.stage == "derotator" and _retards(o))
+        self.splitter = self._first(lambda o: isinstance(o, optics.WollastonPrism))
+
+    def _mirror(self):
+        """Return what stands in the place of the polarizer for unpolarized light."""
+        first = self.leaves[0]
+        kinds = (optics.Diattenuator, optics.DiattenuatorRetarder)
+        return first if isinstance(first, kinds) and first.stage is None else None
+
+    def _first(self, test):
+        # what an effect has added stands for nothing else
+        own = (leaf for leaf in self.leaves if leaf.name and not leaf.name.startswith("gap_"))
+        return next((leaf for leaf in own if test(leaf)), None)
+
+
+def _retards(optic):
+    kinds = (optics.LinearRetarder, optics.EllipticalRetarder, optics.TwoLayerWaveplate)
+    return isinstance(optic, kinds)
+
+
+class Effect(ABC):
+    """
+    An effect that the model of an instrument may lack.
+
+    A subclass gives the attributes, `applies` and `edit`, and is registered with
+    `register_effect`.
+
+    Attributes
+    ----------
+    name : str
+        Identifier.
+    title : str
+        What it is, for a reader.
+    kind : str
+        One of `KINDS`.
+    place : str
+        Where in the instrument.
+    shows : str
+        Where in the data.
+    reference : str
+        Paper.
+    absorbed_by : str or None
+        The parameters of a usual nominal model that take the effect up
+        entirely, so that data never show it; None where there are none.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("beam_gain").kind
+    'detector'
+    """
+
+    name = title = kind = place = shows = reference = absorbed_by = None
+    #: Degree of the law in wavelength.
+    degree = 2
+
+    def applies(self, chains):
+        """
+        Return whether the chains have the place for this effect.
+
+        Parameters
+        ----------
+        chains : sequence
+            One a dataset.
+
+        Returns
+        -------
+        bool
+        """
+        return any(self.applies_to(Roles(chain)) for chain in chains)
+
+    @abstractmethod
+    def applies_to(self, roles):
+        """Return whether one chain has the place."""
+
+    @abstractmethod
+    def edit(self, chains, context):
+        """
+        Return the chains with the effect at zero.
+
+        Parameters
+        ----------
+        chains : sequence
+            One a dataset; not changed.
+        context : Context
+            Wavelengths and fluxes.
+
+        Returns
+        -------
+        Edit
+        """
+
+    def variants(self, context):
+        """
+        Return the effect in all the settings among which the data may choose.
+
+        Parameters
+        ----------
+        context : Context
+            Wavelengths and fluxes.
+
+        Returns
+        -------
+        list of Effect
+            Only itself, unless a setting enters the law in a way that is not
+            linear, as the thickness of a window does.
+        """
+        return [self]
+
+    def __repr__(self):
+        return f"<Effect {self.name}: {self.title}>"
+
+
+class Insertion(Effect):
+    """
+    An effect that is one more optic, at a place given by another.
+
+    A subclass gives `anchor`, `build` and the parameters that it frees.
+
+    Attributes
+    ----------
+    anchor : str
+        The role that it stands next to, see `Roles`.
+    side : {"after", "before"}
+        On which side.
+    free : dict of str to (scale, limit)
+        The optic's parameters that the effect frees.
+    follows : bool
+        Whether its orientation is that of the optic it stands next to.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import Insertion, get_effect
+    >>> isinstance(get_effect("static_retarder"), Insertion)
+    True
+    """
+
+    anchor = "derotator"
+    side = "after"
+    follows = False
+    constant = True
+    free = ()
+
+    @property
+    def label(self):
+        """Name of the optic in the chain."""
+        return f"gap_{self.name}"
+
+    def applies_to(self, roles):
+        """Return whether one chain has the optic to stand next to."""
+        return getattr(roles, self.anchor) is not None
+
+    @abstractmethod
+    def build(self, size, anchor, context):
+        """Return the optic with all of its parameters at zero."""
+
+    def edit(self, chains, context):
+        """Return the chains with the optic at zero; see `Effect.edit`."""
+        edited, ties = [], {}
+        size = len(context.wavelength)
+        for chain in chains:
+            anchor = getattr(Roles(chain), self.anchor)
+            if anchor is None:
+                edited.append(chain)
+                continue
+            optic = self._freed(self.build(size, anchor, context))
+            if self.follows:
+                optic.theta = anchor.theta.value * u.deg
+                if not anchor.theta.fixed:
+                    optic.theta.bounds = (None, None)
+                    ties[f"{self.label}.theta"] = Tie(f"{anchor.name}.theta")
+            edited.append(insert_optic(chain, optic, **{self.side: anchor.name}))
+        return Edit(edited, self.parameters(context), ties)
+
+    def _freed(self, optic):
+        for key in optic.param_names:
+            parameter = getattr(optic, key)
+            parameter.fixed = key not in self.free
+        return optic
+
+    def parameters(self, context):
+        """Return the parameters that the effect adds."""
+        return [
+            EffectParameter(f"{self.label}.{key}", *sizes, self.law(key, context))
+            for key, sizes in self.free.items()
+        ]
+
+    def law(self, key, context):
+        """Return the law of a parameter in wavelength, None for a single number."""
+        if self.degree is None or len(context.wavelength) == 1:
+            return None
+        return context.basis(self.degree, self.constant)

@@ -1,0 +1,205 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Discrete alternatives: parity, signs of angles, exchanged beams."""
+
+from abc import abstractmethod
+
+import astropy.units as u
+
+from astropolcal import optics
+from astropolcal.chain import insert_optic, remove_optic
+from astropolcal.gap.effects.base import Edit, Effect, Roles
+
+__all__ = [
+    "DerotatorOffset",
+    "DerotatorSign",
+    "MirrorBeforePlate",
+    "MirrorFlip",
+    "PlateOffset",
+    "PlateSign",
+    "SwappedBeams",
+]
+
+
+class _Discrete(Effect):
+    """An alternative without parameters: it is fitted from the start, or not at all."""
+
+    kind = "discrete"
+    reference = "McIntosh et al. 2026, Sec. 4; the reflections and signs of a chain"
+
+    @abstractmethod
+    def change(self, chain, roles):
+        """Return the changed chain."""
+
+    def edit(self, chains, context):
+        """Return the changed chains; nothing is added that could be fitted."""
+        edited = []
+        for chain in chains:
+            roles = Roles(chain)
+            edited.append(self.change(chain.copy(), roles) if self.applies_to(roles) else chain)
+        return Edit(edited, [])
+
+
+class MirrorFlip(_Discrete):
+    """
+    A reflection more or less between derotator and splitter.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("mirror_flip").kind
+    'discrete'
+    """
+
+    name, place = "mirror_flip", "relay behind the derotator"
+    title = "odd number of reflections behind the derotator that the model lacks (or has too many)"
+    shows = "everywhere: U and V have the wrong sign"
+
+    def applies_to(self, roles):
+        """Return whether there are derotator and splitter."""
+        return roles.derotator is not None and roles.splitter is not None
+
+    def change(self, chain, roles):
+        """Return the chain with a parity flip taken out, or put in."""
+        order = [leaf.name for leaf in roles.leaves]
+        behind = roles.leaves[order.index(roles.derotator.name) :]
+        flips = [leaf for leaf in behind if isinstance(leaf, optics.ParityFlip)]
+        if flips:
+            return remove_optic(chain, flips[0].name)
+        flip = optics.ParityFlip(name=f"gap_{self.name}")
+        return insert_optic(chain, flip, before=roles.splitter.name)
+
+
+class MirrorBeforePlate(_Discrete):
+    """
+    A reflection more in front of the half-wave plate.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("mirror_flip_before_plate").place
+    'in front of the half-wave plate'
+    """
+
+    name, place = "mirror_flip_before_plate", "in front of the half-wave plate"
+    title = "odd number of reflections in front of the half-wave plate that the model lacks"
+    shows = "everywhere: the polarization turns the other way"
+
+    def applies_to(self, roles):
+        """Return whether there is a plate."""
+        return roles.plate is not None
+
+    def change(self, chain, roles):
+        """Return the chain with a parity flip in front of the plate."""
+        flip = optics.ParityFlip(name=f"gap_{self.name}")
+        return insert_optic(chain, flip, before=roles.plate.name)
+
+
+class PlateSign(_Discrete):
+    """
+    Half-wave plate whose angle counts the other way.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("hwp_sign").title
+    'angle of the half-wave plate with the wrong sign'
+    """
+
+    name, place = "hwp_sign", "stage of the half-wave plate"
+    title = "angle of the half-wave plate with the wrong sign"
+    shows = "everywhere: the polarization turns the other way"
+    role = "plate"
+
+    def applies_to(self, roles):
+        """Return whether there is an optic on the stage."""
+        return getattr(roles, self.role) is not None
+
+    def change(self, chain, roles):
+        """Return the chain with the sign of the stage turned."""
+        leaf = next(o for o in Roles(chain).leaves if o.name == getattr(roles, self.role).name)
+        leaf.mount = leaf.stage if leaf.stage_sign < 0 else f"-{leaf.stage}"
+        return chain
+
+
+class DerotatorSign(PlateSign):
+    """
+    Derotator whose angle counts the other way.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("derotator_sign").role
+    'derotator'
+    """
+
+    name, place, role = "derotator_sign", "stage of the derotator", "derotator"
+    title = "angle of the derotator with the wrong sign"
+    shows = "everywhere that depends on the derotator angle"
+
+
+class SwappedBeams(_Discrete):
+    """
+    Ordinary and extraordinary beam exchanged.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("beams_swapped").place
+    'detector'
+    """
+
+    name, place = "beams_swapped", "detector"
+    title = "right and left beam exchanged"
+    shows = "everywhere: the differences have the wrong sign"
+
+    def applies_to(self, roles):
+        """Return whether there is a splitter."""
+        return roles.splitter is not None
+
+    def change(self, chain, roles):
+        """Return the chain with the splitter turned by 90 deg."""
+        leaf = next(o for o in Roles(chain).leaves if o.name == roles.splitter.name)
+        leaf.theta = (leaf.theta.value + 90) * u.deg
+        return chain
+
+
+class PlateOffset(PlateSign):
+    """
+    Half-wave plate whose angle counts from another zero.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("hwp_offset").offset
+    <Quantity 45. deg>
+    """
+
+    name = "hwp_offset"
+    title = "angle of the half-wave plate from another zero or keyword, off by 45 deg"
+    shows = "everywhere: the polarization is turned by 90 deg"
+    offset = 45 * u.deg
+
+    def change(self, chain, roles):
+        """Return the chain with the optic turned, and the bounds of its angle with it."""
+        name, offset = getattr(roles, self.role).name, self.offset.to_value(u.deg)
+        leaf = next(o for o in Roles(chain).leaves if o.name == name)
+        bounds = [None if b is None else b + offset for b in leaf.theta.bounds]
+        leaf.theta = (leaf.theta.value + offset) * u.deg
+        leaf.theta.bounds = tuple(bounds)
+        return chain
+
+
+class DerotatorOffset(PlateOffset):
+    """
+    Derotator whose angle counts from another zero.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("derotator_offset").role
+    'derotator'
+    """
+
+    name, place, role = "derotator_offset", "stage of the derotator", "derotator"
+    title = "angle of the derotator from another zero or keyword, off by 45 deg"
+    shows = "everywhere that depends on the derotator angle"

@@ -1,0 +1,339 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The nominal model with effects added to it, step by step."""
+
+import warnings
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.calibration import calibrate
+from astropolcal.chain import leaves
+from astropolcal.exceptions import AstropolcalWarning, GapError
+from astropolcal.gap.effects import Context
+from astropolcal.gap.problem import Fit, GapProblem
+from astropolcal.units import canonical_factor
+
+__all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
+
+_ROUNDS = 3
+# directions in which a size at its limit does less than this to the data, in units of the
+# noise, are not looked at; nor those of which the model takes up all but this share
+_VISIBLE = 1.0
+_ABSORBED = 1e-6
+
+
+@dataclass
+class Model:
+    """
+    Chains, what has been added to them, and their fit in both channels.
+
+    Parameters
+    ----------
+    problem : GapProblem
+        Residuals and derivatives.
+    fit : Fit
+        The solution.
+    added : dict of str to list of EffectParameter
+        Effects in the chains, with the parameters that they added.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.model import nominal_model
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> model = nominal_model([chain], [simulate(chain, charis.wavelength, frames, seed=1)])
+    >>> model.added, model.fit.converged
+    ({}, True)
+    """
+
+    problem: GapProblem
+    fit: object
+    added: dict = field(default_factory=dict)
+
+    @property
+    def chains(self):
+        """The chains, with the fitted values in them."""
+        measurement = self.problem.measurement
+        return measurement.put_back(self.problem.vector(self.fit.coefficients))
+
+    @property
+    def observations(self):
+        """The datasets."""
+        return [dataset.observations for dataset in self.problem.datasets]
+
+    @property
+    def residual(self):
+        """Whitened residuals, shape (n_rows,)."""
+        return self.problem.residual(self.fit.coefficients)
+
+    @property
+    def context(self):
+        """What an effect may know of the data."""
+        fluxes = [np.nanmedian(o.flux_right + o.flux_left) / 2 for o in self.observations]
+        return Context(self.problem.wavelength, float(np.median(fluxes)))
+
+    def degrees_of_freedom(self, tangent):
+        """Return the number of data less that of the directions fitted."""
+        return self.problem.n_data - tangent.shape[1]
+
+    def edited(self, effect, context=None):
+        """
+        Return the problem of the chains with an effect at zero, and its parameters.
+
+        Parameters
+        ----------
+        effect : Effect
+            The effect.
+        context : Context, optional
+            By default that of the data.
+
+        Returns
+        -------
+        problem : GapProblem
+        parameters : list of EffectParameter
+        """
+        edit = effect.edit(self.chains, self.context if context is None else context)
+        problem = GapProblem(
+            edit.chains,
+            self.observations,
+            ties=self.problem.ties | edit.ties,
+            laws=self.problem.laws | _laws(edit.parameters),
+            priors=self.problem.priors | _priors(edit),
+            like=self.problem,
+        )
+        return problem, edit.parameters
+
+    def with_effect(self, effect, context=None):
+        """Return the model with an effect added and everything fitted again."""
+        problem, parameters = self.edited(effect, context)
+        fit = problem.fit(problem.start)
+        return Model(problem, fit, self.added | {effect.name: parameters})
+
+    def sizes(self, name):
+        """
+        Return the fitted coefficients of an added effect and their errors.
+
+        Parameters
+        ----------
+        name : str
+            Name of the effect.
+
+        Returns
+        -------
+        dict of str to tuple
+            ``"optic.parameter"`` to coefficients, errors, unit and EffectParameter.
+        """
+        errors = self.problem.errors(self.fit.coefficients)
+        found = {}
+        for parameter in self.added[name]:
+            slot, where = self.problem.free.by_name[parameter.name], None
+            where = self.problem.slices[parameter.name]
+            found[parameter.name] = (
+                self.fit.coefficients[where] / slot.factor,
+                errors[where] / slot.factor,
+                slot.unit,
+                parameter,
+            )
+        return found
+
+    def is_physical(self, name):
+        """Return whether the fitted values of an effect are within its limits."""
+        vector = self.problem.vector(self.fit.coefficients)
+        for parameter in self.added[name]:
+            slot = self.problem.free.by_name[parameter.name]
+            neutral = 1.0 if slot.name.split(".")[1].startswith("retained") else 0.0
+            if np.abs(vector[slot.slice] - neutral).max() > _canonical(parameter.limit):
+                return False
+        return True
+
+
+def _laws(parameters):
+    return {p.name: p.basis for p in parameters if p.basis is not None}
+
+
+def _priors(edit):
+    return {p.name: _canonical(p.limit) / 2 for p in edit.parameters}
+
+
+def _canonical(value):
+    value = u.Quantity(value)
+    return float(value.value * canonical_factor(value.unit))
+
+
+def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):
+    """
+    Fit the nominal chains in both channels.
+
+    Parameters
+    ----------
+    chains : sequence
+        The chain of each dataset.
+    observations : sequence of Observations
+        The datasets.
+    calibration : Calibration, optional
+        A calibration of these data; by default it is made.
+    like : Model, optional
+        A model whose noise is taken over.
+    fit : bool
+        Whether to fit in both channels, or take the values of the calibration.
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    GapError
+        If the nominal fit does not converge.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.model import nominal_model
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> model = nominal_model([charis.chain()], [observations])
+    >>> bool(model.fit.chi2 < 1.1 * model.problem.n_rows)
+    True
+    """
+    if calibration is None:
+        calibration = nominal_calibration(chains, observations)
+    if calibration.converged is False and fit:
+        raise _no_convergence()
+    problem = GapProblem(
+        calibration.chains, observations, like=None if like is None else like.problem
+    )
+    if not fit:
+        residual = problem.residual(problem.start)
+        return Model(problem, Fit(problem.start, float(residual @ residual), False))
+    if like is None:
+        problem.settle_noise()
+    found = problem.fit()
+    for _ in range(_ROUNDS - 1 if like is None else 0):
+        problem.settle_noise(found.coefficients)
+        found = problem.fit(found.coefficients)
+    if not (found.converged and np.isfinite(found.chi2)):
+        raise _no_convergence()
+    return Model(problem, found)
+
+
+def _no_convergence():
+    return GapError(
+        "the nominal fit did not converge: nothing can be said of missing effects; "
+        "check the angles, the optics in the beam and the starting values"
+    )
+
+
+def nominal_calibration(chains, observations):
+    """
+    Calibrate chains without cross-validation, for a diagnosis.
+
+    Parameters
+    ----------
+    chains : sequence
+        The chain of each dataset.
+    observations : sequence of Observations
+        The datasets.
+
+    Returns
+    -------
+    Calibration
+        It may not have converged, see its ``converged``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.model import nominal_calibration
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> nominal_calibration([chain], [simulate(chain, charis.wavelength, frames, seed=1)]).converged
+    True
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropolcalWarning)
+        return calibrate(list(chains), list(observations), cross_validate=False)
+
+
+def effect_tangent(model, effect, nominal, context=None):
+    """
+    Return the directions in the data that an effect adds to a model.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    effect : Effect
+        An effect that is not in the model.
+    nominal : `~numpy.ndarray`
+        Orthonormal basis of what the model can do already, (n_rows, rank).
+    context : Context, optional
+        By default that of the data.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Orthonormal, shape (n_rows, k). Directions are left out in which even an
+        effect at its physical limit would change the data by less than their
+        noise.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import get_effect
+    >>> from astropolcal.gap.model import effect_tangent, nominal_model
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> model = nominal_model([charis.chain()], [observations])
+    >>> nominal = model.problem.tangent(model.fit.coefficients)
+    >>> effect_tangent(model, get_effect("beam_gain"), nominal).shape[1]
+    3
+    """
+    edit = effect.edit([_held(chain) for chain in model.chains], context or model.context)
+    names = {p.name for p in edit.parameters}
+    problem = GapProblem(
+        edit.chains,
+        model.observations,
+        ties={name: tie for name, tie in edit.ties.items() if tie.source in names},
+        laws=_laws(edit.parameters),
+        like=model.problem,
+    )
+    if not problem.size:
+        return np.zeros((problem.n_rows, 0))
+    limits = _priors(edit)
+    size = np.concatenate(
+        [
+            np.full(problem.slices[n].stop - problem.slices[n].start, limits[n])
+            for n in problem.slices
+        ]
+    )
+    # each column is what a size at the brink of the possible would do
+    slopes = problem.jacobian(problem.start) * size
+    left = slopes - nominal @ (nominal.T @ slopes)
+    # twice is enough to be orthogonal to rounding
+    left -= nominal @ (nominal.T @ left)
+    basis, singular, _ = np.linalg.svd(left, full_matrices=False)
+    floor = max(_VISIBLE, _ABSORBED * np.linalg.norm(slopes, axis=0).max())
+    return basis[:, singular > floor]
+
+
+def _held(chain):
+    """Return a copy of the chain with every parameter fixed."""
+    copy = chain.copy()
+    for leaf in leaves(copy):
+        for key in leaf.param_names:
+            getattr(leaf, key).fixed = True
+    return copy

@@ -1,0 +1,424 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+A diagnosis in words, in numbers for machines, as a table and as a page to send.
+
+All of them say the same: `to_dict` works it out, and the others show it.
+"""
+
+import base64
+import io
+import textwrap
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.chain import leaves
+from astropolcal.exceptions import GapError
+from astropolcal.files import atomic_path
+from astropolcal.gap import _numbers, _words
+from astropolcal.gap.planning import plan
+from astropolcal.gap.residuals import locate
+
+__all__ = ["causes_table", "summary", "to_dict", "write_html"]
+
+_WIDTH = 80
+_DPI = 130
+_MOST_SCORES = 8
+
+
+# ---- for machines ------------------------------------------------------------------------
+
+
+def to_dict(diagnosis):
+    """
+    Return a diagnosis as plain numbers, lists and strings, ready for JSON.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+
+    Returns
+    -------
+    dict
+        Keys ``verdict``, ``sentences``, ``nominal``, ``n_free``, ``seconds``,
+        ``noise_floor_percent``, ``gap_before_percent``, ``gap_after_percent``,
+        ``shrinkage_percent``, ``where``, ``causes``, ``accuracy_before``,
+        ``accuracy_after``, ``next_observations`` and others; what is not a number
+        is None.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.gap.report import to_dict
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> wavelength = [1.2, 1.3, 1.45, 1.6, 1.9, 2.2] * u.um
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=wavelength)
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, wavelength, frames, seed=1)
+    >>> content = to_dict(diagnose(chain, data))
+    >>> content["verdict"], content["n_free"], content["causes"]
+    ('none', 17, [])
+    """
+    crossed = bool(diagnosis.held_out)
+    # a model with the wrong parity is not worth a fit, and so has no prediction
+    exchanged = any(cause.effect.kind == "discrete" for cause in diagnosis.causes)
+    same = diagnosis.improved is diagnosis.nominal
+    before = _numbers.accuracies(diagnosis.nominal, crossed and not exchanged)
+    after = before if same else _numbers.accuracies(diagnosis.improved, crossed)
+    content = {
+        "verdict": diagnosis.verdict,
+        "nominal": _nominal(diagnosis.nominal),
+        "n_free": int(diagnosis.nominal.problem.size),
+        "n_data": int(diagnosis.nominal.problem.n_data),
+        "seconds": diagnosis.seconds,
+        "exchanged": exchanged,
+        "cross_validated": crossed,
+        "noise_floor_percent": diagnosis.noise_floor_percent,
+        "gap_before_percent": before["rms_percent"],
+        "gap_after_percent": after["rms_percent"],
+        "shrinkage_percent": _shrinkage(diagnosis, before, after),
+        "gap_p_value": diagnosis.gap_p_value,
+        "remainder_p_value": diagnosis.remainder_p_value,
+        "where": _where(diagnosis),
+        "causes": [_cause(diagnosis, i) for i in range(len(diagnosis.causes))],
+        "scores": [_score(score) for score in diagnosis.scores[:_MOST_SCORES]],
+        "n_effects": len(diagnosis.scores),
+        "alpha": diagnosis.settings.get("alpha"),
+        "accuracy_before": before,
+        "accuracy_after": after,
+        "next_observations": _next(diagnosis),
+    }
+    for cause in content["causes"]:
+        cause["words"] = _words.cause(cause)
+    return _plain(content | {"sentences": _words.sentences(content)})
+
+
+def _nominal(model):
+    """Return the nominal model in words: the optics of each dataset, and what is free."""
+    chains = dict.fromkeys(" | ".join(leaf.name for leaf in leaves(c)) for c in model.chains)
+    free = ", ".join(slot.name for slot in model.problem.free.slots)
+    return f"{'; '.join(chains)}. Free: {free}"
+
+
+def _shrinkage(diagnosis, before, after):
+    """Return by how much the mean square of the gap is lower, with its 68 % interval."""
+    value = 100 * (1 - (after["rms_percent"] / before["rms_percent"]) ** 2)
+    found = {"value": value, "low": None, "high": None}
+    smooth = all(cause.effect.kind != "discrete" for cause in diagnosis.causes)
+    if len(diagnosis.held_out) > 1 and smooth:
+        _, found["low"], found["high"] = diagnosis.held_out[0].shrinkage(diagnosis.held_out[-1])
+    return found
+
+
+def _cause(diagnosis, i):
+    cause = diagnosis.causes[i]
+    before, after = cause.before, cause.after
+    if cause.effect.kind == "discrete" and diagnosis.held_out:
+        # what an exchanged optic leaves is what the next step begins with
+        after = diagnosis.held_out[0]
+    return {
+        "rank": i + 1,
+        "effect": cause.name,
+        "title": cause.effect.title,
+        "place": cause.effect.place,
+        "kind": cause.effect.kind,
+        "shows": cause.effect.shows,
+        "reference": cause.effect.reference,
+        "aliases": list(cause.aliases),
+        "alias_titles": [_title(name) for name in cause.aliases],
+        "p_value": cause.p_value,
+        "explained": cause.explained,
+        "evidence": cause.evidence,
+        "gap_cv_before_percent": before.percent if before else None,
+        "gap_cv_after_percent": after.percent if after else None,
+        "parameters": _numbers.sizes(diagnosis.improved, cause.name),
+        "significance": _numbers.significance(diagnosis.improved, cause.name),
+        "physical": bool(cause.physical),
+    }
+
+
+def _title(name):
+    from astropolcal.gap.effects import EFFECTS
+
+    return EFFECTS[name].title if name in EFFECTS else name
+
+
+def _score(score):
+    return {
+        "effect": score.effect.name,
+        "title": score.effect.title,
+        "statistic": score.statistic,
+        "rank": score.rank,
+        "p_value": score.p_value,
+    }
+
+
+def _where(diagnosis):
+    """Return where the gap of the nominal model lies."""
+    return list(locate(diagnosis.nominal).entries)
+
+
+def _next(diagnosis):
+    """Return the exposures that tell the aliases of each cause apart, or fix what is open."""
+    model, found = diagnosis.nominal, []
+    smooth = [cause for cause in diagnosis.causes if cause.effect.kind != "discrete"]
+    if len(smooth) < len(diagnosis.causes):
+        # the fit goes on from chains in which an optic was exchanged
+        return plan(diagnosis.improved)
+    for i, cause in enumerate(smooth):
+        last = i + 1 == len(smooth)
+        fresh = diagnosis.improved if last else model.with_effect(cause.effect)
+        if cause.aliases:
+            found += plan(model, [cause.name, *cause.aliases], members={cause.name: fresh})
+        model = fresh
+    return sorted(found, key=lambda entry: -entry["gain"]) or plan(diagnosis.improved)
+
+
+def _plain(value):
+    """Turn numpy scalars into plain ones, and what is not finite into None."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+# ---- tables --------------------------------------------------------------------------------
+
+
+def causes_table(diagnosis):
+    """
+    Return the causes as a table, one row each.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Columns ``rank``, ``effect``, ``place``, ``cannot_be_told_from``, ``p_value``,
+        ``explained``, ``physical``, ``gap_before`` and ``gap_after`` (percent of
+        polarization on left-out frames, NaN where there was no cross-validation).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.gap.report import causes_table
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> wavelength = [1.2, 1.3, 1.45, 1.6, 1.9, 2.2] * u.um
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=wavelength)
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, wavelength, frames, seed=1)
+    >>> len(causes_table(diagnose(chain, data)))
+    0
+    """
+    causes = diagnosis.causes
+    percent = [[np.nan if h is None else h.percent for h in (c.before, c.after)] for c in causes]
+    before, after = np.reshape(percent, (-1, 2)).T * u.percent
+    return QTable(
+        {
+            "rank": np.arange(1, len(causes) + 1),
+            "effect": np.array([c.name for c in causes], dtype=str),
+            "place": np.array([c.effect.place for c in causes], dtype=str),
+            "cannot_be_told_from": np.array([", ".join(c.aliases) for c in causes], dtype=str),
+            "p_value": np.array([c.p_value for c in causes], dtype=float),
+            "explained": np.array([c.explained for c in causes], dtype=float),
+            "physical": np.array([c.physical for c in causes], dtype=bool),
+            "gap_before": before,
+            "gap_after": after,
+        }
+    )
+
+
+# ---- for the terminal ------------------------------------------------------------------------
+
+
+def summary(diagnosis, content=None):
+    """
+    Return a diagnosis as text of at most 80 columns.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+    content : dict, optional
+        What `to_dict` returned for it, if it is known already.
+
+    Returns
+    -------
+    str
+        Three sentences, and below them the causes with their sizes, where the gap
+        lies, the accuracies before and after, and what to observe next.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.gap.report import summary
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> wavelength = [1.2, 1.3, 1.45, 1.6, 1.9, 2.2] * u.um
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=wavelength)
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, wavelength, frames, seed=1)
+    >>> print(summary(diagnose(chain, data)).splitlines()[0])
+    The model agrees with the measurements: frames left out of the fit are predicted
+    """
+    content = to_dict(diagnosis) if content is None else content
+    parts = [
+        [" ".join(content["sentences"])],
+        [f"Nominal model: {content['nominal']}"],
+        *(_cause_lines(cause) for cause in content["causes"]),
+        _where_lines(content["where"]),
+        _accuracy_lines(content),
+        _next_lines(content["next_observations"]),
+    ]
+    return "\n\n".join("\n".join(_wrap(part)) for part in parts if part)
+
+
+def _wrap(lines):
+    for line in lines:
+        if len(line) <= _WIDTH:
+            yield line
+            continue
+        indent = " " * (len(line) - len(line.lstrip(" -")))
+        yield from textwrap.wrap(line, _WIDTH, subsequent_indent=indent) or [""]
+
+
+def _cause_lines(cause):
+    sizes = [f"  - {line}" for line in _words.sizes(cause["parameters"])]
+    return [f"Cause {cause['rank']}: {cause['words']}", *sizes]
+
+
+def _where_lines(where):
+    lines = [
+        f"  - {e['detail']}: {_words.share(e['share'])} of the gap, {_words.p_is(e['p_value'])}"
+        for e in where
+    ]
+    return ["Where the gap of the nominal model lies", *lines] if lines else []
+
+
+def _accuracy_lines(content):
+    """Return the accuracies of each dataset and for targets, before and after."""
+    keys = _numbers.ACCURACIES
+    heads = "".join(f"{key:^20}" for key in keys).rstrip()
+    rows = ["Accuracy of single differences before -> after, percent, median over wavelengths"]
+    rows.append(f"  {'':<16}{heads}")
+    for old, new in _pairs(content, "datasets"):
+        cells = (_arrow(old[f"{key}_percent"], new[f"{key}_percent"]) for key in keys)
+        rows.append(f"  {old['name'][:16]:<16}{''.join(cells)}".rstrip())
+    for old, new in _pairs(content, "targets"):
+        rows.append(
+            f"  target of {old['dolp_percent']:g} % by {old['column']}: s_p "
+            f"{_words.change(old['s_p_percent'], new['s_p_percent'])} %, s_chi "
+            f"{_words.change(old['s_chi_deg'], new['s_chi_deg'])} deg"
+        )
+    return rows
+
+
+def _pairs(content, key):
+    return zip(content["accuracy_before"][key], content["accuracy_after"][key], strict=True)
+
+
+def _arrow(old, new):
+    return "{:>8} -> {:<8}".format(*("-" if v is None else f"{v:.4f}" for v in (old, new)))
+
+
+def _next_lines(entries):
+    lines = [f"  - {entry['words']}" for entry in entries]
+    return ["What to observe next", *lines] if lines else []
+
+
+# ---- a page ------------------------------------------------------------------------------------
+
+
+def write_html(diagnosis, path, *, figures=None, content=None):
+    """
+    Write a diagnosis as one self-contained page.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+    path : path-like
+        The file; an existing one is replaced.
+    figures : dict of str to `~matplotlib.figure.Figure`, optional
+        Figures by caption, such as those of `astropolcal.plotting.gap`. They
+        become part of the page.
+    content : dict, optional
+        What `to_dict` returned for the diagnosis, if it is known already.
+
+    Raises
+    ------
+    GapError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.gap.report import write_html
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> wavelength = [1.2, 1.3, 1.45, 1.6, 1.9, 2.2] * u.um
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=wavelength)
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, wavelength, frames, seed=1)
+    >>> write_html(diagnose(chain, data), "gap.html")
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("astropolcal.gap", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": _words.number, "p": _words.p, "share": _words.share}
+    page = environment.get_template("report.html").render(
+        content=to_dict(diagnosis) if content is None else content,
+        datasets=_about(diagnosis),
+        figures={caption: _image(figure) for caption, figure in (figures or {}).items()},
+        sizes=_words.sizes,
+        is_determined=_words.is_determined,
+        accuracies=_numbers.ACCURACIES,
+        version=_version(),
+    )
+    with atomic_path(path, error=GapError) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _about(diagnosis):
+    return [
+        {
+            "name": o.name,
+            "instrument": o.instrument,
+            "source": o.source,
+            "n_frames": o.n_frames,
+            "hash": o.content_hash,
+        }
+        for o in diagnosis.nominal.observations
+    ]
+
+
+def _image(figure):
+    """Return a figure as a data URI."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=_DPI)
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+
+
+def _version():
+    from astropolcal.version import version
+
+    return version

@@ -1,0 +1,215 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+How far the gap shrinks on frames that the fit has not seen.
+
+Frames are left out in groups (a derotator angle at a time, in all datasets),
+the model is fitted to the others, and predicts what was left out. The gap is
+the root mean square of the normalized single differences, in percent of
+polarization. Its errors come from a bootstrap over the groups.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from astropolcal.exceptions import GapError
+
+__all__ = ["HeldOut", "frame_groups", "held_out"]
+
+_SAME_ANGLE = 0.5
+# next to the solution of all frames the fit to most of them is all but linear
+_STEPS = 3
+
+
+@dataclass
+class HeldOut:
+    """
+    Squares of prediction errors, by group.
+
+    Parameters
+    ----------
+    labels : list of str
+        What was left out.
+    squares : `~numpy.ndarray`
+        Sum of squared prediction errors of the normalized single difference,
+        one a group.
+    whitened : `~numpy.ndarray`
+        Half the sum of squares of the whitened prediction errors of both channels.
+    counts : `~numpy.ndarray`
+        Number of data of each group.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.gap.shrinkage import HeldOut
+    >>> one = HeldOut(["a", "b"], np.array([0.02, 0.02]), np.ones(2), np.array([200, 200]))
+    >>> round(one.percent, 6)
+    1.0
+    """
+
+    labels: list
+    squares: np.ndarray
+    whitened: np.ndarray
+    counts: np.ndarray
+
+    @property
+    def percent(self):
+        """Root mean square prediction error, in percent of polarization."""
+        return 100 * float(np.sqrt(self.squares.sum() / self.counts.sum()))
+
+    @property
+    def chi2(self):
+        """Mean square over the variances."""
+        return float(self.whitened.sum() / self.counts.sum())
+
+    def shrinkage(self, other):
+        """
+        Return by how much the mean square is lower in another model, in percent.
+
+        Parameters
+        ----------
+        other : HeldOut
+            Of the same groups.
+
+        Returns
+        -------
+        value, low, high : float
+            With the 16th and 84th percentile of a bootstrap over the groups.
+        """
+        value = 1 - other.squares.sum() / self.squares.sum()
+        rng = np.random.default_rng(20261121)
+        draws = rng.integers(0, len(self.counts), (1000, len(self.counts)))
+        spread = 1 - other.squares[draws].sum(axis=1) / self.squares[draws].sum(axis=1)
+        low, high = np.percentile(spread, [16, 84])
+        return 100 * float(value), 100 * float(low), 100 * float(high)
+
+    def better_than(self, other):
+        """
+        Return by how many standard errors the whitened squares are below those of another.
+
+        Parameters
+        ----------
+        other : HeldOut
+            Of the same groups.
+
+        Returns
+        -------
+        float
+            Mean difference over the groups by its standard error; at least two
+            groups.
+        """
+        difference = (other.whitened - self.whitened) / self.counts
+        error = difference.std(ddof=1) / np.sqrt(len(difference))
+        return float(difference.mean() / error) if error > 0 else np.inf * difference.mean()
+
+
+def frame_groups(observations):
+    """
+    Return the group of every frame of every dataset.
+
+    Parameters
+    ----------
+    observations : sequence of Observations
+        The datasets.
+
+    Returns
+    -------
+    labels : list of str
+        Names of the groups.
+    numbers : list of `~numpy.ndarray`
+        Group of each frame, one array a dataset.
+
+    Raises
+    ------
+    GapError
+        If there are fewer than three groups to leave out.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.shrinkage import frame_groups
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> frame_groups([simulate(charis.chain(), charis.wavelength, frames, seed=1)])[0]
+    ['derotator at 45 deg', 'derotator at 60 deg', 'derotator at 90 deg']
+    """
+    if all("derotator" in o.frames.colnames for o in observations):
+        angles = [np.rad2deg(o.position("derotator")) for o in observations]
+        rounded = [np.round(a / _SAME_ANGLE) for a in angles]
+        kinds = np.unique(np.concatenate(rounded))
+        several = len(kinds) < sum(map(len, rounded)) / 2
+        if several and len(kinds) >= 3:
+            every = np.concatenate(rounded)
+            middle = [np.concatenate(angles)[every == k].mean() for k in kinds]
+            labels = [f"derotator at {value:g} deg" for value in np.round(middle, 1)]
+            return labels, [np.searchsorted(kinds, r) for r in rounded]
+    return _blocks(observations)
+
+
+def _blocks(observations, count=8):
+    """Return blocks of frames that were taken one after the other."""
+    shortest = min(o.n_frames for o in observations)
+    count = min(count, shortest // 4)
+    if count < 3:
+        raise GapError(
+            f"too few frames to leave out in groups: {shortest} in the shortest dataset; "
+            "three derotator angles, or twelve frames, are the least"
+        )
+    labels = [f"frames {i + 1} of {count}" for i in range(count)]
+    return labels, [np.arange(o.n_frames) * count // o.n_frames for o in observations]
+
+
+def held_out(model, groups):
+    """
+    Return the prediction errors of a model on frames left out in groups.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    groups : tuple
+        As `frame_groups` gives them.
+
+    Returns
+    -------
+    HeldOut
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.model import nominal_model
+    >>> from astropolcal.gap.shrinkage import frame_groups, held_out
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 75, 90] * u.deg)
+    >>> observations = simulate(chain, charis.wavelength, frames, seed=1)
+    >>> model = nominal_model([chain], [observations])
+    >>> bool(held_out(model, frame_groups([observations])).percent < 0.1)
+    True
+    """
+    labels, numbers = groups
+    problem = model.problem
+    squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
+    for i in range(len(labels)):
+        out = [number == i for number in numbers]
+        rows = np.concatenate(
+            [
+                np.broadcast_to(~o, channel.shape).ravel()
+                for o, channel in zip(out, problem.channels, strict=True)
+            ]
+        )
+        fit = problem.fit(model.fit.coefficients, rows=rows, steps=_STEPS)
+        for o, channel, gap in zip(
+            out, problem.channels, problem.differences(fit.coefficients), strict=True
+        ):
+            seen = channel.valid & o
+            squares[i] += np.sum(gap[0][seen] ** 2)
+            whitened[i] += np.sum(channel.whiten(gap)[:, seen] ** 2) / 2
+            counts[i] += seen.sum()
+    keep = counts > 0
+    labels = [label for label, here in zip(labels, keep, strict=True) if here]
+    return HeldOut(labels, squares[keep], whitened[keep], counts[keep])

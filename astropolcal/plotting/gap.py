@@ -1,0 +1,426 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Figures of a diagnosis: the gap by wavelength, its maps, what causes it, where it lies."""
+
+import textwrap
+
+import numpy as np
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.gap.residuals import locate
+from astropolcal.plotting._style import (
+    BLACK,
+    BLUE,
+    GREY,
+    MINUS,
+    ORANGE,
+    SKY,
+    VERMILION,
+    canvas,
+    legend_outside,
+    style,
+    wavelength_label,
+)
+
+__all__ = ["plot_effect_scores", "plot_gap_maps", "plot_gap_spectrum", "plot_where"]
+
+_CHANNELS = {
+    "difference": ("normalized difference of the beams", "R\N{MINUS SIGN}L over R+L"),
+    "sum": ("logarithm of the sum of the beams", "ln(R+L)"),
+}
+# share of the residuals that the colour scale of the maps covers
+_COVERED = 99.5
+_WIDTH = 42
+_MOST_TICKS = 10
+
+
+def _gaps(model, noise):
+    """Return residuals in percent without the lamp, one array (2, W, F) a dataset."""
+    found = []
+    gaps = model.problem.differences(model.fit.coefficients)
+    for channel, gap in zip(noise.problem.channels, gaps, strict=True):
+        # whitened by the same noise before and after, lest the two differ by their lamps
+        percent = 100 * channel.whiten(gap) * channel.sigma
+        found.append(np.where(channel.valid, percent, np.nan))
+    return found
+
+
+def _rms(values, axis=None):
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0) ** 2
+    return np.sqrt(total.sum(axis=axis) / np.maximum(known.sum(axis=axis), 1))
+
+
+def _title(diagnosis):
+    """Return the verdict as a line."""
+    names = ", ".join(cause.name for cause in diagnosis.causes)
+    return {
+        "effect": f"an effect is missing: {names}",
+        "none": "no gap beyond the noise",
+        "unexplained": "a real gap that no effect explains"
+        + (f" (in part: {names})" if names else ""),
+    }.get(diagnosis.verdict, diagnosis.verdict)
+
+
+def _name(channel):
+    if channel not in _CHANNELS:
+        raise ParameterError(f"channel = {channel!r}; allowed are {', '.join(_CHANNELS)}")
+    return list(_CHANNELS).index(channel)
+
+
+def plot_gap_spectrum(diagnosis, *, figure=None):
+    """
+    Draw the gap by wavelength, before and after, with the noise floor.
+
+    One row a dataset, the difference of the beams at the left and the sum at
+    the right, less the lamp's drift and flicker; of the fits, not of left-out
+    frames.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.plotting.gap import plot_gap_spectrum
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
+    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> len(plot_gap_spectrum(diagnosis).axes)
+    2
+    """
+    nominal, improved = diagnosis.nominal, diagnosis.improved
+    before, after = _gaps(nominal, nominal), _gaps(improved, nominal)
+    nm = 1000 * nominal.problem.wavelength
+    order = np.argsort(nm)
+    n = len(before)
+    with style():
+        figure = canvas(figure, 10, 1.4 + 3.0 * n)
+        grid = figure.subplots(n, 2, sharex=True, squeeze=False)
+        for i, row in enumerate(grid):
+            sigma = nominal.problem.channels[i].sigma
+            valid = nominal.problem.channels[i].valid
+            for c, axes in enumerate(row):
+                floor = _rms(np.where(valid, 100 * sigma[c], np.nan), axis=1)[order]
+                axes.fill_between(nm[order], floor, color="0.85", label="noise")
+                axes.plot(nm[order], floor, color=GREY, linewidth=1)
+                one = _rms(before[i][c], axis=1)[order]
+                two = _rms(after[i][c], axis=1)[order]
+                axes.plot(nm[order], two, "o-", color=BLUE, markersize=4, label="after")
+                # hollow and larger, so that both are seen where they are the same
+                hollow = {"markerfacecolor": "none", "markersize": 8}
+                axes.plot(nm[order], one, "s--", color=VERMILION, label="before", **hollow)
+                _percent_axis(axes, np.concatenate([floor, one, two]))
+                _spectrum_labels(axes, nominal.observations[i].name, c, i == n - 1)
+        handles = grid[0, 0].get_legend_handles_labels()[0]
+        legend_outside(figure, handles, columns=3)
+        figure.suptitle(f"Gap between model and data: {_title(diagnosis)}")
+    return figure
+
+
+def _percent_axis(axes, values):
+    """Choose a logarithmic axis where the values need it."""
+    low, high = values[values > 0].min(), values.max()
+    if high > 5 * low:
+        axes.set_yscale("log")
+        axes.set_ylim(low / 1.6, high * 1.6)
+        # a handful of plain numbers rather than powers of ten
+        axes.yaxis.set_major_formatter(_plain())
+        axes.yaxis.set_minor_formatter(_plain((2, 5) if high < 30 * low else ()))
+    else:
+        axes.set_ylim(0, 1.15 * high)
+
+
+def _plain(digits=(1,)):
+    from matplotlib.ticker import FuncFormatter
+
+    def text(value, _):
+        first = value / 10 ** np.floor(np.log10(value))
+        return f"{value:g}" if np.any(np.isclose(first, digits)) else ""
+
+    return FuncFormatter(text)
+
+
+def _spectrum_labels(axes, name, channel, last):
+    title, label = list(_CHANNELS.values())[channel]
+    axes.set_title(f"{name}: {title}", loc="left")
+    axes.set_ylabel(f"rms of {label} (%)")
+    if last:
+        wavelength_label(axes)
+
+
+def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
+    """
+    Draw maps of the residuals, wavelength against frame, before and after.
+
+    All maps have the same colours. Frames are in the order of the table; lines
+    separate derotator angles. Masked data are grey.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+    channel : {"difference", "sum"}
+        Of the beams.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If the channel is another.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.plotting.gap import plot_gap_maps
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
+    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> plot_gap_maps(diagnosis).axes[0].get_ylabel()
+    'wavelength (nm)'
+    """
+    c = _name(channel)
+    nominal, improved = diagnosis.nominal, diagnosis.improved
+    pairs = list(zip(_gaps(nominal, nominal), _gaps(improved, nominal), strict=True))
+    sizes = np.abs(np.concatenate([gap[c].ravel() for pair in pairs for gap in pair]))
+    limit = max(np.nanpercentile(sizes, _COVERED), 1e-12)
+    with style():
+        figure = canvas(figure, 12, 1.3 + 3.2 * len(pairs))
+        grid = figure.subplots(len(pairs), 2, sharey=True, squeeze=False)
+        for row, pair, observations in zip(grid, pairs, nominal.observations, strict=True):
+            for axes, gap, when in zip(row, pair, ("before", "after"), strict=True):
+                drawn = _map(axes, gap[c], nominal.problem.wavelength, limit)
+                rms = _rms(gap[c])
+                axes.set_title(f"{observations.name}, {when}: rms {rms:.2g} %", loc="left")
+                _frame_axis(axes, observations)
+            row[0].set_ylabel("wavelength (nm)")
+        extend = "both" if np.nanmax(sizes) > limit else "neither"
+        bar = figure.colorbar(drawn, ax=grid, extend=extend, shrink=0.85, aspect=35)
+        bar.set_label(f"observed {MINUS} model (%); grey: masked")
+        figure.suptitle(f"Residuals of the {_CHANNELS[channel][0]}: {_title(diagnosis)}")
+    return figure
+
+
+def _map(axes, gap, wavelength, limit):
+    from astropolcal.plotting.residuals import _edges
+
+    order = np.argsort(wavelength)
+    axes.grid(False)
+    axes.set_facecolor("0.75")
+    return axes.pcolormesh(
+        np.arange(gap.shape[1] + 1),
+        _edges(1000 * wavelength[order]),
+        np.ma.masked_invalid(gap[order]),
+        cmap="RdBu_r",
+        vmin=-limit,
+        vmax=limit,
+        rasterized=True,
+    )
+
+
+def _frame_axis(axes, observations):
+    """Name the runs of frames at one derotator angle, or number the frames."""
+    from astropolcal.gap.patterns import frame_blocks
+
+    blocks = frame_blocks(observations)
+    count = blocks.max() + 1
+    if count == blocks.size or "derotator" not in observations.frames.colnames:
+        axes.set_xlabel("frame")
+        return
+    starts = np.searchsorted(blocks, np.arange(count))
+    ends = np.append(starts[1:], blocks.size)
+    for edge in starts[1:]:
+        axes.axvline(edge, color=BLACK, linewidth=0.6)
+    angles = np.rad2deg(observations.position("derotator")[starts])
+    step = -(-count // _MOST_TICKS)
+    labels = [f"{angle:.4g}" for angle in angles[::step]]
+    axes.set_xticks(((starts + ends) / 2)[::step], labels=labels)
+    axes.tick_params(axis="x", length=0)
+    axes.set_xlabel("frames by derotator angle (deg)")
+
+
+def plot_effect_scores(diagnosis, *, limit=12, figure=None):
+    """
+    Draw how much of the gap each effect of the library would explain.
+
+    The length of a bar is the signal-to-noise ratio of the effect in the scan,
+    the square root of the expected lowering of chi-square over the scatter that
+    remains. Effects that were found and their aliases have their own colours,
+    effects that are not significant are pale.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+    limit : int
+        Most effects to draw, best first.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.plotting.gap import plot_effect_scores
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
+    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> plot_effect_scores(diagnosis).axes[0].get_xlabel()[:8]
+    'signal-t'
+    """
+    scores = sorted(diagnosis.scores[:limit], key=lambda s: -_strength(s))
+    alpha = diagnosis.settings.get("alpha", 0.01)
+    found = {cause.name for cause in diagnosis.causes}
+    aliases = {name for cause in diagnosis.causes for name in cause.aliases} - found
+    used = set()
+    with style():
+        figure = canvas(figure, 10, 2.2 + 0.36 * max(len(scores), 2))
+        axes = figure.subplots()
+        for i, score in enumerate(scores):
+            name, size = score.effect.name, _strength(score)
+            kind = _kind(name, score.p_value < alpha, found, aliases)
+            used.add(kind)
+            axes.barh(i, size, **_LOOKS[kind])
+            axes.text(size, i, f"  {_chance(score.p_value)}", va="center", fontsize=9.5)
+        axes.set_yticks(range(len(scores)), labels=[s.effect.name for s in scores])
+        axes.invert_yaxis()
+        axes.grid(visible=False, axis="y")
+        axes.set_xlabel("signal-to-noise ratio in the scan; at the bars: corrected probability")
+        axes.set_xlim(0, 1.18 * max(map(_strength, scores), default=1.0))
+        legend_outside(figure, _keys(used), columns=4)
+        figure.suptitle(f"Scan of the effects: {_title(diagnosis)}")
+        if not scores:
+            axes.text(0.5, 0.5, "no effect to score", transform=axes.transAxes, ha="center")
+    return figure
+
+
+def _chance(p):
+    return "p < 1e-15" if p < 1e-15 else f"p = {p:.1g}"
+
+
+_LOOKS = {
+    "found": {"color": VERMILION},
+    "alias: the data cannot tell": {"facecolor": ORANGE, "edgecolor": BLACK, "hatch": "//"},
+    "significant": {"color": SKY},
+    "not significant": {"color": "0.85"},
+}
+
+
+def _strength(score):
+    return float(np.sqrt(score.statistic / score.scale))
+
+
+def _kind(name, significant, found, aliases):
+    if name in found:
+        return "found"
+    if name in aliases:
+        return "alias: the data cannot tell"
+    return "significant" if significant else "not significant"
+
+
+def _keys(used):
+    from matplotlib.patches import Patch
+
+    return [Patch(label=label, **look) for label, look in _LOOKS.items() if label in used]
+
+
+def plot_where(diagnosis, *, limit=12, figure=None):
+    """
+    Draw the shares of the gap by axis: what it follows, and where it is largest.
+
+    Patterns share the gap among themselves; places do so for each axis, so that
+    bars of different axes do not add up.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis or Where
+        The diagnosis, whose nominal model is looked at, or what
+        `~astropolcal.gap.residuals.locate` found.
+    limit : int
+        Most bars of either kind.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.plotting.gap import plot_where
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
+    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> len(plot_where(diagnosis).axes)
+    2
+    """
+    where = diagnosis if hasattr(diagnosis, "table") else _where(diagnosis)
+    told = where.told
+    kinds = [told[told["kind"] == kind][:limit] for kind in ("pattern", "place")]
+    heights = [max(len(rows), 1) for rows in kinds]
+    titles = ("what the gap follows (one after the other)", "where the gap is largest")
+    with style():
+        figure = canvas(figure, 10, 1.6 + 0.62 * sum(heights))
+        panels = figure.subplots(2, 1, height_ratios=heights, sharex=True)
+        for axes, rows, color, title in zip(panels, kinds, (BLUE, ORANGE), titles, strict=True):
+            _shares(axes, rows, color)
+            axes.set_title(title, loc="left")
+        panels[-1].set_xlabel("share of the excess over the noise (%)")
+        figure.suptitle("Where the gap lies")
+    return figure
+
+
+def _where(diagnosis):
+    found = getattr(diagnosis, "where", None)
+    return found if hasattr(found, "table") else locate(diagnosis.nominal)
+
+
+def _shares(axes, rows, color):
+    shares = 100 * np.array(rows["share"], dtype=float)
+    labels = [textwrap.fill(str(row["detail"]), _WIDTH) for row in rows]
+    axes.barh(range(len(rows)), shares, color=color, height=0.6)
+    for i, share in enumerate(shares):
+        axes.text(share, i, f" {share:.0f}", va="center")
+    axes.set_yticks(range(len(rows)), labels=labels, fontsize=9)
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set_xlim(0, 110)
+    if not len(rows):
+        axes.set_yticks([])
+        axes.text(0.5, 0.5, "nothing beyond the noise", transform=axes.transAxes, ha="center")

@@ -1,0 +1,233 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""``astropolcal diagnose``: which effect a model lacks, and how far that explains the gap."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from astropolcal.exceptions import AstropolcalError
+from astropolcal.scripts._calibrate import _stated
+from astropolcal.scripts._common import check_outputs, edit_chains, read_datasets, write_json
+
+_EPILOG = """\
+examples:
+  astropolcal diagnose polarized.ecsv unpolarized.ecsv --report gap.html
+  astropolcal diagnose cal.asdf polarized.ecsv         the model of a calibration
+  astropolcal diagnose run.ecsv --derotator linear     a simpler model
+  astropolcal diagnose run.ecsv --effects beam_gain,hwp_tilt
+  astropolcal diagnose run.ecsv --save improved.asdf   calibrate with what is found
+
+Several tables are used together. The effects are listed by --effects help.
+"""
+
+
+def add_parser(commands):
+    """Add the subcommand to what ``add_subparsers`` returned."""
+    parser = commands.add_parser(
+        "diagnose",
+        help="find what a model lacks to explain the measurements",
+        description="Find what an instrument's model lacks to explain the measurements: where\n"
+        "the gap lies, which effect causes it, and how far it shrinks on left-out frames.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "files",
+        nargs="*",
+        metavar="FILE",
+        help="observation tables (ECSV); before them may stand a calibration (.asdf), whose "
+        "model is then the nominal one",
+    )
+    _add_model_options(parser)
+    parser.add_argument(
+        "--effects",
+        default="all",
+        metavar="all|NAME,NAME",
+        help="which effects to try (default: all; help lists them)",
+    )
+    _add_output_options(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_model_options(parser):
+    """Add what says which model is the nominal one."""
+    parser.add_argument("--instrument", metavar="NAME", help="default: as the tables say")
+    parser.add_argument(
+        "--derotator",
+        metavar="MODEL",
+        help="elliptical (default) or linear retarder; not with a calibration",
+    )
+    for option, form, words in (
+        ("--without", "OPTIC", "take an optic out of the model"),
+        ("--free", "NAME", "free a parameter, such as wollaston.theta"),
+        ("--fix", "NAME[=VALUE]", "hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg"),
+    ):
+        parser.add_argument(option, action="append", default=[], metavar=form, help=words)
+
+
+def _add_output_options(parser):
+    """Add what says what is written."""
+    parser.add_argument(
+        "--report", metavar="FILE.html", help="write a page with tables and figures"
+    )
+    parser.add_argument(
+        "--save",
+        metavar="CAL.asdf",
+        help="calibrate with the effects that were found, and write the calibration",
+    )
+    parser.add_argument(
+        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+
+
+def run(arguments):
+    """Diagnose, print what came out and write what was asked for."""
+    from astropolcal.gap import diagnose
+    from astropolcal.gap.report import summary, to_dict
+
+    if arguments.effects == "help":
+        print(_list_of_effects())
+        return
+    quiet = arguments.quiet or arguments.json == "-"
+    say = (lambda *_: None) if quiet else print
+    check_outputs(arguments.report, arguments.save, arguments.json)
+    effects = _effects(arguments.effects)
+    nominal, datasets, instrument = _nominal(arguments)
+    diagnosis = diagnose(nominal, datasets, effects=effects, progress=None if quiet else _progress)
+    content = to_dict(diagnosis)
+    # first the files: a reader of our words may have gone in the meantime
+    written = _write(diagnosis, content, arguments, instrument)
+    say(summary(diagnosis, content))
+    if written:
+        say("\nWritten: " + "\n         ".join(written))
+
+
+def _progress(line):
+    print(f"astropolcal: {line}", file=sys.stderr, flush=True)
+
+
+# ---- effects --------------------------------------------------------------------------------
+
+
+def _effects(text):
+    from astropolcal.gap import get_effect
+
+    if text == "all":
+        return "all"
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
+        raise AstropolcalError(f"--effects {text!r}: give all, or names separated by commas")
+    for name in names:
+        get_effect(name)
+    return names
+
+
+def _list_of_effects():
+    from astropolcal.gap import EFFECTS
+
+    width = max(map(len, EFFECTS)) + 2
+    return "\n".join(f"{name:<{width}}{effect.title}" for name, effect in EFFECTS.items())
+
+
+# ---- the nominal model ------------------------------------------------------------------------
+
+
+def _nominal(arguments):
+    """Return the nominal calibration or chains, the datasets, and the instrument's name."""
+    from astropolcal import instruments
+
+    first, *rest = arguments.files or [""]
+    known = first if Path(first).suffix == ".asdf" else None
+    files = rest if known else arguments.files
+    if not files:
+        raise AstropolcalError("no tables to diagnose; give at least one FILE")
+    datasets = read_datasets(files)
+    edits = {key: getattr(arguments, key) for key in ("without", "free", "fix")}
+    if known:
+        return _of_calibration(known, files, datasets, edits, arguments)
+    instrument = instruments.get(arguments.instrument or _stated(datasets))
+    chains = instrument.chains_for(datasets, derotator=arguments.derotator or "elliptical")
+    return edit_chains(chains, **edits), datasets, instrument.name
+
+
+def _of_calibration(path, files, datasets, edits, arguments):
+    """Return the model of a calibration for the datasets, which need not be its own."""
+    from astropolcal.calibration import Calibration
+
+    for option in ("instrument", "derotator"):
+        if getattr(arguments, option):
+            raise AstropolcalError(f"--{option}: the model is that of {path}; give one of them")
+    calibration = Calibration.read(path)
+    records = [
+        _record(calibration, path, file, dataset)
+        for file, dataset in zip(files, datasets, strict=True)
+    ]
+    hashes = [dataset.content_hash for dataset in datasets]
+    if hashes == [r.content_hash for r in calibration.datasets] and not any(edits.values()):
+        return calibration.with_observations(datasets), datasets, calibration.instrument
+    chains = [calibration.chains[i].copy() for i in records]
+    return edit_chains(chains, **edits), datasets, calibration.instrument
+
+
+def _record(calibration, path, file, dataset):
+    """Return which dataset of a calibration has the chain for a table."""
+    known = calibration.datasets
+    same = [i for i, r in enumerate(known) if r.content_hash == dataset.content_hash]
+    alike = [i for i, r in enumerate(known) if r.source == dataset.source]
+    if same or alike:
+        return (same or alike)[0]
+    raise AstropolcalError(
+        f"{file}: its source is {dataset.source!r}, and {path} has a model for "
+        f"{', '.join(sorted({repr(r.source) for r in known}))} only"
+    )
+
+
+# ---- outputs --------------------------------------------------------------------------------
+
+
+def _write(diagnosis, content, arguments, instrument):
+    """Write what was asked for; return the names of the files."""
+    written = []
+    if arguments.json:
+        write_json(content, arguments.json)
+        written += [arguments.json] if arguments.json != "-" else []
+    if arguments.report:
+        from astropolcal.gap.report import write_html
+
+        write_html(diagnosis, arguments.report, figures=_figures(diagnosis), content=content)
+        written.append(arguments.report)
+    if arguments.save:
+        _improved(diagnosis, instrument).write(arguments.save, overwrite=True)
+        written.append(arguments.save)
+    return written
+
+
+def _figures(diagnosis):
+    """Return the figures of the page by caption."""
+    from astropolcal.plotting import gap
+
+    figures = {
+        "Gap at each wavelength before and after, with the noise": gap.plot_gap_spectrum(diagnosis),
+        "Residuals of the differences, by wavelength and frame": gap.plot_gap_maps(diagnosis),
+        "Where the gap of the nominal model lies": gap.plot_where(diagnosis),
+    }
+    if diagnosis.scores:
+        figures["Evidence for each effect that was tried"] = gap.plot_effect_scores(diagnosis)
+    return figures
+
+
+def _improved(diagnosis, instrument):
+    """Return the calibration of the improved chains, the effects held at their fitted sizes."""
+    from astropolcal.calibration import calibrate
+
+    model = diagnosis.improved
+    held = [p.name for parameters in model.added.values() for p in parameters]
+    observations = model.observations
+    return calibrate(
+        model.chains,
+        observations,
+        fix=dict.fromkeys(held) or None,
+        ties={name: tie for name, tie in model.problem.ties.items() if name not in held},
+        instrument=instrument,
+    )

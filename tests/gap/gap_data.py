@@ -1,0 +1,65 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Small data with a known gap, for the tests of the diagnosis."""
+
+from functools import cache
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import instruments
+from astropolcal.gap.effects import Context, get_effect
+from astropolcal.gap.model import Model
+from astropolcal.gap.problem import GapProblem
+from astropolcal.observations import Observations
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+WAVELENGTH = [1170, 1300, 1450, 1620, 1800, 2000, 2200] * u.nm
+DEROTATOR = [45, 70, 95, 120] * u.deg
+
+
+def chain():
+    return instruments.get("charis").chain(wavelength=WAVELENGTH, derotator="linear")
+
+
+def frames():
+    return half_wave_plate_cycles(derotator=DEROTATOR)
+
+
+def observed(true=None, *, seed=1, flux=1e6, table=None, **options):
+    true = chain() if true is None else true
+    table = frames() if table is None else table
+    options = {"name": "lamp"} | options
+    return simulate(true, WAVELENGTH, table, flux=flux, seed=seed, **options)
+
+
+def with_effect(name, **values):
+    """Return the chain with an effect of a certain size."""
+    edit = get_effect(name).edit([chain()], Context(WAVELENGTH.to_value(u.um)))
+    for parameter in edit.parameters:
+        optic, key = parameter.name.split(".")
+        target = getattr(edit.chains[0][optic], key)
+        target.value = np.full(np.shape(target.value), values.get(key, 0.0))
+    return edit.chains[0]
+
+
+def with_flux(observations, factor):
+    """Return the observations with the right beam multiplied, one factor a frame."""
+    table = observations.to_table()
+    grown = np.repeat(factor, observations.n_bins)
+    table["flux_right"] = table["flux_right"] * grown
+    return Observations.from_table(table, name=observations.name)
+
+
+def fitted(observations, chains=None):
+    """Return the nominal model of data; the chains start at the truth, no calibration is needed."""
+    observations = observations if isinstance(observations, list) else [observations]
+    problem = GapProblem(chains or [chain()] * len(observations), observations)
+    problem.settle_noise()
+    fit = problem.fit()
+    problem.settle_noise(fit.coefficients)
+    return Model(problem, problem.fit(fit.coefficients))
+
+
+@cache
+def clean_model(seed=1):
+    return fitted(observed(seed=seed))

@@ -1,0 +1,657 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Every effect of the library: laws, recovery from noisy data, serialization.
+
+`CASES` has an entry for each registered effect; a test fails where one lacks.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import asdf
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from astropolcal import Calibration, calibrate, instruments, optics
+from astropolcal.chain import leaves
+from astropolcal.exceptions import GapError
+from astropolcal.gap.attribution import scan
+from astropolcal.gap.effects import (
+    EFFECTS,
+    KINDS,
+    Context,
+    Effect,
+    EffectParameter,
+    Insertion,
+    Roles,
+    check_effect,
+    get_effect,
+    register_effect,
+)
+from astropolcal.gap.model import Model, effect_tangent
+from astropolcal.gap.problem import GapProblem, orthonormal
+from astropolcal.observations import Observations
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+from astropolcal.units import canonical_factor
+
+WAVELENGTH = np.geomspace(1.16, 2.3, 6) * u.um
+FRAMES = half_wave_plate_cycles(derotator=[45, 62, 77, 98] * u.deg)
+LONG = half_wave_plate_cycles(np.arange(0, 360, 33.75) * u.deg, [45, 62, 77, 98] * u.deg)
+#: Photons of a beam, at first.
+FLUX = 1e8
+
+
+def lamp(n_frames):
+    """Return the brightness of a lamp that grows dim, frame by frame."""
+    return np.exp(-0.7 * np.linspace(0, 1, n_frames))
+
+
+def _nothing(chains):
+    return chains
+
+
+def _hold(*names):
+    """Return what fixes the orientation of optics."""
+
+    def change(chains):
+        for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+            if leaf.name in names:
+                leaf.theta.fixed = True
+        return chains
+
+    return change
+
+
+def _bounded(optic, key, low, high):
+    """Return what narrows the bounds of a parameter, so that its value is at one."""
+
+    def change(chains):
+        for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+            if leaf.name == optic:
+                parameter = getattr(leaf, key)
+                value = np.asarray(parameter.value)
+                parameter.bounds = (value.min() + low, value.max() + high)
+        return chains
+
+    return change
+
+
+@dataclass
+class Case:
+    """How an effect is tested."""
+
+    #: Coefficients in units of the size to expect, one a coefficient, repeated as needed.
+    size: tuple = (1.0, -0.6, 0.4)
+    #: What the nominal chains need before the effect has a place.
+    prepare: object = _nothing
+    frames: object = None
+
+
+_ONE_SIGN = (1.0,)
+CASES = {
+    "anisotropic_depolarizer": Case((-1.0, 0.3, 0.2)),
+    "background": Case((2.0, -0.6, 0.4)),
+    "beam_crosstalk": Case((-1.0, 0.3, 0.2)),
+    "beam_gain": Case(),
+    "beams_swapped": Case(),
+    "derotator_45_retardance": Case(),
+    "derotator_angle_bound": Case(_ONE_SIGN, _bounded("derotator", "theta", -5, 0)),
+    "derotator_circular_retardance": Case(),
+    "derotator_diattenuation": Case(),
+    "derotator_encoder": Case(),
+    "derotator_encoder_eccentricity": Case((5.0, 5.0)),
+    "derotator_misalignment": Case(_ONE_SIGN, _hold("derotator")),
+    "derotator_offset": Case(),
+    "derotator_retardance_bound": Case(_ONE_SIGN, _bounded("derotator", "retardance", -400, 0)),
+    "derotator_sign": Case(),
+    "detector_nonlinearity": Case(),
+    "dichroic_j_band": Case((1.0, -0.6, 0.4, 0.8, -1.0)),
+    "fringes": Case(),
+    "fringes_12_um": Case(),
+    "fringes_4_um": Case(),
+    "hwp_angle_bound": Case(_ONE_SIGN, _bounded("hwp", "theta", -5, 0)),
+    "hwp_axis_dispersion": Case(),
+    "hwp_beam_wander": Case(frames=LONG),
+    "hwp_diattenuation": Case(),
+    "hwp_encoder_eccentricity": Case(frames=LONG),
+    "hwp_encoder_two_lobe": Case(frames=LONG),
+    "hwp_misalignment": Case(_ONE_SIGN, _hold("hwp")),
+    "hwp_offset": Case(),
+    "hwp_retardance": Case(),
+    "hwp_retardance_free": Case((1.0, -0.6, 0.4, 0.8, -1.0)),
+    "hwp_sign": Case(),
+    "hwp_thickness_bound": Case(_ONE_SIGN, _bounded("hwp", "w_sio2", -0.1, 0)),
+    "hwp_tilt": Case(frames=LONG),
+    "hwp_transmission": Case(frames=LONG),
+    "hwp_transmission_once": Case(frames=LONG),
+    "mirror_flip": Case(),
+    "mirror_flip_before_plate": Case(),
+    "mirror_misalignment": Case((4.0,)),
+    "persistence": Case((0.3,)),
+    "polarizer_angle_bound": Case(_ONE_SIGN, _bounded("calibration_polarizer", "theta", -5, 0)),
+    "polarizer_leak": Case((-1.0, 0.3, 0.2)),
+    "polarizer_misalignment": Case(_ONE_SIGN, _hold("calibration_polarizer")),
+    "retarder_before_plate": Case(),
+    "source_circular": Case(),
+    "source_rotation_drift": Case((5.0,)),
+    "static_diattenuator": Case(),
+    "static_retarder": Case(),
+    "wavelength_scale": Case(),
+    "wollaston_orientation": Case(),
+}
+#: One effect of each kind of fingerprint, against which the others are scanned.
+RIVALS = (
+    "beam_gain",
+    "derotator_45_retardance",
+    "derotator_encoder",
+    "detector_nonlinearity",
+    "hwp_axis_dispersion",
+    "hwp_diattenuation",
+    "hwp_encoder_two_lobe",
+    "hwp_retardance",
+    "source_circular",
+    "static_retarder",
+)
+SMOOTH = [name for name in CASES if EFFECTS[name].kind != "discrete"]
+SHOWN = [name for name in SMOOTH if EFFECTS[name].absorbed_by is None]
+
+
+def nominal_chains(case):
+    """Return a polarized and an unpolarized chain at their true values."""
+    charis = instruments.get("charis")
+    made = [
+        charis.chain(source, wavelength=WAVELENGTH, derotator="linear")
+        for source in ("polarized", "unpolarized")
+    ]
+    made[1]["fold_mirror"].diattenuation = 0.013 + 0.001 * np.arange(WAVELENGTH.size)
+    return case.prepare(made)
+
+
+@cache
+def clean(name):
+    """Return nominal chains of a case, and noiseless data."""
+    case = CASES[name]
+    chains = nominal_chains(case)
+    frames = FRAMES if case.frames is None else case.frames
+    settings = {"flux": FLUX, "lamp": lamp(len(frames)), "noise": False}
+    data = [simulate(chain, WAVELENGTH, frames, **settings) for chain in chains]
+    return chains, data
+
+
+def context_of(data):
+    flux = np.median([np.median(o.flux_right + o.flux_left) / 2 for o in data])
+    return Context(WAVELENGTH.to_value(u.um), float(flux))
+
+
+def problem_of(edit, data):
+    laws = {p.name: p.basis for p in edit.parameters if p.basis is not None}
+    return GapProblem(edit.chains, data, ties=edit.ties, laws=laws)
+
+
+def canonical(value):
+    value = u.Quantity(value)
+    return value.value * canonical_factor(value.unit)
+
+
+def with_size(problem, parameters, size):
+    """Return coefficients with the effect at a size, and where its own are."""
+    q, own = problem.start.copy(), []
+    for parameter in parameters:
+        where = problem.slices[parameter.name]
+        k = where.stop - where.start
+        q[where] += np.resize(size, k) * canonical(parameter.scale)
+        own += range(where.start, where.stop)
+    return q, own
+
+
+def noisy(problem, q, data, seed):
+    """Return data as a problem predicts them, with photon noise."""
+    rng, found = np.random.default_rng(seed), []
+    for dataset, old in zip(problem.datasets, data, strict=True):
+        shape = (WAVELENGTH.size, old.n_frames)
+        fluxes = np.stack(
+            [np.broadcast_to(f, shape) for f in dataset.forward(problem.vector(q)).fluxes]
+        )
+        fluxes = fluxes * FLUX * lamp(old.n_frames)
+        drawn = fluxes + rng.normal(size=fluxes.shape) * np.sqrt(fluxes)
+        frames = np.repeat(np.arange(old.n_frames), WAVELENGTH.size)
+        table = QTable({"frame": frames, "wavelength": np.tile(WAVELENGTH, old.n_frames)})
+        table["bin"] = np.tile(np.arange(WAVELENGTH.size), old.n_frames)
+        for stage in ("hwp", "derotator"):
+            table[stage] = old.position(stage)[frames] * u.rad
+        for beam, flux, mean in zip(("right", "left"), drawn, fluxes, strict=True):
+            table[f"flux_{beam}"] = flux.T.ravel() * u.adu
+            table[f"flux_{beam}_err"] = np.sqrt(mean).T.ravel() * u.adu
+        found.append(Observations.from_table(table, name=old.name))
+    return found
+
+
+def fitted(chains, data):
+    """Return the nominal model, fitted from the true values."""
+    problem = GapProblem(chains, data)
+    problem.settle_noise()
+    problem.settle_noise(problem.fit().coefficients)
+    return Model(problem, problem.fit())
+
+
+def simulated(names, size=None, seed=3):
+    """Return chains and noisy data with effects at a size, and the true coefficients."""
+    chains, data = clean(names[0])
+    edit_chains, parameters, ties = chains, [], {}
+    for name in names:
+        edit = EFFECTS[name].edit(edit_chains, context_of(data))
+        edit_chains, ties = edit.chains, ties | edit.ties
+        parameters += edit.parameters
+    edit = type(edit)(edit_chains, parameters, ties)
+    problem = problem_of(edit, data)
+    q, _ = with_size(problem, parameters, CASES[names[0]].size if size is None else size)
+    truth = {p.name: q[problem.slices[p.name]] for p in parameters}
+    return chains, noisy(problem, q, data, seed), truth
+
+
+def assert_recovered(model, name, truth):
+    for key, (found, error, unit, _) in model.sizes(name).items():
+        off = (found - truth[key] / canonical_factor(unit)) / error
+        assert np.all(np.abs(off) < 4), f"{key}: {off} standard errors"
+
+
+def fixed_tangent(model):
+    """Return the tangent space of what is not at a bound."""
+    problem, q = model.problem, model.fit.coefficients
+    inside = (q > problem.low + 1e-9) & (q < problem.high - 1e-9)
+    return orthonormal(problem.jacobian(q)[:, inside])
+
+
+# ---- the registry --------------------------------------------------------------------------
+
+
+def test_every_effect_has_a_case():
+    assert sorted(EFFECTS) == sorted(CASES), "add an entry to CASES for each registered effect"
+
+
+def test_library_is_large_and_in_words():
+    assert len(EFFECTS) >= 25
+    for effect in EFFECTS.values():
+        assert effect.kind in KINDS
+        for words in (effect.title, effect.place, effect.shows, effect.reference):
+            assert words
+            assert not words.endswith(".")
+    titles = [effect.title for effect in EFFECTS.values()]
+    assert len(set(titles)) == len(titles)
+
+
+def test_effects_of_the_gap_cases_keep_their_names(shared_data):
+    import json
+
+    key = json.loads((shared_data / "gap-cases" / "key.json").read_text(encoding="utf-8"))
+    known = {case["effect"] for case in key.values()} - {"none", "unlisted_hysteresis"}
+    assert known <= set(EFFECTS)
+
+
+def test_documentation_shows_every_effect(repository):
+    page = (repository / "docs" / "effects.rst").read_text(encoding="utf-8")
+    text = " ".join(page.split())
+    for name, effect in EFFECTS.items():
+        for words in (f"``{name}``", effect.title, effect.shows, effect.reference):
+            assert words in text, f"docs/effects.rst lacks {words!r} of {name}"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_checks(name):
+    """Identity at zero, names, derivatives of both channels against differences."""
+    check_effect(name, *clean(name))
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_sizes_are_within_bounds_and_limits(name):
+    chains, data = clean(name)
+    edit = EFFECTS[name].edit(chains, context_of(data))
+    problem = problem_of(edit, data)
+    assert edit.parameters
+    for parameter in edit.parameters:
+        assert 0 < canonical(parameter.scale) < canonical(parameter.limit)
+        assert parameter.name in problem.free.by_name
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_has_no_place_without_its_optic(name):
+    alone = optics.Depolarizer(name="relay") | optics.ParityFlip(name="nbs")
+    assert not EFFECTS[name].applies([alone])
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_is_not_offered_again_once_it_is_in_the_model(name):
+    chains, data = clean(name)
+    edit = EFFECTS[name].edit(chains, context_of(data)).chains
+    if EFFECTS[name].kind == "parameter" and not isinstance(EFFECTS[name], Insertion):
+        assert not EFFECTS[name].applies(edit)
+    names = [leaf.name for leaf in leaves(edit[0])]
+    assert len(set(names)) == len(names)
+
+
+# ---- recovery ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_recovery(name):
+    chains, data, truth = simulated([name])
+    effect, model = EFFECTS[name], fitted(chains, data)
+    nominal = fixed_tangent(model)
+    assert effect.applies(model.chains)
+    rivals = [EFFECTS[other] for other in RIVALS if other != name]
+    scores = scan(model, [effect, *rivals], nominal=nominal)
+    mine = next(score for score in scores if score.effect is effect)
+    assert mine.p_value < 1e-3
+    best = max(score.statistic for score in scores if score.rank <= mine.rank)
+    assert mine.statistic > 0.95 * best, [s.effect.name for s in scores[:4]]
+    improved = model.with_effect(effect)
+    assert improved.fit.converged
+    assert_recovered(improved, name, truth)
+    assert improved.fit.chi2 < model.problem.n_data + 5 * np.sqrt(2 * model.problem.n_data)
+
+
+@pytest.mark.parametrize("name", [name for name in SMOOTH if name not in SHOWN])
+def test_absorbed_effects_add_no_direction(name):
+    chains, data, _ = simulated([name])
+    model = fitted(chains, data)
+    nominal = model.problem.tangent(model.fit.coefficients)
+    assert effect_tangent(model, EFFECTS[name], nominal).shape[1] == 0
+    optic, key = EFFECTS[name].absorbed_by.split(".")
+    assert not getattr(chains[0][optic], key).fixed
+    assert model.fit.chi2 < model.problem.n_data + 5 * np.sqrt(2 * model.problem.n_data)
+
+
+def test_variants_of_fringes_cover_the_band():
+    fringes = get_effect("fringes")
+    found = fringes.variants(Context(np.geomspace(1.16, 2.37, 22)))
+    thickness = [one.thickness for one in found]
+    assert len({one.name for one in found}) == len(found) >= 6
+    assert np.allclose(np.diff(thickness), thickness[0], rtol=1e-6)
+    assert fringes.variants(Context(np.array([1.2, 1.6]))) == [fringes]
+    assert EFFECTS["beam_gain"].variants(None) == [EFFECTS["beam_gain"]]
+
+
+def test_data_choose_among_the_variants_of_fringes():
+    chains, data, _ = simulated(["fringes_4_um"])
+    model = fitted(chains, data)
+    variants = EFFECTS["fringes"].variants(model.context)
+    best = scan(model, variants)[0].effect
+    assert abs(best.thickness - 4) < variants[0].thickness
+
+
+# ---- several at once ------------------------------------------------------------------------
+
+PAIRS = [
+    ("hwp_retardance", "hwp_axis_dispersion"),
+    ("derotator_circular_retardance", "derotator_45_retardance"),
+    ("derotator_encoder", "derotator_encoder_eccentricity"),
+    ("hwp_encoder_eccentricity", "hwp_encoder_two_lobe"),
+    ("hwp_encoder_two_lobe", "derotator_encoder"),
+    ("hwp_axis_dispersion", "hwp_encoder_two_lobe"),
+    ("beam_gain", "background"),
+]
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids="+".join)
+@pytest.mark.parametrize("order", [1, -1])
+def test_pairs(pair, order):
+    """Two effects in one chain, whichever is added first."""
+    chains, data, truth = simulated(list(pair))
+    model = fitted(chains, data)
+    for name in pair[::order]:
+        model = model.with_effect(EFFECTS[name])
+    assert model.fit.converged
+    assert list(model.added) == list(pair[::order])
+    for name in pair:
+        assert_recovered(model, name, truth)
+    assert model.fit.chi2 < model.problem.n_data + 5 * np.sqrt(2 * model.problem.n_data)
+
+
+# ---- improved chains are ordinary chains ---------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_improved_chains_serialize(name, tmp_path):
+    chains, data = clean(name)
+    edit = EFFECTS[name].edit(chains, context_of(data))
+    if edit.parameters:
+        problem = problem_of(edit, data)
+        q, _ = with_size(problem, edit.parameters, CASES[name].size)
+        edited = problem.measurement.put_back(problem.vector(q))
+    else:
+        edited = edit.chains
+    path = tmp_path / "chains.asdf"
+    asdf.AsdfFile({"optics": [leaves(chain) for chain in edited]}).write_to(path)
+    with asdf.open(path) as file:
+        for chain, read in zip(edited, file["optics"], strict=True):
+            for ours, theirs in zip(leaves(chain), read, strict=True):
+                assert (type(ours), ours.name, ours.mount) == (
+                    type(theirs),
+                    theirs.name,
+                    theirs.mount,
+                )
+                assert ours._settings() == theirs._settings()
+                for key in ours.param_names:
+                    mine, other = getattr(ours, key), getattr(theirs, key)
+                    assert np.array_equal(mine.value, other.value)
+                    assert (mine.fixed, tuple(mine.bounds)) == (other.fixed, tuple(other.bounds))
+
+
+@pytest.mark.filterwarnings("ignore::astropolcal.exceptions.AstropolcalWarning")
+@pytest.mark.parametrize("name", ["static_retarder", "derotator_encoder", "hwp_tilt"])
+def test_improved_chains_calibrate(name, tmp_path):
+    chains, data, _ = simulated([name])
+    improved = fitted(chains, data).with_effect(EFFECTS[name])
+    calibration = calibrate(improved.chains, data, ties=improved.problem.ties, cross_validate=False)
+    path = tmp_path / "improved.asdf"
+    calibration.write(path)
+    read = Calibration.read(path)
+    for ours, theirs in zip(calibration.chains, read.chains, strict=True):
+        assert [leaf.name for leaf in leaves(ours)] == [leaf.name for leaf in leaves(theirs)]
+    assert any(leaf.name.startswith("gap_") for leaf in leaves(read.chains[0]))
+
+
+# ---- what is refused -----------------------------------------------------------------------
+
+
+def _tinted(degrees, name, kind=optics.LinearRetarder):
+    return kind(retardance=degrees * u.deg, theta=45 * u.deg, name=name)
+
+
+class Tinted(Insertion):
+    """A retarder behind the derotator."""
+
+    name, kind, place = "test_tinted", "optic", "relay"
+    title, shows, reference = "a test", "nowhere", "none"
+    free = {"retardance": (1 * u.deg, 10 * u.deg)}
+
+    def build(self, size, anchor, context):
+        return _tinted(np.zeros(size), self.label)
+
+
+class Crooked(optics.LinearRetarder):
+    """A retarder whose derivative is wrong."""
+
+    def _derivatives(self, dispersion, retardance):
+        return tuple(1.01 * one for one in super()._derivatives(dispersion, retardance))
+
+
+class WrongDerivative(Tinted):
+    """Gives a wrong derivative."""
+
+    name = "test_derivative"
+
+    def build(self, size, anchor, context):
+        return _tinted(np.zeros(size), self.label, Crooked)
+
+
+class NoIdentity(Tinted):
+    """Is not the identity at zero."""
+
+    name = "test_identity"
+
+    def build(self, size, anchor, context):
+        return _tinted(np.ones(size), self.label)
+
+
+class Clash(Tinted):
+    """Names a parameter that is free already."""
+
+    name = "test_clash"
+
+    def parameters(self, context):
+        return [EffectParameter("hwp.theta", 1 * u.deg, 5 * u.deg)]
+
+
+class Unknown(Tinted):
+    """Names a parameter that is not there."""
+
+    name = "test_unknown"
+
+    def parameters(self, context):
+        return [EffectParameter("relay.theta", 1 * u.deg, 5 * u.deg)]
+
+
+class WrongUnit(Tinted):
+    """Gives its size in a unit that does not fit."""
+
+    name = "test_unit"
+    free = {"retardance": (1 * u.um, 10 * u.um)}
+
+
+class SameOptic(Tinted):
+    """Names its optic as another one."""
+
+    name = "test_same"
+    label = "hwp"
+
+
+class Vandal(Tinted):
+    """Changes the chains that it is given."""
+
+    name = "test_vandal"
+
+    def edit(self, chains, context):
+        edit = super().edit(chains, context)
+        for chain in chains:
+            Roles(chain).splitter.theta = 1 * u.deg
+        return edit
+
+
+class Duplicate(Tinted):
+    """Has a name that is taken."""
+
+    name = "beam_gain"
+
+
+class Discrete(Tinted):
+    """Says that it is discrete, and has a parameter."""
+
+    name, kind = "test_discrete", "discrete"
+
+
+class NoPlace(Tinted):
+    """Finds no place."""
+
+    name = "test_place"
+
+    def applies_to(self, roles):
+        return False
+
+
+class NoTitle(Tinted):
+    """Lacks its title."""
+
+    name, title = "test_title", ""
+
+
+class NoKind(Tinted):
+    """Is of no known kind."""
+
+    name, kind = "test_kind", "magic"
+
+
+REFUSED = [
+    (WrongDerivative, "test_derivative: derivative to .* differs .* by (1|1\\.0.*) %"),
+    (NoIdentity, "at zero parameters"),
+    (Clash, "hwp.theta is free in the chains without it already"),
+    (Unknown, "relay.theta is not free in its chains; new and free: gap_test_unknown.retardance"),
+    (WrongUnit, "um"),
+    (SameOptic, "cannot edit|cannot be fitted"),
+    (Vandal, "changes the chains that it is given"),
+    (Duplicate, "'beam_gain' is registered already"),
+    (Discrete, "discrete and has parameters"),
+    (NoPlace, "has no place"),
+    (NoTitle, "lacks title"),
+    (NoKind, "kind 'magic'; allowed are optic"),
+]
+
+
+def test_check_accepts_an_effect_that_is_not_registered():
+    check_effect(Tinted, *clean("beam_gain"))
+    check_effect(Tinted(), *clean("beam_gain"))
+
+
+@pytest.mark.parametrize(("effect", "words"), REFUSED, ids=lambda x: getattr(x, "__name__", ""))
+def test_check_refuses(effect, words):
+    chains, data = clean("beam_gain")
+    chains = [chain.copy() for chain in chains]
+    with pytest.raises(GapError, match=words):
+        check_effect(effect, chains, data)
+
+
+@pytest.mark.parametrize("effect", [Duplicate, NoTitle, NoKind])
+def test_registration_refuses(effect):
+    before = dict(EFFECTS)
+    with pytest.raises(GapError):
+        register_effect(effect)
+    assert before == EFFECTS
+
+
+def test_registration_refuses_what_is_no_effect():
+    with pytest.raises(GapError, match="is no Effect"):
+        register_effect(dict)
+
+
+def test_registration_of_ones_own():
+    try:
+        assert register_effect(Tinted) is Tinted
+        assert isinstance(get_effect("test_tinted"), Effect)
+        with pytest.raises(GapError, match="another name"):
+            register_effect(Tinted)
+    finally:
+        EFFECTS.pop("test_tinted", None)
+
+
+def test_unknown_name():
+    with pytest.raises(GapError, match="did you mean 'beam_gain'"):
+        get_effect("beam_gian")
+
+
+# ---- parameters that are held, or at a bound -------------------------------------------------
+
+
+def test_held_parameters_have_no_place_where_they_are_free():
+    chains, _ = clean("beam_gain")
+    for name in ("hwp_misalignment", "derotator_misalignment", "polarizer_misalignment"):
+        assert not EFFECTS[name].applies(chains)
+    for name in CASES:
+        if EFFECTS[name].kind == "bound":
+            assert not EFFECTS[name].applies(chains)
+
+
+def test_bounds_are_lifted_on_a_copy():
+    chains, data = clean("hwp_angle_bound")
+    edit = EFFECTS["hwp_angle_bound"].edit(chains, context_of(data))
+    assert chains[0]["hwp"].theta.bounds == (-5, 0)
+    assert edit.chains[0]["hwp"].theta.bounds == (-10, 10)
+    assert edit.parameters[0].name == "hwp.theta"
+
+
+def test_size_of_a_held_angle_counts_from_where_it_was_held():
+    chains, data = clean("polarizer_misalignment")
+    edit = EFFECTS["polarizer_misalignment"].edit(chains, context_of(data))
+    assert edit.parameters[0].neutral == 90 * u.deg
+    assert chains[0]["calibration_polarizer"].theta.fixed

@@ -1,0 +1,140 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What to observe next: predicted separations are those that new data give."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from gap_data import WAVELENGTH, chain, fitted, observed, with_effect
+
+from astropolcal import instruments
+from astropolcal.exceptions import GapError
+from astropolcal.gap.effects import get_effect
+from astropolcal.gap.planning import Exposure, exposures, plan
+from astropolcal.simulation import half_wave_plate_cycles
+
+PAIR = ("source_circular", "static_retarder")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return fitted(observed(with_effect("source_circular", retardance=1.5)))
+
+
+@pytest.fixture(scope="module")
+def members(model):
+    return {name: model.with_effect(get_effect(name)) for name in PAIR}
+
+
+def test_plan_ranks_by_gain(model, members):
+    found = plan(model, members=members, limit=4)
+    gains = [entry["gain"] for entry in found]
+    assert gains == sorted(gains, reverse=True)
+    assert 1 <= len(found) <= 4
+    for entry in found:
+        assert set(entry) == {"words", "separates", "gain"}
+        assert set(entry["separates"]) <= {*PAIR, *model.problem.names}
+        assert entry["words"].startswith("Take 8 half-wave-plate angles")
+
+
+def test_predicted_separation_is_that_of_new_data(model, members):
+    """Take the exposure, without noise, and fit both: chi-square differs as predicted."""
+    exposure = Exposure(0, tuple(np.arange(8) * 11.25), (("derotator", 150.0),))
+    truth, other = members["source_circular"], members["static_retarder"]
+    (entry,) = [
+        e
+        for e in plan(model, members=members, candidates=[exposure])
+        if set(e["separates"]) == set(PAIR)
+    ]
+    angles = [45, 70, 95, 120] * u.deg
+    old = half_wave_plate_cycles(np.arange(8) * 11.25 * u.deg, angles)
+    new = half_wave_plate_cycles(np.arange(8) * 11.25 * u.deg, [150] * u.deg)
+
+    def missed(tables):
+        data = [observed(truth.chains[0], table=t, noise=False) for t in tables]
+        base = fitted(data, [c for c in [chain()] * len(data)])
+        return base.with_effect(get_effect(other_name)).fit.chi2
+
+    other_name = next(iter(other.added))
+    gained = missed([old, new]) - missed([old])
+    # the lesser of both directions is predicted, and the noise settles a little differently
+    assert entry["gain"] <= 1.5 * np.sqrt(gained)
+    assert entry["gain"] > 0.3 * np.sqrt(gained)
+
+
+def test_identical_effects_cannot_be_separated(model, members):
+    one = members["source_circular"]
+    assert not [e for e in plan(model, members={"a": one, "b": one}) if "a" in e["separates"]]
+
+
+def test_a_brighter_lamp_tells_more(model, members):
+    base = Exposure(0, tuple(np.arange(8) * 11.25), (("derotator", 150.0),))
+    brighter = Exposure(0, base.hwp, base.positions, lamp=4.0)
+    gains = {
+        lamp: plan(model, members=members, candidates=[one])[0]["gain"]
+        for lamp, one in ((1, base), (4, brighter))
+    }
+    assert 1.2 * gains[1] < gains[4] < 2.01 * gains[1]
+
+
+def test_candidates_cover_what_can_be_changed(model):
+    kinds = exposures(model, flux_matters=True)
+    assert {one.polarizer_turned for one in kinds} == {0.0, 45.0}
+    assert {one.lamp for one in kinds} == {0.5, 1.0, 2.0}
+    assert ("calibration_polarizer",) in {one.without for one in kinds}
+    assert any(max(one.hwp) > 300 for one in kinds)
+
+
+def test_polarizer_is_taken_out_only_where_no_dataset_is_without_it():
+    charis = instruments.get("charis")
+    bare = charis.chain("unpolarized", wavelength=WAVELENGTH, derotator="linear")
+    both = fitted([observed(), observed(bare, seed=2)], [chain(), bare])
+    assert {one.without for one in exposures(both)} == {()}
+    assert {one.dataset for one in exposures(both)} == {0, 1}
+
+
+def elliptical(angles):
+    true = instruments.get("charis").chain(wavelength=WAVELENGTH, derotator="elliptical")
+    table = half_wave_plate_cycles(derotator=angles * u.deg)
+    return fitted(observed(true, table=table), [true])
+
+
+def test_open_directions_are_fixed_by_another_derotator_angle():
+    found = plan(elliptical([60]))
+    assert found
+    assert "fixes" in found[0]["words"]
+    assert "open directions" in found[0]["words"]
+    assert all(name.startswith("derotator.") for name in found[0]["separates"])
+    same = Exposure(0, tuple(np.arange(8) * 11.25), (("derotator", 60.0),))
+    assert plan(elliptical([60]), candidates=[same]) == []
+
+
+def test_what_no_exposure_fixes_is_not_promised():
+    """A common rotation of what is in front of the derotator stays open whatever is taken."""
+    assert plan(elliptical([45, 70, 95, 120])) == []
+
+
+@pytest.mark.parametrize(
+    ("exposure", "message"),
+    [
+        (Exposure(3, (0.0,)), "dataset 3"),
+        (Exposure(0, ()), "half-wave-plate angles"),
+        (Exposure(0, (np.nan,)), "half-wave-plate angles"),
+        (Exposure(0, (0.0,), lamp=0.0), "lamp = 0"),
+    ],
+)
+def test_impossible_exposures(model, exposure, message):
+    with pytest.raises(GapError, match=message):
+        plan(model, candidates=[exposure])
+
+
+def test_unknown_effect(model):
+    with pytest.raises(GapError):
+        plan(model, ["no_such_effect"])
+
+
+def test_words_of_an_exposure():
+    one = Exposure(0, (0.0, 45.0), (("derotator", 60.0),), lamp=2.0, without=("polarizer",))
+    assert one.words == (
+        "2 half-wave-plate angles (0 to 45 deg) at derotator 60 deg without polarizer "
+        "with the lamp 2 times as bright"
+    )

@@ -1,0 +1,338 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What a report says, in words, numbers and as a page."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import instruments
+from astropolcal.exceptions import GapError
+from astropolcal.gap import _words, diagnose, get_effect
+from astropolcal.gap.effects import Context
+from astropolcal.gap.report import causes_table, summary, to_dict, write_html
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+CHARIS = instruments.get("charis")
+WAVELENGTH = CHARIS.wavelength[[2, 6, 10, 14, 18, 20]]
+FRAMES = half_wave_plate_cycles(derotator=[45, 62.5, 80, 100] * u.deg)
+SIZE = 0.012
+CONTRACT = {
+    "verdict",
+    "nominal",
+    "n_free",
+    "seconds",
+    "noise_floor_percent",
+    "gap_before_percent",
+    "gap_after_percent",
+    "where",
+    "causes",
+    "accuracy_before",
+    "accuracy_after",
+    "next_observations",
+}
+CAUSE = {
+    "rank",
+    "effect",
+    "place",
+    "kind",
+    "aliases",
+    "p_value",
+    "explained",
+    "gap_cv_before_percent",
+    "gap_cv_after_percent",
+    "parameters",
+    "physical",
+    "words",
+}
+
+
+def data(size=0.0, name="run <b>&", seed=3):
+    """Simulated frames of a chain with unequal beam gains, the same at all wavelengths."""
+    chain = CHARIS.chain(derotator="linear", wavelength=WAVELENGTH)
+    context = Context(WAVELENGTH.to_value(u.um), 1e6)
+    (edited,) = get_effect("beam_gain").edit([chain], context).chains
+    edited["gap_beam_gain"].imbalance = np.full(len(WAVELENGTH), size)
+    meta = {"source": "polarized", "instrument": "charis"}
+    observations = simulate(edited, WAVELENGTH, FRAMES, seed=seed, meta=meta, name=name)
+    return chain, observations
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Diagnosis of unequal gains."""
+    return diagnose(*data(SIZE), effects=["beam_gain", "hwp_diattenuation", "hwp_tilt"])
+
+
+@pytest.fixture(scope="module")
+def nothing():
+    """Diagnosis of a model that lacks nothing."""
+    return diagnose(*data(), effects=["beam_gain", "hwp_diattenuation"])
+
+
+@pytest.fixture(scope="module")
+def unknown():
+    """Diagnosis with a library that lacks the effect."""
+    return diagnose(*data(SIZE), effects=["hwp_encoder_eccentricity"])
+
+
+@pytest.fixture(scope="module")
+def content(found):
+    return to_dict(found)
+
+
+# ---- numbers ---------------------------------------------------------------------------
+
+
+def test_contract(content, nothing, unknown):
+    for one in (content, to_dict(nothing), to_dict(unknown)):
+        assert set(one) >= CONTRACT
+        # finite or null, and nothing but plain types
+        assert json.loads(json.dumps(one, allow_nan=False)) == one
+        assert one["n_free"] > 0
+        assert len(one["sentences"]) == 3
+        for when in ("accuracy_before", "accuracy_after"):
+            (entry,) = one[when]["datasets"]
+            assert entry["name"] == "run <b>&"
+            assert entry["s_mean_percent"] < entry["s_res_percent"]
+    (cause,) = content["causes"]
+    assert set(cause) >= CAUSE
+    assert (cause["rank"], cause["effect"], cause["kind"]) == (1, "beam_gain", "detector")
+    assert content["verdict"] == "effect"
+
+
+def test_gap_is_that_of_left_out_frames(found, content):
+    assert content["cross_validated"]
+    assert content["gap_before_percent"] == pytest.approx(found.gap_before_percent, rel=1e-6)
+    assert content["gap_after_percent"] == pytest.approx(found.gap_after_percent, rel=1e-6)
+    before, after = (content[f"accuracy_{w}"]["datasets"][0] for w in ("before", "after"))
+    assert after["s_cv_percent"] < 0.5 * before["s_cv_percent"]
+    # noise is all that is left
+    assert content["gap_after_percent"] < 1.3 * content["noise_floor_percent"]
+    shrunk = content["shrinkage_percent"]
+    assert shrunk["low"] <= shrunk["value"] <= shrunk["high"]
+    (cause,) = content["causes"]
+    assert cause["gap_cv_before_percent"] == pytest.approx(content["gap_before_percent"])
+    assert cause["gap_cv_after_percent"] == pytest.approx(content["gap_after_percent"])
+
+
+def test_sizes_are_those_of_the_simulation(content):
+    (cause,) = content["causes"]
+    (entry,) = cause["parameters"].values()
+    value, std = np.array(entry["value"]), np.array(entry["std"])
+    assert value.shape == std.shape == (len(WAVELENGTH),)
+    assert np.all(std > 0)
+    assert np.all(np.abs(value - SIZE) < 4.5 * std)
+    assert np.all(std < 0.1 * SIZE)
+    assert cause["significance"] > 30
+    assert cause["physical"]
+
+
+def test_errors_of_sizes_agree_with_the_scatter_of_simulations():
+    pulls = []
+    for seed in range(5):
+        diagnosis = diagnose(*data(SIZE, seed=seed), effects=["beam_gain"], cross_validate=False)
+        (cause,) = to_dict(diagnosis)["causes"]
+        (entry,) = cause["parameters"].values()
+        pulls.append((np.array(entry["value"]) - SIZE) / np.array(entry["std"]))
+    # 5 x 3 coefficients of the law
+    assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 1.6
+
+
+def test_targets_are_worse_before(content):
+    before, after = (content[f"accuracy_{w}"]["targets"] for w in ("before", "after"))
+    assert [(t["dolp_percent"], t["column"]) for t in before] == [
+        (1, "s_mean"),
+        (30, "s_mean"),
+        (1, "s_cv"),
+        (30, "s_cv"),
+    ]
+    assert all(a["s_p_percent"] < b["s_p_percent"] for a, b in zip(after, before, strict=True))
+    assert before[0]["missing"] == ["unpolarized", "on_sky"]
+
+
+def test_without_cross_validation_the_report_says_so():
+    diagnosis = diagnose(*data(SIZE), effects=["beam_gain"], cross_validate=False)
+    content = to_dict(diagnosis)
+    assert not content["cross_validated"]
+    assert content["gap_after_percent"] < content["gap_before_percent"]
+    (cause,) = content["causes"]
+    assert cause["gap_cv_before_percent"] is None
+    assert content["accuracy_before"]["datasets"][0]["s_cv_percent"] is None
+    assert "the frames of the fit" in content["sentences"][0]
+    assert "left out" not in " ".join(content["sentences"])
+    assert np.isnan(causes_table(diagnosis)["gap_before"][0])
+
+
+# ---- words -------------------------------------------------------------------------------
+
+
+def test_words_of_an_effect(found, content):
+    large, what, left = content["sentences"]
+    assert f"{content['gap_before_percent']:.3g} % of polarization" in large
+    assert "the gap is real" in large
+    assert get_effect("beam_gain").title in what
+    assert "what remains is noise" in left
+    text = summary(found, content)
+    assert max(map(len, text.splitlines())) <= 80
+    assert "gap_beam_gain.imbalance" in text
+    assert "physically possible" in text
+
+
+def test_words_of_nothing(nothing):
+    text = summary(nothing)
+    assert text.startswith("The model agrees with the measurements")
+    assert "take up entirely" in text.replace("\n", " ")
+    assert "Cause" not in text
+
+
+def test_words_of_the_unknown(unknown):
+    content = to_dict(unknown)
+    assert content["verdict"] == "unexplained"
+    assert "not in the library" in content["sentences"][1]
+    # the effect is in both beams alike at all plate angles: the null channel or the differences
+    assert content["where"][0]["detail"] in content["sentences"][2]
+
+
+def test_an_alias_group_has_no_winner(found):
+    (cause,) = found.causes
+    grouped = replace(found, causes=[replace(cause, aliases=["background", "hwp_diattenuation"])])
+    content = to_dict(grouped)
+    titles = [get_effect(n).title for n in ("beam_gain", "background", "hwp_diattenuation")]
+    assert "cannot tell apart" in content["sentences"][1]
+    assert all(title in content["sentences"][1] for title in titles)
+    assert "cannot tell it from" in content["causes"][0]["words"]
+    assert causes_table(grouped)["cannot_be_told_from"][0] == "background, hwp_diattenuation"
+
+
+def test_an_impossible_size_is_said_to_be_one(found):
+    (cause,) = found.causes
+    content = to_dict(replace(found, causes=[replace(cause, physical=False)]))
+    assert "physically impossible" in content["sentences"][2]
+    assert "physically impossible" in content["causes"][0]["words"]
+
+
+def test_a_pattern_among_noise_is_not_called_a_large_gap(found):
+    content = to_dict(replace(found, gap_p_value=0.3))
+    assert "the gap is real" not in content["sentences"][0]
+    assert "pattern" in content["sentences"][0]
+
+
+def test_an_alternative_has_no_size_and_the_nominal_model_no_prediction(found):
+    (cause,) = found.causes
+    swapped = replace(cause, effect=get_effect("beams_swapped"), before=None, after=None)
+    improved = replace(found.improved, added={"beams_swapped": []})
+    content = to_dict(replace(found, improved=improved, causes=[swapped]))
+    assert content["accuracy_before"]["datasets"][0]["s_cv_percent"] is None
+    assert "The model misses the frames by" in content["sentences"][0]
+    assert "has no size" in content["causes"][0]["words"]
+    assert content["causes"][0]["parameters"] == {}
+    assert content["causes"][0]["gap_cv_before_percent"] is None
+    assert content["causes"][0]["gap_cv_after_percent"] == found.held_out[0].percent
+
+
+def test_what_the_data_do_not_tell_is_not_given_as_a_size():
+    known = {"unit": "deg", "limit": 30.0}
+    lines = _words.sizes(
+        {
+            "a.b": {"value": [1.0, 2.0, 9.0], "std": [0.1, 0.011, 25.0], **known},
+            "a.c": {"value": [1.0, 2.0], "std": [None, 25.0], **known},
+            "a.d": {"value": 1.23456, "std": 0.0123, **known},
+            "a.e": {"value": 1.23456, "std": None, **known},
+        }
+    )
+    assert lines[0].startswith("a.b: 1.000 to 2.000 deg, errors 0.011 to 0.100")
+    assert lines[0].endswith("determined at 2 of 3 wavelengths")
+    assert lines[1] == "a.c: not determined by these data at any wavelength"
+    assert lines[2] == "a.d: 1.235 +- 0.012 deg"
+    assert lines[3] == "a.e: not determined by these data"
+
+
+def test_several_causes_are_numbered(found):
+    (cause,) = found.causes
+    two = [replace(cause, explained=0.6), replace(cause, explained=0.3)]
+    content = to_dict(replace(found, causes=two))
+    assert "misses 2 effects, (1) " in content["sentences"][1]
+    assert "90 %" in content["sentences"][1]
+
+
+def test_table(found, nothing):
+    table = causes_table(found)
+    assert table["effect"][0] == "beam_gain"
+    assert table["gap_before"][0] > table["gap_after"][0]
+    assert table["gap_before"].unit == u.percent
+    assert causes_table(nothing).colnames == table.colnames
+
+
+# ---- page ---------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """Collects what a page consists of, and checks that its tags match."""
+
+    void = {"meta", "img", "link", "br"}
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.open, self.links, self.images, self.words = [], [], [], [], []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        attrs = dict(attrs)
+        self.links += [attrs[key] for key in ("src", "href") if key in attrs]
+        if tag == "img":
+            self.images.append(attrs)
+        if tag not in self.void:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, text):
+        self.words.append(text)
+
+
+def test_page_is_self_contained_and_complete(found, content, tmp_path):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3, 2))
+    figure.subplots().plot([1, 2])
+    path = tmp_path / "gap.html"
+    write_html(found, path, figures={"Gap <of> the run": figure})
+    text = path.read_text(encoding="utf-8")
+    page = Page(text)
+    words = " ".join(" ".join(page.words).split())
+    for sentence in content["sentences"]:
+        assert sentence in words
+    assert all(link.startswith("data:image/png;base64,") for link in page.links)
+    assert not re.search(r"https?://|<script|@import|url\(", text)
+    (image,) = page.images
+    assert image["alt"] == "Gap <of> the run"
+    assert base64.b64decode(image["src"].partition(",")[2]).startswith(b"\x89PNG")
+    # what comes from a table or its name is no markup
+    assert "run <b>&" in words
+    assert "b" not in page.tags
+    assert "summary" in page.tags
+    assert len([w for w in page.words if re.fullmatch(r"\d{4}\.\d", w)]) == len(WAVELENGTH)
+
+
+def test_page_of_nothing_and_of_the_unknown(nothing, unknown, tmp_path):
+    for diagnosis, words in ((nothing, "no gap"), (unknown, "a real gap, unexplained")):
+        path = tmp_path / "gap.html"
+        write_html(diagnosis, path)
+        page = Page(path.read_text(encoding="utf-8"))
+        assert words in " ".join(" ".join(page.words).split())
+        assert page.images == []
+    assert [p.name for p in tmp_path.iterdir()] == ["gap.html"]
+
+
+def test_page_that_cannot_be_written(found, content, tmp_path):
+    with pytest.raises(GapError, match="cannot be written"):
+        write_html(found, tmp_path / "nowhere" / "gap.html", content=content)

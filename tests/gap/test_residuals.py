@@ -1,0 +1,285 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Where the gap lies: noise has no place, planted gaps have the right one."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from gap_data import (
+    WAVELENGTH,
+    chain,
+    clean_model,
+    fitted,
+    observed,
+    with_effect,
+    with_flux,
+)
+from scipy import stats
+
+from astropolcal import optics
+from astropolcal.chain import insert_optic
+from astropolcal.exceptions import GapError
+from astropolcal.gap.patterns import badly_separated, frame_blocks, frame_patterns
+from astropolcal.gap.remainder import _chance, outlying_frames, remainder
+from astropolcal.gap.residuals import Where, locate
+from astropolcal.observations import Observations
+from astropolcal.simulation import half_wave_plate_cycles
+
+N_SEEDS = 24
+
+
+@pytest.fixture(scope="module")
+def noise():
+    return [locate(clean_model(seed)) for seed in range(N_SEEDS)]
+
+
+def first(where, kind="pattern"):
+    return next(row for row in where.told if row["kind"] == kind)
+
+
+# ---- noise ---------------------------------------------------------------------------------
+
+
+def test_noise_is_silent(noise):
+    assert sum(bool(where.entries) for where in noise) <= 1
+    assert noise[0].words == "No axis stands out from the noise."
+
+
+def test_p_values_of_patterns_are_uniform_on_noise(noise):
+    tables = [where.table for where in noise]
+    p = np.concatenate([t["p_single"][t["kind"] == "pattern"] for t in tables])
+    # the p-values of one dataset depend on each other, those of two do not: no test over all
+    for level in (0.05, 0.1, 0.3, 0.5, 0.8):
+        assert level - 0.07 < np.mean(p < level) < level + 0.05
+    constant = [
+        t["p_single"][[d.startswith("harmonic 8") and "diff" in d for d in t["detail"]]][0]
+        for t in tables
+    ]
+    assert stats.kstest(constant, "uniform").pvalue > 0.01
+
+
+def test_p_values_of_places_are_uniform_on_noise(noise):
+    for axis in ("wavelength", "derotator", "beam"):
+        p = [float(where.table["p_single"][find(where, axis)]) for where in noise]
+        assert stats.kstest(p, "uniform").pvalue > 0.005, axis
+
+
+def find(where, axis):
+    rows = (where.table["axis"] == axis) & (where.table["kind"] == "place")
+    return np.flatnonzero(rows)[0]
+
+
+def test_corrected_values_are_never_below_single_ones(noise):
+    for where in noise[:3]:
+        assert np.all(where.table["p_value"] >= where.table["p_single"])
+        assert np.all((where.table["share"] >= 0) & (where.table["share"] <= 1))
+
+
+def test_expected_squares_of_labels_add_up():
+    model = clean_model()
+    from astropolcal.gap.residuals import _Whitened
+
+    data = _Whitened(model)
+    label = np.arange(model.problem.n_rows) % 3
+    assert data.freedom(label, 3).sum() == pytest.approx(data.n_freedom, rel=1e-9)
+
+
+# ---- planted gaps --------------------------------------------------------------------------
+
+
+def test_beam_gain_is_constant_in_the_plate_angle():
+    where = locate(fitted(observed(with_effect("beam_gain", imbalance=0.01))))
+    row = first(where)
+    assert row["axis"] == "hwp"
+    assert row["detail"] == "what is constant in the half-wave-plate angle, in the differences"
+    assert row["share"] > 0.5
+    assert "constant in the half-wave-plate angle" in where.words
+    null = [r for r in where.told if "null channel" in r["detail"]]
+    assert null
+    assert null[0]["share"] > 0.5
+
+
+def test_sharp_gap_is_found_at_its_wavelengths():
+    gain = np.where(np.arange(len(WAVELENGTH)) == 2, 0.004, 0.0)
+    true = insert_optic(chain(), optics.BeamGain(imbalance=gain, name="gain"), after="wollaston")
+    where = locate(fitted(observed(true)))
+    place = next(e for e in where.entries if e["axis"] == "wavelength")
+    assert place["detail"] == "1450 nm"
+    assert place["share"] > 0.6
+    assert first(where)["axis"] == "wavelength x hwp"
+
+
+def test_encoder_error_follows_the_angles():
+    where = locate(fitted(observed(with_effect("derotator_encoder", cosine=0.3))))
+    axes = {e["axis"] for e in where.entries if "dataset" not in e["detail"]}
+    assert axes & {"hwp x derotator", "hwp", "derotator"}
+    assert first(where)["axis"] in {"hwp x derotator", "hwp", "derotator", "time x hwp"}
+
+
+def test_order_within_a_block_is_found():
+    rng = np.random.default_rng(3)
+    # the angles in another order in each block, so that order is no angle
+    base = np.array([0, 45, 11.25, 56.25, 22.5, 67.5, 33.75, 78.75])
+    table = QTable(
+        {
+            "hwp": np.concatenate([rng.permutation(base) for _ in range(4)]) * u.deg,
+            "derotator": np.repeat([45, 70, 95, 120], 8) * u.deg,
+        }
+    )
+    slot = np.tile(np.arange(8), 4) / 7 - 0.5
+    data = with_flux(observed(table=table), 1 + 0.02 * slot)
+    row = first(locate(fitted(data)))
+    assert row["axis"] == "time"
+    assert "order of frames within a block" in row["detail"]
+
+
+def test_one_bad_derotator_angle_is_a_place():
+    rng = np.random.default_rng(4)
+    factor = np.where(np.arange(32) // 8 == 2, 1 + 0.01 * rng.normal(size=32), 1.0)
+    where = locate(fitted(with_flux(observed(), factor)))
+    assert "derotator at 95 deg" in [e["detail"] for e in where.entries]
+    assert "frames 16-23" in [e["detail"] for e in where.entries]
+
+
+def test_the_bad_dataset_is_named():
+    bad = with_flux(observed(name="bad"), 1 + 0.01 * np.cos(np.arange(32)))
+    where = locate(fitted([observed(seed=2, name="good"), bad]))
+    assert 'dataset "bad"' in [e["detail"] for e in where.entries]
+
+
+def test_sequential_shares_do_not_exceed_the_gap():
+    where = locate(fitted(with_flux(observed(), 1 + 0.01 * np.cos(np.arange(32)))))
+    taken = [e["share"] for e in where.entries if e["axis"] not in ("beam", "wavelength")]
+    assert max(taken) <= 1
+
+
+def test_entries_follow_the_contract():
+    where = locate(fitted(observed(with_effect("beam_gain", imbalance=0.01))))
+    for entry in where.entries:
+        assert set(entry) == {"axis", "detail", "share", "p_value"}
+        assert isinstance(entry["share"], float)
+        assert entry["p_value"] < where.alpha
+    assert isinstance(where.table, QTable)
+
+
+def test_no_freedom_is_an_error(monkeypatch):
+    model = clean_model()
+    monkeypatch.setattr(type(model.problem), "n_data", property(lambda self: 3))
+    with pytest.raises(GapError, match="3 data"):
+        locate(model)
+
+
+def test_words_of_a_gap_without_places():
+    table = QTable(
+        {
+            "axis": ["hwp"],
+            "detail": ["harmonic 4"],
+            "kind": ["pattern"],
+            "share": [0.42],
+            "p_single": [1e-9],
+            "p_value": [1e-7],
+        }
+    )
+    assert Where(table, 1.0, 1).words == "42 % of the gap follows harmonic 4."
+
+
+# ---- patterns ------------------------------------------------------------------------------
+
+
+def test_harmonics_that_look_alike_are_named_once():
+    words = [w for axis, w in frame_patterns(observed()) if axis == "hwp"]
+    # the eight angles are one period of harmonic 4: 16 would be the same as 0
+    assert "harmonic 4 of the half-wave-plate angle" in words
+    assert len(words) == len(set(words))
+    turn = half_wave_plate_cycles(np.arange(4) * 22.5 * u.deg, [45, 90] * u.deg)
+    words = [w for axis, w in frame_patterns(observed(table=turn)) if axis == "hwp"]
+    # at steps of 22.5 deg harmonic 12 is harmonic 4
+    assert "harmonic 12 of the half-wave-plate angle" not in words
+
+
+def test_a_full_turn_separates_the_harmonics():
+    full = half_wave_plate_cycles(np.arange(32) * 11.25 * u.deg, [45, 90] * u.deg)
+    assert badly_separated([observed(table=full)]) == {}
+    assert "harmonic 1 of the half-wave-plate angle" in badly_separated([observed()])
+
+
+def test_altitude_and_parallactic_angle_are_axes():
+    data = observed()
+    table = data.to_table()
+    for name, step in (("altitude", 1.0), ("parallactic", 2.0)):
+        table[name] = np.repeat(20 + step * np.arange(32), data.n_bins) * u.deg
+    axes = {axis for axis, _ in frame_patterns(Observations.from_table(table))}
+    assert {"altitude", "parallactic", "hwp x altitude"} <= axes
+
+
+def test_blocks_are_runs_at_one_angle():
+    blocks = frame_blocks(observed())
+    assert blocks.tolist() == np.repeat(np.arange(4), 8).tolist()
+
+
+# ---- remainder -----------------------------------------------------------------------------
+
+
+def test_largest_singular_value_of_noise():
+    rng = np.random.default_rng(5)
+    tops = [np.linalg.svd(rng.normal(size=(20, 60)))[1][0] ** 2 for _ in range(300)]
+    p = [_chance(top, 20, 60) for top in tops]
+    assert stats.kstest(p, "uniform").pvalue > 0.01
+
+
+def test_noise_has_no_remainder():
+    assert sum(len(remainder(clean_model(seed))) for seed in range(8)) == 0
+
+
+def test_remainder_of_a_beam_gain():
+    found = remainder(fitted(observed(with_effect("beam_gain", imbalance=0.01))))
+    assert found[0].channel == "difference"
+    assert found[0].share > 0.8
+    assert "constant in the half-wave-plate angle" in found[0].words
+    assert found[0].spectrum.shape == WAVELENGTH.shape
+
+
+def test_remainder_that_follows_nothing_says_so():
+    rng = np.random.default_rng(6)
+    found = remainder(fitted(with_flux(observed(), 1 + 0.01 * rng.normal(size=32))))
+    assert "follows no angle and no trend" in found[0].words
+
+
+# ---- frames at odds ------------------------------------------------------------------------
+
+
+def test_good_frames_are_not_accused():
+    assert sum(len(outlying_frames(clean_model(seed))) for seed in range(8)) == 0
+
+
+def test_drifting_lamp_is_no_fault():
+    lamp = 1 + 0.2 * np.linspace(0, 1, 32) ** 2
+    assert len(outlying_frames(fitted(observed(lamp=lamp)))) == 0
+
+
+def test_lamp_that_is_unstable_at_one_angle():
+    lamp = np.ones(32)
+    lamp[:8] = 1 - 0.5 * np.exp(-np.arange(8) / 3)
+    rows = outlying_frames(fitted(observed(lamp=lamp)))
+    assert rows["frames"][0] == "0-7"
+    assert "lamp unstable at derotator 45 deg" in rows["words"][0]
+
+
+def test_frame_whose_difference_departs():
+    factor = np.where(np.arange(32) == 11, 1.03, 1.0)
+    rows = outlying_frames(fitted(with_flux(observed(), factor)))
+    assert "11" in rows["frames"][rows["channel"] == "difference"].tolist()
+
+
+def test_faulty_frames_of_the_real_unpolarized_run(shared_data):
+    from astropolcal import instruments
+
+    data = Observations.read(
+        shared_data / "data" / "charis" / "dataset4_unpolarized_2025-10-05.ecsv"
+    )
+    chains = instruments.get("charis").chains_for([data], derotator="elliptical")
+    model = fitted(data, chains)
+    rows = outlying_frames(model)
+    assert rows["frames"][0] == "0-7"
+    assert rows["sigma"][0] > 30
+    assert "lamp unstable at derotator 45 deg" in rows["words"][0]

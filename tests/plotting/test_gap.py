@@ -1,0 +1,105 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Figures of a diagnosis show the numbers of the diagnosis."""
+
+import astropy.units as u
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from astropolcal import instruments, optics
+from astropolcal.chain import insert_optic
+from astropolcal.exceptions import ParameterError
+from astropolcal.gap import diagnose
+from astropolcal.gap.residuals import locate
+from astropolcal.plotting.gap import (
+    plot_effect_scores,
+    plot_gap_maps,
+    plot_gap_spectrum,
+    plot_where,
+)
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+ALL = [plot_effect_scores, plot_gap_maps, plot_gap_spectrum, plot_where]
+WAVELENGTH = [1200, 1400, 1600, 1900, 2200] * u.nm
+
+
+def make(imbalance):
+    chain = instruments.get("charis").chain(wavelength=WAVELENGTH, derotator="linear")
+    gain = optics.BeamGain(imbalance=np.full(5, imbalance), name="gain")
+    frames = half_wave_plate_cycles(derotator=[45, 70, 95] * u.deg)
+    true = insert_optic(chain, gain, after="wollaston")
+    data = simulate(true, WAVELENGTH, frames, flux=1e6, seed=1, name="lamp")
+    mask = np.zeros((24, 5), dtype=bool)
+    mask[3, 2] = True
+    effects = ["beam_gain", "hwp_diattenuation", "source_circular"]
+    return diagnose(
+        chain, data.with_mask(mask, "cosmic ray"), effects=effects, cross_validate=False
+    )
+
+
+@pytest.fixture(scope="module")
+def gap():
+    return make(0.02)
+
+
+@pytest.fixture(scope="module")
+def none():
+    return make(0.0)
+
+
+@pytest.mark.parametrize("plot", ALL)
+def test_a_figure_without_traces(plot, gap, none):
+    before = dict(mpl.rcParams)
+    for diagnosis in (gap, none):
+        own = Figure()
+        assert plot(diagnosis, figure=own) is own
+        own.canvas.draw()
+    assert dict(mpl.rcParams) == before
+
+
+def test_spectrum_shows_the_residuals(gap):
+    axes = plot_gap_spectrum(gap).axes[0]
+    lines = {line.get_label(): line.get_ydata() for line in axes.lines}
+    residual = gap.nominal.problem.differences(gap.nominal.fit.coefficients)[0][0]
+    valid = gap.nominal.problem.channels[0].valid
+    rms = 100 * np.sqrt((residual**2).sum(axis=1) / valid.sum(axis=1))
+    np.testing.assert_allclose(lines["before"], rms, rtol=1e-9)
+    assert np.all(lines["after"] < lines["before"])
+
+
+def test_maps_have_one_scale_and_grey_masks(gap):
+    figure = plot_gap_maps(gap)
+    meshes = [axes.collections[0] for axes in figure.axes[:2]]
+    assert meshes[0].get_clim() == meshes[1].get_clim()
+    assert meshes[0].get_clim()[0] == -meshes[0].get_clim()[1]
+    assert np.ma.getmaskarray(meshes[0].get_array()).sum() == 1
+    assert "before" in figure.axes[0].get_title(loc="left")
+
+
+def test_map_of_the_sums(gap):
+    assert "sum" in plot_gap_maps(gap, channel="sum").get_suptitle()
+    with pytest.raises(ParameterError, match="product"):
+        plot_gap_maps(gap, channel="product")
+
+
+def test_scores_mark_what_was_found(gap, none):
+    figure = plot_effect_scores(gap)
+    labels = [t.get_text() for t in figure.axes[0].get_yticklabels()]
+    assert labels[0] == gap.causes[0].name == "beam_gain"
+    widths = [patch.get_width() for patch in figure.axes[0].patches]
+    assert widths == sorted(widths, reverse=True)
+    assert widths[0] ** 2 == pytest.approx(gap.scores[0].statistic / gap.scores[0].scale)
+    assert "found" in [t.get_text() for t in figure.legends[0].get_texts()]
+    assert "found" not in [t.get_text() for t in plot_effect_scores(none).legends[0].get_texts()]
+
+
+def test_shares_are_those_of_the_table(gap, none):
+    where = locate(gap.nominal)
+    axes = plot_where(where).axes[0]
+    widths = [patch.get_width() for patch in axes.patches]
+    told = where.told
+    assert widths == pytest.approx(list(100 * told["share"][told["kind"] == "pattern"]))
+    assert plot_where(gap).axes[0].patches[0].get_width() == pytest.approx(widths[0])
+    texts = [t.get_text() for t in plot_where(none).axes[0].texts]
+    assert "nothing beyond the noise" in texts

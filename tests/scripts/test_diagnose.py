@@ -1,0 +1,148 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""``astropolcal diagnose``."""
+
+import json
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import Calibration, Observations, calibrate, instruments
+from astropolcal.chain import leaves
+from astropolcal.gap import EFFECTS, get_effect
+from astropolcal.gap.effects import Context
+from astropolcal.scripts.main import main
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+CHARIS = instruments.get("charis")
+WAVELENGTH = CHARIS.wavelength[[2, 6, 10, 14, 18, 20]]
+SIZE = 0.012
+FEW = ["--effects", "beam_gain,hwp_diattenuation"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Tables of a polarized and an unpolarized run with unequal beam gains."""
+    folder = tmp_path_factory.mktemp("tables")
+    frames = half_wave_plate_cycles(derotator=[45, 62.5, 80, 100] * u.deg)
+    meta = CHARIS.published_meta() | {
+        "yjh50_dichroic": "out",
+        "nasmyth_beam_switcher": "not installed",
+    }
+    for i, source in enumerate(("polarized", "unpolarized")):
+        chain = CHARIS.chain(source, wavelength=WAVELENGTH, derotator="linear")
+        if source == "unpolarized":
+            chain["fold_mirror"].diattenuation = np.full(len(WAVELENGTH), 0.01)
+        context = Context(WAVELENGTH.to_value(u.um), 1e6)
+        (edited,) = get_effect("beam_gain").edit([chain], context).chains
+        edited["gap_beam_gain"].imbalance = np.full(len(WAVELENGTH), SIZE)
+        observations = simulate(edited, WAVELENGTH, frames, seed=i, meta=meta | {"source": source})
+        observations.write(folder / f"{source}.ecsv")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cal(folder):
+    """A calibration of the polarized run, with a linear derotator."""
+    table = Observations.read(folder / "polarized.ecsv")
+    chains = CHARIS.chains_for([table], derotator="linear")
+    calibrate(chains, [table], instrument="charis", cross_validate=False).write(
+        folder / "cal.asdf", overwrite=True
+    )
+    return folder / "cal.asdf"
+
+
+def run(tmp_path, *arguments):
+    out = tmp_path / "out.json"
+    assert main(["diagnose", "-q", "--json", str(out), *map(str, arguments)]) == 0
+    return json.loads(out.read_text())
+
+
+def complaint(capsys, *arguments):
+    try:
+        status = main(["diagnose", *map(str, arguments)])
+    except SystemExit as stop:
+        status = stop.code
+    captured = capsys.readouterr()
+    assert status == 2
+    (line,) = [line for line in captured.err.splitlines() if "error" in line]
+    return line
+
+
+def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys):
+    tables = [folder / "polarized.ecsv", folder / "unpolarized.ecsv"]
+    report, saved = tmp_path / "gap.html", tmp_path / "improved.asdf"
+    outputs = ["--report", report, "--save", saved, "--json", tmp_path / "out.json"]
+    arguments = [*tables, "--derotator", "linear", *FEW, *outputs]
+    assert main(["diagnose", *map(str, arguments)]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("The model misses frames left out of the fit")
+    assert str(report) in printed.out
+    assert "astropolcal: scanning the effects" in printed.err
+    content = json.loads((tmp_path / "out.json").read_text())
+    assert content["verdict"] == "effect"
+    assert [cause["effect"] for cause in content["causes"]] == ["beam_gain"]
+    assert content["nominal"].count(" | ") == 6
+    assert [d["name"] for d in content["accuracy_after"]["datasets"]] == [
+        "polarized",
+        "unpolarized",
+    ]
+    assert content["accuracy_after"]["targets"][0]["missing"] == ["on_sky"]
+    assert content["sentences"][1] in report.read_text(encoding="utf-8")
+    check_improved(saved, content)
+
+
+def check_improved(saved, content):
+    improved = Calibration.read(saved)
+    assert improved.converged
+    assert improved.instrument == "charis"
+    for chain in improved.chains:
+        gain = chain["gap_beam_gain"].imbalance
+        assert gain.fixed
+        np.testing.assert_allclose(gain.value, SIZE, rtol=0.05)
+        assert list(leaves(chain))[-1].name in ("gap_beam_gain", "wollaston")
+    (entry,) = content["causes"][0]["parameters"].values()
+    np.testing.assert_allclose(gain.value, entry["value"], rtol=1e-6)
+
+
+def test_model_of_a_calibration(folder, cal, tmp_path):
+    content = run(tmp_path, cal, folder / "polarized.ecsv", *FEW)
+    assert content["causes"][0]["effect"] == "beam_gain"
+    # a linear derotator, as in the calibration
+    assert "derotator.retardance" in content["nominal"]
+    edited = run(tmp_path, cal, folder / "polarized.ecsv", *FEW, "--fix", "hwp.theta=0")
+    assert edited["n_free"] == content["n_free"] - 1
+
+
+def test_edits_of_the_model(folder, tmp_path):
+    table = folder / "polarized.ecsv"
+    elliptical = run(tmp_path, table, *FEW)
+    assert "derotator.diagonal" in elliptical["nominal"]
+    edits = ["--derotator", "linear", "--free", "wollaston.theta", "--fix", "derotator.theta"]
+    content = run(tmp_path, table, "--effects", "beam_gain", *edits)
+    assert "wollaston.theta" in content["nominal"]
+    assert "derotator.theta" not in content["nominal"]
+    assert "derotator.retardance" in content["nominal"]
+
+
+def test_list_of_effects(capsys):
+    assert main(["diagnose", "--effects", "help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(EFFECTS)
+
+
+def test_bad_input(folder, cal, tmp_path, capsys):
+    table, dark = folder / "polarized.ecsv", folder / "unpolarized.ecsv"
+    assert "at least one FILE" in complaint(capsys)
+    assert "at least one FILE" in complaint(capsys, cal)
+    assert "did you mean 'beam_gain'" in complaint(capsys, table, "--effects", "beam_gian")
+    assert "separated by commas" in complaint(capsys, table, "--effects", ",")
+    assert "no folder" in complaint(capsys, table, "--report", tmp_path / "no" / "gap.html")
+    assert "same frames" in complaint(capsys, table, table)
+    assert "--derotator" in complaint(capsys, cal, table, "--derotator", "linear")
+    line = complaint(capsys, cal, dark)
+    assert "unpolarized.ecsv: its source is 'unpolarized'" in line
+    assert "'polarized' only" in line
+    assert "nowhere.ecsv" in complaint(capsys, folder / "nowhere.ecsv")
+    assert "mirror" in complaint(capsys, table, "--without", "mirror")
+    assert "no parameter 'nonsense'" in complaint(capsys, table, "--free", "hwp.nonsense")
