@@ -109,8 +109,7 @@ def accuracies(model, cross_validate=True):
         ],
         "wavelength_nm": _number(1e3 * model.problem.wavelength),
         "rms_percent_per_wavelength": _per_wavelength(measurement, judged),
-        "targets": _targets(model, tables, "s_mean")
-        + (_targets(model, tables, "s_cv") if cross_validate else []),
+        "targets": _targets(model, tables, "s_mean") + _targets(model, tables, "s_cv"),
     }
 
 

@@ -114,7 +114,7 @@ def scan(model, effects, *, residual=None, nominal=None):
     total, freedom = residual @ residual, model.degrees_of_freedom(nominal)
     context, chains, scores = model.context, model.chains, []
     for effect in effects:
-        if effect.name in model.added or not effect.applies(chains):
+        if effect.name in model.added or effect.absorbed_by or not effect.applies(chains):
             continue
         basis = effect_tangent(model, effect, nominal, context)
         rank = basis.shape[1]

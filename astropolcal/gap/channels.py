@@ -155,7 +155,7 @@ class _Lamp:
         var = 1 / np.maximum((weight**2).sum(axis=0), 1e-300)
         seen = (weight > 0).any(axis=0)
         self.sequence = 2 * sequence - 1
-        self.degree = _best_degree(self.sequence, common, seen, saturating)
+        self.degree = _best_degree(self.sequence, common, seen)
         left, freedom = _left_over(self._curve(self.degree), saturating, common, seen)
         scatter = left @ left / freedom if freedom > 0 else 0.0
         #: Standard deviation of the flicker, in the logarithm of the flux.
@@ -215,12 +215,13 @@ def _left_over(curve, saturating, values, seen):
     return left, int(seen.sum()) - int(rank)
 
 
-def _best_degree(sequence, values, seen, saturating):
+def _best_degree(sequence, values, seen):
     """Return the degree of the drift by the Bayesian information criterion."""
     best, degree, n = np.inf, 0, int(seen.sum())
+    nothing = np.zeros((len(sequence), 0))
     for trial in range(_LARGEST_DEGREE + 1):
         curve = np.polynomial.legendre.legvander(sequence, trial)
-        left, freedom = _left_over(curve, saturating, values, seen)
+        left, freedom = _left_over(curve, nothing, values, seen)
         if freedom < 3:
             break
         score = n * np.log(max(left @ left / n, 1e-24)) + (n - freedom) * np.log(n)

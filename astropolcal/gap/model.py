@@ -12,11 +12,14 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap.effects import Context
 from astropolcal.gap.problem import Fit, GapProblem
+from astropolcal.measurement import parameter_table
 from astropolcal.units import canonical_factor
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
 _ROUNDS = 3
+# a fit with more than this mean square may sit in a wrong minimum
+_FAR = 2.0
 # directions in which a size at its limit does less than this to the data, in units of the
 # noise, are not looked at; nor those of which the model takes up all but this share
 _VISIBLE = 1.0
@@ -146,10 +149,18 @@ class Model:
         vector = self.problem.vector(self.fit.coefficients)
         for parameter in self.added[name]:
             slot = self.problem.free.by_name[parameter.name]
-            neutral = 1.0 if slot.name.split(".")[1].startswith("retained") else 0.0
-            if np.abs(vector[slot.slice] - neutral).max() > _canonical(parameter.limit):
+            size = np.abs(vector[slot.slice] - _neutral(parameter))
+            if size.max() > _canonical(parameter.limit):
                 return False
         return True
+
+
+def _neutral(parameter):
+    """Return the value at which an effect is absent, canonical; scalar or one a wavelength."""
+    if parameter.neutral is not None:
+        value = u.Quantity(parameter.neutral)
+        return value.value * canonical_factor(value.unit)
+    return 1.0 if parameter.name.split(".")[1].startswith("retained") else 0.0
 
 
 def _laws(parameters):
@@ -216,13 +227,27 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
         return Model(problem, Fit(problem.start, float(residual @ residual), False))
     if like is None:
         problem.settle_noise()
-    found = problem.fit()
+    found = _lowest(problem, chains)
     for _ in range(_ROUNDS - 1 if like is None else 0):
         problem.settle_noise(found.coefficients)
         found = problem.fit(found.coefficients)
     if not (found.converged and np.isfinite(found.chi2)):
         raise _no_convergence()
     return Model(problem, found)
+
+
+def _lowest(problem, chains):
+    """Fit from the calibration and, where that is far from the data, from the chains given."""
+    found = problem.fit()
+    if found.chi2 < _FAR * problem.n_data:
+        return found
+    known = parameter_table(chains)
+    vector = problem.vector(problem.start)
+    for slot in problem.free.slots:
+        value = np.ravel(known[slot.name][0].value) * slot.factor
+        vector[slot.slice] = value if value.size in (1, slot.size) else vector[slot.slice]
+    other = problem.fit(np.clip(problem._coefficients(vector), problem.low, problem.high))
+    return other if other.converged and other.chi2 < found.chi2 else found
 
 
 def _no_convergence():

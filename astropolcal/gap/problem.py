@@ -28,6 +28,8 @@ _HOLD = 1e-6
 # count, and above what no step leads down
 _FIRST_DAMPING, _FREE, _STUCK = 1e-6, 1e-3, 1e3
 _MAX_DAMPINGS = 14
+# a coefficient closer to its bound than this (canonical units) sits at it
+_AT_BOUND = 1e-9
 
 
 def law_basis(wavelength, degree):
@@ -260,7 +262,7 @@ class GapProblem:
             for _ in range(_MAX_DAMPINGS):
                 trial = np.clip(q + self._step(q, live, *reduced, damping), self.low, self.high)
                 there, new = self._cost(trial, take)
-                if np.isfinite(new) and new <= cost:
+                if np.isfinite(new) and new <= cost * (1 + 1e-12):
                     break
                 damping = max(10 * damping, _FIRST_DAMPING)
             else:
@@ -306,8 +308,13 @@ class GapProblem:
     # ---- what follows from a fit --------------------------------------------------------
 
     def tangent(self, coefficients):
-        """Return an orthonormal basis of the derivatives, shape (n_rows, rank)."""
-        return orthonormal(self.jacobian(coefficients))
+        """
+        Return an orthonormal basis of the derivatives, shape (n_rows, rank).
+
+        A coefficient at its bound cannot take anything up and is left out.
+        """
+        inside = (coefficients > self.low + _AT_BOUND) & (coefficients < self.high - _AT_BOUND)
+        return orthonormal(self.jacobian(coefficients)[:, inside])
 
     @property
     def n_data(self):

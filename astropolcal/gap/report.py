@@ -271,7 +271,7 @@ def summary(diagnosis, content=None):
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> data = simulate(chain, wavelength, frames, seed=1)
     >>> print(summary(diagnose(chain, data)).splitlines()[0])
-    The model agrees with the measurements: frames left out of the fit are predicted
+    The model agrees with the measurements: it predicts frames left out of the fit
     """
     content = to_dict(diagnosis) if content is None else content
     parts = [

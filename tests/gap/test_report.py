@@ -234,6 +234,10 @@ def test_an_alternative_has_no_size_and_the_nominal_model_no_prediction(found):
     assert content["causes"][0]["parameters"] == {}
     assert content["causes"][0]["gap_cv_before_percent"] is None
     assert content["causes"][0]["gap_cv_after_percent"] == found.held_out[0].percent
+    before, after = (content[f"accuracy_{w}"]["targets"][-1] for w in ("before", "after"))
+    assert before["s_p_percent"] is None
+    assert after["s_p_percent"] > 0
+    assert " - -> " in summary(found, content)
 
 
 def test_what_the_data_do_not_tell_is_not_given_as_a_size():
