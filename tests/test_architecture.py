@@ -37,6 +37,7 @@ HEAVY = (
     "dask",
     "distributed",
     "emcee",
+    "jinja2",
     "h5py",
     "matplotlib",
     "photutils",

@@ -104,7 +104,7 @@ def sample(
         belongs to another run, is in use, or cannot be written.
     CalibrationFileError
         If the calibration was read from a file, which holds no data, and
-        `~astropolcal.Calibration.with_observations` did not bring them back.
+        `~astropolcal.calibration.Calibration.with_observations` did not bring them back.
 
     Notes
     -----

@@ -98,7 +98,7 @@ class Weighting:
         """
         Return the noise that the residuals of a fit with this noise show.
 
-        ``whitened`` is `around` of the measurement with this noise, if at hand.
+        ``whitened`` is the linear problem of the measurement with this noise, if at hand.
         """
         if not self.from_residuals:
             return self

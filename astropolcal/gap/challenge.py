@@ -222,11 +222,11 @@ def run_challenge(
     snr : (float, float)
         Range of the signal-to-noise ratio, drawn evenly in its logarithm.
     kinds : sequence of str
-        Of `KINDS`, drawn with the frequencies given there.
+        Of ``KINDS``, drawn with the frequencies given there.
     setup : Setup, optional
         What is simulated.
     client : optional
-        A ``dask.distributed.Client``, or an executor of `concurrent.futures`;
+        A ``dask.distributed.Client``, or an executor of ``concurrent.futures``;
         by default they run here, one after the other.
     checkpoint : path-like, optional
         File to which each record is appended as a line of JSON. A run with the
@@ -363,7 +363,7 @@ class ChallengeResult:
         Parameters
         ----------
         *kinds : str
-            Of `KINDS`.
+            Of ``KINDS``.
         least, below : float
             Range of the signal-to-noise ratio of the weakest effect.
 

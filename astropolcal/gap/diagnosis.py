@@ -23,6 +23,8 @@ from astropolcal.gap.shrinkage import frame_groups, held_out
 __all__ = ["Cause", "Diagnosis", "diagnose"]
 
 _MOST_CAUSES = 6
+# so many effects may be refused by left-out frames before the selection ends
+_MOST_REFUSED = 3
 # an effect that explains less of a significant gap than this is no cause of it
 _LEAST_SHARE = 0.05
 # above this mean square the residuals are no noise, and held-out frames have the last word
@@ -135,13 +137,15 @@ class Diagnosis:
 
     @property
     def gap_before_percent(self):
-        """Gap of the nominal model on left-out frames, in percent."""
-        return self.held_out[0].percent
+        """Gap of the nominal model on left-out frames (else of its fit), in percent."""
+        if self.held_out and not any(c.effect.kind == "discrete" for c in self.causes):
+            return self.held_out[0].percent
+        return _gap_of_fit(self.nominal)
 
     @property
     def gap_after_percent(self):
-        """Gap of the improved model on left-out frames, in percent."""
-        return self.held_out[-1].percent
+        """Gap of the improved model on left-out frames (else of its fit), in percent."""
+        return self.held_out[-1].percent if self.held_out else _gap_of_fit(self.improved)
 
     @property
     def chains(self):
@@ -154,6 +158,13 @@ class Diagnosis:
             f"<Diagnosis: {self.verdict} ({names}); gap {self.gap_before_percent:.3g} % -> "
             f"{self.gap_after_percent:.3g} %>"
         )
+
+
+def _gap_of_fit(model):
+    """Return the root mean square of the differences' residuals, in percent."""
+    gaps = model.problem.differences(model.fit.coefficients)
+    parts = [g[0][c.valid] for g, c in zip(gaps, model.problem.channels, strict=True)]
+    return 100 * float(np.sqrt(np.mean(np.square(np.concatenate(parts)))))
 
 
 def diagnose(
@@ -247,7 +258,10 @@ def _start(calibration, observations, library, alpha, say):
     chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
     if len(chains) != len(observations):
         raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
-    given = nominal_calibration(chains, observations) if given is None else given
+    if given is None:
+        given = nominal_calibration(chains, observations)
+    elif given.measurement is None:
+        given = given.with_observations(observations)
     if _misfit(given) < _WRONG_SIGN:
         return nominal_model(chains, observations, calibration=given), []
     found = []
@@ -294,7 +308,8 @@ def _select(base, scores, smooth, alpha, groups, say):
     """Add effects one by one; return candidates, the last model and its held-out errors."""
     model, selected = base, []
     history = [_errors(base, groups)]
-    while len(selected) < _MOST_CAUSES:
+    refused = 0
+    while len(selected) < _MOST_CAUSES and refused < _MOST_REFUSED:
         candidate = choose(model, scores, alpha=alpha)
         if candidate is None or not _worthy(model, candidate):
             break
@@ -302,7 +317,9 @@ def _select(base, scores, smooth, alpha, groups, say):
         say(f"left-out frames with: {candidate.score.effect.title}")
         errors = _errors(candidate.model, groups)
         if not _holds(errors, history[-1], _mean_square(candidate.model)):
-            break
+            refused += 1
+            scores = [score for score in scores if score.effect.name != candidate.name]
+            continue
         selected.append(candidate)
         history.append(errors)
         model = candidate.model
@@ -322,7 +339,9 @@ def _holds(errors, before, scatter):
     if errors is None:
         return True
     # among pure noise the scan is to be trusted, unless left-out frames speak against it
-    return errors.better_than(before) > (-2 if scatter < _STRUCTURED else 1)
+    if scatter < _STRUCTURED:
+        return errors.better_than(before) > -2
+    return errors.better_than(before) > 1 and errors.squares.sum() < before.squares.sum()
 
 
 def _errors(model, groups):

@@ -168,7 +168,7 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=5):
     members : dict of str to Model, optional
         The model fitted with each of the effects, if known already.
     candidates : sequence of Exposure, optional
-        By default those of `exposures`.
+        By default those of ``exposures``.
     limit : int
         Most exposures to return.
 

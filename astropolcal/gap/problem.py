@@ -457,8 +457,8 @@ def _noise(channel, residual):
                 raise FitError("no errors in the table, and the residuals tell no noise")
             sigma[i] = rough
             continue
-        factor = rough / _roughness_of(sigma[i], channel.valid)
-        sigma[i] *= max(1.0, factor)
+        if np.isfinite(rough):
+            sigma[i] *= max(1.0, rough / _roughness_of(sigma[i], channel.valid))
         sigma[i] = np.where(stated, sigma[i], np.median(sigma[i][stated]))
     return sigma
 

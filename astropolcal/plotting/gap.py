@@ -365,7 +365,7 @@ def plot_where(diagnosis, *, limit=12, figure=None):
     ----------
     diagnosis : Diagnosis or Where
         The diagnosis, whose nominal model is looked at, or what
-        `~astropolcal.gap.residuals.locate` found.
+        `~astropolcal.gap.locate` found.
     limit : int
         Most bars of either kind.
     figure : `~matplotlib.figure.Figure`, optional

@@ -94,6 +94,22 @@ def test_held_out_errors_of_a_right_model_are_noise():
     assert 0.7 < errors.chi2 < 2.0
 
 
+def test_without_left_out_frames_the_gap_is_that_of_the_fit():
+    found = diagnose(data.chain(), data.observed(), cross_validate=False)
+    assert found.held_out == []
+    assert found.gap_before_percent == found.gap_after_percent
+    assert found.gap_before_percent == pytest.approx(found.noise_floor_percent, rel=0.25)
+
+
+def test_calibration_from_a_file(tmp_path):
+    from astropolcal import Calibration, calibrate
+
+    observations = data.observed()
+    calibrate(data.chain(), observations).write(tmp_path / "cal.asdf")
+    found = diagnose(Calibration.read(tmp_path / "cal.asdf"), observations)
+    assert found.verdict == "none"
+
+
 def test_nothing_significant_chooses_nothing():
     model = data.clean_model()
     assert choose(model, scan(model, [EFFECTS["beam_gain"]])) is None

@@ -182,7 +182,7 @@ class Effect(ABC):
     title : str
         What it is, for a reader.
     kind : str
-        One of `KINDS`.
+        One of ``KINDS``.
     place : str
         Where in the instrument.
     shows : str
