@@ -315,8 +315,9 @@ def _select(base, scores, smooth, alpha, groups, say):
             break
         candidate = freed(model, candidate)
         say(f"left-out frames with: {candidate.score.effect.title}")
-        errors = _errors(candidate.model, groups)
-        if not _holds(errors, history[-1], _mean_square(candidate.model)):
+        errors = _errors(candidate.model, groups) if candidate.physical else None
+        scatter = _mean_square(candidate.model)
+        if not (candidate.physical and _holds(errors, history[-1], scatter)):
             refused += 1
             scores = [score for score in scores if score.effect.name != candidate.name]
             continue

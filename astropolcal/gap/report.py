@@ -352,7 +352,7 @@ def write_html(diagnosis, path, *, figures=None, content=None):
     path : path-like
         The file; an existing one is replaced.
     figures : dict of str to `~matplotlib.figure.Figure`, optional
-        Figures by caption, such as those of `astropolcal.plotting.gap`. They
+        Figures by caption, such as those of `astropolcal.plotting`. They
         become part of the page.
     content : dict, optional
         What `to_dict` returned for the diagnosis, if it is known already.
