@@ -346,6 +346,9 @@ def test_inconsistent_posterior_is_not_written(sampled, path, change, message):
     ],
 )
 def test_changed_posterior_is_refused(sampled, path, old, new, message):
+    if old.startswith(b"r_hat"):
+        # without it there is no such array in the file
+        pytest.importorskip("arviz_stats")
     sampled.write(path)
     assert_refused(path, replaced(path.read_bytes(), old, new), message)
 

@@ -227,6 +227,7 @@ def test_bad_burn_in(posterior, burn_in):
 
 
 def test_thinned_posterior_keeps_what_the_run_says(posterior):
+    pytest.importorskip("arviz_stats")
     thinned = posterior.thinned()
     start = posterior.burn_in
     assert thinned.log_prob.size <= 4000
