@@ -134,7 +134,7 @@ class Model:
         errors = self.problem.errors(self.fit.coefficients)
         found = {}
         for parameter in self.added[name]:
-            slot, where = self.problem.free.by_name[parameter.name], None
+            slot = self.problem.free.by_name[parameter.name]
             where = self.problem.slices[parameter.name]
             found[parameter.name] = (
                 self.fit.coefficients[where] / slot.factor,
