@@ -16,7 +16,7 @@ changes from frame to frame.
 
 import numpy as np
 
-from astropolcal.chain import leaves, with_beam
+from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError
 from astropolcal.optics import FrameOptic
 
@@ -54,6 +54,15 @@ class _Node:
         if self.per_frame:
             return np.ascontiguousarray(np.moveaxis(matrix, 1, -1))
         return matrix if matrix.ndim == 3 else matrix.reshape(-1, 4, 4)
+
+
+def _for_beam(leaf, beam):
+    """Return an optic as it acts on a beam."""
+    if not hasattr(leaf, "beam"):
+        return leaf
+    copy = leaf.copy()
+    copy.beam = beam
+    return copy
 
 
 def _of_beam(leaf, positions):
@@ -118,8 +127,11 @@ class Propagator:
         make = [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(self.leaves)]
         self._common = make[:split]
         self._arms = [
-            [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(leaves(arm))][split:]
-            for arm in (with_beam(chain, "right"), with_beam(chain, "left"))
+            [
+                _Node(i, _for_beam(leaf, beam), wavelength, positions)
+                for i, leaf in enumerate(self.leaves[split:], start=split)
+            ]
+            for beam in ("right", "left")
         ]
 
     def values(self):

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments
-from astropolcal.chain import leaves
+from astropolcal.chain import leaves, stages
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import scan
 from astropolcal.gap.channels import Channels
@@ -80,13 +80,23 @@ class Setup:
         usual = instruments.get(self.instrument).wavelength
         return np.geomspace(usual.min(), usual.max(), self.n_wavelengths)
 
+    @property
+    def sources(self):
+        """The sources of the instrument that need nothing but plate and derotator."""
+        return [
+            name for name in instruments.get(self.instrument).sources if self._is_internal(name)
+        ]
+
+    def _is_internal(self, source):
+        return set(stages(self._chain(source))) <= {"hwp", "derotator"}
+
+    def _chain(self, source):
+        instrument = instruments.get(self.instrument)
+        return instrument.chain(source, wavelength=self.wavelength, **self.options)
+
     def chains(self):
         """Return the nominal chain of each internal source, at its starting values."""
-        instrument = instruments.get(self.instrument)
-        return [
-            instrument.chain(source, wavelength=self.wavelength, **self.options)
-            for source in instrument.sources
-        ]
+        return [self._chain(source) for source in self.sources]
 
     def frames(self):
         """Return the frames of one dataset."""
@@ -178,7 +188,7 @@ class _Bench:
                 name=source,
                 meta={"instrument": instrument.name, "source": source},
             )
-            for chain, source in zip(self.chains, instrument.sources, strict=True)
+            for chain, source in zip(self.chains, setup.sources, strict=True)
         ]
         middle = [np.median(o.flux_right + o.flux_left) / 2 for o in self.clean]
         self.context = Context(self.wavelength.to_value(u.um), float(np.median(middle)))

@@ -26,6 +26,8 @@ _MOST_REFITTED = 8
 # an effect fits nearly as well as another if it is this close in evidence
 _SAME_EVIDENCE = 10.0
 _WORTH_A_REFIT = 0.4
+# the first fits end after so many steps; those this close to the best are carried on
+_FIRST_STEPS, _NEARLY = 12, 0.8
 
 
 @dataclass
@@ -227,6 +229,11 @@ def choose(model, scores, *, alpha=ALPHA):
         :_MOST_REFITTED
     ]
     fitted = [_fitted(model, score, freedom) for score in worth]
+    best = max(c.evidence for c in fitted)
+    fitted = [
+        _polished(model, c, freedom) if c.evidence > min(_NEARLY * best, best - 20) else c
+        for c in fitted
+    ]
     # what is out of its physical limits is no explanation while another one is left
     fitted.sort(key=lambda c: (not c.physical, -c.evidence))
     top = fitted[0]
@@ -244,7 +251,16 @@ def choose(model, scores, *, alpha=ALPHA):
 
 
 def _fitted(model, score, freedom):
-    fresh = model.with_effect(score.effect)
+    return _candidate(model, score, model.with_effect(score.effect, steps=_FIRST_STEPS), freedom)
+
+
+def _polished(model, candidate, freedom):
+    if candidate.model.fit.converged:
+        return candidate
+    return _candidate(model, candidate.score, candidate.model.polished(), freedom)
+
+
+def _candidate(model, score, fresh, freedom):
     physical = fresh.is_physical(score.effect.name)
     gain = model.fit.chi2 - fresh.fit.chi2
     scale = max(1.0, fresh.fit.chi2 / max(freedom, 1))

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from astropolcal.calibration import Calibration
 from astropolcal.exceptions import GapError
-from astropolcal.gap.attribution import ALPHA, Candidate, Score, choose, freed, scan
+from astropolcal.gap.alternatives import starting_model
+from astropolcal.gap.attribution import ALPHA, choose, freed, scan
 from astropolcal.gap.effects import EFFECTS, get_effect
-from astropolcal.gap.model import Model, nominal_calibration, nominal_model
+from astropolcal.gap.model import Model
 from astropolcal.gap.shrinkage import frame_groups, held_out
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
@@ -29,8 +29,6 @@ _MOST_REFUSED = 3
 _LEAST_SHARE = 0.05
 # above this mean square the residuals are no noise, and held-out frames have the last word
 _STRUCTURED = 1.5
-# discrete alternatives are tried where double differences are off by more than this
-_WRONG_SIGN = 0.02
 _REMAINDER = 1e-4
 
 
@@ -224,7 +222,7 @@ def diagnose(
     groups = frame_groups(observations) if cross_validate else None
     _check_instruments(observations)
     say("fitting the nominal model")
-    nominal, causes = _start(calibration, observations, library, alpha, say)
+    nominal, causes = starting_model(calibration, observations, library, say)
     base = causes[-1].model if causes else nominal
     say("scanning the effects")
     smooth = [effect for effect in library if effect.kind != "discrete"]
@@ -248,60 +246,11 @@ def _check_instruments(observations):
         raise GapError(f"the datasets are of different instruments: {', '.join(sorted(named))}")
 
 
-# ---- the nominal model and discrete alternatives ------------------------------------------
-
-
-def _start(calibration, observations, library, alpha, say):
-    """Return the nominal model, and the discrete alternative that beats it, if any."""
-    given = calibration if isinstance(calibration, Calibration) else None
-    chains = calibration.chains if given else calibration
-    chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
-    if len(chains) != len(observations):
-        raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
-    if given is None:
-        given = nominal_calibration(chains, observations)
-    elif given.measurement is None:
-        given = given.with_observations(observations)
-    if _misfit(given) < _WRONG_SIGN:
-        return nominal_model(chains, observations, calibration=given), []
-    found = []
-    for effect in (e for e in library if e.kind == "discrete" and e.applies(chains)):
-        say(f"trying: {effect.title}")
-        other = nominal_calibration(effect.edit(chains, None).chains, observations)
-        found.append((_misfit(other), effect, other))
-    return _best_alternative(chains, observations, given, found)
-
-
-def _misfit(calibration):
-    """Return the root mean square residual of the double differences, in polarization."""
-    return float(np.sqrt(np.mean(np.square(calibration.measurement.residuals()))))
-
-
-def _best_alternative(chains, observations, given, found):
-    """Return the nominal model, and the alternative that fits far better, with its aliases."""
-    found.sort(key=lambda item: item[0])
-    if not found or found[0][0] > 0.5 * _misfit(given):
-        return nominal_model(chains, observations, calibration=given), []
-    least, effect, calibration = found[0]
-    model = nominal_model(calibration.chains, observations, calibration=calibration)
-    # one that fits badly need not converge to be left behind
-    nominal = nominal_model(chains, observations, calibration=given, like=model, fit=False)
-    score = Score(effect, nominal.fit.chi2 - model.fit.chi2, 1, None, 1.0, 0.0)
-    top = Candidate(score, model, score.statistic, score.statistic, True)
-    model.added[effect.name] = []
-    top.aliases = [
-        Candidate(Score(e, 0.0, 1, None, 1.0), None, 0.0, 0.0, True)
-        for misfit, e, _ in found[1:]
-        if misfit < 1.1 * least
-    ]
-    return nominal, [top]
+# ---- selection -------------------------------------------------------------------------------
 
 
 def _mean_square(model):
     return model.fit.chi2 / max(model.problem.n_data - model.problem.size, 1)
-
-
-# ---- selection -------------------------------------------------------------------------------
 
 
 def _select(base, scores, smooth, alpha, groups, say):

@@ -3,6 +3,7 @@
 
 import warnings
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import astropy.units as u
 import numpy as np
@@ -64,6 +65,11 @@ class Model:
         measurement = self.problem.measurement
         return measurement.put_back(self.problem.vector(self.fit.coefficients))
 
+    @cached_property
+    def held_chains(self):
+        """Copies of the chains with every parameter fixed."""
+        return [_held(chain) for chain in self.chains]
+
     @property
     def observations(self):
         """The datasets."""
@@ -111,11 +117,32 @@ class Model:
         )
         return problem, edit.parameters
 
-    def with_effect(self, effect, context=None):
-        """Return the model with an effect added and everything fitted again."""
+    def with_effect(self, effect, context=None, **settings):
+        """
+        Return the model with an effect added and everything fitted again.
+
+        Parameters
+        ----------
+        effect : Effect
+            The effect.
+        context : Context, optional
+            By default that of the data.
+        **settings
+            Of `GapProblem.fit`.
+
+        Returns
+        -------
+        Model
+        """
         problem, parameters = self.edited(effect, context)
-        fit = problem.fit(problem.start)
+        fit = problem.fit(problem.start, **settings)
         return Model(problem, fit, self.added | {effect.name: parameters})
+
+    def polished(self):
+        """Return the model with its fit carried on to the end."""
+        if self.fit.converged:
+            return self
+        return Model(self.problem, self.problem.fit(self.fit.coefficients), self.added)
 
     def sizes(self, name):
         """
@@ -327,7 +354,7 @@ def effect_tangent(model, effect, nominal, context=None):
     >>> effect_tangent(model, get_effect("beam_gain"), nominal).shape[1]
     3
     """
-    edit = effect.edit([_held(chain) for chain in model.chains], context or model.context)
+    edit = effect.edit(model.held_chains, context or model.context)
     names = {p.name for p in edit.parameters}
     problem = GapProblem(
         edit.chains,
@@ -335,6 +362,7 @@ def effect_tangent(model, effect, nominal, context=None):
         ties={name: tie for name, tie in edit.ties.items() if tie.source in names},
         laws=_laws(edit.parameters),
         like=model.problem,
+        copy=False,
     )
     if not problem.size:
         return np.zeros((problem.n_rows, 0))

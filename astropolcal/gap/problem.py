@@ -9,7 +9,7 @@ one column a coefficient. What is fitted is the flat vector of coefficients.
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import qr
+from scipy.linalg import qr, solve_triangular
 from scipy.optimize import lsq_linear
 
 from astropolcal.chain import stages
@@ -20,14 +20,15 @@ from astropolcal.measurement import Measurement
 __all__ = ["Fit", "GapProblem", "law_basis", "orthonormal"]
 
 _MAX_STEPS = 40
-# a step that lowers chi-square by less than this has arrived
-_ARRIVED = 1e-4
+# a step that lowers chi-square by less than this, or than this share of it, has arrived
+_ARRIVED, _ARRIVED_SHARE = 1e-4, 1e-5
 # keeps what the data do not determine where it is
 _HOLD = 1e-6
-# Marquardt's damping, of columns of unit length: where it begins, below what it does not
-# count, and above what no step leads down
-_FIRST_DAMPING, _FREE, _STUCK = 1e-6, 1e-3, 1e3
-_MAX_DAMPINGS = 14
+# Marquardt's damping, of columns of unit length: where it begins, below what it is dropped,
+# below what it does not count, and above what no step leads down
+_FIRST_DAMPING, _LEAST_DAMPING, _FREE, _STUCK = 1e-5, 1e-7, 1e-3, 1e3
+# the share of the frames' freedom that harmonics may take from the measure of the noise
+_MOST_TURNING = 0.7
 # a coefficient closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-9
 
@@ -83,6 +84,8 @@ class GapProblem:
     like : GapProblem, optional
         Another problem of the same data whose noise, lamp and fluxes are taken
         over; by default `settle_noise` must be called.
+    copy : bool
+        Whether to copy the chains; without it values are put back into those given.
 
     Examples
     --------
@@ -99,7 +102,9 @@ class GapProblem:
     True
     """
 
-    def __init__(self, chains, observations, *, ties=None, laws=None, priors=None, like=None):
+    def __init__(
+        self, chains, observations, *, ties=None, laws=None, priors=None, like=None, copy=True
+    ):
         self.ties, self.laws, self.priors = dict(ties or {}), dict(laws or {}), dict(priors or {})
         chains, observations = list(chains), list(observations)
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
@@ -108,6 +113,7 @@ class GapProblem:
             observations,
             observable="normalized_single_difference",
             ties=ties,
+            copy=copy,
             positions=[
                 _positions(*each) for each in zip(chains, observations, self.fluxes, strict=True)
             ],
@@ -223,7 +229,8 @@ class GapProblem:
             self.channels, self.datasets, self.differences(q), strict=True
         ):
             settings = _settings(dataset.observations)
-            channel.set_noise(_noise(channel, residual), residual, settings)
+            noise = _noise(channel, residual, dataset.observations)
+            channel.set_noise(noise, residual, settings)
         self.fluxes = [
             _expected_fluxes(channel, dataset.forward(self.vector(q)))
             for channel, dataset in zip(self.channels, self.datasets, strict=True)
@@ -231,9 +238,9 @@ class GapProblem:
 
     # ---- fit -------------------------------------------------------------------------
 
-    def fit(self, start=None, rows=None, held=None, steps=_MAX_STEPS):
+    def fit(self, start=None, rows=None, held=None, steps=_MAX_STEPS, share=_ARRIVED_SHARE):
         """
-        Fit by Gauss-Newton steps within the bounds.
+        Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
 
         Parameters
         ----------
@@ -245,6 +252,8 @@ class GapProblem:
             Coefficients that stay.
         steps : int
             The most steps.
+        share : float
+            A step that lowers chi-square by less than this share of it is the last.
 
         Returns
         -------
@@ -258,21 +267,25 @@ class GapProblem:
         for _ in range(steps):
             if converged:
                 break
-            reduced = self._reduced(q, residual, take, live)
-            for _ in range(_MAX_DAMPINGS):
-                trial = np.clip(q + self._step(q, live, *reduced, damping), self.low, self.high)
+            reduced, growth = self._reduced(q, residual, take, live), 2
+            while damping < _STUCK:
+                step, promised = self._step(q, live, *reduced, damping)
+                trial = np.clip(q + step, self.low, self.high)
                 there, new = self._cost(trial, take)
                 if np.isfinite(new) and new <= cost * (1 + 1e-12):
                     break
-                damping = max(10 * damping, _FIRST_DAMPING)
+                damping, growth = max(growth * damping, _FIRST_DAMPING), 2 * growth
             else:
                 break
-            small = cost - new < _ARRIVED * max(1.0, 1e-4 * new)
+            small = cost - new < max(_ARRIVED, share * new)
             converged, slow = small and (damping < _FREE or slow), small
+            # Nielsen's rule: the better the promise was kept, the less the next step is damped
+            kept = (cost - new) / promised if promised > 0 else 0.0
+            damping *= min(max(1 / 3, 1 - (2 * kept - 1) ** 3), 2.0)
+            damping = damping if damping > _LEAST_DAMPING else 0.0
             q, residual, cost = trial, there, new
-            damping = damping / 10 if damping > _FIRST_DAMPING else 0.0
         # where no step leads down any more, the bottom is reached as well
-        return Fit(q, float(residual @ residual), bool(converged or damping > _STUCK))
+        return Fit(q, float(residual @ residual), bool(converged or damping >= _STUCK))
 
     def _cost(self, q, take):
         residual = self.residual(q)[take]
@@ -283,27 +296,26 @@ class GapProblem:
         slopes = self.jacobian(q)[take][:, live]
         scale = np.sqrt(np.sum(slopes**2, axis=0) + self.tight[live] ** 2)
         scale = np.where(scale > 0, scale, 1.0)
-        table = np.concatenate([slopes / scale, residual[:, None]], axis=1)
-        # the triangle of the QR decomposition is the same problem with n rows
-        triangle = qr(table, mode="r", check_finite=False, overwrite_a=True)[0]
-        n = int(live.sum())
+        matrix, target = _triangle(slopes / scale, residual)
         offset = (self.centre - q)[live] * self.tight[live]
-        matrix = np.concatenate([triangle[:n, :n], np.diag(self.tight[live] / scale)])
-        return scale, matrix, np.concatenate([triangle[:n, n], offset])
+        matrix = np.concatenate([matrix, np.diag(self.tight[live] / scale)])
+        return scale, matrix, np.concatenate([target, offset])
 
     def _step(self, q, live, scale, matrix, target, damping):
         n = len(scale)
-        matrix = np.concatenate([matrix, np.sqrt(damping + _HOLD**2) * np.eye(n)])
-        target = np.concatenate([target, np.zeros(n)])
+        held = np.concatenate([matrix, np.sqrt(damping + _HOLD**2) * np.eye(n)])
+        triangle, wanted = _triangle(held, np.concatenate([target, np.zeros(n)]))
         low = (self.low[live] - q[live]) * scale
         high = (self.high[live] - q[live]) * scale
-        found = np.linalg.lstsq(matrix, target, rcond=None)[0]
+        found = solve_triangular(triangle, wanted, check_finite=False) if n else wanted
         if np.any((found < low) | (found > high)):
             slack = 1e-9 * np.maximum(1.0, scale)
-            found = lsq_linear(matrix, target, (low - slack, high + slack), method="bvls").x
+            found = lsq_linear(triangle, wanted, (low - slack, high + slack), method="bvls").x
+            found = np.clip(found, low, high)
+        left = matrix @ found - target
         step = np.zeros(self.size)
-        step[live] = np.clip(found, low, high) / scale
-        return step
+        step[live] = found / scale
+        return step, target @ target - left @ left
 
     # ---- what follows from a fit --------------------------------------------------------
 
@@ -332,6 +344,14 @@ class GapProblem:
         variance = np.sum((right[good] / singular[good, None]) ** 2, axis=0)
         is_open = np.sum(right[~good] ** 2, axis=0) > 1e-6
         return np.where(is_open, np.inf, np.sqrt(variance) / scale)
+
+
+def _triangle(matrix, target):
+    """Return the same least-squares problem with a triangle for its matrix."""
+    n = matrix.shape[1]
+    table = np.concatenate([matrix, target[:, None]], axis=1)
+    factors = qr(table, mode="raw", check_finite=False, overwrite_a=True)[0][0][:n]
+    return np.triu(factors[:, :n]), factors[:, n].copy()
 
 
 def orthonormal(columns, keep=1e-9):
@@ -446,11 +466,18 @@ def _settings(observations):
     )
 
 
-def _noise(channel, residual):
-    """Return the noise of every datum: the stated errors, or more where the data say so."""
+def _noise(channel, residual, observations):
+    """
+    Return the noise of every datum: the stated errors, or more where the data say so.
+
+    What optics that stand still or turn can do to a beam is a sum of a few
+    harmonics of the stages' angles, sharp in wavelength or not; everything else
+    is smooth in wavelength. So noise is what is left without either.
+    """
     sigma = np.sqrt(channel.variance)
+    basis = _turning(observations, channel.valid)
     for i in range(2):
-        rough = _roughness(residual[i], channel.valid)
+        rough = _roughness(residual[i], channel.valid, basis)
         stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & channel.valid
         if not stated.any():
             if not rough > 0:
@@ -463,14 +490,33 @@ def _noise(channel, residual):
     return sigma
 
 
-def _roughness(residual, valid):
+def _turning(observations, valid):
+    """Return an orthonormal basis of the harmonics of the stages, (F, k); k may be 0."""
+    n = observations.n_frames
+    waves = [np.ones(n, dtype=complex)]
+    for stage, orders in (("hwp", (2, 4)), ("derotator", (2, 4))):
+        if stage in observations.frames.colnames:
+            turns = [np.exp(1j * k * observations.position(stage)) for k in orders]
+            waves += [wave * t for wave in waves for turn in turns for t in (turn, turn.conj())]
+    whole = valid.all(axis=0)
+    columns = np.concatenate([part(np.array(waves)) for part in (np.real, np.imag)]).T
+    basis = orthonormal(columns * whole[:, None], keep=1e-6)
+    # too few frames would be left to tell the noise
+    return basis if basis.shape[1] <= _MOST_TURNING * whole.sum() else basis[:, :0]
+
+
+def _roughness(residual, valid, basis):
     """Return the scatter of second differences along the wavelengths, per datum."""
     if len(residual) < 5:
         return np.nan
-    second = (residual[:-2] - 2 * residual[1:-1] + residual[2:]) / np.sqrt(6)
+    whole = valid.all(axis=0) if basis.shape[1] else np.ones(valid.shape[1], dtype=bool)
+    left = np.where(whole, residual, 0.0)
+    left = left - (left @ basis) @ basis.T
+    second = (left[:-2] - 2 * left[1:-1] + left[2:]) / np.sqrt(6)
     second = second - np.median(second, axis=1, keepdims=True)
-    keep = valid[:-2] & valid[1:-1] & valid[2:]
-    return float(1.4826 * np.median(np.abs(second[keep])))
+    keep = valid[:-2] & valid[1:-1] & valid[2:] & whole
+    shrunk = np.sqrt(1 - basis.shape[1] / whole.sum())
+    return float(1.4826 * np.median(np.abs(second[keep])) / shrunk) if keep.any() else np.nan
 
 
 def _roughness_of(sigma, valid):

@@ -17,8 +17,8 @@ from astropolcal.exceptions import GapError
 __all__ = ["HeldOut", "frame_groups", "held_out"]
 
 _SAME_ANGLE = 0.5
-# next to the solution of all frames the fit to most of them is all but linear
-_STEPS = 3
+# next to the solution of all frames the fit to most of them takes few steps
+_STEPS, _SHARE = 8, 1e-5
 
 
 @dataclass
@@ -202,7 +202,7 @@ def held_out(model, groups):
                 for o, channel in zip(out, problem.channels, strict=True)
             ]
         )
-        fit = problem.fit(model.fit.coefficients, rows=rows, steps=_STEPS)
+        fit = problem.fit(model.fit.coefficients, rows=rows, steps=_STEPS, share=_SHARE)
         for o, channel, gap in zip(
             out, problem.channels, problem.differences(fit.coefficients), strict=True
         ):

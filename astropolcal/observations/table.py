@@ -515,6 +515,51 @@ class Observations:
         )
         return Observations(chosen, self.meta, self.name, self.path)
 
+    def select_bins(self, bins):
+        """
+        Return the observations at some wavelengths.
+
+        Parameters
+        ----------
+        bins : array_like of bool
+            One boolean a bin, shape (B,).
+
+        Returns
+        -------
+        Observations
+
+        Raises
+        ------
+        ObservationError
+            If the shape or type is wrong, or no usable cell remains.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.observations import Observations, example_table
+        >>> obs = Observations.from_table(example_table())
+        >>> obs.select_bins(obs.wavelength < 1.5 * u.um).n_bins
+        1
+        """
+        chosen, grid = np.asarray(bins), self._grid
+        if chosen.dtype != bool or chosen.shape != (self.n_bins,):
+            raise ObservationError(
+                f"{self._label}: bins of type {chosen.dtype} and shape {chosen.shape}; allowed "
+                f"are {self.n_bins} booleans"
+            )
+        if grid.reason[:, chosen].all():
+            raise ObservationError(f"{self._label}: the bins selected have no usable cell")
+        fewer = dataclasses.replace(
+            grid,
+            bin=grid.bin[chosen],
+            wavelength=grid.wavelength[chosen],
+            flux_right=grid.flux_right[:, chosen],
+            flux_left=grid.flux_left[:, chosen],
+            errors={name: error[:, chosen] for name, error in grid.errors.items()},
+            reason=grid.reason[:, chosen],
+        )
+        return Observations(fewer, self.meta, self.name, self.path)
+
     def _frame_index(self, frames):
         if frames.dtype == bool and frames.shape == (self.n_frames,):
             return np.flatnonzero(frames)

@@ -151,16 +151,16 @@ def test_datasets_of_two_instruments_are_refused():
 
 
 def test_fit_that_did_not_converge_is_refused(monkeypatch):
-    from astropolcal.gap import diagnosis
+    from astropolcal.gap import alternatives
 
-    real = diagnosis.nominal_calibration
+    real = alternatives.nominal_calibration
 
     def stopped(chains, observations):
         found = real(chains, observations)
         found.fit["converged"] = False
         return found
 
-    monkeypatch.setattr(diagnosis, "nominal_calibration", stopped)
+    monkeypatch.setattr(alternatives, "nominal_calibration", stopped)
     with pytest.raises(GapError, match="the nominal fit did not converge"):
         diagnose(data.chain(), data.observed())
 

@@ -1,0 +1,177 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+The nominal model, and what is discrete about it: parity, signs, exchanged beams.
+
+A wrong sign leaves a gap as large as the signal. Every alternative is then
+calibrated from the start at a few wavelengths, which is enough to tell right
+from wrong, and the best one at all of them.
+"""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.calibration import Calibration
+from astropolcal.chain import join, leaves
+from astropolcal.exceptions import GapError
+from astropolcal.gap.attribution import Candidate, Score
+from astropolcal.gap.model import nominal_calibration, nominal_model
+from astropolcal.observations import common_wavelengths
+
+__all__ = ["starting_model", "thinned"]
+
+# alternatives are tried where double differences are off by more than this
+_WRONG_SIGN = 0.02
+# an alternative must lower the residuals to this share, and those within a tenth are aliases
+_FAR_BETTER, _ALIKE = 0.5, 1.1
+_FEW = 5
+
+
+def starting_model(calibration, observations, library, say):
+    """
+    Return the nominal model, and the discrete alternative that beats it.
+
+    Parameters
+    ----------
+    calibration : Calibration, `~astropy.modeling.CompoundModel` or sequence of them
+        A calibration, or the chain of each dataset.
+    observations : list of Observations
+        The datasets.
+    library : sequence of Effect
+        Effects, of which the discrete ones are tried.
+    say : callable
+        Called with a line on what is done next.
+
+    Returns
+    -------
+    nominal : Model
+        The nominal model.
+    alternatives : list of Candidate
+        The alternative with its aliases, or nothing.
+
+    Raises
+    ------
+    GapError
+        If chains and datasets do not go together, or the nominal fit does not
+        converge.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.alternatives import starting_model
+    >>> from astropolcal.gap.effects import EFFECTS
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> observations = simulate(chain, charis.wavelength, frames, seed=1)
+    >>> starting_model(chain, [observations], EFFECTS.values(), print)[1]
+    []
+    """
+    given = calibration if isinstance(calibration, Calibration) else None
+    chains = calibration.chains if given else calibration
+    chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
+    if len(chains) != len(observations):
+        raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    if given is None:
+        given = nominal_calibration(chains, observations)
+    elif given.measurement is None:
+        given = given.with_observations(observations)
+    if _misfit(given) > _WRONG_SIGN:
+        discrete = [e for e in library if e.kind == "discrete" and e.applies(chains)]
+        found = _tried(chains, observations, discrete, say)
+        if found and found[0][0] < _FAR_BETTER * _misfit(given):
+            say(f"calibrating: {found[0][1].title}")
+            best = nominal_calibration(found[0][1].edit(chains, None).chains, observations)
+            if _misfit(best) < _FAR_BETTER * _misfit(given):
+                return _with_alternative(chains, observations, given, best, found)
+    return nominal_model(chains, observations, calibration=given), []
+
+
+def _tried(chains, observations, effects, say):
+    """Return misfit and effect of every alternative at a few wavelengths, best first."""
+    if not effects:
+        return []
+    few = thinned(chains, observations, _FEW)
+    found = []
+    for effect in effects:
+        say(f"trying: {effect.title}")
+        trial = nominal_calibration(effect.edit(few[0], None).chains, few[1])
+        found.append((_misfit(trial), effect))
+    return sorted(found, key=lambda item: item[0])
+
+
+def _misfit(calibration):
+    """Return the root mean square residual of the double differences, in polarization."""
+    return float(np.sqrt(np.mean(np.square(calibration.measurement.residuals()))))
+
+
+def _with_alternative(chains, observations, given, best, found):
+    """Return the nominal model, and the model of the alternative with its aliases."""
+    model = nominal_model(best.chains, observations, calibration=best)
+    # what fits badly need not converge to be left behind
+    nominal = nominal_model(chains, observations, calibration=given, like=model, fit=False)
+    least, effect = found[0]
+    score = Score(effect, nominal.fit.chi2 - model.fit.chi2, 1, None, 1.0, 0.0)
+    top = Candidate(score, model, score.statistic, score.statistic, True)
+    model.added[effect.name] = []
+    top.aliases = [
+        Candidate(Score(other, 0.0, 1, None, 1.0), None, 0.0, 0.0, True)
+        for misfit, other in found[1:]
+        if misfit < _ALIKE * least
+    ]
+    return nominal, [top]
+
+
+def thinned(chains, observations, count):
+    """
+    Return chains and datasets at a few of the wavelengths.
+
+    Parameters
+    ----------
+    chains : sequence
+        The chain of each dataset, on the common wavelengths.
+    observations : sequence of Observations
+        The datasets.
+    count : int
+        How many wavelengths to keep, evenly spread.
+
+    Returns
+    -------
+    chains : list
+    observations : list of Observations
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.alternatives import thinned
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> chains, few = thinned([charis.chain()], [observations], 5)
+    >>> few[0].n_bins, chains[0]["derotator"].horizontal.shape
+    (5, (5,))
+    """
+    grid = common_wavelengths(observations)
+    if count >= len(grid):
+        return list(chains), list(observations)
+    keep = np.unique(np.linspace(0, len(grid) - 1, count).round().astype(int))
+    few = [_at(o, grid[keep]) for o in observations]
+    return [join([_picked(leaf, keep, len(grid)) for leaf in leaves(c)]) for c in chains], few
+
+
+def _at(observations, wavelength):
+    own = observations.wavelength.to_value(u.um)
+    near = np.isclose(own[:, None], wavelength, rtol=1e-4).any(axis=1)
+    return observations.select_bins(near)
+
+
+def _picked(leaf, keep, size):
+    values = {}
+    for key in leaf.param_names:
+        parameter = getattr(leaf, key)
+        if parameter.shape == (size,):
+            values[key] = parameter.value[keep] * (parameter.unit or 1)
+    return leaf.with_parameters(**values) if values else leaf.copy()
