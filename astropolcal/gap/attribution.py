@@ -23,8 +23,8 @@ __all__ = ["Candidate", "Score", "choose", "false_discovery", "freed", "scan"]
 ALPHA = 0.01
 # the best candidates that are fitted in full
 _MOST_REFITTED = 8
-# an effect fits nearly as well as another if it is this close in evidence
-_SAME_EVIDENCE = 10.0
+#: An effect fits nearly as well as another if it is this close in evidence.
+SAME_EVIDENCE = 10.0
 _WORTH_A_REFIT = 0.4
 # the first fits end after so many steps; those this close to the best are carried on
 _FIRST_STEPS, _NEARLY = 12, 0.8
@@ -175,6 +175,8 @@ class Candidate:
         Whether the fitted sizes are within the effect's limits.
     aliases : list of Candidate
         Those that fit nearly as well.
+    context : Context, optional
+        With which it was added, None for that of the data.
 
     Examples
     --------
@@ -189,14 +191,20 @@ class Candidate:
     evidence: float
     physical: bool
     aliases: list = field(default_factory=list)
+    context: object = None
 
     @property
     def name(self):
         """Name of the effect."""
         return self.score.effect.name
 
+    @property
+    def recipe(self):
+        """Effect and context, as `Model.with_effects` takes them."""
+        return self.score.effect, self.context
 
-def choose(model, scores, *, alpha=ALPHA):
+
+def choose(model, scores, *, alpha=ALPHA, most=_MOST_REFITTED):
     """
     Fit the best effects in full, and return the best with its alias group.
 
@@ -208,6 +216,8 @@ def choose(model, scores, *, alpha=ALPHA):
         As `scan` gives them.
     alpha : float
         False discovery rate.
+    most : int
+        So many are fitted in full.
 
     Returns
     -------
@@ -226,7 +236,7 @@ def choose(model, scores, *, alpha=ALPHA):
     freedom = model.problem.n_data - model.problem.size
     best = max(s.evidence(freedom) for s in significant)
     worth = [s for s in significant if s.evidence(freedom) > min(_WORTH_A_REFIT * best, best - 20)][
-        :_MOST_REFITTED
+        :most
     ]
     fitted = [_fitted(model, score, freedom) for score in worth]
     best = max(c.evidence for c in fitted)
@@ -245,7 +255,7 @@ def choose(model, scores, *, alpha=ALPHA):
     fitted.sort(key=lambda c: (not c.physical, -c.evidence))
     top = fitted[0]
     top.aliases = [
-        c for c in fitted[1:] if c.physical and top.evidence - c.evidence < _SAME_EVIDENCE
+        c for c in fitted[1:] if c.physical and top.evidence - c.evidence < SAME_EVIDENCE
     ]
     return top
 
@@ -318,4 +328,4 @@ def freed(model, candidate):
         return candidate
     lowered = (model.fit.chi2 - loose.fit.chi2) / scale
     evidence = lowered - (candidate.score.rank + after - before) * np.log(freedom)
-    return Candidate(candidate.score, loose, lowered, evidence, True, candidate.aliases)
+    return Candidate(candidate.score, loose, lowered, evidence, True, candidate.aliases, context)

@@ -11,25 +11,20 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import stats
 
 from astropolcal.exceptions import GapError
 from astropolcal.gap.alternatives import starting_model
-from astropolcal.gap.attribution import ALPHA, choose, freed, scan
+from astropolcal.gap.attribution import ALPHA, scan
 from astropolcal.gap.effects import EFFECTS, get_effect
 from astropolcal.gap.model import Model
-from astropolcal.gap.shrinkage import frame_groups, held_out
+from astropolcal.gap.selection import REMAINDER, select
+from astropolcal.gap.shrinkage import frame_groups
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
 
-_MOST_CAUSES = 6
-# so many effects may be refused by left-out frames before the selection ends
-_MOST_REFUSED = 3
-# an effect that explains less of a significant gap than this is no cause of it
-_LEAST_SHARE = 0.05
-# above this mean square the residuals are no noise, and held-out frames have the last word
-_STRUCTURED = 1.5
-_REMAINDER = 1e-4
+# effects that explain less of the gap than this share, and leave no noise, are stand-ins for
+# what the library does not hold
+_EXPLAINED = 0.9
 
 
 @dataclass
@@ -227,7 +222,7 @@ def diagnose(
     say("scanning the effects")
     smooth = [effect for effect in library if effect.kind != "discrete"]
     scores = scan(base, smooth)
-    selected, improved, history = _select(base, scores, smooth, alpha, groups, say)
+    selected, improved, history = select(base, scores, smooth, alpha, groups, say)
     return _conclude(nominal, improved, causes, selected, scores, history, alpha, started)
 
 
@@ -244,64 +239,6 @@ def _check_instruments(observations):
     named = {o.instrument for o in observations if o.instrument is not None}
     if len({name.lower() for name in named}) > 1:
         raise GapError(f"the datasets are of different instruments: {', '.join(sorted(named))}")
-
-
-# ---- selection -------------------------------------------------------------------------------
-
-
-def _mean_square(model):
-    return model.fit.chi2 / max(model.problem.n_data - model.problem.size, 1)
-
-
-def _select(base, scores, smooth, alpha, groups, say):
-    """Add effects one by one; return candidates, the last model and its held-out errors."""
-    model, selected = base, []
-    history = [_errors(base, groups)]
-    refused = 0
-    while len(selected) < _MOST_CAUSES and refused < _MOST_REFUSED:
-        candidate = choose(model, scores, alpha=alpha)
-        if candidate is None or not _worthy(model, candidate):
-            break
-        candidate = freed(model, candidate)
-        say(f"left-out frames with: {candidate.score.effect.title}")
-        errors = _errors(candidate.model, groups) if candidate.physical else None
-        scatter = _mean_square(candidate.model)
-        if not (candidate.physical and _holds(errors, history[-1], scatter)):
-            refused += 1
-            scores = [score for score in scores if score.effect.name != candidate.name]
-            continue
-        selected.append(candidate)
-        history.append(errors)
-        model = candidate.model
-        scores = scan(model, smooth)
-    return selected, model, history
-
-
-def _worthy(model, candidate):
-    """Whether a candidate explains enough of what is left, or all that is to be explained."""
-    excess = model.fit.chi2 - (model.problem.n_data - model.problem.size)
-    lowered = model.fit.chi2 - candidate.model.fit.chi2
-    left = _p_value(candidate.model)
-    return left > _REMAINDER or lowered > _LEAST_SHARE * max(excess, 1e-300)
-
-
-def _holds(errors, before, scatter):
-    if errors is None:
-        return True
-    # among pure noise the scan is to be trusted, unless left-out frames speak against it
-    if scatter < _STRUCTURED:
-        return errors.better_than(before) > -2
-    return errors.better_than(before) > 1 and errors.squares.sum() < before.squares.sum()
-
-
-def _errors(model, groups):
-    return None if groups is None else held_out(model, groups)
-
-
-def _p_value(model):
-    """Return the probability of the residuals by noise alone."""
-    tangent = model.problem.tangent(model.fit.coefficients)
-    return float(stats.chi2.sf(model.fit.chi2, model.degrees_of_freedom(tangent)))
 
 
 # ---- conclusion --------------------------------------------------------------------------------
@@ -329,12 +266,12 @@ def _conclude(nominal, improved, causes, selected, scores, history, alpha, start
             )
         )
         before = candidate.model
-    gap_p, left_p = _p_value(nominal), _p_value(improved)
+    gap_p, left_p = nominal.p_value, improved.p_value
     explained = sum(cause.explained for cause in found)
-    if found and (explained > 0.5 or left_p > _REMAINDER):
+    if found and (explained > _EXPLAINED or left_p > REMAINDER):
         verdict = "effect"
     else:
-        verdict = "unexplained" if left_p < _REMAINDER else "none"
+        verdict = "unexplained" if left_p < REMAINDER else "none"
     return Diagnosis(
         verdict=verdict,
         nominal=nominal,

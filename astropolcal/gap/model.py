@@ -7,6 +7,7 @@ from functools import cached_property
 
 import astropy.units as u
 import numpy as np
+from scipy import stats
 
 from astropolcal.calibration import calibrate
 from astropolcal.chain import leaves
@@ -90,6 +91,17 @@ class Model:
         """Return the number of data less that of the directions fitted."""
         return self.problem.n_data - tangent.shape[1]
 
+    @property
+    def mean_square(self):
+        """Mean square of the whitened residuals: 1 where noise is all that is left."""
+        return self.fit.chi2 / max(self.problem.n_data - self.problem.size, 1)
+
+    @property
+    def p_value(self):
+        """Probability of the residuals by noise alone."""
+        tangent = self.problem.tangent(self.fit.coefficients)
+        return float(stats.chi2.sf(self.fit.chi2, self.degrees_of_freedom(tangent)))
+
     def edited(self, effect, context=None):
         """
         Return the problem of the chains with an effect at zero, and its parameters.
@@ -137,6 +149,26 @@ class Model:
         problem, parameters = self.edited(effect, context)
         fit = problem.fit(problem.start, **settings)
         return Model(problem, fit, self.added | {effect.name: parameters})
+
+    def with_effects(self, effects):
+        """
+        Return the model with several effects added, and fitted once.
+
+        Parameters
+        ----------
+        effects : sequence of tuple
+            Effect and context each, the latter None for that of the data.
+
+        Returns
+        -------
+        Model
+        """
+        model = self
+        for effect, context in effects:
+            problem, parameters = model.edited(effect, context)
+            added = model.added | {effect.name: parameters}
+            model = Model(problem, Fit(problem.start, np.inf, False), added)
+        return self if model is self else model.polished()
 
     def polished(self):
         """Return the model with its fit carried on to the end."""

@@ -288,7 +288,9 @@ class GapProblem:
         return Fit(q, float(residual @ residual), bool(converged or damping >= _STUCK))
 
     def _cost(self, q, take):
-        residual = self.residual(q)[take]
+        # a trial may be where the model is not defined; it is not taken then
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            residual = self.residual(q)[take]
         return residual, residual @ residual + np.sum(((q - self.centre) * self.tight) ** 2)
 
     def _reduced(self, q, residual, take, live):
