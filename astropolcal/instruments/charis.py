@@ -18,9 +18,18 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join
+from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments.base import Instrument
+from astropolcal.instruments.layout import FileLayout
+from astropolcal.instruments.telescope import (
+    M3_MODELS,
+    published_mirror,
+    star_source,
+    telescope,
+    tertiary_mirror,
+)
+from astropolcal.observations import is_star
 
 __all__ = ["CHARIS"]
 
@@ -75,12 +84,53 @@ class CHARIS(Instrument):
         "parallactic": "PARANG",
         "altitude": "ALTITUDE",
     }
+    files = FileLayout(
+        keywords=keywords
+        | {
+            "exposure_time": "EXPTIME",
+            "mjd": "MJD",
+            "date": "UTC-DATE",
+            "time": "UTC-TIME",
+            "right_ascension": "RA",
+            "declination": "DEC",
+            "object": "OBJECT",
+            "instrument": "INSTRUME",
+            "filter": "FILTNAME",
+            "pickoff": "X_CHAPKO",
+        },
+        alternatives={
+            "mjd": ("MJD-STR",),
+            "date": ("DATE-OBS",),
+            "time": ("UT",),
+            "filter": ("Y_FLTNAM", "FILTER01"),
+        },
+        shape=(22, 201, 201),
+        units={"exposure_time": "s", "mjd": "d"},
+        raw_columns=("hwp", "hwp_true", "derotator", "instrument"),
+        identities=("CHARIS",),
+        prefix="CRSA",
+        gain=2.0,
+        read_noise=10.0,
+        saturation=40000.0,
+        internal_apertures=((71.75, 86.25), (131.5, 116.25), 44.48, 112.38, 0.4633),
+        star_offset=(63.5, 33.1),
+        pixel_scale=16.2,
+        edge=1.0,
+        # longitude, latitude (deg), height (m) of the Subaru Telescope
+        site=(-155.4761, 19.8255, 4139.0),
+    )
     references = (
         "McIntosh et al. 2026, recalibration after the Nasmyth beam switcher",
         "'t Hart et al. 2021, Proc. SPIE 11833",
         "van Holstein et al. 2020, Proc. SPIE 11447",
     )
-    sources = ("polarized", "unpolarized")
+    sources = (
+        "polarized",
+        "unpolarized",
+        "unpolarized standard star",
+        "polarized standard star",
+        "star",
+    )
 
     def chain(
         self,
@@ -90,9 +140,12 @@ class CHARIS(Instrument):
         wavelength=None,
         derotator="elliptical",
         bounds="physical",
+        m3="free",
+        star="star",
+        target=None,
     ):
         """
-        Return the chain of the internal source, ready to be calibrated.
+        Return the chain of an internal source or a star, ready to be calibrated.
 
         Free are the paper's parameters: two thicknesses and the misalignments
         of polarizer, half-wave plate and derotator for all wavelengths, and
@@ -100,9 +153,12 @@ class CHARIS(Instrument):
 
         Parameters
         ----------
-        source : {"polarized", "unpolarized"}
-            Internal source with or without its polarizer; without it the fold
-            mirror's diattenuation is a free parameter for each wavelength.
+        source : str
+            ``"polarized"`` or ``"unpolarized"``: internal source with or without its
+            polarizer; without it the fold mirror's diattenuation is a free parameter for each
+            wavelength. ``"unpolarized standard star"``: a star of zero polarization, behind the
+            telescope's tertiary mirror. ``"polarized standard star"`` or ``"star"``: the star's
+            q and u are free parameters for each wavelength, in the frame of the sky.
         optics_in : sequence of str
             Optional optics in the beam: ``"nbs"`` (beam switcher, parity flip)
             and ``"dichroic"`` (YJH50, as a retarder of zero retardance that
@@ -116,6 +172,13 @@ class CHARIS(Instrument):
             bounds (0 to 360 deg in the published signs). Either way
             thicknesses are within 0.6 to 1.4 of 't Hart's, misalignments
             within 5 deg, efficiencies between 0 and 1.
+        m3 : {"free", "power law", "metal"}
+            Tertiary mirror of a star's chain, see
+            `~astropolcal.instruments.telescope.tertiary_mirror`.
+        star : str
+            Name of the source optic in a star's chain.
+        target : str, optional
+            Name of the star, for what the catalogue of standards knows of it.
 
         Returns
         -------
@@ -124,7 +187,7 @@ class CHARIS(Instrument):
         Raises
         ------
         InstrumentError
-            If a choice is unknown; stars are not supported yet.
+            If a choice is unknown.
 
         Examples
         --------
@@ -140,14 +203,62 @@ class CHARIS(Instrument):
         if unknown:
             raise InstrumentError(f"optics_in: no {sorted(unknown)}; allowed are 'nbs', 'dichroic'")
         grid = self.wavelength if wavelength is None else u.Quantity(wavelength)
-        first = _polarizer() if source == "polarized" else _fold_mirror(grid.size)
-        train = [first, _half_wave_plate(), _derotator(grid, derotator, _BOUNDS[bounds])]
+        _choice("m3", m3, M3_MODELS)
+        train = self._source_optics(source, grid, m3, star, target)
+        train += [_half_wave_plate(), _derotator(grid, derotator, _BOUNDS[bounds])]
         if "dichroic" in optics_in:
             train.append(optics.LinearRetarder(name="dichroic", fixed={"retardance": True}))
         if "nbs" in optics_in:
             train.append(optics.ParityFlip(name="nbs"))
         train.append(optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston"))
         return join(train)
+
+    @staticmethod
+    def _source_optics(source, grid, m3, star, target):
+        if source == "polarized":
+            return [_polarizer()]
+        if source == "unpolarized":
+            return [_fold_mirror(grid.size)]
+        return [
+            star_source(source, grid, star, target),
+            *telescope(tertiary_mirror(m3, grid)),
+        ]
+
+    def on_sky(self, chain):
+        """
+        Return the chain of a star that has the optics of an internal chain.
+
+        The source and what belongs to it go; the tertiary mirror is the published one.
+
+        Parameters
+        ----------
+        chain : `~astropy.modeling.CompoundModel`
+            A chain; one with the telescope already is returned as it is.
+
+        Returns
+        -------
+        `~astropy.modeling.CompoundModel`
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> charis = instruments.get("charis")
+        >>> [optic.name for optic in charis.on_sky(charis.published())][:4]
+        ['parallactic', 'm3', 'altitude', 'hwp']
+        """
+        found = leaves(chain)
+        if "parallactic" in stages(chain):
+            return chain
+        start = next(i for i, leaf in enumerate(found) if leaf.name == "hwp")
+        return join([*telescope(published_mirror()), *found[start:]])
+
+    def particulars(self, observations):
+        """Return name of the source optic and target of a star: ``star_`` and the object's name."""
+        target = str(observations.meta.get("object") or "")
+        words = re.sub(r"\W+", "", target)
+        if not words or not is_star(observations.source):
+            return {}
+        return {"star": f"star_{words}", "target": target}
 
     def published(self):
         """
@@ -206,14 +317,14 @@ class CHARIS(Instrument):
         Raises
         ------
         InstrumentError
-            If the meta do not say, or name a source that is not supported.
+            If the meta do not say, or name a source that is unknown.
         """
         meta, name = observations.meta, observations.name
         source = observations.source
         if source not in self.sources:
             raise InstrumentError(
                 f"{name}: source {source!r} in the table's meta; allowed are "
-                f"{', '.join(self.sources)} (stars are not supported yet)"
+                f"{', '.join(self.sources)}"
             )
         present = []
         if _stated(meta, name, "yjh50_dichroic", {"in": True, "out": False}):

@@ -5,8 +5,9 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import Model
 
+from astropolcal import instruments
 from astropolcal.chain import leaves, stages
-from astropolcal.exceptions import ObservationError, WavelengthRangeError
+from astropolcal.exceptions import InstrumentError, ObservationError, WavelengthRangeError
 from astropolcal.observations import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
@@ -74,12 +75,14 @@ class Dataset:
     wavelength : `~numpy.ndarray`
         Common grid in micrometre.
     positions : dict of str to `~numpy.ndarray`, optional
-        Position of every stage in radian, shape (n_frames,).
+        Position of every stage in radian, shape (n_frames,), or (nodes, n_frames) at the
+        Gauss-Legendre nodes of each exposure, whose fluxes are averaged; by default as the
+        instrument that the table names reads it, or the columns of the table.
 
     Raises
     ------
     ObservationError
-        If a wavelength of the data is not on the grid.
+        If a wavelength of the data is not on the grid, or nodes differ in number.
 
     Examples
     --------
@@ -103,16 +106,18 @@ class Dataset:
         self.frames = self._frames_of_data()
         columns = self.frames.T.ravel()
         given = _positions(chain, observations, positions)
-        placed = {stage: angle[..., columns] for stage, angle in given.items()}
+        self._node_weights = _node_weights(given, observations)
         #: Position of each stage in the frames of each datum, radian,
-        #: (frames_per_datum, n_groups).
+        #: (frames_per_datum, n_groups); the mean over the nodes of an exposure.
         self.positions = {
-            stage: angle.reshape(self.frames.T.shape)
-            for stage, angle in placed.items()
+            stage: _mean_over_nodes(angle)[columns].reshape(self.frames.T.shape)
+            for stage, angle in given.items()
             if stage not in COORDINATES
         }
+        n_nodes = self._node_weights.size
+        placed = {stage: _at_nodes(angle, columns, n_nodes) for stage, angle in given.items()}
         # where nothing moves all frames are alike, but there are as many
-        placed = placed or {"frame": np.zeros(columns.size)}
+        placed = placed or {"frame": np.zeros(n_nodes * columns.size)}
         try:
             self.propagator = Propagator(chain, observations.wavelength.to_value(u.um), placed)
         except WavelengthRangeError as error:
@@ -157,6 +162,24 @@ class Dataset:
     def _flat(self, array):
         return array.transpose(1, 0, 2).reshape(array.shape[1], -1)
 
+    def _fluxes(self, sweep):
+        """Return the fluxes of a sweep, averaged over the nodes, in groups."""
+        return tuple(self._grouped(self._over_nodes(flux, mean=True)) for flux in sweep.fluxes)
+
+    def _over_nodes(self, array, mean=False):
+        """Return the sum, or the weighted mean, of (n_wavelengths, nodes x columns) over nodes."""
+        weights = self._node_weights
+        if weights.size == 1:
+            return array
+        nodes = array.reshape(array.shape[0], weights.size, -1)
+        return np.einsum("wnc,n->wc", nodes, weights if mean else np.ones_like(weights))
+
+    def _to_nodes(self, array):
+        """Spread weights of columns over the nodes of their exposures."""
+        if self._node_weights.size == 1:
+            return array
+        return (array[:, None, :] * self._node_weights[:, None]).reshape(array.shape[0], -1)
+
     # ---- parameters ------------------------------------------------------------
 
     def _plan(self, chain, free):
@@ -180,7 +203,7 @@ class Dataset:
 
     def values(self, sweep):
         """Return the predicted data of a forward sweep, shape (n_data,)."""
-        right, left = (self._grouped(flux) for flux in sweep.fluxes)
+        right, left = self._fluxes(sweep)
         predicted = self.observable.evaluate(right, left)
         return predicted.ravel() if self._all_valid else predicted[self.valid]
 
@@ -193,14 +216,15 @@ class Dataset:
 
     def jacobian(self, sweep):
         """Return the derivative of the data to the flat vector, (n_free, n_data)."""
-        right, left = (self._grouped(flux) for flux in sweep.fluxes)
-        weights = [self._flat(d) for d in self.observable.derivative(right, left)]
+        right, left = self._fluxes(sweep)
+        derivative = self.observable.derivative(right, left)
+        weights = [self._to_nodes(self._flat(d)) for d in derivative]
         slopes = sweep.derivatives([key for key, *_ in self._live], weights)
         n_groups, n_bins = self.frames.shape[0], len(self.bins)
         out = np.zeros((self.n_free, n_bins, n_groups))
         each = np.arange(n_bins)
         for key, where, factor, _ in self._live:
-            slope = factor * self._grouped(slopes[key]).sum(axis=0)
+            slope = factor * self._grouped(self._over_nodes(slopes[key])).sum(axis=0)
             if np.ndim(where):
                 out[where, each] += slope
             else:
@@ -222,5 +246,43 @@ def _bins_on_grid(observations, wavelength):
 
 def _positions(chain, observations, positions):
     if positions is None:
-        return {stage: observations.position(stage) for stage in stages(chain)}
+        positions = _reader(observations)(observations, chain)
     return {stage: np.asarray(angle, dtype=float) for stage, angle in positions.items()}
+
+
+def _reader(observations):
+    """Return what reads positions: the instrument that the table names, or a plain reader."""
+    if observations.instrument is not None:
+        try:
+            return instruments.get(observations.instrument).positions
+        except InstrumentError:
+            pass  # of an instrument that is not registered the columns are read
+    return _columns
+
+
+def _columns(observations, chain):
+    return {stage: observations.position(stage) for stage in stages(chain)}
+
+
+def _node_weights(positions, observations):
+    """Return the weights of the nodes of an exposure, which sum to one."""
+    counts = {s: len(a) for s, a in positions.items() if a.ndim == 2}
+    if len(set(counts.values())) > 1:
+        raise ObservationError(
+            f"{observations.name}: the stages have different numbers of nodes: {counts}"
+        )
+    if not counts:
+        return np.ones(1)
+    _, weights = np.polynomial.legendre.leggauss(next(iter(counts.values())))
+    return weights / 2
+
+
+def _mean_over_nodes(angle):
+    return angle.mean(axis=0) if angle.ndim == 2 else angle
+
+
+def _at_nodes(angle, columns, n_nodes):
+    """Return positions of all columns, node after node."""
+    if angle.ndim == 2:
+        return angle[:, columns].ravel()
+    return np.tile(angle[..., columns], n_nodes)

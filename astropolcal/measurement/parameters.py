@@ -16,7 +16,7 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError
-from astropolcal.measurement.priors import bind_prior
+from astropolcal.measurement.priors import bind_prior, normal_per_wavelength
 from astropolcal.units import canonical_factor, to_unit
 
 __all__ = ["FreeParameters", "Slot", "Tie", "parameter_table"]
@@ -186,6 +186,9 @@ class FreeParameters:
     def __init__(self, chains, n_wavelengths, ties=None):
         self.ties = dict(ties or {})
         self._table = parameter_table(chains)
+        for parameter in (p for parameters in self._table.values() for p in parameters):
+            if parameter.prior is not None:
+                parameter.prior = normal_per_wavelength(parameter.prior, parameter.unit)
         self._check_ties()
         self.slots = []
         self.size = 0
@@ -200,8 +203,17 @@ class FreeParameters:
             for slot in self.slots
             if (prior := self._table[slot.name][0].prior) is not None
         ]
+        self._check_priors()
         self._followers = {name: self._follower(name, tie) for name, tie in self.ties.items()}
         self._bounds = self._limits()
+
+    def _check_priors(self):
+        for slot, prior in self.priors:
+            size = np.size(prior.mode)
+            if size not in (1, slot.size):
+                raise ParameterError(
+                    f"prior of {slot.name} has {size} values; allowed are 1 or {slot.size}"
+                )
 
     def of_chains(self, chains):
         """Return the same parameters, bound to copies of the chains."""

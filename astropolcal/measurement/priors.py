@@ -12,12 +12,13 @@ is a bound.
 from dataclasses import dataclass
 from functools import cached_property
 
+import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor, to_unit
 
-__all__ = ["BoundPrior", "Normal", "Uniform", "bind_prior"]
+__all__ = ["BoundPrior", "Normal", "Uniform", "bind_prior", "normal_per_wavelength"]
 
 # step of the numerical derivative of a general prior's residual, in its standard deviations
 _STEP = 1e-5
@@ -31,7 +32,8 @@ class Normal:
     Parameters
     ----------
     mean, std : `~astropy.units.Quantity` or float
-        In any unit that converts to the parameter's.
+        In any unit that converts to the parameter's; one value a wavelength for a
+        parameter that has one.
 
     Examples
     --------
@@ -49,8 +51,8 @@ class Normal:
         """Return the scipy distribution of the value in ``unit``."""
         from scipy.stats import norm
 
-        mean, std = (float(to_unit(v, unit, f"prior of {name}")) for v in (self.mean, self.std))
-        if not (np.isfinite(mean) and np.isfinite(std) and std > 0):
+        mean, std = (_plain(to_unit(v, unit, f"prior of {name}")) for v in (self.mean, self.std))
+        if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(std)) and np.all(std > 0)):
             raise ParameterError(f"prior of {name}: Normal({mean}, {std}) needs a positive std")
         return norm(mean, std)
 
@@ -119,7 +121,7 @@ class BoundPrior:
     @cached_property
     def _moments(self):
         """Mean and standard deviation; a frozen distribution works them out at every call."""
-        return float(self.distribution.mean()), float(self.distribution.std())
+        return _plain(self.distribution.mean()), _plain(self.distribution.std())
 
     @cached_property
     def _support(self):
@@ -128,7 +130,7 @@ class BoundPrior:
 
     @cached_property
     def _log_peak(self):
-        return float(self.distribution.logpdf(self.mode))
+        return _plain(self.distribution.logpdf(self.mode))
 
     @property
     def is_flat(self):
@@ -174,7 +176,7 @@ class BoundPrior:
         canonical = np.asarray(canonical, dtype=float)
         std = self._moments[1] * self.factor
         if self._is_normal:
-            return np.full(canonical.shape, 1 / std)
+            return np.broadcast_to(1 / std, canonical.shape).copy()
         low, high = self._support
         up = np.minimum(canonical + _STEP * std, high)
         down = np.maximum(canonical - _STEP * std, low)
@@ -224,16 +226,52 @@ def bind_prior(prior, name, unit, bounds):
         np.inf if bounds[1] is None else bounds[1],
     )
     start, end = distribution.support()
-    if (
-        start >= high
-        or end <= low
-        or (distribution.dist.name != "uniform" and not low <= mode <= high)
-    ):
+    inside = (low <= mode) & (mode <= high) | (distribution.dist.name == "uniform")
+    if np.any(start >= high) or np.any(end <= low) or not np.all(inside):
+        worst = mode if np.ndim(mode) == 0 else mode[np.argmin(inside)]
+        start, end = np.min(start), np.max(end)
         raise ParameterError(
-            f"prior of {name} peaks at {mode:g} on ({start:g}, {end:g}), outside the bounds "
+            f"prior of {name} peaks at {worst:g} on ({start:g}, {end:g}), outside the bounds "
             f"{low:g} to {high:g} {unit or ''}".rstrip()
         )
     return BoundPrior(name, distribution, canonical_factor(unit), mode)
+
+
+def normal_per_wavelength(prior, unit):
+    """
+    Return a frozen normal distribution of several values as `Normal`, which files can hold.
+
+    Parameters
+    ----------
+    prior : object
+        Any prior.
+    unit : `~astropy.units.Unit` or None
+        Unit of its values.
+
+    Returns
+    -------
+    object
+        The prior itself, if it is another one.
+
+    Examples
+    --------
+    >>> from scipy.stats import norm
+    >>> from astropolcal.measurement.priors import normal_per_wavelength
+    >>> normal_per_wavelength(norm([0.01, 0.02], 0.001), None).mean
+    <Quantity [0.01, 0.02]>
+    """
+    name = getattr(getattr(prior, "dist", None), "name", None)
+    if name != "norm" or np.ndim(prior.mean()) == 0:
+        return prior
+    unit = u.one if unit is None else unit
+    mean, std = np.broadcast_arrays(prior.mean(), prior.std())
+    return Normal(mean * unit, std * unit)
+
+
+def _plain(value):
+    """Return a float, or an array where there is one value a wavelength."""
+    value = np.asarray(value, dtype=float)
+    return value if value.ndim else float(value)
 
 
 def _mode(distribution):
@@ -241,7 +279,7 @@ def _mode(distribution):
     from scipy.optimize import minimize_scalar
 
     if distribution.dist.name in ("norm", "uniform"):
-        return float(distribution.mean())
+        return _plain(distribution.mean())
     ends = distribution.ppf([1e-6, 1 - 1e-6])
     inside = minimize_scalar(
         lambda x: -distribution.logpdf(x),

@@ -23,6 +23,22 @@ from astropolcal.observations.observables import (
     single_sum,
 )
 from astropolcal.observations.pairing import pair_frames
+from astropolcal.observations.pointing import (
+    motion,
+    pointing,
+    sky_angles,
+    sky_positions,
+    smeared,
+    tracked,
+)
+from astropolcal.observations.quality import (
+    brightness,
+    cycle_numbers,
+    is_star,
+    mask_incomplete_cycles,
+    mask_saturated,
+    mask_unstable_lamp,
+)
 from astropolcal.observations.table import Observations
 from astropolcal.observations.wavelengths import SAME_WAVELENGTH, common_wavelengths
 
@@ -35,12 +51,24 @@ __all__ = [
     "Observations",
     "PerFrameDoubleDifference",
     "RatioMethod",
+    "brightness",
     "common_wavelengths",
+    "cycle_numbers",
     "double_difference",
     "double_sum",
     "example_table",
     "get_observable",
+    "is_star",
+    "mask_incomplete_cycles",
+    "mask_saturated",
+    "mask_unstable_lamp",
+    "motion",
     "pair_frames",
+    "pointing",
     "single_difference",
     "single_sum",
+    "sky_angles",
+    "sky_positions",
+    "smeared",
+    "tracked",
 ]

@@ -171,6 +171,8 @@ def _angle(table, name, label):
     values = numeric_column(table, name, label, u.deg)
     allowed = f"finite angles up to {_MAX_ANGLE:g} deg"
     first_bad_row(~(np.abs(values) <= _MAX_ANGLE), name, values, label, allowed)
+    if name == "altitude":
+        first_bad_row(np.abs(values) > 90, name, values, label, "-90 to 90 deg")
     return numeric_column(table, name, label) * table[name].unit
 
 

@@ -10,15 +10,18 @@ registry tests then hold it to the laws that all optics obey.
 from astropolcal.optics.beamsplitters import BeamGain, WollastonPrism
 from astropolcal.optics.core import COORDINATES, Optic, rotation_generator
 from astropolcal.optics.depolarizers import Depolarizer
+from astropolcal.optics.derotators import KMirror
 from astropolcal.optics.general import MuellerElement
-from astropolcal.optics.mirrors import ParityFlip
+from astropolcal.optics.mirrors import MetalMirror, ParityFlip, PowerLawMirror
 from astropolcal.optics.modulated import (
+    DriftRetarder,
     DriftRotator,
     FluxGain,
     FrameOptic,
     HarmonicGain,
     HarmonicRetarder,
     HarmonicRotator,
+    PolarizedBackground,
     StrayLight,
 )
 from astropolcal.optics.polarizers import (
@@ -29,6 +32,7 @@ from astropolcal.optics.polarizers import (
 )
 from astropolcal.optics.retarders import EllipticalRetarder, LinearRetarder, TwoLayerWaveplate
 from astropolcal.optics.rotators import Rotator
+from astropolcal.optics.sources import PolarizedSource
 
 __all__ = [
     "COORDINATES",
@@ -37,6 +41,7 @@ __all__ = [
     "Depolarizer",
     "Diattenuator",
     "DiattenuatorRetarder",
+    "DriftRetarder",
     "DriftRotator",
     "EllipticalRetarder",
     "FluxGain",
@@ -44,11 +49,16 @@ __all__ = [
     "HarmonicGain",
     "HarmonicRetarder",
     "HarmonicRotator",
+    "KMirror",
     "LinearPolarizer",
     "LinearRetarder",
+    "MetalMirror",
     "MuellerElement",
     "Optic",
     "ParityFlip",
+    "PolarizedBackground",
+    "PolarizedSource",
+    "PowerLawMirror",
     "Rotator",
     "StrayLight",
     "TwoLayerWaveplate",
@@ -65,16 +75,22 @@ OPTICS = {
         Depolarizer,
         Diattenuator,
         DiattenuatorRetarder,
+        DriftRetarder,
         DriftRotator,
         EllipticalRetarder,
         FluxGain,
         HarmonicGain,
         HarmonicRetarder,
         HarmonicRotator,
+        KMirror,
         LinearPolarizer,
         LinearRetarder,
+        MetalMirror,
         MuellerElement,
         ParityFlip,
+        PolarizedBackground,
+        PolarizedSource,
+        PowerLawMirror,
         Rotator,
         StrayLight,
         TwoLayerWaveplate,

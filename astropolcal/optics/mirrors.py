@@ -1,11 +1,36 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Changes of handedness by mirrors and beam switchers."""
+r"""
+Mirrors: changes of handedness, and reflection by metals with a film.
 
+A mirror at oblique incidence is a diattenuator-retarder. With ``theta`` = 0 the
+field across the plane of incidence (s) is along +Q, so that
+:math:`\epsilon = (R_s - R_p)/(R_s + R_p)` is positive for a metal and
+:math:`\Delta = \arg r_p - \arg r_s` is 180 deg for an ideal mirror,
+diag(1, 1, -1, -1). See `astropolcal.thinfilm` for signs and phases.
+"""
+
+from abc import abstractmethod
+
+import astropy.units as u
 import numpy as np
+from astropy.modeling import Parameter
 
+from astropolcal.exceptions import ParameterError
+from astropolcal.materials import get_material
+from astropolcal.mueller.elements import _diattenuator_retarder
 from astropolcal.optics.core import Optic
+from astropolcal.optics.polarizers import (
+    DiattenuatorRetarder,
+    _phase_block,
+    _to_diattenuation,
+    _transverse,
+)
+from astropolcal.thinfilm import _Stack, _wrapped
 
-__all__ = ["ParityFlip"]
+__all__ = ["MetalMirror", "ParityFlip", "PowerLawMirror"]
+
+_LN10 = np.log(10.0)
+_UM_IN_M = 1e-6
 
 
 class ParityFlip(Optic):
@@ -32,3 +57,356 @@ class ParityFlip(Optic):
 
     def _derivatives(self, dispersion):
         return ()
+
+
+class _Mirror(Optic):
+    """
+    A diattenuator-retarder by reflection.
+
+    A subclass gives ln(r_p / r_s) and its derivative to every parameter; its
+    real part is the diattenuation -tanh(...), its imaginary part the retardance.
+    """
+
+    @abstractmethod
+    def _log_ratio(self, dispersion, *values):
+        """Return ln(r_p / r_s)."""
+
+    @abstractmethod
+    def _log_slopes(self, dispersion, *values):
+        """Return ln(r_p / r_s) and its derivatives to the values."""
+
+    def _matrix(self, dispersion, *values):
+        ratio = self._log_ratio(dispersion, *values)
+        return _diattenuator_retarder(-np.tanh(ratio.real), ratio.imag)
+
+    def _derivatives(self, dispersion, *values):
+        ratio, slopes = self._log_slopes(dispersion, *values)
+        diattenuation, c, s = -np.tanh(ratio.real), np.cos(ratio.imag), np.sin(ratio.imag)
+        steepness = (1 - diattenuation) * (1 + diattenuation)
+        to_diattenuation = -steepness[..., None, None] * _to_diattenuation(diattenuation, c, s)
+        to_retardance = np.zeros_like(to_diattenuation)
+        root = _transverse(diattenuation)
+        _phase_block(to_retardance, -root * s, root * c)
+        return tuple(
+            slope.real[..., None, None] * to_diattenuation
+            + slope.imag[..., None, None] * to_retardance
+            for slope in slopes
+        )
+
+    def _check(self, good, key, value, unit, words):
+        """Refuse values that no mirror has; bounds may have been lifted."""
+        if not np.all(good):
+            worst = np.ravel(value)[np.argmin(np.ravel(good))]
+            raise ParameterError(
+                f"{self.name or type(self).__name__}.{key} = {worst:.6g}{unit}; allowed are {words}"
+            )
+
+    def _check_incidence(self, incidence):
+        # the same mirror from the other side: a fit may cross zero
+        good = np.abs(incidence) < np.pi / 2
+        self._check(good, "incidence", np.rad2deg(incidence), " deg", "less than 90 deg")
+
+    def _ratio_at(self, wavelength):
+        dispersion, _, values = self._resolve(wavelength, None)
+        return self._log_ratio(dispersion, *values)
+
+    def diattenuation(self, wavelength):
+        """
+        Return the diattenuation at a wavelength.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Scalar or shape (n_wavelengths,).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Positive where the field across the plane of incidence is better reflected.
+        """
+        return -np.tanh(self._ratio_at(wavelength).real)
+
+    def retardance(self, wavelength):
+        """
+        Return the retardance at a wavelength.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Scalar or shape (n_wavelengths,).
+
+        Returns
+        -------
+        `~astropy.units.Quantity`
+            0 to 360 deg; 180 deg for an ideal mirror.
+        """
+        return np.rad2deg(_wrapped(self._ratio_at(wavelength).imag)) * u.deg
+
+    def loosened(self, wavelength):
+        """
+        Return the diattenuator-retarder that starts with the same values.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Shape (n_wavelengths,).
+
+        Returns
+        -------
+        DiattenuatorRetarder
+            One free diattenuation and one free retardance a wavelength.
+        """
+        settings = Optic._settings(self)
+        free = DiattenuatorRetarder(
+            diattenuation=self.diattenuation(wavelength),
+            retardance=self.retardance(wavelength),
+            theta=self.theta.value * u.deg,
+            **settings,
+        )
+        free.theta.fixed, free.theta.bounds = self.theta.fixed, self.theta.bounds
+        return free
+
+
+class PowerLawMirror(_Mirror):
+    r"""
+    Bare mirror whose permittivity follows two power laws of the wavelength.
+
+    .. math:: \epsilon = -10^{b_1}\lambda^{m_1} + i\,10^{b_2}\lambda^{m_2}
+
+    with :math:`\lambda` in metre (paper, Eq. for the physical model of M3, after
+    't Hart et al. 2021): straight lines in log-log space. The index is the root
+    of :math:`\epsilon`, and the reflection that of Fresnel. Only what a metal
+    looks like fixes the four numbers: :math:`m_1` = 2 and :math:`m_2` = 3 are those
+    of free electrons.
+
+    Parameters
+    ----------
+    b1, m1 : float or array_like
+        Offset and slope of the real part (negative).
+    b2, m2 : float or array_like
+        Offset and slope of the imaginary part (absorption).
+    incidence : `~astropy.units.Quantity`
+        Angle of incidence.
+    theta : `~astropy.units.Quantity`
+        Orientation of the field across the plane of incidence.
+
+    Raises
+    ------
+    ParameterError
+        If the angle of incidence is 90 deg or more.
+
+    References
+    ----------
+    't Hart et al. 2021, Proc. SPIE 11833, arXiv:2108.04833.
+
+    Examples
+    --------
+    The published M3 of Subaru:
+
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import PowerLawMirror
+    >>> m3 = PowerLawMirror(b1=15.56, m1=3.186, b2=9.69, m2=1.040, name="m3")
+    >>> m3.diattenuation([1.2, 1.6, 2.2] * u.um).round(4)
+    array([0.0171, 0.0147, 0.0125])
+    """
+
+    b1 = Parameter(default=13.70, bounds=(0, 40), description="log10 of -Re(permittivity) at 1 m")
+    m1 = Parameter(default=1.94, bounds=(-2, 6), description="power of the real part")
+    b2 = Parameter(default=13.89, bounds=(0, 40), description="log10 of Im(permittivity) at 1 m")
+    m2 = Parameter(default=2.08, bounds=(-2, 6), description="power of the imaginary part")
+    incidence = Parameter(
+        default=45.0, unit=u.deg, bounds=(0, 89), fixed=True, description="angle of incidence"
+    )
+
+    def _dispersion(self, wavelength):
+        return np.log(np.asarray(wavelength) * _UM_IN_M)
+
+    @staticmethod
+    def _parts(log, b1, m1, b2, m2):
+        """Return the two terms of the permittivity."""
+        return -np.exp(b1 * _LN10 + m1 * log), 1j * np.exp(b2 * _LN10 + m2 * log)
+
+    def _stack(self, parts, incidence):
+        self._check_incidence(incidence)
+        # a bare surface has no phase that depends on the wavelength
+        return _Stack(1.0, incidence, [1.0, np.sqrt(sum(parts))], [])
+
+    def _log_ratio(self, log, *values):
+        return self._stack(self._parts(log, *values[:4]), values[4]).log_ratio()
+
+    def _log_slopes(self, log, *values):
+        real, imaginary = self._parts(log, *values[:4])
+        stack = self._stack((real, imaginary), values[4])
+        to_incidence, (to_index,), _ = stack.log_slopes()
+        per_part = to_index / (2 * stack.substrate.index)
+        to_b1, to_b2 = per_part * real * _LN10, per_part * imaginary * _LN10
+        slopes = to_b1, to_b1 * log / _LN10, to_b2, to_b2 * log / _LN10, to_incidence
+        return stack.log_ratio(), slopes
+
+    def index(self, wavelength):
+        """
+        Return the complex index n + ik of the law.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Scalar or shape (n_wavelengths,).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Complex.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.optics import PowerLawMirror
+        >>> PowerLawMirror().index(1.6 * u.um).round(1)
+        np.complex128(2+17j)
+        """
+        log, _, values = self._resolve(wavelength, None)
+        return np.sqrt(sum(self._parts(log, *values[:4])))
+
+
+class _Metallic(_Mirror):
+    """What is coated with a metal and a film: one or several reflections in one plane."""
+
+    def __init__(self, *args, material="silver", film="fused silica", **kwargs):
+        super().__init__(*args, **kwargs)
+        self.material = material
+        self.film = film
+
+    @property
+    def material(self):
+        """Name of the metal, see `~astropolcal.materials.get_material`."""
+        return self._material
+
+    @material.setter
+    def material(self, value):
+        self._material = _material_name(value, f"{type(self).__name__}.material")
+
+    @property
+    def film(self):
+        """Name of the material of the film."""
+        return self._film
+
+    @film.setter
+    def film(self, value):
+        self._film = _material_name(value, f"{type(self).__name__}.film")
+
+    def _settings(self):
+        return super()._settings() | {"material": self.material, "film": self.film}
+
+    def _dispersion(self, wavelength):
+        wavelength = np.asarray(wavelength)
+        materials = (get_material(name) for name in (self._material, self._film))
+        return wavelength, *(material._index_um(wavelength) for material in materials)
+
+    @abstractmethod
+    def _reflections(self, incidence):
+        """Return (angle, its derivative to the parameter, how often) of each reflection."""
+
+    def _stacks(self, dispersion, incidence, film_thickness, n_scale, k_scale):
+        wavelength, metal, film = dispersion
+        self._check_incidence(incidence)
+        for key, value, unit in (
+            ("film_thickness", film_thickness, " um"),
+            ("n_scale", n_scale, ""),
+            ("k_scale", k_scale, ""),
+        ):
+            self._check(value >= 0, key, value, unit, "values that are not negative")
+        indices = [1.0, film, n_scale * metal.real + 1j * k_scale * metal.imag]
+        return [
+            (_Stack(wavelength, angle, indices, [film_thickness]), slope, count)
+            for angle, slope, count in self._reflections(incidence)
+        ]
+
+    def _log_ratio(self, dispersion, *values):
+        return sum(
+            count * stack.log_ratio() for stack, _, count in self._stacks(dispersion, *values)
+        )
+
+    def _log_slopes(self, dispersion, *values):
+        metal = dispersion[1]
+        ratios, slopes = [], []
+        for stack, slope, count in self._stacks(dispersion, *values):
+            to_incidence, (_, to_metal), (to_thickness,) = stack.log_slopes()
+            to_scales = to_metal * metal.real, 1j * to_metal * metal.imag
+            ratios.append(count * stack.log_ratio())
+            slopes.append(count * np.stack([slope * to_incidence, to_thickness, *to_scales]))
+        return sum(ratios), sum(slopes)
+
+
+class MetalMirror(_Metallic):
+    r"""
+    Metal mirror, bare or with a film.
+
+    Fresnel reflection by the complex index of the metal, through the
+    characteristic matrix of the film. Metals differ from film to film: a
+    ``n_scale`` and a ``k_scale`` multiply n and k of the tables.
+
+    Parameters
+    ----------
+    incidence : `~astropy.units.Quantity`
+        Angle of incidence.
+    film_thickness : `~astropy.units.Quantity`
+        Thickness of the film; zero, the default, is a bare metal.
+    n_scale, k_scale : float or array_like
+        Factors on the real and the imaginary part of the index of the metal.
+    material, film : str
+        Names of the metal and of the material of the film, see
+        `~astropolcal.materials.get_material`.
+    theta : `~astropy.units.Quantity`
+        Orientation of the field across the plane of incidence.
+
+    Raises
+    ------
+    ParameterError
+        If the angle of incidence is 90 deg or more, a thickness or
+        factor is negative, or a material is not known.
+    WavelengthRangeError
+        If the index of a material is not known at a wavelength.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import MetalMirror
+    >>> fold = MetalMirror(material="gold", name="fold_mirror")
+    >>> fold.diattenuation([1.2, 1.6, 2.2] * u.um).round(4)
+    array([0.0094, 0.0082, 0.0069])
+    >>> fold.retardance(1.6 * u.um).round(1)
+    <Quantity 187.9 deg>
+    """
+
+    incidence = Parameter(
+        default=45.0, unit=u.deg, bounds=(0, 89), fixed=True, description="angle of incidence"
+    )
+    film_thickness = Parameter(
+        default=0.0, unit=u.nm, bounds=(0, 2000), fixed=True, description="thickness of the film"
+    )
+    n_scale = Parameter(
+        default=1.0, bounds=(0.05, 20), fixed=True, description="factor on n of the metal"
+    )
+    k_scale = Parameter(
+        default=1.0, bounds=(0.2, 5), fixed=True, description="factor on k of the metal"
+    )
+
+    def _reflections(self, incidence):
+        return ((incidence, 1.0, 1),)
+
+
+def _material_name(value, label):
+    """Return the name by which a material is found again, in a file too."""
+    if isinstance(value, str):
+        get_material(value)
+        return value
+    name = getattr(value, "name", None)
+    try:
+        if name and get_material(name) is value:
+            return name
+    except ParameterError:
+        pass
+    raise ParameterError(
+        f"{label} = {value!r}; allowed is the name of a material, which register_material "
+        "gives to one of your own"
+    )

@@ -14,19 +14,21 @@ import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller.elements import _linear_retarder
+from astropolcal.mueller.elements import _elliptical_retarder, _linear_retarder
 from astropolcal.optics.beamsplitters import BEAMS, _BeamOptic
 from astropolcal.optics.core import Optic, blank
-from astropolcal.optics.retarders import _linear_slope
+from astropolcal.optics.retarders import EllipticalRetarder, _linear_slope
 from astropolcal.units import to_unit
 
 __all__ = [
+    "DriftRetarder",
     "DriftRotator",
     "FluxGain",
     "FrameOptic",
     "HarmonicGain",
     "HarmonicRetarder",
     "HarmonicRotator",
+    "PolarizedBackground",
     "StrayLight",
 ]
 
@@ -172,6 +174,61 @@ class DriftRotator(FrameOptic):
 
     def _derivatives(self, coordinate, rate):
         return (_times(coordinate, _turned_slope(rate * np.asarray(coordinate))),)
+
+
+class DriftRetarder(FrameOptic):
+    r"""
+    Linear retarder of any orientation whose retardance changes through the run.
+
+    The retardance vector is :math:`(h + \dot h x,\; d + \dot d x,\; 0)`, with x
+    from 0 in the first to 1 in the last frame. Fringes whose phase drifts with the
+    temperature are one, with a cosine and a sine of the wavenumber for each
+    parameter.
+
+    Parameters
+    ----------
+    horizontal, diagonal : `~astropy.units.Quantity`
+        Retardances h and d in the first frame; scalars, or one value a wavelength.
+    horizontal_rate, diagonal_rate : `~astropy.units.Quantity`
+        Their changes over the run.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import DriftRetarder
+    >>> window = DriftRetarder(diagonal_rate=2 * u.deg, mount="sequence", name="window")
+    >>> float(window.mueller(position=0.5)[1, 3].round(5))
+    -0.01745
+    """
+
+    horizontal = Parameter(
+        default=0.0, unit=u.deg, bounds=(-360, 360), description="horizontal linear retardance"
+    )
+    diagonal = Parameter(
+        default=0.0, unit=u.deg, bounds=(-360, 360), description="45 deg linear retardance"
+    )
+    horizontal_rate = Parameter(
+        default=0.0, unit=u.deg, bounds=(-360, 360), description="change over the run"
+    )
+    diagonal_rate = Parameter(
+        default=0.0, unit=u.deg, bounds=(-360, 360), description="change over the run"
+    )
+
+    @staticmethod
+    def _vector(coordinate, horizontal, diagonal, horizontal_rate, diagonal_rate):
+        x = np.asarray(coordinate)
+        return horizontal + horizontal_rate * x, diagonal + diagonal_rate * x, 0.0
+
+    def _matrix(self, coordinate, *values):
+        return _elliptical_retarder(*self._vector(coordinate, *values))
+
+    def _derivatives(self, coordinate, *values):
+        vector = self._vector(coordinate, *values)
+        to_horizontal, to_diagonal, _ = EllipticalRetarder()._derivatives(None, *vector)
+        rates = (_times(coordinate, slope) for slope in (to_horizontal, to_diagonal))
+        return to_horizontal, to_diagonal, *rates
 
 
 class HarmonicRetarder(_Harmonic):
@@ -420,6 +477,57 @@ class StrayLight(FrameOptic):
         out = blank(coordinate, amount)
         out[..., 0, 0] = self._share(coordinate)
         return (out,)
+
+
+class PolarizedBackground(StrayLight):
+    r"""
+    Polarized light that is added to that of the source, whatever the source does.
+
+    .. math:: I' = I\,(1 + b F_0/F),\quad Q' = Q + q F_0/F\,I,\quad U' = U + u F_0/F\,I
+
+    with F the sum of both beams in the table (``mount="total_flux"``), so that
+    the same Stokes vector :math:`(b, q, u) F_0` is added to each frame: moonlight,
+    twilight or a zodiacal background (Patat & Romaniello 2006,
+    doi:10.1086/497581). Where F = 0 nothing is added.
+
+    Parameters
+    ----------
+    amount : float or array_like
+        Added flux b over :math:`F_0`; 0 where the flux of the background was
+        subtracted, but not its polarization.
+    q, u : float or array_like
+        Added polarized flux over :math:`F_0`, in the frame of what follows;
+        scalars, or one value a wavelength.
+    reference : float
+        :math:`F_0`, in the unit of the tables.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes of q and u.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import PolarizedBackground
+    >>> moon = PolarizedBackground(q=0.01, reference=1e6, mount="total_flux", name="moon")
+    >>> float(moon.mueller(position=5e5)[1, 0])
+    0.02
+    """
+
+    q = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added Q over the reference")
+    u = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added U over the reference")
+
+    def _matrix(self, coordinate, amount, q, u):
+        out = blank(coordinate, amount, q, u)
+        out[...] = _IDENTITY
+        for row, value in enumerate((amount, q, u)):
+            out[..., row, 0] += value * self._share(coordinate)
+        return out
+
+    def _derivatives(self, coordinate, amount, q, u):
+        slopes = []
+        for row in range(3):
+            out = blank(coordinate, amount, q, u)
+            out[..., row, 0] = self._share(coordinate)
+            slopes.append(out)
+        return tuple(slopes)
 
 
 def _positive(value, name):

@@ -10,6 +10,7 @@ is imported when the first figure is drawn.
 from astropolcal.plotting.accuracy import plot_accuracy
 from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
+from astropolcal.plotting.efficiency import plot_polarimetric_efficiency
 from astropolcal.plotting.gap import (
     plot_effect_scores,
     plot_gap_maps,
@@ -25,6 +26,7 @@ from astropolcal.plotting.parameters import (
 from astropolcal.plotting.posterior import plot_corner, plot_traces
 from astropolcal.plotting.residuals import plot_residuals
 from astropolcal.plotting.saving import save_all
+from astropolcal.plotting.standards import plot_observability
 
 __all__ = [
     "plot_accuracy",
@@ -36,7 +38,9 @@ __all__ = [
     "plot_gap_maps",
     "plot_gap_spectrum",
     "plot_identifiability",
+    "plot_observability",
     "plot_parameters",
+    "plot_polarimetric_efficiency",
     "plot_residuals",
     "plot_retardances",
     "plot_traces",

@@ -1,21 +1,40 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""``astropolcal simulate``: beam fluxes of an instrument, with noise."""
+"""``astropolcal simulate``: beam fluxes or image cubes of an instrument, with noise."""
 
+from astropolcal.exceptions import AstropolcalError
 from astropolcal.scripts._common import check_outputs, edit_chains, write_json
 
 #: What the packaged example was made with.
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
+
+_STAR_CYCLE = [0, 45, 22.5, 67.5]
+
+#: Options of ``--cubes`` that are numbers: default, unit and meaning.
+_IMAGES = {
+    "fwhm": (5.0, "PIX", "full width of a star's core at half maximum"),
+    "halo": (0.0, "SHARE", "share of a star's light in its halo"),
+    "motion": (0.0, "PIX", "standard deviation of a star's place from frame to frame"),
+    "seeing": (0.0, "PART", "relative standard deviation of its width"),
+    "background": (0.0, "ADU", "of each pixel"),
+    "bad_pixels": (0.0, "SHARE", "share of the pixels without a value"),
+    "flat_error": (0.0, "PART", "relative standard deviation of the pixels' response"),
+}
 
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
     parser = commands.add_parser(
         "simulate",
-        help="simulate an observation table, with photon and read noise",
+        help="simulate an observation table or image cubes, with photon and read noise",
         description="Simulate the beam fluxes of an instrument's chain: the published values, "
-        "or those of a calibration file.",
+        "or those of a calibration file. With --cubes, simulate its image cubes.",
     )
-    parser.add_argument("-o", "--output", metavar="OBS.ecsv", required=True, help="the table")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OBS.ecsv",
+        help="the table (required without --cubes; with it, the true fluxes)",
+    )
     parser.add_argument("--instrument", metavar="NAME", default="charis", help="default: charis")
     parser.add_argument("--calibration", metavar="CAL.asdf", help="take the chain from this file")
     parser.add_argument(
@@ -32,6 +51,8 @@ def add_parser(commands):
         default=None,
         help="derotator angles (default: 45 to 132.5 by 12.5)",
     )
+    _add_star(parser)
+    _add_cubes(parser)
     parser.add_argument(
         "--flux",
         type=float,
@@ -44,14 +65,14 @@ def add_parser(commands):
         type=float,
         default=EXAMPLE["gain"],
         metavar="E/ADU",
-        help="electrons per adu (default: %(default)g)",
+        help="electrons per adu (default: %(default)g; cubes: the instrument's)",
     )
     parser.add_argument(
         "--read-noise",
         type=float,
         default=EXAMPLE["read_noise"],
         metavar="E",
-        help="electrons per beam and frame (default: %(default)g)",
+        help="electrons per beam and frame (default: %(default)g; cubes: the instrument's)",
     )
     parser.add_argument("--no-noise", action="store_true", help="leave the noise out")
     parser.add_argument("--seed", type=int, default=EXAMPLE["seed"], help="default: %(default)s")
@@ -75,6 +96,46 @@ def add_parser(commands):
     parser.set_defaults(run=run)
 
 
+def _add_star(parser):
+    parser.add_argument(
+        "--source",
+        choices=("internal", "star"),
+        default="internal",
+        help="the internal source, or a star (default: %(default)s)",
+    )
+    for name in ("altitude", "parallactic"):
+        parser.add_argument(
+            f"--{name}",
+            metavar="DEG[,DEG]",
+            type=_angles,
+            help=f"{name} angle of a star in all frames, or in the first and last",
+        )
+
+
+def _add_cubes(parser):
+    group = parser.add_argument_group("image cubes")
+    group.add_argument(
+        "--cubes", metavar="DIR", help="write image cubes to this folder, raw headers to DIR/raw"
+    )
+    group.add_argument(
+        "--psf",
+        choices=("moffat", "gaussian"),
+        default="moffat",
+        help="profile of a star's core (default: %(default)s)",
+    )
+    for name, (default, unit, meaning) in _IMAGES.items():
+        group.add_argument(
+            f"--{name.replace('_', '-')}",
+            type=float,
+            default=default,
+            metavar=unit,
+            help=f"{meaning} (default: %(default)g)",
+        )
+    group.add_argument(
+        "--saturate", action="store_true", help="cut pixels off at the instrument's saturation"
+    )
+
+
 def _angles(text):
     """Return the angles of a comma-separated list, in degree."""
     import argparse
@@ -86,36 +147,93 @@ def _angles(text):
 
 
 def run(arguments):
-    """Simulate and write the table."""
-    import astropy.units as u
-
-    from astropolcal.simulation import half_wave_plate_cycles, simulate
-
+    """Simulate and write the table, the cubes or both."""
+    if not (arguments.output or arguments.cubes):
+        raise AstropolcalError("nothing to write: give -o OBS.ecsv, --cubes DIR or both")
     check_outputs(arguments.output, arguments.json)
     chain, wavelength, meta = _truth(arguments)
     (chain,) = edit_chains([chain], without=arguments.without, fix=arguments.fix)
-    given = {"hwp": arguments.hwp, "derotator": arguments.derotator or _derotator_angles()}
-    frames = half_wave_plate_cycles(**{k: v * u.deg for k, v in given.items() if v is not None})
-    observations = simulate(
-        chain,
-        wavelength,
-        frames,
-        flux=arguments.flux,
-        gain=arguments.gain,
-        read_noise=arguments.read_noise,
-        noise=not arguments.no_noise,
-        seed=arguments.seed,
-        meta=_meta(meta, arguments.without),
-        name="simulated",
-    )
-    observations.write(arguments.output, overwrite=True)
+    frames = _frames(arguments)
+    observations = _table(arguments, chain, wavelength, frames, _meta(meta, arguments))
+    written = []
+    if arguments.cubes:
+        paths = _write_cubes(arguments, chain, wavelength, frames)
+        written.append(f"{arguments.cubes} ({len(paths)} cubes)")
+    if arguments.output:
+        observations.write(arguments.output, overwrite=True)
+        size = f"{observations.n_frames} frames x {observations.n_bins} wavelengths"
+        written.append(f"{arguments.output} ({size})")
     if arguments.json:
         write_json(_summary(observations, arguments), arguments.json)
     if arguments.json != "-":
-        print(
-            f"Written: {arguments.output} ({observations.n_frames} frames x "
-            f"{observations.n_bins} wavelengths)"
-        )
+        print(f"Written: {', '.join(written)}")
+
+
+def _frames(arguments):
+    """Return the half-wave-plate cycles, for a star with the pointing of each frame."""
+    import astropy.units as u
+    import numpy as np
+
+    from astropolcal.simulation import half_wave_plate_cycles
+
+    star = arguments.source == "star"
+    hwp = arguments.hwp or (_STAR_CYCLE if star else None)
+    given = {"derotator": arguments.derotator or _derotator_angles()}
+    given |= {"hwp": hwp} if hwp else {}
+    frames = half_wave_plate_cycles(**{k: v * u.deg for k, v in given.items()})
+    for name in ("altitude", "parallactic"):
+        ends = getattr(arguments, name)
+        if star and (ends is None or len(ends) > 2):
+            raise AstropolcalError(f"a star needs --{name} DEG, or DEG,DEG of first and last frame")
+        if ends and not star:
+            raise AstropolcalError(f"--{name}: is for --source star")
+        if star:
+            frames[name] = np.linspace(ends[0], ends[-1], len(frames)) * u.deg
+    return frames
+
+
+def _table(arguments, chain, wavelength, frames, meta):
+    """Return the table: with noise, or beside cubes the true fluxes."""
+    from astropolcal import instruments
+    from astropolcal.reduction.cubes import true_observations
+    from astropolcal.simulation import simulate
+
+    options = {
+        "flux": arguments.flux,
+        "gain": arguments.gain,
+        "read_noise": arguments.read_noise,
+        "noise": not (arguments.no_noise or arguments.cubes),
+        "seed": arguments.seed,
+        "meta": meta,
+        "name": "simulated",
+    }
+    if arguments.source == "internal":
+        return simulate(chain, wavelength, frames, **options)
+    instrument = instruments.get(arguments.instrument)
+    return true_observations(
+        chain, instrument, frames, wavelength=wavelength, source="star", **options
+    )
+
+
+def _write_cubes(arguments, chain, wavelength, frames):
+    from astropolcal import instruments
+    from astropolcal.reduction.cubes import simulate_cubes
+
+    return simulate_cubes(
+        arguments.cubes,
+        chain,
+        instruments.get(arguments.instrument),
+        frames,
+        wavelength=wavelength,
+        source=arguments.source,
+        flux=arguments.flux,
+        psf=arguments.psf,
+        noise=not arguments.no_noise,
+        saturate=arguments.saturate,
+        seed=arguments.seed,
+        progress=True,
+        **{name: getattr(arguments, name) for name in _IMAGES},
+    )
 
 
 def _derotator_angles():
@@ -126,29 +244,54 @@ def _truth(arguments):
     """Return the true chain, its wavelengths and the meta that describe its set-up."""
     from astropolcal import instruments
 
+    instrument = instruments.get(arguments.instrument)
     if arguments.calibration:
         from astropolcal.calibration import Calibration
 
         calibration = Calibration.read(arguments.calibration)
-        return calibration.chain.copy(), calibration.wavelength, dict(calibration.datasets[0].meta)
-    instrument = instruments.get(arguments.instrument)
-    return instrument.published(), instrument.wavelength, instrument.published_meta()
+        chain, wavelength = calibration.chain.copy(), calibration.wavelength
+        meta = dict(calibration.datasets[0].meta)
+    else:
+        chain, wavelength = instrument.published(), instrument.wavelength
+        meta = instrument.published_meta()
+    if arguments.source == "star":
+        chain = _behind_telescope(chain, instrument, wavelength)
+        meta |= {"source": "star"}
+    return chain, wavelength, meta
 
 
-def _meta(meta, without):
+def _behind_telescope(chain, instrument, wavelength):
+    """Return the chain with star and telescope in the place of the internal source."""
+    from astropolcal.chain import join, leaves, stages
+
+    if "parallactic" in stages(chain):
+        return chain
+    star = leaves(instrument.chain(source="star", wavelength=wavelength))
+    parts = []
+    for train in (star, leaves(chain)):
+        first = next((i for i, leaf in enumerate(train) if leaf.stage == "hwp"), None)
+        if first is None:
+            raise AstropolcalError("a star needs a chain with an optic on the stage hwp")
+        parts.append((train[:first], train[first:]))
+    return join([*parts[0][0], *parts[1][1]])
+
+
+def _meta(meta, arguments):
     """Return the meta of the table: the set-up, less the optics taken out."""
     absent = {
         "nbs": {"nasmyth_beam_switcher": "not installed"},
         "dichroic": {"yjh50_dichroic": "out"},
     }
-    for optic in without:
+    for optic in arguments.without:
         meta = meta | absent.get(optic, {})
     return meta | {"simulated": True}
 
 
 def _summary(observations, arguments):
     return {
-        "output": str(arguments.output),
+        "output": arguments.output and str(arguments.output),
+        "cubes": arguments.cubes and str(arguments.cubes),
+        "source": arguments.source,
         "n_frames": observations.n_frames,
         "n_wavelengths": observations.n_bins,
         "content_hash": observations.content_hash,

@@ -39,14 +39,32 @@ def build_parser():
     >>> build_parser().parse_args(["info"]).command
     'info'
     """
-    from astropolcal.scripts import _calibrate, _challenge, _diagnose, _info, _sample, _simulate
+    from astropolcal.scripts import (
+        _calibrate,
+        _challenge,
+        _diagnose,
+        _efficiency,
+        _info,
+        _reduce,
+        _sample,
+        _simulate,
+        _standards,
+    )
 
     parser = _OneLineParser(prog="astropolcal", description=_DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"astropolcal {version}")
-    commands = parser.add_subparsers(
-        dest="command", required=True, metavar="{calibrate,sample,diagnose,challenge,simulate,info}"
-    )
-    for module in (_calibrate, _sample, _diagnose, _challenge, _simulate, _info):
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in (
+        _reduce,
+        _calibrate,
+        _sample,
+        _diagnose,
+        _efficiency,
+        _standards,
+        _simulate,
+        _challenge,
+        _info,
+    ):
         module.add_parser(commands)
     return parser
 

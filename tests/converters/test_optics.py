@@ -30,7 +30,9 @@ some_bounds = st.tuples(st.none() | numbers, st.none() | numbers)
 SETTINGS = {
     "beam": st.sampled_from(["right", "left"]),
     "differential": st.booleans(),
+    "film": st.sampled_from(["fused silica", "Al2O3"]),
     "harmonic": st.sampled_from([1, 2, 4]),
+    "material": st.sampled_from(["silver", "gold"]),
     "power": st.sampled_from([1, -1]),
     "reference": st.floats(min_value=0, exclude_min=True, allow_infinity=False),
 }

@@ -21,7 +21,7 @@ SCHEMAS = {
     for uri, content in mapping.items()
     if "/schemas/" in uri
 }
-KINDS = {"angle": "deg", "thickness": "mm", "number": None}
+KINDS = {"angle": "deg", "thickness": "mm", "film": "nm", "number": None}
 
 
 def manifest():

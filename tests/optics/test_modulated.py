@@ -35,7 +35,8 @@ ANGLE = st.floats(-180, 180).map(lambda x: x * u.deg)
 @pytest.mark.parametrize("sign", ["", "-"])
 def test_only_some_optics_stand_on_numbers(name, coordinate, sign):
     mount = sign + coordinate
-    if name in ("DriftRotator", "FluxGain", "StrayLight"):
+    numeric = ("DriftRetarder", "DriftRotator", "FluxGain", "PolarizedBackground", "StrayLight")
+    if name in numeric:
         optic = OPTICS[name](mount=mount)
         assert optic.position.unit == u.one
         assert (optic.stage, optic.stage_sign) == (coordinate, -1.0 if sign else 1.0)

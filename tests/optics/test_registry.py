@@ -19,7 +19,9 @@ from hypothesis import strategies as st
 
 from astropolcal import mueller, optics
 from astropolcal.exceptions import ParameterError
+from astropolcal.materials import get_material
 from astropolcal.optics import COORDINATES, OPTICS, FrameOptic, Optic
+from astropolcal.thinfilm import reflect
 from astropolcal.units import canonical_factor, canonical_unit
 
 WAVELENGTH = [1.2, 1.6, 2.1] * u.um
@@ -36,6 +38,8 @@ COMPONENT = st.floats(-0.7, 0.7)
 OTHER_UNITS = {u.rad: (u.deg, u.rad, u.arcmin), u.um: (u.mm, u.um, u.nm)}
 # small enough for the five-point rule, large enough for rounding
 STEP = {u.rad: 1e-3, u.um: 1e-2, u.dimensionless_unscaled: 1e-4}
+# the phase of a film turns faster than that of a crystal plate
+STEP_OF_UNIT = {u.nm: 2e-4}
 
 
 @st.composite
@@ -77,12 +81,50 @@ def vector_diattenuator(horizontal, diagonal):
     return mueller.rotate(mueller.diattenuator(np.hypot(diagonal, horizontal)), angle)
 
 
+def polarized_source(q, u):
+    shape = np.broadcast_shapes(np.shape(q), np.shape(u))
+    light = np.zeros((*shape, 4))
+    light[..., 0], light[..., 1], light[..., 2] = 1.0, q, u
+    return light[..., :, None] * np.array([1.0, 0, 0, 0])
+
+
+def coated(metal, reflections, incidence, film_thickness, n_scale, k_scale):
+    """Diattenuator-retarder of metal mirrors, wavelength by wavelength and in a row."""
+    index = get_material(metal).index(WAVELENGTH).value
+    index = n_scale * index.real + 1j * k_scale * index.imag
+    film = ("fused silica", film_thickness)
+    stages = [reflect(WAVELENGTH, angle, index, [film]).mueller() for angle in reflections]
+    product = mueller.compose(*stages)
+    return product / product[..., :1, :1]
+
+
+def metal_mirror(incidence, **values):
+    return coated("gold", [incidence], incidence, **values)
+
+
+def k_mirror(incidence, **values):
+    angles = [incidence, 2 * incidence - 90 * u.deg, incidence]
+    return coated("silver", angles, incidence, **values)
+
+
+def power_law_mirror(b1, m1, b2, m2, incidence):
+    length = WAVELENGTH.to_value(u.m)
+    permittivity = -(10.0**b1) * length**m1 + 1j * 10.0**b2 * length**m2
+    return reflect(WAVELENGTH, incidence, np.sqrt(permittivity)).mueller()
+
+
 def gained(gain):
     return np.asarray(gain)[..., None, None] * np.eye(4)
 
 
 def stray(share):
     return np.eye(4) + np.asarray(share)[..., None, None] * np.diag([1.0, 0, 0, 0])
+
+
+def background(share, q, u):
+    out = stray(share) + np.zeros((*np.shape(share * q * u), 4, 4))
+    out[..., 1, 0], out[..., 2, 0] = q, u
+    return out
 
 
 def wave(n, x, cosine, sine):
@@ -178,6 +220,18 @@ CASES = {
         diattenuation=SIGNED,
         retardance=DEGREES,
     ),
+    "DriftRetarder": case(
+        optics.DriftRetarder,
+        lambda x, horizontal, diagonal, horizontal_rate, diagonal_rate: mueller.elliptical_retarder(
+            horizontal + horizontal_rate * x, diagonal + diagonal_rate * x, 0 * u.deg
+        ),
+        mount="sequence",
+        position=FRACTION,
+        horizontal=DEGREES,
+        diagonal=DEGREES,
+        horizontal_rate=DEGREES,
+        diagonal_rate=DEGREES,
+    ),
     "DriftRotator": case(
         optics.DriftRotator,
         lambda x, rate: mueller.rotation_matrix(rate * x),
@@ -226,6 +280,16 @@ CASES = {
         position=st.floats(1e3, 6e4),
         amount=st.floats(0, 0.5),
     ),
+    "PolarizedBackground": case(
+        optics.PolarizedBackground,
+        lambda x, amount, q, u: background(*(part * 3e4 / x for part in (amount, q, u))),
+        settings={"reference": 3e4},
+        mount="total_flux",
+        position=st.floats(1e3, 6e4),
+        amount=st.floats(0.2, 0.5),
+        q=st.floats(-0.1, 0.1),
+        u=st.floats(-0.1, 0.1),
+    ),
     "HarmonicGain": case(optics.HarmonicGain, harmonic_gain(1), cosine=GAIN, sine=GAIN),
     "HarmonicGain, left": case(
         optics.HarmonicGain,
@@ -259,8 +323,25 @@ CASES = {
         cosine=SMALL,
         sine=SMALL,
     ),
+    "KMirror": case(
+        optics.KMirror,
+        k_mirror,
+        incidence=st.floats(50, 75),
+        film_thickness=st.floats(5, 400),
+        n_scale=st.floats(0.5, 2),
+        k_scale=st.floats(0.7, 1.4),
+    ),
     "LinearPolarizer": case(optics.LinearPolarizer, mueller.linear_polarizer),
     "LinearRetarder": case(optics.LinearRetarder, mueller.linear_retarder, retardance=DEGREES),
+    "MetalMirror": case(
+        optics.MetalMirror,
+        metal_mirror,
+        settings={"material": "gold"},
+        incidence=st.floats(2, 80),
+        film_thickness=st.floats(5, 600),
+        n_scale=st.floats(0.3, 3),
+        k_scale=st.floats(0.7, 1.4),
+    ),
     "MuellerElement": Case(
         optics.MuellerElement,
         mueller_elements(),
@@ -270,6 +351,21 @@ CASES = {
         optics.ParityFlip,
         # a mirror, which keeps +Q and changes the sign of U and V, turned by 45 deg
         lambda: mueller.rotate(mueller.linear_retarder(180 * u.deg), 45 * u.deg),
+    ),
+    "PolarizedSource": case(
+        optics.PolarizedSource,
+        polarized_source,
+        q=COMPONENT,
+        u=COMPONENT,
+    ),
+    "PowerLawMirror": case(
+        optics.PowerLawMirror,
+        power_law_mirror,
+        b1=st.floats(12, 15),
+        m1=st.floats(1.6, 2.2),
+        b2=st.floats(12, 15),
+        m2=st.floats(1.6, 2.4),
+        incidence=st.floats(2, 80),
     ),
     "Rotator": case(optics.Rotator, lambda: mueller.rotation_matrix(0 * u.deg)),
     "TwoLayerWaveplate": case(
@@ -535,7 +631,7 @@ def test_light_of_many_frames(label, data, seed):
 def differences(optic, key, position=None):
     """Five-point derivative of the Mueller matrix, per canonical unit."""
     unit = optic._declared(key).unit
-    step = STEP[canonical_unit(unit)]
+    step = STEP_OF_UNIT.get(unit, STEP[canonical_unit(unit)])
     value = np.asarray(getattr(optic, key).value)
 
     def matrix(shift):

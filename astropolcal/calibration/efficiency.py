@@ -1,0 +1,290 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Polarimetric efficiency: how much of the linear polarization of the sky an observation measures.
+
+What a retarder turns into circular polarization is lost for an instrument that measures linear
+polarization only. The efficiency is the degree of linear polarization that a cycle of the
+half-wave plate measures of a source that is completely polarized (McIntosh et al. 2026, Sec. 7.1):
+of the normalized double differences at 0 and 22.5 deg, behind an ideal beam splitter. The
+modulation efficiency of the real one does not enter.
+"""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.chain import join, leaves, stages, system_mueller
+from astropolcal.exceptions import ChainError, ParameterError
+from astropolcal.observations.pointing import TRACKING, horizontal, tracked
+from astropolcal.optics import COORDINATES, Rotator
+from astropolcal.units import angle_to_rad
+
+__all__ = [
+    "DEROTATOR_LAWS",
+    "BestDerotator",
+    "best_derotator",
+    "polarimetric_efficiency",
+    "sky_path",
+]
+
+#: Derotator angle = offset + f * altitude + g * parallactic angle, as (f, g). The first is what
+#: the tables of three stars show; the second keeps the image instead of the pupil still.
+DEROTATOR_LAWS = {"pupil": (0.5, 0.0), "field": (0.5, 0.5)}
+
+# plus and minus angles of the half-wave plate
+_CYCLE = [0, 45, 22.5, 67.5] * u.deg
+_MOST_CELLS = 2_000_000
+
+
+def sky_path(chain):
+    """
+    Return the optics from the sky to the beam splitter, without either.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        A chain; of an internal source what stands before the first optic on a stage
+        belongs to the source.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    ChainError
+        If nothing is left.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration.efficiency import sky_path
+    >>> [optic.name for optic in sky_path(instruments.get("charis").published())]
+    ['hwp', 'derotator', 'dichroic', 'nbs']
+    """
+    found = leaves(chain)
+    end = next((i for i, leaf in enumerate(found) if leaf.depends_on_beam), len(found))
+    moving = (i for i, leaf in enumerate(found) if leaf.stage not in (None, *COORDINATES))
+    train = list(found[next(moving, end) : end])
+    if not train:
+        raise ChainError("the chain has no optic on a stage in front of a beam splitter")
+    if end < len(found) and found[end].theta.value:
+        # the frame of a beam splitter that does not stand straight
+        train.append(Rotator(theta=found[end].theta.quantity, name="analyser"))
+    return join(train)
+
+
+def polarimetric_efficiency(
+    chain,
+    wavelength,
+    *,
+    derotator,
+    altitude=None,
+    parallactic=None,
+    aolp=90 * u.deg,
+    law=TRACKING,
+):
+    r"""
+    Return the degree of linear polarization measured of a completely polarized source.
+
+    For a linear retarder :math:`\Delta` at the angle D behind an ideal half-wave plate it is
+    :math:`\sqrt{\cos^2 2D + \sin^2 2D \cos^2\Delta}`, at all angles of polarization: least at
+    45 and 135 deg. Telescope and half-wave plate change that by a few percent.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        A calibrated chain, from the sky or of an internal source, see `sky_path`.
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_wavelengths,); that of the chain's parameters where these are given per
+        wavelength.
+    derotator : `~astropy.units.Quantity`
+        Derotator angle; the angles broadcast against each other.
+    altitude, parallactic : `~astropy.units.Quantity`, optional
+        Where the telescope points; needed for a chain from the sky. The half-wave plate then
+        follows the tracking law.
+    aolp : `~astropy.units.Quantity` or None
+        Angle of the source's polarization, on sky or behind an internal source; 90 deg, the
+        paper's choice, is -Q. With None the angle that is measured worst.
+    law : (float, float)
+        Tracking law of the half-wave plate, see `~astropolcal.observations.tracked`.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Between 0 and 1, of the broadcast shape of the angles and (n_wavelengths,).
+
+    Raises
+    ------
+    ChainError
+        If the chain has a stage that has no position here.
+    ParameterError
+        If an angle is missing or not finite, or too many values are asked for.
+    ObservationError
+        If the altitude is not above 0 to 90 deg.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration import polarimetric_efficiency
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.on_sky(charis.published())
+    >>> efficiency = polarimetric_efficiency(chain, charis.wavelength, derotator=[45, 90] * u.deg,
+    ...                                      altitude=60 * u.deg, parallactic=94 * u.deg)
+    >>> efficiency.shape, efficiency[:, 9].round(2).tolist()
+    ((2, 22), [0.28, 0.99])
+    """
+    path = sky_path(chain)
+    positions = _positions(path, derotator, altitude, parallactic, law)
+    lam = np.atleast_1d(u.Quantity(wavelength))
+    shape = np.broadcast_shapes(*(np.shape(angle) for angle in positions.values()))
+    if np.prod(shape, dtype=float) * lam.size > _MOST_CELLS:
+        raise ParameterError(
+            f"{shape} angles at {lam.size} wavelengths are too many; allowed are {_MOST_CELLS}"
+        )
+    flat = {stage: np.broadcast_to(a, shape).ravel() * u.rad for stage, a in positions.items()}
+    matrices = np.stack([_at(path, lam, flat, hwp) for hwp in _CYCLE])
+    return _measured(matrices, aolp).reshape(*shape, lam.size)
+
+
+def _at(path, lam, positions, hwp):
+    """Return the first two rows of the matrices with the plate turned further."""
+    if "hwp" in positions:
+        positions = positions | {"hwp": positions["hwp"] + hwp}
+    return np.asarray(system_mueller(path, lam, positions))[..., :2, :]
+
+
+def _positions(path, derotator, altitude, parallactic, law):
+    wanted = set(stages(path)) - set(COORDINATES)
+    found = {"derotator": angle_to_rad(derotator, "derotator"), "hwp": 0.0}
+    if {"altitude", "parallactic"} & wanted:
+        if altitude is None or parallactic is None:
+            raise ParameterError("a chain from the sky needs altitude= and parallactic=")
+        a, p = horizontal(altitude, parallactic)
+        found |= {"altitude": a, "parallactic": p, "hwp": tracked(0.0, p, a, law)}
+    unknown = wanted - set(found)
+    if unknown:
+        raise ChainError(f"no position of the stages {', '.join(sorted(unknown))}")
+    for name, angle in found.items():
+        if not np.all(np.isfinite(angle)):
+            raise ParameterError(f"{name} = {angle} must be finite")
+    return {stage: found[stage] for stage in wanted} | {"derotator": found["derotator"]}
+
+
+def _measured(rows, aolp):
+    """Return the degree of polarization of a cycle, from rows I and Q at its four angles."""
+    if aolp is not None:
+        angle = 2 * float(angle_to_rad(aolp, "aolp"))
+        total, difference = np.moveaxis(
+            rows @ np.array([1.0, np.cos(angle), np.sin(angle), 0.0]), -1, 0
+        )
+        double = (difference[0::2] - difference[1::2]) / (total[0::2] + total[1::2])
+        return np.hypot(*double)
+    # to first order of what the optics polarize themselves
+    total = rows[0::2, ..., 0, 0] + rows[1::2, ..., 0, 0]
+    difference = rows[0::2, ..., 1, 1:3] - rows[1::2, ..., 1, 1:3]
+    response = np.moveaxis(difference / total[..., None], 0, -2)
+    return np.linalg.svd(response, compute_uv=False)[..., -1]
+
+
+# ---- planning --------------------------------------------------------------------------------
+
+
+@dataclass
+class BestDerotator:
+    """
+    Offsets of the derotator for an observation, and the efficiency each gives.
+
+    Parameters
+    ----------
+    offset : `~astropy.units.Quantity`
+        The best offset.
+    table : `~astropy.table.QTable`
+        One row an offset: ``offset``; ``mean`` and ``least``, efficiency over the observation and
+        the wavelengths, at the worst angle of polarization; and ``now``, the same at the first
+        moment.
+    law : str
+        How the derotator follows, a key of `DEROTATOR_LAWS`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal.calibration import BestDerotator
+    >>> BestDerotator(65 * u.deg, QTable(), "pupil").offset
+    <Quantity 65. deg>
+    """
+
+    offset: u.Quantity
+    table: QTable
+    law: str
+
+
+def best_derotator(
+    chain, wavelength, altitude, parallactic, *, law="pupil", offsets=None, by="least"
+):
+    """
+    Find the offset of the derotator that loses least polarization in an observation.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        A calibrated chain from the sky.
+    wavelength : `~astropy.units.Quantity`
+        The wavelengths that count, on the grid of the chain's parameters.
+    altitude, parallactic : `~astropy.units.Quantity`
+        Over the observation, shape (n_times,); `~astropolcal.observations.pointing` gives them for
+        target, time and site.
+    law : {"pupil", "field"}
+        How the derotator follows the sky, see `DEROTATOR_LAWS`.
+    offsets : `~astropy.units.Quantity`, optional
+        Offsets to try, by default 0 to 179 deg in steps of 1 deg.
+    by : {"least", "mean"}
+        Whether the worst or the mean moment and wavelength decides.
+
+    Returns
+    -------
+    BestDerotator
+
+    Raises
+    ------
+    ParameterError
+        If a choice is unknown.
+    ObservationError
+        If the target is below the horizon.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration import best_derotator
+    >>> charis = instruments.get("charis")
+    >>> best = best_derotator(charis.on_sky(charis.published()), charis.wavelength,
+    ...                       [60, 65] * u.deg, [-30, -20] * u.deg,
+    ...                       offsets=range(0, 180, 5) * u.deg)
+    >>> bool(best.table["least"].max() > 0.9)
+    True
+    """
+    if law not in DEROTATOR_LAWS or by not in ("least", "mean"):
+        raise ParameterError(
+            f"law = {law!r}, by = {by!r}; allowed are {', '.join(DEROTATOR_LAWS)}, and least, mean"
+        )
+    offsets = np.arange(180) * u.deg if offsets is None else np.atleast_1d(u.Quantity(offsets))
+    a, p = (np.atleast_1d(angle) * u.rad for angle in horizontal(altitude, parallactic))
+    f, g = DEROTATOR_LAWS[law]
+    efficiency = polarimetric_efficiency(
+        chain,
+        wavelength,
+        derotator=offsets[:, None] + f * a + g * p,
+        altitude=a,
+        parallactic=p,
+        aolp=None,
+    )
+    table = QTable({"offset": offsets.to(u.deg)})
+    table["mean"] = efficiency.mean(axis=(1, 2))
+    table["least"] = efficiency.min(axis=(1, 2))
+    table["now"] = efficiency[:, 0].min(axis=1)
+    return BestDerotator(table["offset"][np.argmax(table[by])], table, law)

@@ -1,0 +1,168 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Polarization of stars as a calibrated instrument sees it, cycle by cycle.
+"""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal import stokes
+from astropolcal.calibration.standards import predicted_chain
+from astropolcal.chain import join, leaves
+from astropolcal.exceptions import ChainError, ObservationError
+from astropolcal.measurement import Measurement
+from astropolcal.observations import cycle_numbers
+from astropolcal.optics import PolarizedSource
+
+__all__ = ["star_accuracy", "star_stokes"]
+
+
+def star_stokes(calibration, chain, observations, positions=None):
+    """
+    Return q and u of a star on sky from every cycle of the half-wave plate.
+
+    The data are linear in q and u to first order of the instrumental polarization; the
+    normalized double differences of each cycle are inverted by least squares, with all that the
+    calibration knows of the instrument. The star's own q and u in the chain do not count.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    chain : `~astropy.modeling.CompoundModel`
+        Chain of the star, with a `~astropolcal.optics.PolarizedSource` first.
+    observations : Observations
+        The star.
+    positions : dict of str to `~numpy.ndarray`, optional
+        See `~astropolcal.measurement.Measurement`.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        One row a wavelength: ``wavelength``; ``q``, ``u`` (means over the cycles) and their
+        standard errors ``q_err``, ``u_err``, from the scatter of the cycles; ``dolp`` (debiased)
+        and ``aolp`` with errors; ``n_cycles``; ``q_cycles`` and ``u_cycles``, one a cycle, NaN
+        where a cycle does not determine them.
+
+    Raises
+    ------
+    ChainError
+        If the chain has no polarized source.
+    ObservationError
+        If no cycle determines q and u.
+
+    Examples
+    --------
+    See the page on stars.
+    """
+    chain = _with_free_star(chain)
+    predicted = predicted_chain(calibration, chain, observations)
+    measurement = Measurement(
+        predicted,
+        observations,
+        observable=calibration.settings["observable"],
+        positions=None if positions is None else [positions],
+    )
+    vector, (part,) = measurement.vector(), measurement.datasets
+    residuals, slopes = measurement.residuals(vector), _star_slopes(measurement, vector)
+    cycle = cycle_numbers(observations)[part.frames[:, 0]][part.group_of_datum]
+    labels = np.unique(cycle)
+    found = np.full((2, len(part.bins), len(labels)), np.nan)
+    for i, b in enumerate(part.bins):
+        for j, label in enumerate(labels):
+            rows = (part.bin_of_datum == b) & (cycle == label)
+            found[:, i, j] = _solved(slopes[:, rows], residuals[rows])
+    if np.isnan(found).all():
+        raise ObservationError(f"{observations.name}: no cycle determines q and u")
+    return _table(observations.wavelength, found)
+
+
+def _with_free_star(chain):
+    first, *rest = leaves(chain)
+    if not isinstance(first, PolarizedSource):
+        raise ChainError("the chain of a star begins with a PolarizedSource")
+    return join([PolarizedSource(q=0.0, u=0.0, name=first.name), *rest])
+
+
+def _star_slopes(measurement, vector):
+    """Return the derivatives of the data to q and u, (2, n_data)."""
+    name = leaves(measurement.chains[0])[0].name
+    jacobian = measurement.jacobian(vector)
+    return np.stack([jacobian[measurement.free.by_name[f"{name}.{key}"].start] for key in "qu"])
+
+
+def _solved(slopes, residuals):
+    if slopes.shape[1] < 2 or np.linalg.svd(slopes, compute_uv=False)[1] < 1e-3:
+        return np.nan
+    return np.linalg.lstsq(slopes.T, residuals, rcond=None)[0]
+
+
+def _table(wavelength, found):
+    count = np.isfinite(found[0]).sum(axis=1)
+    mean = np.nanmean(found, axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = np.nanstd(found, axis=2) / np.sqrt(np.maximum(count - 1, 0))
+    percent = 100 * u.percent
+    table = QTable({"wavelength": wavelength})
+    for key, value in zip(("q", "u", "q_err", "u_err"), (*mean, *error), strict=True):
+        table[key] = value * percent
+    spread = np.hypot(*error) / np.sqrt(2)
+    dolp = np.hypot(*mean)
+    table["dolp"] = stokes.debias_dolp(dolp, spread) * percent
+    table["dolp_err"] = spread * percent
+    table["aolp"] = np.rad2deg(np.mod(0.5 * np.arctan2(mean[1], mean[0]), np.pi)) * u.deg
+    with np.errstate(divide="ignore", invalid="ignore"):
+        table["aolp_err"] = np.rad2deg(0.5 * spread / dolp) * u.deg
+    table["n_cycles"] = count
+    for key, value in zip(("q_cycles", "u_cycles"), found, strict=True):
+        table[key] = value * percent
+    return table
+
+
+def star_accuracy(table, q=0.0, u_=0.0):
+    """
+    Return how well a star of known polarization came out, per wavelength.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        As from `star_stokes`.
+    q, u_ : float or array_like
+        What is known of the star, one a wavelength.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        ``wavelength``; ``dolp_error`` and ``aolp_error``, of the mean, observed less known;
+        ``s_dolp``, the rms error of single cycles along the known polarization, or of both
+        components where it is zero; ``s_q`` and ``s_u``, the rms errors of single cycles.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from astropolcal.calibration.stars import star_accuracy
+    >>> table = QTable({"wavelength": [1.6] * u.um, "q": [1] * u.percent, "u": [0] * u.percent,
+    ...                 "q_cycles": [[0.9, 1.1]] * u.percent,
+    ...                 "u_cycles": [[0.1, -0.1]] * u.percent})
+    >>> star_accuracy(table, q=0.01)["s_dolp"].round(3)
+    <Quantity [0.1] %>
+    """
+    known = np.stack(np.broadcast_arrays(q, u_, np.zeros(len(table)))[:2])
+    mean = np.stack([table[key].to_value(u.one) for key in ("q", "u")])
+    off = np.stack([table[f"{k}_cycles"].to_value(u.one) for k in "qu"]) - known[..., None]
+    length, percent = np.hypot(*known), 100 * u.percent
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = np.einsum("kw,kwc->wc", known / length, off)
+    squares = np.where(length[:, None] > 0, along**2, 0.5 * (off**2).sum(axis=0))
+    angle = 0.5 * (np.arctan2(mean[1], mean[0]) - np.arctan2(known[1], known[0]))
+    turn = np.mod(angle + np.pi / 2, np.pi) - np.pi / 2
+    result = QTable({"wavelength": table["wavelength"]})
+    result["dolp_error"] = (np.hypot(*mean) - length) * percent
+    result["aolp_error"] = np.rad2deg(np.where(length > 0, turn, np.nan)) * u.deg
+    result["s_dolp"] = np.sqrt(np.nanmean(squares, axis=1)) * percent
+    for key, value in zip(("s_q", "s_u"), np.sqrt(np.nanmean(off**2, axis=2)), strict=True):
+        result[key] = value * percent
+    return result

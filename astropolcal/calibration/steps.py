@@ -1,0 +1,197 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Calibrations in steps, each of which holds what the steps before have found.
+
+Two-step: the polarized internal source as in McIntosh et al. (2026, Sec. 5.2). Sequential: one
+dataset after another, as the paper goes from the polarized source to the unpolarized one
+and to the star.
+"""
+
+from itertools import groupby
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.chain import join, leaves
+from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.observations import is_star
+
+__all__ = ["kind_of_source", "sequential", "two_step"]
+
+_ORDER = ("polarized", "unpolarized", "star")
+
+
+def kind_of_source(source, chain=None):
+    """
+    Return what a dataset calibrates.
+
+    Parameters
+    ----------
+    source : str or None
+        As the table says.
+    chain : Optic or `~astropy.modeling.CompoundModel`, optional
+        Decides where the table does not say: a polarizer in front is "polarized".
+
+    Returns
+    -------
+    {"polarized", "unpolarized", "star"}
+
+    Examples
+    --------
+    >>> from astropolcal.calibration.steps import kind_of_source
+    >>> kind_of_source("unpolarized standard star"), kind_of_source("unpolarized")
+    ('star', 'unpolarized')
+    """
+    if is_star(source):
+        return "star"
+    return "unpolarized" if "unpolarized" in (source or "").lower() else "polarized"
+
+
+def two_step(measurement, weighting, joint, run, options):
+    """
+    Fit per wavelength with misalignments held, then global, then per wavelength again.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Fitted in place.
+    weighting : Weighting
+        Noise of the data.
+    joint, run : callable
+        Take a measurement and a weighting, fit in place, with and without a search of
+        branches; return how it went, and the noise.
+    options : dict
+        Further arguments of the measurements of each step.
+
+    Returns
+    -------
+    outcome : dict
+        How it went.
+    weighting : Weighting
+        The noise.
+    stages : list of dict
+        Values after each step.
+
+    Examples
+    --------
+    ``calibrate(chain, observations, strategy="two-step")`` is the way to it.
+    """
+    parts = [dataset.observations for dataset in measurement.datasets]
+    single = {slot.name for slot in measurement.free.slots if not slot.per_wavelength}
+    several = {slot.name for slot in measurement.free.slots if slot.per_wavelength}
+    ties = measurement.free.ties
+    measurement.put_back()
+    options = options | {"wavelength": measurement.wavelength * u.um}
+    stages = []
+
+    loose = [_loosened(chain, measurement.wavelength * u.um) for chain in measurement.chains]
+    first = _step_of(loose, single, parts, ties, options)
+    outcome, weighting = joint(first, weighting)
+    outcomes = [outcome]
+    stages.append(_stage("per wavelength, misalignments held", first))
+    _copy_values(first.put_back(), measurement.chains)
+
+    for title, held in (("global", several), ("per wavelength, global parameters held", single)):
+        step = _step_of(measurement.chains, held, parts, ties, options)
+        if step.free.size:
+            outcome, weighting = run(step, weighting)
+            outcomes.append(outcome)
+        stages.append(_stage(title, step))
+        _copy_values(step.put_back(), measurement.chains)
+    measurement.parameters = measurement.free.start()
+    return _worst(outcomes), weighting, stages
+
+
+def sequential(measurement, weights, joint, run, options):
+    """
+    Fit one kind of source after another and hold what was found.
+
+    First the polarized internal source, then the unpolarized one, then stars; datasets of one
+    kind are fitted together. Errors of the steps before do not enter the later ones, and the
+    later data do not improve what is held: that is the paper's procedure.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Of all datasets; its parameters are set.
+    weights : callable
+        Takes the measurement of a step, returns its first weighting.
+    joint, run, options
+        As for `two_step`; the first step searches branches, the others go downhill.
+
+    Returns
+    -------
+    outcome : dict
+        How it went.
+    stages : list of dict
+        Values after each step.
+
+    Examples
+    --------
+    ``calibrate(chains, datasets, strategy="sequential")`` is the way to it.
+    """
+    measurement.put_back()
+    ties, chains = measurement.free.ties, measurement.chains
+    positions = options["positions"] or [None] * len(chains)
+    options = options | {"wavelength": measurement.wavelength * u.um}
+    parts = [d.observations for d in measurement.datasets]
+    kinds = [kind_of_source(o.source) for o in parts]
+    order = sorted(range(len(parts)), key=lambda i: _ORDER.index(kinds[i]))
+    held, outcomes, stages = set(), [], []
+    for kind, group in groupby(order, key=lambda i: kinds[i]):
+        rows = list(group)
+        own = [chains[i] for i in rows]
+        known = {"positions": [positions[i] for i in rows]}
+        present = {n: tie for n, tie in ties.items() if n in parameter_table(own)}
+        step = _step_of(own, held, [parts[i] for i in rows], present, options | known)
+        if step.free.size:
+            outcome, _ = (run if stages else joint)(step, weights(step))
+            outcomes.append(outcome)
+        stages.append(_stage(f"{kind}, what came before held" if stages else kind, step))
+        _copy_values(step.put_back(), chains)
+        held |= {slot.name for slot in step.free.slots}
+    measurement.parameters = measurement.free.start()
+    return _worst(outcomes), stages
+
+
+def _worst(outcomes):
+    """Return the first step that did not arrive, which spoils those behind it, or the last."""
+    return next((o for o in outcomes if not o["converged"]), outcomes[-1])
+
+
+def _step_of(chains, held, parts, ties, options):
+    """Return the measurement of one step; what follows a held parameter is held too."""
+    known = set(parameter_table(chains))
+    live = {n: tie for n, tie in ties.items() if n in known and tie.source in known - held}
+    return Measurement(_held(chains, held | (set(ties) - set(live))), parts, ties=live, **options)
+
+
+def _loosened(chain, wavelength):
+    return join(leaf.loosened(wavelength) for leaf in leaves(chain.copy()))
+
+
+def _held(chains, names):
+    """Return copies of the chains with more parameters fixed."""
+    copies = [chain.copy() for chain in chains]
+    for name, parameters in parameter_table(copies).items():
+        if name in names:
+            for parameter in parameters:
+                parameter.fixed = True
+    return copies
+
+
+def _copy_values(origin, target):
+    """Copy the values of parameters that both have, name by name."""
+    known = parameter_table(origin)
+    for name, parameters in parameter_table(target).items():
+        for parameter in parameters:
+            if name in known and np.shape(known[name][0].value) == np.shape(parameter.value):
+                parameter.value = known[name][0].value
+
+
+def _stage(title, measurement):
+    """Record the values of one stage, with units, and its residuals."""
+    measurement.put_back()
+    values = {slot.name: measurement.free.values_of(slot.name) for slot in measurement.free.slots}
+    rms = float(np.sqrt(np.mean(measurement.residuals() ** 2)))
+    return {"title": title, "parameters": values, "residual_rms": rms}

@@ -1,0 +1,391 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Where the telescope points: altitude, parallactic angle, and what follows them.
+
+On sky, the light turns by the parallactic angle before the telescope and by the
+altitude behind it, and the half-wave plate follows both. The angles come from the table, or
+from time, target and site. An exposure takes time, and the angles change while it lasts:
+a frame is then the mean over a few nodes of Gauss and Legendre.
+"""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+from astropy.time import Time
+from astropy.utils.exceptions import AstropyWarning
+
+from astropolcal.exceptions import ObservationError
+from astropolcal.observations.coordinates import clock
+from astropolcal.observations.reading import numeric_column
+from astropolcal.units import angle_to_rad
+
+__all__ = ["motion", "pointing", "sky_angles", "sky_positions", "smeared", "tracked"]
+
+#: The tracking law of the half-wave plate (paper, Sec. 6.1): factors of parallactic angle
+#: and altitude.
+TRACKING = (0.5, 1.0)
+
+_WHEN = {"start": 0.5, "middle": 0.0, "end": -0.5}
+_MOST_NODES = 32
+
+
+def pointing(coord, time, location):
+    """
+    Return altitude and parallactic angle of a target.
+
+    Refraction is left out. Nothing is downloaded: for times that the Earth-rotation tables
+    at hand do not cover, the angles are good to a few arcseconds.
+
+    Parameters
+    ----------
+    coord : `~astropy.coordinates.SkyCoord`
+        The target.
+    time : `~astropy.time.Time`
+        When, of any shape.
+    location : `~astropy.coordinates.EarthLocation`
+        Where.
+
+    Returns
+    -------
+    altitude, parallactic : `~astropy.units.Quantity`
+        Degree; the parallactic angle is between -180 and 180 deg, positive in the west.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import EarthLocation, SkyCoord
+    >>> from astropy.time import Time
+    >>> from astropolcal.observations import pointing
+    >>> site = EarthLocation(lon=-155.476 * u.deg, lat=19.8255 * u.deg, height=4139 * u.m)
+    >>> altitude, parallactic = pointing(
+    ...     SkyCoord(80 * u.deg, -1 * u.deg), Time("2025-11-03T13:00"), site)
+    >>> altitude.round(1), parallactic.round(0)
+    (<Quantity 69.1 deg>, <Quantity 6. deg>)
+    """
+    from astropy.coordinates import HADec
+    from astropy.utils import iers
+
+    with (
+        warnings.catch_warnings(),
+        iers.conf.set_temp("auto_download", False),
+        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
+    ):
+        # of times that the tables do not cover; an arcsecond is nothing here
+        warnings.filterwarnings("ignore", "Tried to get polar motions", AstropyWarning)
+        seen = coord.transform_to(HADec(obstime=time, location=location))
+    hour, dec = seen.ha.rad, seen.dec.rad
+    latitude = location.to_geodetic().lat.rad
+    sine = np.sin(latitude) * np.sin(dec) + np.cos(latitude) * np.cos(dec) * np.cos(hour)
+    across = np.sin(hour) * np.cos(latitude)
+    along = np.sin(latitude) * np.cos(dec) - np.cos(latitude) * np.sin(dec) * np.cos(hour)
+    angles = np.arcsin(np.clip(sine, -1, 1)), np.arctan2(across, along)
+    return tuple(np.rad2deg(angle) * u.deg for angle in angles)
+
+
+def tracked(hwp, parallactic, altitude, law=TRACKING):
+    r"""
+    Return the true angle of a half-wave plate that follows the sky.
+
+    :math:`\theta' = \theta + 0.5\,p + a` (paper, Sec. 6.1).
+
+    Parameters
+    ----------
+    hwp, parallactic, altitude : `~astropy.units.Quantity`
+        Commanded angle, parallactic angle and altitude.
+    law : (float, float)
+        Factors of parallactic angle and altitude.
+
+    Returns
+    -------
+    `~astropy.units.Quantity`
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.observations import tracked
+    >>> tracked(45 * u.deg, 30 * u.deg, 60 * u.deg)
+    <Quantity 120. deg>
+    """
+    return hwp + law[0] * parallactic + law[1] * altitude
+
+
+# ---- angles of a table -----------------------------------------------------------------------
+
+
+def sky_angles(observations, location=None):
+    """
+    Return altitude and parallactic angle of every frame.
+
+    From the columns of that name; where they are absent from the columns ``time`` (a
+    `~astropy.time.Time`, or text that it understands, in UTC), ``right_ascension`` and
+    ``declination`` (columns, or meta, in degree).
+
+    Parameters
+    ----------
+    observations : Observations
+        The dataset.
+    location : `~astropy.coordinates.EarthLocation`, optional
+        Where; needed only where the angles must be computed.
+
+    Returns
+    -------
+    altitude, parallactic : `~numpy.ndarray`
+        Radian, shape (F,).
+
+    Raises
+    ------
+    ObservationError
+        If the table does not say where the telescope pointed, or the target is below
+        the horizon.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.observations import Observations, example_table, sky_angles
+    >>> table = example_table()
+    >>> table["altitude"], table["parallactic"] = 60 * u.deg, 30 * u.deg
+    >>> [angle[0].round(4) for angle in sky_angles(Observations.from_table(table))]
+    [np.float64(1.0472), np.float64(0.5236)]
+    """
+    there = observations.frames.colnames
+    if "altitude" in there and "parallactic" in there:
+        angles = observations.position("altitude"), observations.position("parallactic")
+    else:
+        angles = _computed(observations, location)
+    _check_altitude(observations, angles[0])
+    return angles
+
+
+def _check_altitude(observations, altitude):
+    low = altitude <= 0
+    if low.any():
+        frame = int(np.argmax(low))
+        raise ObservationError(
+            f"{observations.name}, frame {observations.frames['frame'][frame]}: altitude = "
+            f"{np.rad2deg(altitude[frame]):.4g} deg; a star is above 0 deg"
+        )
+
+
+def _computed(observations, location):
+    time, target = _times(observations), _target(observations)
+    needed = {"a column time": time, "right_ascension and declination": target, "a site": location}
+    lacking = [words for words, thing in needed.items() if thing is None]
+    if lacking:
+        raise ObservationError(
+            f"{observations.name}: a star needs its pointing: columns altitude and parallactic, "
+            f"or all of {', '.join(needed)}; missing: {', '.join(lacking)}"
+        )
+    return tuple(angle.to_value(u.rad) for angle in pointing(target, time, location))
+
+
+def _times(observations):
+    frames = observations.frames
+    if "time" not in frames.colnames:
+        return None
+    column = frames["time"]
+    if isinstance(column, Time):
+        return column
+    try:
+        return Time(np.asarray(column).astype(str), scale="utc")
+    except ValueError:
+        return None
+
+
+def _target(observations):
+    from astropy.coordinates import SkyCoord
+
+    found = []
+    for key in ("right_ascension", "declination"):
+        if key in observations.frames.colnames:
+            angle = numeric_column(observations.frames, key, observations.name, u.deg)
+        else:
+            angle = observations.meta.get(key)
+        if angle is None:
+            return None
+        found.append(u.Quantity(angle, u.deg))
+    return SkyCoord(*found)
+
+
+# ---- exposures -------------------------------------------------------------------------------
+
+
+def motion(observations, angle, duty=None):
+    """
+    Return by how much an angle changes while a frame is exposed.
+
+    Parameters
+    ----------
+    observations : Observations
+        With columns ``exposure_time`` and ``time``, unless ``duty`` is given.
+    angle : array_like
+        The angle of every frame, radian, shape (F,).
+    duty : float, optional
+        Share of the time from one frame to the next in which light is collected, 0 to 1.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Radian, shape (F,).
+
+    Raises
+    ------
+    ObservationError
+        If neither times nor ``duty`` are known, or are not possible.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import Observations, example_table
+    >>> from astropolcal.observations.pointing import motion
+    >>> motion(Observations.from_table(example_table()), [0.0, 0.1, 0.2, 0.3], duty=0.5).round(3)
+    array([0.05, 0.05, 0.05, 0.05])
+    """
+    steady = np.unwrap(np.asarray(angle, dtype=float))
+    if len(steady) < 2:
+        return np.zeros_like(steady)
+    if duty is not None:
+        if not 0 <= duty <= 1:
+            raise ObservationError(f"duty = {duty}; allowed is 0 to 1")
+        return duty * np.gradient(steady)
+    seconds, exposure = _seconds(observations)
+    if np.any(np.diff(seconds) <= 0):
+        raise ObservationError(f"{observations.name}: the times of the frames do not increase")
+    return np.gradient(steady, seconds) * exposure
+
+
+def _seconds(observations):
+    frames, times = observations.frames, _times(observations)
+    numbers = clock(frames)
+    if "exposure_time" not in frames.colnames or (times is None and numbers is None):
+        raise ObservationError(
+            f"{observations.name}: the motion within an exposure needs columns time and "
+            "exposure_time, or duty=..., the share of the time in which light is collected"
+        )
+    exposure = numeric_column(frames, "exposure_time", observations.name, u.s)
+    if times is not None:
+        return (times.mjd - times.mjd[0]) * 86400.0, exposure
+    return (numbers * (getattr(frames["time"], "unit", None) or u.s)).to_value(u.s), exposure
+
+
+def smeared(angle, change, nodes=3, when="middle"):
+    """
+    Return an angle at the Gauss-Legendre nodes of every exposure.
+
+    A measurement that is given such positions averages the fluxes of the nodes, see
+    `~astropolcal.measurement.Measurement`. Three nodes are exact for everything that is of
+    fifth degree in time.
+
+    Parameters
+    ----------
+    angle : array_like
+        The angle that the table gives, radian, shape (F,).
+    change : array_like
+        By how much it changes during the exposure, shape (F,), see `motion`.
+    nodes : int
+        Number of nodes.
+    when : {"start", "middle", "end"}
+        The moment of the exposure that the table's angle belongs to.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Radian, shape (nodes, F).
+
+    Raises
+    ------
+    ObservationError
+        If the number of nodes or the moment is not possible.
+
+    Examples
+    --------
+    >>> from astropolcal.observations.pointing import smeared
+    >>> smeared([1.0], [0.2], nodes=2).round(3).tolist()
+    [[0.942], [1.058]]
+    """
+    if when not in _WHEN:
+        raise ObservationError(f"when = {when!r}; allowed are {', '.join(_WHEN)}")
+    if not 1 <= nodes <= _MOST_NODES:
+        raise ObservationError(f"nodes = {nodes}; allowed are 1 to {_MOST_NODES}")
+    points, _ = np.polynomial.legendre.leggauss(nodes)
+    share = 0.5 * points[:, None] + _WHEN[when]
+    return np.asarray(angle, dtype=float) + share * np.asarray(change, dtype=float)
+
+
+def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="middle", duty=None):
+    """
+    Return the positions of all that moves with the sky, in radian.
+
+    Parameters
+    ----------
+    observations : Observations
+        A star. Where the table has a column ``hwp_true``, it is the position of the
+        half-wave plate; else the plate follows the tracking law from the commanded ``hwp``.
+    location : `~astropy.coordinates.EarthLocation`, optional
+        See `sky_angles`.
+    law : (float, float)
+        See `tracked`.
+    nodes, when, duty
+        Nodes of an exposure, see `smeared` and `motion`; with one node a frame has one
+        angle, that of the table.
+
+    Returns
+    -------
+    dict of str to `~numpy.ndarray`
+        ``altitude``, ``parallactic``, ``hwp`` and ``derotator``, shape (F,), or
+        (nodes, F) with more than one node.
+
+    Raises
+    ------
+    ObservationError
+        As `sky_angles` and `motion`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal.observations import Observations, example_table
+    >>> from astropolcal.observations.pointing import sky_positions
+    >>> table = example_table()
+    >>> table["altitude"], table["parallactic"] = 60 * u.deg, 30 * u.deg
+    >>> np.rad2deg(sky_positions(Observations.from_table(table))["hwp"]).round(1).tolist()
+    [75.0, 97.5, 120.0, 142.5]
+    """
+    altitude, parallactic = sky_angles(observations, location)
+    found = {"altitude": altitude, "parallactic": parallactic}
+    if "derotator" in observations.frames.colnames:
+        found["derotator"] = observations.position("derotator")
+    hwp = observations.position("hwp")
+    follows = tracked(0.0, parallactic, altitude, law)
+    offset = hwp
+    if "hwp_true" in observations.frames.colnames:
+        offset = observations.position("hwp_true") - follows
+    if nodes > 1:
+        found = {
+            stage: smeared(angle, motion(observations, angle, duty), nodes, when)
+            for stage, angle in found.items()
+        }
+    follows = tracked(0.0, found["parallactic"], found["altitude"], law)
+    return found | {"hwp": offset + follows}
+
+
+def location_of(site):
+    """Return the `~astropy.coordinates.EarthLocation` of (longitude, latitude, height), or None."""
+    from astropy.coordinates import EarthLocation
+
+    if not len(site):
+        return None
+    longitude, latitude, height = site
+    return EarthLocation(lon=longitude * u.deg, lat=latitude * u.deg, height=height * u.m)
+
+
+def horizontal(altitude, parallactic):
+    """Return altitude and parallactic angle in radian, refusing what no star can have."""
+    altitude, parallactic = (
+        angle_to_rad(angle, name)
+        for name, angle in (("altitude", altitude), ("parallactic", parallactic))
+    )
+    bad = ~((altitude > 0) & (altitude <= np.pi / 2 + 1e-9))
+    if np.any(bad):
+        shown = np.rad2deg(np.ravel(altitude)[np.ravel(bad)][0])
+        raise ObservationError(f"altitude = {shown:.4g} deg; allowed is above 0 to 90 deg")
+    return altitude, parallactic

@@ -1,0 +1,317 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Frames of a run that cannot be used, found from the table and masked with a reason.
+
+Nothing is dropped: a masked frame stays in the table with its reason, and one warning a
+reason says how many there are and which. See also `astropolcal.observations.masking`, which judges
+single cells while a table is read.
+"""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.units import angle_to_rad
+
+__all__ = [
+    "brightness",
+    "cycle_numbers",
+    "is_star",
+    "mask_incomplete_cycles",
+    "mask_saturated",
+    "mask_unstable_lamp",
+]
+
+# derotator angles that differ by less belong to one run
+_SAME_ANGLE = np.deg2rad(0.5)
+_PLATE_STEPS = np.deg2rad(0.3)
+_MAD = 1.4826
+_MOST_NAMED = 8
+
+
+def is_star(source):
+    """
+    Return whether a table's source is a star.
+
+    Parameters
+    ----------
+    source : str or None
+        The entry ``source`` of its meta.
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> from astropolcal.observations import is_star
+    >>> is_star("unpolarized standard star"), is_star("unpolarized"), is_star(None)
+    (True, False, False)
+    """
+    words = (source or "").lower().replace("-", " ").split()
+    return "star" in words or "sky" in words
+
+
+# ---- cycles of the half-wave plate ---------------------------------------------------------------
+
+
+def cycle_numbers(observations):
+    """
+    Return the number of the half-wave-plate cycle of every frame.
+
+    That is the column ``cycle`` of the frames where there is one. Else a cycle ends where
+    a plate angle (of one state of a modulator) comes again or the derotator moves.
+
+    Parameters
+    ----------
+    observations : Observations
+        The dataset.
+
+    Returns
+    -------
+    `~numpy.ndarray` of int
+        Shape (F,), from 0.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import Observations, cycle_numbers, example_table
+    >>> cycle_numbers(Observations.from_table(example_table())).tolist()
+    [0, 0, 0, 0]
+    """
+    frames = observations.frames
+    if "cycle" in frames.colnames:
+        return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
+    plate = np.rint(np.mod(observations.position("hwp"), np.pi) / _PLATE_STEPS).astype(int)
+    # 180 deg is 0 deg again
+    plate %= round(np.pi / _PLATE_STEPS)
+    state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
+    moved = np.abs(np.diff(observations.position("derotator"), prepend=0.0)) > _SAME_ANGLE
+    cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
+    for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
+        if i and (moved[i] or key in seen):
+            number, seen = number + 1, set()
+        seen.add(key)
+        cycle[i] = number
+    return cycle
+
+
+def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
+    """
+    Mask the frames of cycles that lack an angle of the half-wave plate.
+
+    An incomplete cycle gives q without u, or neither. A frame that is masked at all
+    wavelengths counts as missing.
+
+    Parameters
+    ----------
+    observations : Observations
+        The dataset.
+    angles : `~astropy.units.Quantity`
+        Commanded angles that a cycle has, modulo 180 deg.
+
+    Returns
+    -------
+    Observations
+
+    Raises
+    ------
+    ObservationError
+        If no cycle is complete.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If frames are masked.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import Observations, example_table, mask_incomplete_cycles
+    >>> mask_incomplete_cycles(Observations.from_table(example_table())).mask_reasons
+    {}
+    """
+    wanted = np.mod(np.atleast_1d(angle_to_rad(angles, "angles")), np.pi)
+    plate, cycle = observations.position("hwp"), cycle_numbers(observations)
+    lost = observations.mask.all(axis=1)
+    apart = np.abs(np.mod(plate[:, None] - wanted + np.pi / 2, np.pi) - np.pi / 2)
+    there = (apart < _PLATE_STEPS) & ~lost[:, None]
+    complete = np.array([there[cycle == c].any(axis=0).all() for c in range(cycle.max() + 1)])
+    if not complete.any():
+        shown = ", ".join(f"{angle:g}" for angle in np.rad2deg(wanted))
+        raise ObservationError(
+            f"{observations.name}: none of its {len(complete)} half-wave-plate cycles has all "
+            f"of the angles {shown} deg"
+        )
+    return _masked(observations, ~complete[cycle] & ~lost, "incomplete half-wave-plate cycle")
+
+
+# ---- detector and lamp ---------------------------------------------------------------------------
+
+
+def mask_saturated(observations):
+    """
+    Mask the frames that the column ``saturated`` flags.
+
+    Parameters
+    ----------
+    observations : Observations
+        Its column ``saturated``, if there is one, holds booleans or numbers of pixels.
+
+    Returns
+    -------
+    Observations
+
+    Raises
+    ------
+    ObservationError
+        If the column holds neither booleans nor numbers.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If frames are masked.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import Observations, example_table, mask_saturated
+    >>> table = example_table()
+    >>> table["saturated"] = 0
+    >>> mask_saturated(Observations.from_table(table)).mask_reasons
+    {}
+    """
+    frames = observations.frames
+    if "saturated" not in frames.colnames:
+        return observations
+    flag = np.asarray(getattr(frames["saturated"], "value", frames["saturated"]))
+    if flag.dtype.kind not in "biuf":
+        raise ObservationError(
+            f"{observations.name}: column saturated has type {flag.dtype}; booleans or numbers "
+            "are needed"
+        )
+    return _masked(observations, np.nan_to_num(flag.astype(float)) > 0, "saturated")
+
+
+def brightness(observations):
+    """
+    Return how bright each frame is, common to all wavelengths.
+
+    Parameters
+    ----------
+    observations : Observations
+        The dataset.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Sum of the beams over its median frame, median over the wavelengths, shape (F,);
+        NaN where all are masked.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import Observations, brightness, example_table
+    >>> brightness(Observations.from_table(example_table())).round(3).tolist()
+    [1.0, 1.0, 1.0, 1.0]
+    """
+    total = np.where(observations.mask, np.nan, observations.flux_right + observations.flux_left)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # frames and bins without any cell
+        relative = total / np.nanmedian(total, axis=0)
+        return np.nanmedian(relative, axis=1)
+
+
+def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
+    """
+    Mask the frames of an internal source whose brightness leaves its slow drift.
+
+    The brightness of the frames, see `brightness`, is compared with the parabola in
+    the order of the frames that has the least absolute deviations. A frame is unstable
+    if its logarithm is off by more than ``limit`` and by more than ``sigma`` robust
+    standard deviations. Where at least half of the frames at one derotator angle are, all
+    frames of that angle are masked, as pairs are formed within it.
+
+    Parameters
+    ----------
+    observations : Observations
+        An internal source; a star may fade behind clouds without harm to its
+        differences.
+    limit : float
+        Least change of brightness that counts, relative.
+    sigma : float
+        In robust standard deviations of all frames.
+
+    Returns
+    -------
+    Observations
+
+    Raises
+    ------
+    ObservationError
+        If every frame would be masked, or a limit is not positive.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If frames are masked.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> import warnings
+    >>> from astropolcal import instruments
+    >>> from astropolcal.observations import mask_unstable_lamp
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)
+    >>> lamp = np.where(np.arange(64) < 8, np.linspace(0.2, 3, 64), 1.0)
+    >>> data = simulate(charis.chain("unpolarized"), charis.wavelength, frames, lamp=lamp)
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore")
+    ...     mask_unstable_lamp(data).mask.all(axis=1).sum()
+    np.int64(8)
+    """
+    if not (limit > 0 and sigma > 0):
+        raise ObservationError(f"limit = {limit}, sigma = {sigma}; both must be above zero")
+    logarithm = np.log(brightness(observations))
+    off = np.abs(logarithm - _drift(logarithm))
+    spread = _MAD * np.nanmedian(off)
+    far = np.nan_to_num(off) > max(limit, sigma * spread)
+    moved = np.abs(np.diff(observations.position("derotator"))) > _SAME_ANGLE
+    run = np.concatenate([[0], np.cumsum(moved)])
+    far |= (np.bincount(run, far) >= 0.5 * np.bincount(run))[run]
+    return _masked(observations, far, "unstable lamp")
+
+
+def _drift(values):
+    """Return the parabola of least absolute deviations, by iterated weights."""
+    known = np.isfinite(values)
+    degree = min(2, max(int(known.sum()) - 4, 0))
+    curve = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(values)), degree)
+    weight = np.ones(int(known.sum()))
+    # the median is where the least deviations of a constant are
+    solution = np.zeros(degree + 1)
+    solution[0] = np.nanmedian(values)
+    for _ in range(50):
+        off = np.abs(values - curve @ solution)[known]
+        weight = 1 / np.sqrt(np.maximum(off, 1e-3 * max(np.median(off), 1e-12)))
+        rows = curve[known] * weight[:, None]
+        solution = np.linalg.lstsq(rows, values[known] * weight, rcond=None)[0]
+    return curve @ solution
+
+
+def _masked(observations, frames, reason):
+    """Mask whole frames with a reason, and say so; leave the rest untouched."""
+    new = frames & ~observations.mask.all(axis=1)
+    if not new.any():
+        return observations
+    result = observations.with_mask(np.asarray(new), reason)
+    numbers = np.asarray(observations.frames["frame"])[new].tolist()
+    more = f" and {len(numbers) - _MOST_NAMED} more" if len(numbers) > _MOST_NAMED else ""
+    warnings.warn(
+        f"{observations.name}: {len(numbers)} of {observations.n_frames} frames masked, {reason}: "
+        f"frame {', '.join(map(str, numbers[:_MOST_NAMED]))}{more}",
+        AstropolcalWarning,
+        stacklevel=3,
+    )
+    return result

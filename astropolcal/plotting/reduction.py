@@ -1,0 +1,343 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Quick look at a reduced run: apertures over images, and the run over time."""
+
+from pathlib import Path
+
+import numpy as np
+
+from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.files import atomic_path
+from astropolcal.plotting._style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    MINUS,
+    VERMILION,
+    canvas,
+    legend_outside,
+    style,
+)
+from astropolcal.reduction.frames import open_cube
+from astropolcal.reduction.photometry import BEAMS
+
+__all__ = ["plot_apertures", "plot_run", "save_quicklook"]
+
+_DPI = 130
+_COLORS = {"right": VERMILION, "left": BLUE}
+_LINES = {"right": "-", "left": "--"}
+_MARKERS = {"right": "o", "left": "s"}
+_MAX_PANELS = 12
+# yellow, where a pixel has no value
+_GAP = "#F0E442"
+
+
+def plot_apertures(reduction, *, frames=None, wavelength=None, figure=None):
+    """
+    Draw the apertures over the images of some frames, one panel each.
+
+    Parameters
+    ----------
+    reduction : Reduction
+        The run; the cubes are read again.
+    frames : sequence of int, optional
+        Indices of frames; by default up to twelve, evenly spaced over the run.
+    wavelength : int, optional
+        Index of the slice; by default the middle one.
+    figure : `~matplotlib.figure.Figure`, optional
+        Where to draw.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If an index is out of range.
+
+    Examples
+    --------
+    >>> from astropolcal.plotting.reduction import plot_apertures
+    >>> from astropolcal.reduction import Reduction
+    >>> plot_apertures(Reduction(None, "star"))
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ParameterError: the reduction has no frames
+    """
+    chosen = _chosen(reduction, frames)
+    grid = reduction.instrument.wavelength
+    k = len(grid) // 2 if wavelength is None else int(wavelength)
+    if not 0 <= k < len(grid):
+        raise ParameterError(f"wavelength = {k}; allowed are 0 to {len(grid) - 1}")
+    columns = min(4, len(chosen))
+    rows = -(-len(chosen) // columns)
+    with style():
+        figure = canvas(figure, 3.1 * columns + 0.9, 3.2 * rows + 1.2)
+        axes = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
+        panels = zip(axes, chosen, strict=False)
+        gaps = any([_draw_frame(panel, reduction, index, k) for panel, index in panels])
+        for panel in axes[len(chosen) :]:
+            panel.set_visible(False)
+        for panel in axes[max(len(chosen) - columns, 0) : len(chosen)]:
+            panel.set_xlabel("x (pixel)")
+            panel.tick_params(labelbottom=True)
+        for panel in axes[::columns]:
+            panel.set_ylabel("y (pixel)")
+        figure.suptitle(
+            f"Apertures at {grid[k].to_value('nm'):.0f} nm "
+            f"({len(chosen)} of {len(reduction.frames)} frames; square-root scale)"
+        )
+        legend_outside(figure, _handles(reduction.source, gaps), columns=4)
+    return figure
+
+
+def _chosen(reduction, frames):
+    count = len(reduction.frames)
+    if not count:
+        raise ParameterError("the reduction has no frames")
+    if frames is None:
+        return np.unique(np.linspace(0, count - 1, min(count, _MAX_PANELS)).round().astype(int))
+    chosen = np.atleast_1d(np.asarray(frames, dtype=int))
+    if chosen.size == 0 or chosen.min() < 0 or chosen.max() >= count:
+        raise ParameterError(f"frames = {chosen.tolist()}; allowed are 0 to {count - 1}")
+    return chosen
+
+
+def _handles(source, gaps):
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles = [
+        Line2D([], [], color=_COLORS[b], ls=_LINES[b], lw=1.8, label=f"{b} beam") for b in BEAMS
+    ]
+    if source == "star":
+        handles.append(Line2D([], [], color="0.35", ls=":", lw=1.4, label="background ring"))
+    if gaps:
+        handles.append(Patch(fc=_GAP, ec="0.5", label="no value"))
+    return handles
+
+
+def _draw_frame(panel, reduction, index, k):
+    """Draw one panel; return whether pixels lack a value."""
+    frame = reduction.frames[index]
+    layout = reduction.instrument.files
+    with open_cube(frame.path, layout) as (_, _, cube, good):
+        image = np.array(cube[k], dtype=float)
+        if good is not None:
+            image[~good[k]] = np.nan
+    _draw_image(panel, image)
+    if reduction.source == "star":
+        _draw_circles(panel, frame.photometry, k, reduction.options.get("annulus", 5.0))
+    else:
+        _draw_rectangles(panel, layout)
+    reason = frame.photometry.reasons[k]
+    label = f"frame {index}: hwp {frame.values['hwp']:g}°, der. {frame.values['derotator']:.4g}°"
+    panel.set_title(label + (f"\nMASKED: {reason}" if reason else ""), fontsize=9)
+    panel.grid(False)
+    return bool(np.isnan(image).any())
+
+
+def _draw_image(panel, image):
+    from matplotlib.colors import PowerNorm
+
+    known = image[np.isfinite(image)]
+    if not known.size:
+        panel.text(0.5, 0.5, "no values", transform=panel.transAxes, ha="center")
+        return
+    low, high = np.percentile(known, (2, 99.8))
+    norm = PowerNorm(0.5, vmin=low, vmax=max(high, low + 1e-12), clip=True)
+    drawn = panel.imshow(image, origin="lower", cmap="gray_r", norm=norm, interpolation="nearest")
+    drawn.set_cmap(drawn.cmap.with_extremes(bad=_GAP))
+    panel.set_xlim(-0.5, image.shape[1] - 0.5)
+    panel.set_ylim(-0.5, image.shape[0] - 0.5)
+
+
+def _draw_circles(panel, photometry, k, annulus):
+    from matplotlib.patches import Circle
+
+    for beam, name in enumerate(BEAMS):
+        r = photometry.radius[beam, k]
+        place = (photometry.x[beam, k], photometry.y[beam, k])
+        if r > 0 and place != (0.0, 0.0):
+            look = {"fill": False, "ec": _COLORS[name]}
+            panel.add_patch(Circle(place, r, ls=_LINES[name], lw=1.6, **look))
+            panel.add_patch(Circle(place, r + annulus, ls=":", lw=1.2, **look))
+
+
+def _draw_rectangles(panel, layout):
+    from matplotlib.patches import Rectangle
+
+    left, right, width, height, angle = layout.internal_apertures
+    for name, (x, y) in (("right", right), ("left", left)):
+        panel.add_patch(
+            Rectangle(
+                (x - width / 2, y - height / 2),
+                width,
+                height,
+                angle=np.rad2deg(angle),
+                rotation_point="center",
+                fill=False,
+                ec=_COLORS[name],
+                ls=_LINES[name],
+                lw=1.6,
+            )
+        )
+
+
+def plot_run(reduction, *, wavelength=None, figure=None):
+    """
+    Draw fluxes, single differences and, for stars, centres and widths over the run.
+
+    Parameters
+    ----------
+    reduction : Reduction
+        The run.
+    wavelength : int, optional
+        Index of the slice; by default the middle one.
+    figure : `~matplotlib.figure.Figure`, optional
+        Where to draw.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If an index is out of range.
+
+    Examples
+    --------
+    >>> from astropolcal.plotting.reduction import plot_run
+    >>> from astropolcal.reduction import Reduction
+    >>> plot_run(Reduction(None, "star"))
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ParameterError: the reduction has no frames
+    """
+    _chosen(reduction, None)
+    grid = reduction.instrument.wavelength
+    k = len(grid) // 2 if wavelength is None else int(wavelength)
+    if not 0 <= k < len(grid):
+        raise ParameterError(f"wavelength = {k}; allowed are 0 to {len(grid) - 1}")
+    star = reduction.source == "star"
+    clock, label = _clock(reduction.frames)
+    with style():
+        figure = canvas(figure, 9.0, 11.0 if star else 6.0)
+        axes = figure.subplots(5 if star else 2, 1, sharex=True)
+        _draw_fluxes(axes[0], axes[1], reduction, clock, k)
+        if star:
+            _draw_places(axes[2:], reduction, clock, k)
+        axes[-1].set_xlabel(label)
+        figure.suptitle(f"The run at {grid[k].to_value('nm'):.0f} nm")
+        figure.align_ylabels()
+        legend_outside(figure, _run_handles(reduction, k), columns=4)
+    return figure
+
+
+def _clock(frames):
+    """Return when the frames were taken and the label of that axis."""
+    times = [frame.values.get("mjd") for frame in frames]
+    if None in times or np.ptp(times) == 0:
+        return np.arange(len(frames)), "frame"
+    minutes = (np.array(times) - min(times)) * 1440.0
+    return minutes, "time since the first frame (min)"
+
+
+def _cells(reduction, k, name):
+    """Return an array of the photometry over the run, (2, F), NaN where a cell failed."""
+    values = np.array([getattr(frame.photometry, name)[:, k] for frame in reduction.frames]).T
+    failed = np.array([bool(frame.photometry.reasons[k]) for frame in reduction.frames])
+    return np.where(failed, np.nan, values)
+
+
+def _draw_fluxes(top, below, reduction, clock, k):
+    flux = _cells(reduction, k, "flux")
+    error = np.sqrt(_cells(reduction, k, "variance"))
+    for beam, name in enumerate(BEAMS):
+        top.errorbar(clock, flux[beam], error[beam], lw=0, elinewidth=1.2, **_look(name))
+    top.set_ylabel(f"flux ({reduction.frames[0].unit})")
+    total = flux.sum(axis=0)
+    single = (flux[0] - flux[1]) / total
+    scatter = 2 * np.hypot(flux[1] * error[0], flux[0] * error[1]) / total**2
+    below.errorbar(clock, single, scatter, fmt="D", color=GREEN, ms=5, lw=0, elinewidth=1.2)
+    below.axhline(0.0, color="0.6", lw=0.8)
+    below.set_ylabel(f"(right {MINUS} left) /\n(right + left)")
+    failed = np.isnan(flux[0])
+    if failed.any():
+        for axes in (top, below):
+            height = axes.get_xaxis_transform()
+            axes.plot(
+                clock[failed], np.full(failed.sum(), 0.05), "x", color=BLACK, transform=height
+            )
+
+
+def _look(name):
+    """Return the look of a beam's points; the left one is open, for the two often coincide."""
+    fill = {"mfc": "none", "ms": 8} if name == "left" else {"ms": 5}
+    return {"color": _COLORS[name], "marker": _MARKERS[name], "ls": ""} | fill
+
+
+def _draw_places(panels, reduction, clock, k):
+    for panel, key in zip(panels, ("x", "y", "fwhm"), strict=True):
+        for values, name in zip(_cells(reduction, k, key), BEAMS, strict=True):
+            if key != "fwhm" and np.isfinite(values).any():
+                values = values - np.nanmedian(values)
+            panel.plot(clock, values, **_look(name))
+    for panel, axis in zip(panels, "xy", strict=False):
+        panel.set_ylabel(f"{axis} {MINUS} median\n(pixel)")
+    panels[2].set_ylabel("FWHM (pixel)")
+
+
+def _run_handles(reduction, k):
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], label=f"{name} beam", **_look(name)) for name in BEAMS]
+    handles.append(Line2D([], [], color=GREEN, marker="D", ls="", label="single difference"))
+    if any(frame.photometry.reasons[k] for frame in reduction.frames):
+        handles.append(Line2D([], [], color=BLACK, marker="x", ls="", label="masked frame"))
+    return handles
+
+
+def save_quicklook(reduction, folder):
+    """
+    Write the figures of a run as PNG files.
+
+    Parameters
+    ----------
+    reduction : Reduction
+        The run.
+    folder : path-like
+        Where to write; it is created if it does not exist.
+
+    Returns
+    -------
+    list of `~pathlib.Path`
+        ``apertures.png`` and ``run.png``.
+
+    Raises
+    ------
+    ObservationError
+        If the folder or a file cannot be written.
+
+    Examples
+    --------
+    >>> from astropolcal.plotting.reduction import save_quicklook
+    >>> save_quicklook(None, "/nowhere/deep/down")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: /nowhere/deep/down: there is no folder /nowhere/deep
+    """
+    folder = Path(folder)
+    if not folder.parent.is_dir():
+        raise ObservationError(f"{folder}: there is no folder {folder.parent}")
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise ObservationError(f"{folder}: cannot be made: {error.strerror}") from None
+    written = []
+    for name, plot in (("apertures.png", plot_apertures), ("run.png", plot_run)):
+        with atomic_path(folder / name, ObservationError) as temporary:
+            plot(reduction).savefig(temporary, dpi=_DPI)
+        written.append(folder / name)
+    return written

@@ -1,0 +1,130 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Images of the beams of a dual-beam polarimeter: field stop, stars, detector."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import erf
+
+from astropolcal.exceptions import InstrumentError, ParameterError
+
+# three-point Gauss rule over a pixel
+_NODES, _WEIGHTS = np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15), np.array([5.0, 8.0, 5.0]) / 18
+_SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
+# exponent of the halo's Moffat profile: that of a seeing-limited image, whose wings fall as r^-11/3
+_HALO_BETA = 11 / 6
+
+
+class Scene:
+    """Where the light of each beam falls: the shares of its flux in every pixel."""
+
+    def __init__(self, layout, *, source, psf, fwhm, beta, halo, halo_fwhm, margin):
+        left, right, width, height, angle = layout.internal_apertures
+        self.shape, self.source, self.psf = layout.shape, source, psf
+        self.fwhm, self.beta, self.halo, self.halo_fwhm = fwhm, beta, halo, halo_fwhm
+        self.offset = np.asarray(layout.star_offset, dtype=float)
+        # the field stop moves with the star from beam to beam
+        self.centre = (np.add(left, right) - self.offset) / 2
+        size = (width + 2 * margin, height + 2 * margin)
+        stops = [rectangle(layout.shape[1:], c, size, angle) for c in self.centres(self.centre)]
+        self.boxes = [_bounding_box(stop) for stop in stops]
+        self.stops = [stop[box] for stop, box in zip(stops, self.boxes, strict=True)]
+        self.area = width * height
+        apertures = [rectangle(layout.shape[1:], c, (width, height), angle) for c in (right, left)]
+        for stop, aperture in zip(stops, apertures, strict=True):
+            if source == "internal" and np.any(stop[aperture > 0] < 1):
+                raise ParameterError(
+                    f"margin = {margin:g} pixels: the field stop cuts the apertures of the layout"
+                )
+
+    def centres(self, left):
+        """Return the place in the right and in the left beam."""
+        return np.asarray(left) + self.offset, np.asarray(left)
+
+    def light(self, fluxes, centre, widening):
+        """Return the image of both beams, in the unit of the fluxes."""
+        image = np.zeros(self.shape)
+        places = self.centres(centre)
+        for beam, stop, box, place in zip(fluxes, self.stops, self.boxes, places, strict=True):
+            if self.source == "star":
+                share = stop * self._star(box, place, self.fwhm * widening)
+            else:
+                share = stop / self.area
+            image[(slice(None), *box)] += beam[:, None, None] * share
+        return image
+
+    def _star(self, box, place, fwhm):
+        """Return the share of a star's light in the pixels of a box, (n_wavelengths, y, x)."""
+        core = moffat if self.psf == "moffat" else gaussian
+        share = _by_width(core, box, place, fwhm, self.beta)
+        if self.halo:
+            share = (1 - self.halo) * share + self.halo * _by_width(
+                moffat, box, place, self.halo_fwhm, _HALO_BETA
+            )
+        return share
+
+
+def rectangle(shape, centre, size, angle):
+    """Return the part of each pixel within a turned rectangle, its edges a pixel wide."""
+    y, x = np.indices(shape)
+    dx, dy = x - centre[0], y - centre[1]
+    along = dx * np.cos(angle) + dy * np.sin(angle)
+    across = dy * np.cos(angle) - dx * np.sin(angle)
+    sides = zip((along, across), size, strict=True)
+    return np.prod([np.clip(full / 2 - np.abs(d) + 0.5, 0, 1) for d, full in sides], axis=0)
+
+
+def _bounding_box(stop):
+    used = np.nonzero(stop)
+    if not used[0].size:
+        raise InstrumentError("internal_apertures: a beam lies outside the cube")
+    return tuple(slice(index.min(), index.max() + 1) for index in used)
+
+
+def _by_width(profile, box, place, fwhm, beta):
+    """Return a profile for each wavelength; equal widths are computed once."""
+    widths, which = np.unique(fwhm, return_inverse=True)
+    return np.stack([profile(box, place, width, beta) for width in widths])[which]
+
+
+def gaussian(box, place, fwhm, _beta):
+    """Return the exact integral over every pixel of a Gaussian of unit sum."""
+    scale = np.sqrt(2) * fwhm * _SIGMA_PER_FWHM
+    parts = []
+    for along, middle in zip(box, (place[1], place[0]), strict=True):
+        edges = np.arange(along.start, along.stop + 1) - 0.5
+        parts.append(0.5 * np.diff(erf((edges - middle) / scale)))
+    return np.outer(*parts)
+
+
+def moffat(box, place, fwhm, beta):
+    """Return the integral over every pixel of a Moffat profile of unit sum."""
+    core = fwhm / (2 * np.sqrt(2 ** (1 / beta) - 1))
+    squares = []
+    for along, middle in zip(box, (place[1], place[0]), strict=True):
+        nodes = np.arange(along.start, along.stop)[:, None] + _NODES
+        squares.append((nodes.ravel() - middle) ** 2)
+    profile = (1 + np.add.outer(*squares) / core**2) ** -beta
+    rows, columns = (size // 3 for size in profile.shape)
+    pixels = np.einsum("iajb,a,b->ij", profile.reshape(rows, 3, columns, 3), _WEIGHTS, _WEIGHTS)
+    return pixels * (beta - 1) / (np.pi * core**2)
+
+
+@dataclass(frozen=True)
+class Detector:
+    gain: float
+    read_noise: float
+    background: np.ndarray
+    saturation: float
+    noise: bool
+
+    def expose(self, light, response, rng):
+        """Return the image in adu, and the inverse of its variance."""
+        electrons = self.gain * response * (light + self.background)
+        variance = (electrons + self.read_noise**2) / self.gain**2
+        if self.noise:
+            electrons = rng.poisson(electrons) + self.read_noise * rng.standard_normal(light.shape)
+        image = np.minimum(electrons / self.gain, self.saturation)
+        with np.errstate(divide="ignore"):
+            weight = np.where(variance > 0, 1 / variance, 0.0)
+        return image.astype(np.float32), weight.astype(np.float32)

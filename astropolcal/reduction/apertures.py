@@ -1,0 +1,188 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Photometry of the internal source: a rectangle on each Wollaston beam.
+
+References
+----------
+McIntosh et al. 2026; 't Hart et al. 2021, Proc. SPIE 11833: rectangles that
+keep clear of the edges of the field stop.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+
+from astropolcal.exceptions import InstrumentError, ParameterError
+from astropolcal.reduction.errors import flux_variance, shared_background
+from astropolcal.reduction.photometry import BEAMS, Photometry
+
+__all__ = ["measure_internal", "rectangles"]
+
+_BACKGROUNDS = ("none", "outside")
+# a background pixel is this far, in pixels, from both rectangles
+_CLEAR = 12.0
+
+
+@lru_cache(maxsize=8)
+def rectangles(apertures, shape):
+    """
+    Return the weights of the pixels in the rectangles of both beams.
+
+    Parameters
+    ----------
+    apertures : tuple
+        ((x, y) of the left, (x, y) of the right, width, height, rotation in radian).
+    shape : tuple of int
+        Rows and columns of an image.
+
+    Returns
+    -------
+    tuple
+        For the right and the left beam: rows (slice), columns (slice), weights
+        (`~numpy.ndarray`, the part of each pixel inside).
+
+    Raises
+    ------
+    InstrumentError
+        If a rectangle does not lie wholly inside the image.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.apertures import rectangles
+    >>> layout = instruments.get("charis").files
+    >>> [round(float(w.sum())) for _, _, w in rectangles(layout.internal_apertures, (201, 201))]
+    [4999, 4999]
+    """
+    from photutils.aperture import RectangularAperture
+
+    left, right, width, height, angle = apertures
+    found = []
+    for x, y in (right, left):
+        mask = RectangularAperture((x, y), width, height, theta=angle).to_mask(method="exact")
+        box = mask.bbox
+        inside = box.iymin >= 0 and box.ixmin >= 0 and box.iymax <= shape[0]
+        if not (inside and box.ixmax <= shape[1]):
+            raise InstrumentError(
+                f"the rectangle at ({x:g}, {y:g}) leaves the image of {shape[1]} x {shape[0]} "
+                "pixels"
+            )
+        found.append((slice(box.iymin, box.iymax), slice(box.ixmin, box.ixmax), mask.data))
+    return tuple(found)
+
+
+@lru_cache(maxsize=8)
+def _outside(apertures, shape):
+    """Return the pixels that are clear of both rectangles."""
+    left, right, width, height, angle = apertures
+    grown = (left, right, width + 2 * _CLEAR, height + 2 * _CLEAR, angle)
+    y, x = np.indices(shape)
+    clear = np.ones(shape, dtype=bool)
+    for cx, cy in grown[:2]:
+        along = (x - cx) * np.cos(angle) + (y - cy) * np.sin(angle)
+        across = (y - cy) * np.cos(angle) - (x - cx) * np.sin(angle)
+        clear &= (np.abs(along) > grown[2] / 2) | (np.abs(across) > grown[3] / 2)
+    return clear
+
+
+def measure_internal(cube, good, detector, layout, *, background="none", max_masked=0.2):
+    """
+    Measure both beams of an internal source in all slices of a cube.
+
+    Pixels without a value are left out, and the sum is scaled to the full area.
+
+    Parameters
+    ----------
+    cube : `~numpy.ndarray`
+        Shape (W, Y, X).
+    good : `~numpy.ndarray` of bool or None
+        Pixels that have a value; None if all have.
+    detector : Detector
+        In the unit of the cube.
+    layout : FileLayout
+        With ``internal_apertures``.
+    background : {"none", "outside"}
+        Nothing, or the median of the pixels clear of both beams, is subtracted.
+        The light of the source fills the field stop, so use it only if the
+        pixels outside show the same background as those inside.
+    max_masked : float
+        Largest part of an aperture that may lack values.
+
+    Returns
+    -------
+    Photometry
+
+    Raises
+    ------
+    ParameterError
+        If an option is unknown or out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.apertures import measure_internal
+    >>> from astropolcal.reduction.errors import detector_of
+    >>> layout = instruments.get("charis").files
+    >>> result = measure_internal(np.ones(layout.shape), None, detector_of(layout), layout)
+    >>> result.flux[0].round(1)[:2].tolist()
+    [4998.6, 4998.6]
+    """
+    if background not in _BACKGROUNDS:
+        raise ParameterError(f"background = {background!r}; allowed are {', '.join(_BACKGROUNDS)}")
+    if not 0 <= max_masked < 1:
+        raise ParameterError(f"max_masked = {max_masked:g}; allowed is 0 and above, below 1")
+    result = Photometry.empty(len(cube))
+    level, spread, number = np.zeros(len(cube)), np.full(len(cube), detector.read_noise**2), np.inf
+    if background == "outside":
+        level, spread, number = _level(cube, good, detector, layout)
+        result.background[:] = level
+    areas = []
+    for beam, (rows, columns, weights) in enumerate(
+        rectangles(layout.internal_apertures, cube.shape[1:])
+    ):
+        cut = cube[:, rows, columns]
+        known = None if good is None else good[:, rows, columns]
+        total, area, kept = _weighted(cut, known, weights)
+        scale = area / np.where(kept > 0, kept, 1.0)
+        result.flux[beam] = total * scale - level * area
+        photons = np.maximum(total - level * kept, 0.0) / detector.gain * scale**2
+        result.variance[beam] = flux_variance(photons, area * scale, spread, number)
+        result.flag(kept < (1 - max_masked) * area, f"{BEAMS[beam]} aperture masked")
+        result.flag(_peak(cut, known, weights) >= detector.saturation, "saturated")
+        areas.append(area)
+    if background == "outside":
+        result.covariance[:] = shared_background(*areas, spread, number)
+    result.flag((result.flux <= 0).any(axis=0), "no light")
+    return result
+
+
+def _weighted(cut, known, weights):
+    """Return the weighted sum of each slice, the area, and the area that has values."""
+    flat, w = cut.reshape(len(cut), -1), weights.ravel()
+    area = w.sum()
+    if known is None:
+        return flat @ w, area, np.full(len(cut), area)
+    known = known.reshape(len(cut), -1)
+    return np.where(known, flat, 0.0) @ w, area, known @ w
+
+
+def _peak(cut, known, weights):
+    values = cut if known is None else np.where(known, cut, -np.inf)
+    return values[:, weights > 0].max(axis=1)
+
+
+def _level(cube, good, detector, layout):
+    """Return the median outside the beams, the variance of a pixel, and their number."""
+    clear = _outside(layout.internal_apertures, cube.shape[1:])
+    pixels = np.array(cube[:, clear], dtype=float)
+    # cubes hold exact zeros where the detector has no lenslets
+    unknown = pixels == 0.0
+    if good is not None:
+        unknown |= ~good[:, clear]
+    pixels[unknown] = np.nan
+    number = (~unknown).sum(axis=1)
+    pixels[number == 0] = 0.0
+    level = np.nanmedian(pixels, axis=1)
+    spread = (1.4826 * np.nanmedian(np.abs(pixels - level[:, None]), axis=1)) ** 2
+    return level, np.maximum(spread, detector.variance(level)), np.maximum(number, 1)

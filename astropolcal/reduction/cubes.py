@@ -1,0 +1,496 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Simulated image cubes: both beams of any chain, as FITS files of an instrument.
+
+The fluxes of the beams are those of `astropolcal.simulation.simulate`. A star
+is an image with a core and a halo in each beam, the internal source a flat
+field; both are seen through the field stop, of which the beam splitter makes
+two images.
+"""
+
+import re
+import warnings
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.io import fits
+from astropy.table import QTable
+from astropy.time import Time
+from tqdm import tqdm
+
+from astropolcal.chain import stages
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    InstrumentError,
+    ObservationError,
+    ParameterError,
+)
+from astropolcal.files import atomic_path
+from astropolcal.observations import Observations, tracked
+from astropolcal.reduction._images import Detector, Scene
+from astropolcal.simulation import _expected, _scale, simulate
+from astropolcal.units import angle_to_rad
+
+__all__ = ["simulate_cubes", "true_observations"]
+
+_SOURCES, _PROFILES = ("internal", "star"), ("moffat", "gaussian")
+_TEXT_COLUMNS = ("object", "instrument", "filter", "date", "time", "right_ascension", "declination")
+
+
+def simulate_cubes(
+    directory,
+    chain,
+    instrument,
+    frames,
+    *,
+    wavelength=None,
+    source="internal",
+    stokes=(1.0, 0.0, 0.0, 0.0),
+    flux=1e7,
+    lamp=None,
+    psf="moffat",
+    fwhm=5.0,
+    beta=3.0,
+    halo=0.0,
+    halo_fwhm=30.0,
+    centre=None,
+    motion=0.0,
+    seeing=0.0,
+    margin=6.0,
+    background=0.0,
+    gain=None,
+    read_noise=None,
+    noise=True,
+    saturate=False,
+    bad_pixels=0.0,
+    flat_error=0.0,
+    exposure_time=10 * u.s,
+    start="2025-10-05T08:00:00",
+    headers=None,
+    raw=True,
+    first=1,
+    prefix=None,
+    overwrite=False,
+    seed=None,
+    progress=False,
+):
+    """
+    Write the cubes and raw headers that an instrument would, for a known chain.
+
+    The true fluxes are those of `true_observations`; for stars, the half-wave
+    plate stands at the angle of the tracking law.
+
+    Parameters
+    ----------
+    directory : path-like
+        Folder for the cubes, made if only it is absent; raw headers go to its
+        folder ``raw``.
+    chain : `~astropy.modeling.CompoundModel`
+        The true chain, with a beam splitter.
+    instrument : Instrument
+        With a `~astropolcal.instruments.layout.FileLayout`.
+    frames : `~astropy.table.QTable`
+        One row a frame: ``hwp`` as commanded, ``derotator`` and whatever else
+        the chain needs; for a star ``parallactic`` and ``altitude``. A column
+        ``hwp_true`` replaces the tracking law, ``time`` and ``exposure_time`` the
+        arguments below. All columns that the layout has a keyword for are written.
+    wavelength : `~astropy.units.Quantity`, optional
+        Of the slices; by default the instrument's.
+    source : {"internal", "star"}
+        What is seen.
+    stokes : sequence of float
+        Stokes vector of the light that enters the chain.
+    flux : float or array_like
+        Flux that enters the chain, in adu; scalar or one value a wavelength. Of
+        the internal source, what enters through an area as large as an aperture of
+        the layout.
+    lamp : array_like, optional
+        Relative brightness of the source in each frame.
+    psf : {"moffat", "gaussian"}
+        Profile of a star's core.
+    fwhm : float, array_like or `~astropy.units.Quantity`
+        Full width of the core at half maximum; pixels, or an angle on the sky.
+    beta : float
+        Exponent of a Moffat core.
+    halo : float
+        Share of the light in the halo, a Moffat profile with wings as of seeing.
+    halo_fwhm : float or `~astropy.units.Quantity`
+        Full width of the halo at half maximum.
+    centre : (float, float), optional
+        Place of the star in the left beam, 0-based x and y; by default the
+        middle of the field.
+    motion : float or `~astropy.units.Quantity`
+        Standard deviation of the place from frame to frame, in x and in y.
+    seeing : float
+        Relative standard deviation of ``fwhm`` from frame to frame.
+    margin : float
+        How far the field stop lies outside the apertures of the layout, pixels.
+    background : float or array_like
+        In adu per pixel, scalar or one value a wavelength.
+    gain, read_noise : float, optional
+        Electrons per adu, and electrons per pixel; by default the layout's.
+    noise : bool
+        Whether to draw noise; the variances are given either way.
+    saturate : bool
+        Whether pixels are cut off at the layout's ``saturation``.
+    bad_pixels : float
+        Share of the pixels without a value: NaN, with zero inverse variance.
+    flat_error : float
+        Relative standard deviation of the pixels' response, the same in all frames.
+    exposure_time : `~astropy.units.Quantity`
+        Of a frame; the frames follow each other without a gap.
+    start : str or `~astropy.time.Time`
+        Start of the first frame.
+    headers : dict, optional
+        More keywords and values for all headers.
+    raw : bool
+        Whether the columns that the layout looks up in raw headers are written
+        there only; else they stand in the cubes, and there are no raw headers.
+    first : int
+        Number of the first frame.
+    prefix : str, optional
+        What the names of the files begin with; by default as the layout says.
+    overwrite : bool
+        Whether files that exist are replaced.
+    seed : int, optional
+        Seed of all that is random.
+    progress : bool
+        Whether to show a progress bar; it appears on a terminal only.
+
+    Returns
+    -------
+    list of `~pathlib.Path`
+        The cubes, in the order of the frames.
+
+    Raises
+    ------
+    ParameterError
+        If a number is out of range or of the wrong shape.
+    InstrumentError
+        If the instrument has no file layout, or one without what the source needs.
+    ObservationError
+        If a file exists or cannot be written, or a column is missing.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If a pixel is above the layout's saturation and not cut off.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import astropy.units as u
+    >>> from astropy.io import fits
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.cubes import simulate_cubes
+    >>> from astropolcal.simulation import half_wave_plate_cycles
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(hwp=[0, 45] * u.deg)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = simulate_cubes(folder, charis.published(), charis, frames, seed=1)
+    ...     fits.getdata(paths[0], 1).shape
+    (22, 201, 201)
+    """
+    layout = _layout(instrument)
+    _choice("source", source, _SOURCES)
+    _choice("psf", psf, _PROFILES)
+    frames = _with_headers(frames, layout, source, exposure_time, start)
+    wavelength = instrument.wavelength if wavelength is None else np.atleast_1d(wavelength)
+    n_wavelengths, n_frames = _count(layout, wavelength), len(frames)
+    beams = _beam_fluxes(chain, wavelength, frames, source, flux=flux, lamp=lamp, stokes=stokes)
+    scene = Scene(
+        layout,
+        source=source,
+        psf=psf,
+        fwhm=_pixels("fwhm", fwhm, layout, n_wavelengths),
+        beta=_number("beta", beta, above=1.0),
+        halo=_number("halo", halo, most=1.0),
+        halo_fwhm=_pixels("halo_fwhm", halo_fwhm, layout, n_wavelengths),
+        margin=_number("margin", margin),
+    )
+    detector = Detector(
+        gain=_number("gain", layout.gain if gain is None else gain, above=0.0),
+        read_noise=_number("read_noise", layout.read_noise if read_noise is None else read_noise),
+        background=_per_wavelength("background", background, n_wavelengths)[:, None, None],
+        saturation=layout.saturation if saturate else np.inf,
+        noise=noise,
+    )
+    seeds = np.random.SeedSequence(seed).spawn(n_frames + 2)
+    centres, widths = _variations(
+        np.random.default_rng(seeds[-1]),
+        scene.centre if centre is None else centre,
+        float(_pixels("motion", motion, layout, 1, least=0.0)[0]),
+        _number("seeing", seeing),
+        n_frames,
+    )
+    response, bad = _defects(np.random.default_rng(seeds[-2]), layout, flat_error, bad_pixels)
+    names = _names(Path(directory), layout, prefix, first, n_frames, raw, overwrite)
+    brightest = 0.0
+    for i in tqdm(range(n_frames), desc="cubes", disable=None if progress else True):
+        light = scene.light(beams[:, i], centres[i], widths[i])
+        brightest = max(brightest, float((light + detector.background).max()))
+        image, weight = detector.expose(light, response, np.random.default_rng(seeds[i]))
+        image[bad], weight[bad] = np.nan, 0.0
+        _write(*names[i], image, weight, _header(frames[i], layout) | (headers or {}), layout)
+    if brightest > layout.saturation and not saturate:
+        _warn_of_saturation(brightest, layout)
+    return [cube for cube, _ in names]
+
+
+def true_observations(
+    chain,
+    instrument,
+    frames,
+    *,
+    wavelength=None,
+    source="internal",
+    stokes=(1.0, 0.0, 0.0, 0.0),
+    noise=False,
+    **options,
+):
+    """
+    Return the table that a faultless photometry of simulated cubes would give.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        The true chain.
+    instrument : Instrument
+        With a file layout.
+    frames : `~astropy.table.QTable`
+        As for `simulate_cubes`.
+    wavelength : `~astropy.units.Quantity`, optional
+        By default the instrument's.
+    source : {"internal", "star"}
+        What is seen.
+    stokes : sequence of float
+        Stokes vector of the light that enters the chain.
+    noise : bool
+        Whether to draw the noise of the beam fluxes.
+    **options
+        Of `~astropolcal.simulation.simulate`: ``flux``, ``lamp``, ``meta``, ``seed``...
+
+    Returns
+    -------
+    Observations
+        ``hwp`` as commanded; for a star also ``hwp_true``.
+
+    Raises
+    ------
+    ParameterError, ObservationError, ChainError
+        If a number, column or stage is missing or wrong.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.cubes import true_observations
+    >>> from astropolcal.simulation import half_wave_plate_cycles
+    >>> charis = instruments.get("charis")
+    >>> true_observations(charis.published(), charis, half_wave_plate_cycles()).n_frames
+    8
+    """
+    _choice("source", source, _SOURCES)
+    wavelength = instrument.wavelength if wavelength is None else wavelength
+    known = _with_headers(frames, _layout(instrument), source, 1 * u.s, "2025-01-01")
+    kept = [c for c in QTable(frames).colnames if not isinstance(known[c], Time)]
+    table = known[kept]
+    if source == "star":
+        table["hwp"] = known["hwp_true"]
+    true = simulate(chain, wavelength, table, source=stokes, noise=noise, **options)
+    if source != "star":
+        return true
+    rows, n = true.to_table(), true.n_bins
+    rows["hwp"], rows["hwp_true"] = np.repeat(known["hwp"], n), np.repeat(known["hwp_true"], n)
+    return Observations.from_table(rows, name=true.name)
+
+
+# --- what is checked -------------------------------------------------------------
+
+
+def _choice(name, value, allowed):
+    if value not in allowed:
+        raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
+
+
+def _layout(instrument):
+    layout = instrument.files
+    if layout is None or len(layout.internal_apertures) != 5:
+        raise InstrumentError(
+            f"{instrument.name}: its class does not say how its files look "
+            "(attribute files, with internal_apertures)"
+        )
+    return layout
+
+
+def _count(layout, wavelength):
+    if np.shape(wavelength) != layout.shape[:1]:
+        raise ParameterError(
+            f"wavelength has shape {np.shape(wavelength)}; the cubes have {layout.shape[0]} slices"
+        )
+    return layout.shape[0]
+
+
+def _number(name, value, *, least=0.0, above=-np.inf, most=np.inf):
+    value = float(value)
+    if not (np.isfinite(value) and least <= value <= most and value > above):
+        bounds = f"above {above:g}" if above > least or above == least else f"{least:g} and above"
+        raise ParameterError(f"{name} = {value:g}; allowed is {bounds}, up to {most:g}")
+    return value
+
+
+def _per_wavelength(name, value, n_wavelengths):
+    value = np.asarray(value, dtype=float)
+    if value.shape not in ((), (n_wavelengths,)) or not np.all(np.isfinite(value) & (value >= 0)):
+        raise ParameterError(
+            f"{name} = {value}; allowed are numbers not negative, of shape () or ({n_wavelengths},)"
+        )
+    return np.broadcast_to(value, (n_wavelengths,))
+
+
+def _pixels(name, value, layout, n_wavelengths, least=0.5):
+    """Return a length on the detector in pixels, one a wavelength."""
+    if isinstance(value, u.Quantity) and value.unit is not u.dimensionless_unscaled:
+        if value.unit.is_equivalent(u.pix):
+            value = value.to_value(u.pix)
+        else:
+            value = np.rad2deg(angle_to_rad(value, name)) * 3.6e6 / layout.pixel_scale
+    value = _per_wavelength(name, value, n_wavelengths)
+    if value.min() < least:
+        raise ParameterError(f"{name} = {value.min():g} pixels; allowed are {least:g} and above")
+    return value
+
+
+# --- what is true ----------------------------------------------------------------
+
+
+def _with_headers(frames, layout, source, exposure_time, start):
+    """Return the frames with the true angle of the half-wave plate and the times."""
+    frames = QTable(frames, copy=True)
+    missing = {"hwp", "derotator"} - set(frames.colnames)
+    if missing or not len(frames):
+        raise ObservationError(f"frames: column {', '.join(sorted(missing)) or 'hwp'} is missing")
+    if "hwp_true" not in frames.colnames:
+        frames["hwp_true"] = _tracked(frames, layout) if source == "star" else frames["hwp"]
+    if "exposure_time" not in frames.colnames:
+        frames["exposure_time"] = u.Quantity(exposure_time) * np.ones(len(frames))
+    _number("exposure_time", frames["exposure_time"].to_value(u.s).min(), above=0.0)
+    if "time" not in frames.colnames:
+        before = np.cumsum(frames["exposure_time"]) - frames["exposure_time"]
+        frames["time"] = Time(start) + before
+    return frames
+
+
+def _tracked(frames, layout):
+    missing = {"parallactic", "altitude"} - set(frames.colnames)
+    if missing:
+        raise ObservationError(
+            f"frames: {' and '.join(sorted(missing))} missing, which a star needs"
+        )
+    angle = tracked(frames["hwp"], frames["parallactic"], frames["altitude"], layout.tracking)
+    return angle % (360 * u.deg)
+
+
+def _beam_fluxes(chain, wavelength, frames, source, *, flux, lamp, stokes):
+    """Return what reaches the detector, (beam, frame, wavelength), the right beam first."""
+    table = frames[sorted({"hwp", *stages(chain)} & set(frames.colnames))]
+    if source == "star":
+        table["hwp"] = frames["hwp_true"]
+    right_left = _expected(chain, wavelength, table, stokes)
+    scale = _scale(flux, lamp, len(frames), len(wavelength))
+    return np.stack([fluxes.T * scale for fluxes in right_left])
+
+
+def _variations(rng, centre, motion, seeing, n_frames):
+    """Return the place of the star and the factor of its width, in each frame."""
+    centre = np.asarray(centre, dtype=float)
+    if centre.shape != (2,) or not np.all(np.isfinite(centre)):
+        raise ParameterError(f"centre = {centre}; two numbers are needed, x and y")
+    centres = centre + motion * rng.standard_normal((n_frames, 2))
+    return centres, np.exp(seeing * rng.standard_normal(n_frames))
+
+
+def _defects(rng, layout, flat_error, bad_pixels):
+    """Return the response of the pixels, and which of them have no value."""
+    spread = _number("flat_error", flat_error, most=0.5)
+    share = _number("bad_pixels", bad_pixels, most=0.9)
+    response = (1 + spread * rng.standard_normal(layout.shape)).clip(0.0) if spread else 1.0
+    return response, rng.random(layout.shape) < share
+
+
+# --- files -----------------------------------------------------------------------
+
+
+def _names(directory, layout, prefix, first, n_frames, raw, overwrite):
+    """Return the paths of cube and raw header of every frame."""
+    if not directory.parent.is_dir():
+        raise ObservationError(f"{directory}: there is no folder {directory.parent}")
+    if directory.exists() and not directory.is_dir():
+        raise ObservationError(f"{directory}: is a file, not a folder")
+    prefix = layout.prefix if prefix is None else prefix
+    numbers = [f"{prefix}{first + i:08d}" for i in range(n_frames)]
+    if first < 0 or re.search(layout.frame_pattern, f"{numbers[-1]}_cube.fits") is None:
+        raise ParameterError(
+            f"{numbers[-1]}: the number of the frame must match {layout.frame_pattern}"
+        )
+    names = [
+        (directory / f"{n}_cube.fits", directory / "raw" / f"{n}.fits" if raw else None)
+        for n in numbers
+    ]
+    present = [path for pair in names for path in pair if path is not None and path.exists()]
+    if present and not overwrite:
+        raise ObservationError(f"{present[0]}: exists; overwriting it was not asked for")
+    (directory / "raw" if raw else directory).mkdir(exist_ok=True, parents=True)
+    return names
+
+
+def _write(cube, raw_header, image, weight, header, layout):
+    in_raw = {layout.keywords[c] for c in layout.raw_columns if c in layout.keywords}
+    in_cube = {k: v for k, v in header.items() if raw_header is None or k not in in_raw}
+    hdus = [fits.PrimaryHDU(header=fits.Header(list(in_cube.items())))]
+    # the cube's extension need not be the first
+    hdus += [fits.ImageHDU() for _ in range(layout.cube_extension - 1)]
+    for name, values, unit in (("IMAGE", image, "adu"), ("IVAR", weight, "adu-2")):
+        hdus.append(fits.ImageHDU(values, header=fits.Header({"BUNIT": unit}), name=name))
+    _save(fits.HDUList(hdus), cube)
+    if raw_header is not None:
+        _save(fits.HDUList([fits.PrimaryHDU(header=fits.Header(list(header.items())))]), raw_header)
+
+
+def _warn_of_saturation(brightest, layout):
+    warnings.warn(
+        f"the brightest pixel has {brightest:.3g} adu, above the saturation of "
+        f"{layout.saturation:g} adu: lower the flux, or cut off with saturate",
+        AstropolcalWarning,
+        stacklevel=3,
+    )
+
+
+def _save(hdus, path):
+    with atomic_path(path, ObservationError) as temporary:
+        hdus.writeto(temporary, overwrite=True)
+
+
+def _header(frame, layout):
+    """Return keyword and value of every column that the layout has a keyword for."""
+    header = {}
+    time = Time(frame["time"])
+    date, clock = time.isot.split("T")
+    known = {"date": date, "time": clock, "mjd": time.mjd * u.day}
+    if layout.identities:
+        known["instrument"] = layout.identities[0]
+    known |= {c: frame[c] for c in frame.colnames if c != "time"}
+    for column, keyword in layout.keywords.items():
+        if column in known:
+            header[keyword] = _value(column, known[column], layout)
+    return header
+
+
+def _value(column, value, layout):
+    """Return what a header says: the inverse of how the layout reads it."""
+    if column in _TEXT_COLUMNS and not isinstance(value, u.Quantity):
+        return str(value)
+    number = u.Quantity(value).to_value(layout.units.get(column, "deg"))
+    factor, offset = layout.transforms.get(column, (1.0, 0.0))
+    return float((number - offset) / factor)

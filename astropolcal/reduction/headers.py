@@ -1,0 +1,462 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What the headers of a frame say, and whether they can be right.
+
+An extracted cube may lack keywords that the raw frame of the same number has.
+What is missing, impossible or contradictory is reported for each file.
+"""
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import FK5, SkyCoord
+from astropy.io import fits
+from astropy.time import Time
+
+from astropolcal.exceptions import ObservationError
+
+__all__ = [
+    "FrameHeader",
+    "check_sequence",
+    "frame_number",
+    "pointing",
+    "raw_frames",
+    "read_header",
+    "tracking_error",
+]
+
+_TEXTS = (
+    "date",
+    "time",
+    "right_ascension",
+    "declination",
+    "object",
+    "instrument",
+    "filter",
+    "pickoff",
+)
+_ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
+# beyond these, in degree, an angle in a header cannot be right
+_RANGES = {"altitude": (0.0, 90.0)} | dict.fromkeys(
+    ("hwp", "hwp_true", "derotator", "parallactic"), (-720.0, 720.0)
+)
+_MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
+_SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
+
+
+@dataclass
+class FrameHeader:
+    """
+    The keywords of a frame in the units of a layout.
+
+    Attributes
+    ----------
+    path : str
+        The cube.
+    number : int or None
+        Of the frame, from its name.
+    values : dict
+        Column to number (degree, second, day) or text; what is missing is absent.
+    errors : list of str
+        Why the frame cannot be used.
+    doubts : list of str
+        What is odd, but does not stop the frame from being used.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction.headers import FrameHeader
+    >>> FrameHeader("CRSA00170808_cube.fits", 170808).errors
+    []
+    """
+
+    path: str
+    number: int | None = None
+    values: dict = field(default_factory=dict)
+    errors: list = field(default_factory=list)
+    doubts: list = field(default_factory=list)
+
+
+def frame_number(name, layout, header=None):
+    """
+    Return the number that a cube shares with its raw frame.
+
+    Parameters
+    ----------
+    name : path-like
+        The file; only its name counts.
+    layout : FileLayout
+        With ``frame_pattern`` and ``original_name``.
+    header : `~astropy.io.fits.Header`, optional
+        Where the original name stands if the file was renamed.
+
+    Returns
+    -------
+    int or None
+        None if no name holds one.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.headers import frame_number
+    >>> layout = instruments.get("charis").files
+    >>> frame_number("CRSA00170808_cube.fits", layout)
+    170808
+    >>> frame_number("n0001e_skysub.fits", layout, {"ORIGNAME": "CRSA00170810.fits"})
+    170810
+    """
+    candidates = [Path(name).name]
+    if header is not None:
+        candidates.append(str(header.get(layout.original_name, "")))
+    for text in candidates:
+        # the last one: a date may stand before it
+        found = re.findall(layout.frame_pattern, text)
+        if found:
+            return int(found[-1])
+    return None
+
+
+def raw_frames(folder, layout):
+    """
+    Return the raw frames in a folder by number.
+
+    Parameters
+    ----------
+    folder : path-like
+        Its FITS files are looked at by name, not opened.
+    layout : FileLayout
+        With ``frame_pattern``.
+
+    Returns
+    -------
+    dict of int to `~pathlib.Path`
+
+    Raises
+    ------
+    ObservationError
+        If there is no such folder, or no frame in it has a number.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.headers import raw_frames
+    >>> raw_frames("nowhere", instruments.get("charis").files)
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: nowhere: no such folder
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ObservationError(f"{folder}: no such folder")
+    found = {}
+    for path in sorted(folder.iterdir()):
+        number = frame_number(path.name, layout)
+        if number is not None and path.name.lower().endswith(_SUFFIXES):
+            found.setdefault(number, path)
+    if not found:
+        raise ObservationError(f"{folder}: no FITS file with a frame number in its name")
+    return found
+
+
+def read_header(path, layout, *, header=None, raw=None):
+    """
+    Read what a layout asks for, from the cube and from the raw frame of the same number.
+
+    Parameters
+    ----------
+    path : path-like
+        The cube.
+    layout : FileLayout
+        The keywords.
+    header : `~astropy.io.fits.Header`, optional
+        Primary header of the cube, if it was read already.
+    raw : dict of int to path-like, optional
+        Raw frames by number, see `raw_frames`.
+
+    Returns
+    -------
+    FrameHeader
+        Nothing is raised for a keyword that is missing or impossible: see
+        ``errors`` and ``doubts``.
+
+    Raises
+    ------
+    ObservationError
+        If the file cannot be read.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.headers import read_header
+    >>> header = fits.Header({"RET-ANG1": 22.5, "D_IMRANG": 45.0})
+    >>> read_header("CRSA00170808_cube.fits", instruments.get("charis").files, header=header).values
+    {'hwp': 22.5, 'derotator': 45.0}
+    """
+    header = _primary(path) if header is None else header
+    frame = FrameHeader(str(path), frame_number(path, layout, header))
+    headers = [header]
+    missing = [c for c in layout.raw_columns if _look_up(headers, c, layout)[1] is None]
+    if raw is not None and missing:
+        headers += _raw_header(frame, raw)
+    for column in layout.keywords:
+        keyword, value = _look_up(headers, column, layout)
+        if value is not None:
+            _convert(frame, column, keyword, value, layout)
+    return frame
+
+
+def _primary(path):
+    try:
+        return fits.getheader(path, 0)
+    except FileNotFoundError:
+        raise ObservationError(f"{path}: no such file") from None
+    except Exception as error:  # astropy raises errors of many kinds for damaged files
+        raise ObservationError(f"{path}: not a readable FITS file: {_short(error)}") from error
+
+
+def _short(error):
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _raw_header(frame, raw):
+    if frame.number is None:
+        frame.errors.append("its name holds no frame number to find the raw frame by")
+    elif frame.number not in raw:
+        frame.errors.append(f"no raw frame of number {frame.number}")
+    else:
+        try:
+            return [_primary(raw[frame.number])]
+        except ObservationError as error:
+            frame.errors.append(f"raw frame: {error}")
+    return []
+
+
+def _look_up(headers, column, layout):
+    """Return the first keyword that holds a value for a column, and the value."""
+    for header in headers:
+        for keyword in (layout.keywords[column], *layout.alternatives.get(column, ())):
+            value = header.get(keyword)
+            if isinstance(value, fits.card.Undefined):
+                continue
+            if value is not None and str(value).strip().lower() not in _MISSING:
+                return keyword, value
+    return layout.keywords[column], None
+
+
+def _convert(frame, column, keyword, value, layout):
+    """Store a value in the unit of its column, or say why it cannot be right."""
+    if column in _TEXTS:
+        frame.values[column] = str(value).strip()
+        return
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        frame.errors.append(f"{keyword} = {value!r}, a number is needed")
+        return
+    factor, offset = layout.transforms.get(column, (1.0, 0.0))
+    unit = u.Unit(layout.units.get(column, "deg"))
+    target = u.deg if column in _ANGLES else u.Unit({"exposure_time": "s"}.get(column, unit))
+    number = (factor * number + offset) * unit.to(target)
+    low, high = _RANGES.get(column, (-np.inf, np.inf))
+    if column == "exposure_time":
+        low = np.nextafter(0, 1)
+    if not (np.isfinite(number) and low <= number <= high):
+        frame.errors.append(f"{keyword} = {value}, allowed are {_allowed(low, high, target)}")
+        return
+    frame.values[column] = number
+
+
+def _allowed(low, high, unit):
+    if np.isfinite(high):
+        return f"{low:g} to {high:g} {unit}"
+    return "finite numbers" if np.isinf(low) else "numbers above zero"
+
+
+def pointing(values, site):
+    """
+    Return altitude and parallactic angle of a target, from its place and the time.
+
+    Parameters
+    ----------
+    values : dict
+        ``right_ascension`` (hours, or degrees if it is a plain number),
+        ``declination`` (degrees, both J2000), and ``mjd`` or ``date`` and ``time``.
+    site : tuple of float
+        Longitude, latitude (degree), height (m).
+
+    Returns
+    -------
+    altitude, parallactic : float
+        Degree; the parallactic angle is positive west of the meridian.
+
+    Raises
+    ------
+    ObservationError
+        If something is missing or cannot be understood.
+
+    Notes
+    -----
+    UT1 is taken as UTC, which is right within 0.9 s: 0.004 deg of hour angle.
+    Refraction is left out.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction.headers import pointing
+    >>> values = {"right_ascension": "05:05:05", "declination": "+10:00:00", "mjd": 60250.5}
+    >>> [round(angle, 1) for angle in pointing(values, (-155.4761, 19.8255, 4139.0))]
+    [75.9, -44.9]
+    """
+    time = observation_time(values)
+    try:
+        ra, dec = values["right_ascension"], values["declination"]
+        unit = u.deg if _is_number(ra) else u.hourangle
+        coordinate = SkyCoord(ra, dec, unit=(unit, u.deg), frame=FK5(equinox="J2000"))
+    except KeyError as error:
+        raise ObservationError(f"no {error.args[0]} to compute the pointing from") from None
+    except (ValueError, TypeError, u.UnitsError) as error:
+        raise ObservationError(f"right ascension and declination: {_short(error)}") from None
+    here = coordinate.transform_to(FK5(equinox=time))
+    longitude, latitude = np.deg2rad(site[:2])
+    time.delta_ut1_utc = 0.0
+    hour = time.sidereal_time("mean", longitude * u.rad).rad - here.ra.rad
+    sin_alt = np.sin(latitude) * np.sin(here.dec.rad)
+    sin_alt += np.cos(latitude) * np.cos(here.dec.rad) * np.cos(hour)
+    parallactic = np.arctan2(
+        np.sin(hour),
+        np.cos(here.dec.rad) * np.tan(latitude) - np.sin(here.dec.rad) * np.cos(hour),
+    )
+    return float(np.rad2deg(np.arcsin(sin_alt))), float(np.rad2deg(parallactic))
+
+
+def _is_number(text):
+    try:
+        float(text)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def observation_time(values):
+    """Return the time that ``mjd``, or ``date`` and ``time``, say."""
+    try:
+        if "mjd" in values:
+            return Time(values["mjd"], format="mjd", scale="utc")
+        date = values["date"]
+        return Time(date if "T" in date else f"{date[:10]}T{values['time']}", scale="utc")
+    except KeyError as error:
+        raise ObservationError(f"no {error.args[0]} to compute the time from") from None
+    except ValueError as error:
+        raise ObservationError(f"time: {_short(error)}") from None
+
+
+def tracking_error(values, layout):
+    """
+    Return how far the half-wave plate is from where the tracking law puts it.
+
+    Parameters
+    ----------
+    values : dict
+        ``hwp``, ``hwp_true``, ``parallactic`` and ``altitude`` in degree.
+    layout : FileLayout
+        With ``tracking``.
+
+    Returns
+    -------
+    float or None
+        Degree, between -90 and 90: a half-wave plate turned by half a turn is the
+        same. None if an angle is missing.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.headers import tracking_error
+    >>> values = {"hwp": 45.0, "hwp_true": 302.0, "parallactic": 20.0, "altitude": 67.0}
+    >>> tracking_error(values, instruments.get("charis").files)
+    0.0
+    """
+    names = ("hwp", "hwp_true", "parallactic", "altitude")
+    if not all(name in values for name in names):
+        return None
+    hwp, true, parallactic, altitude = (values[name] for name in names)
+    on_parallactic, on_altitude = layout.tracking
+    law = hwp + on_parallactic * parallactic + on_altitude * altitude
+    # adding a whole number of turns to the parallactic angle shifts the law by half turns
+    return float((true - law + 90.0) % 180.0 - 90.0)
+
+
+def check_sequence(hwp, derotator, layout, tolerance=0.5):
+    """
+    Find commanded angles that do not fit the sequence of a run.
+
+    Angles that are not a multiple of the layout's step do not fit. The frames,
+    in the order they were taken, are then cut into blocks of one derotator
+    angle; the angles that most blocks have are the sequence. A block may lack
+    some of them, but an angle that occurs more often in a block than in the
+    sequence does not fit.
+
+    Parameters
+    ----------
+    hwp, derotator : array_like of float
+        Degree, in the order of the frames.
+    layout : FileLayout
+        With ``hwp_step``.
+    tolerance : float
+        Degree.
+
+    Returns
+    -------
+    dict of int to str
+        Index of a frame to what is wrong with it.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.headers import check_sequence
+    >>> layout = instruments.get("charis").files
+    >>> check_sequence([0, 45, 22.5, 67.5, 0, 45, 30, 67.5], [45] * 4 + [90] * 4, layout)
+    {6: 'half-wave plate at 30 deg, no multiple of 11.25 deg; the sequence has 22.5 deg'}
+    """
+    hwp, derotator = np.asarray(hwp, dtype=float), np.asarray(derotator, dtype=float)
+    if not hwp.size:
+        return {}
+    steps = np.rint(hwp / layout.hwp_step)
+    uneven = np.abs(hwp - layout.hwp_step * steps) > tolerance
+    # an uneven angle is a step of its own, which no sequence has
+    steps[uneven] = 1e6 + np.flatnonzero(uneven)
+    blocks = np.split(np.arange(len(hwp)), np.flatnonzero(np.abs(np.diff(derotator)) > 1.0) + 1)
+    sequence = _sequence([tuple(steps[block]) for block in blocks])
+    found = {}
+    for block in blocks:
+        for i, expected in _misfits(block, steps, sequence, uneven):
+            words = f"half-wave plate at {hwp[i]:g} deg"
+            words += f", no multiple of {layout.hwp_step:g} deg" if uneven[i] else " once too often"
+            if expected is not None and expected < 1e6:
+                words += f"; the sequence has {expected * layout.hwp_step:g} deg"
+            found[int(i)] = words
+    return found
+
+
+def _sequence(blocks):
+    """Return the steps that most blocks have, or None if there is no majority."""
+    ranked = Counter(block for block in blocks if max(block) < 1e6).most_common(2)
+    tied = len(ranked) == 2 and ranked[0][1] == ranked[1][1]
+    return None if len(blocks) < 2 or not ranked or tied else ranked[0][0]
+
+
+def _misfits(block, steps, sequence, uneven):
+    """Yield the frames of a block that do not fit, and the step at their place if it is known."""
+    if sequence is None:
+        yield from ((i, None) for i in block[uneven[block]])
+        return
+    surplus = Counter(steps[block]) - Counter(sequence)
+    aligned = len(block) == len(sequence)
+    # the frame at the right place keeps an angle that occurs twice
+    order = sorted(range(len(block)), key=lambda k: aligned and steps[block[k]] == sequence[k])
+    for k in order:
+        if surplus[steps[block[k]]] > 0:
+            surplus[steps[block[k]]] -= 1
+            yield block[k], sequence[k] if aligned else None

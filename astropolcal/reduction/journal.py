@@ -1,0 +1,96 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""A journal of the files that are done, so that a run can go on where it stopped."""
+
+import hashlib
+import json
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from astropolcal.exceptions import ObservationError
+from astropolcal.reduction.frames import Frame
+
+__all__ = ["Journal"]
+
+
+class Journal:
+    """
+    Results of files as lines of JSON, written as they come.
+
+    A file counts as done if its name, size and time of change and the settings
+    are those of the journal. A line that was cut off is ignored.
+
+    Parameters
+    ----------
+    path : path-like or None
+        The journal; None keeps none.
+    settings : dict
+        What the results depend on besides the files.
+
+    Raises
+    ------
+    ObservationError
+        If it cannot be read or written, or is something else.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction.journal import Journal
+    >>> Journal(None, {}).done("CRSA00170808_cube.fits") is None
+    True
+    """
+
+    def __init__(self, path, settings):
+        self.path = None if path is None else Path(path)
+        text = json.dumps(settings, sort_keys=True, default=repr)
+        self._settings = hashlib.sha256(text.encode()).hexdigest()[:16]
+        self._known = {} if self.path is None else self._read()
+        self._stream = None
+
+    def _read(self):
+        if not self.path.exists():
+            return {}
+        try:
+            lines = self.path.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ObservationError(f"{self.path}: cannot be read as a journal: {error}") from None
+        known = {}
+        for line in lines:
+            # a line may have been cut off when a run was stopped
+            with suppress(ValueError, KeyError, TypeError):
+                entry = json.loads(line)
+                known[entry["key"]] = Frame.from_dict(entry["frame"])
+        if lines and not known:
+            raise ObservationError(f"{self.path}: not a journal of a reduction; take another name")
+        return known
+
+    def _key(self, path):
+        try:
+            state = os.stat(path)
+        except OSError:
+            return None
+        return f"{Path(path).resolve()}|{state.st_size}|{state.st_mtime_ns}|{self._settings}"
+
+    def done(self, path):
+        """Return the frame of a file that is done, else None."""
+        return self._known.get(self._key(path))
+
+    def add(self, frame):
+        """Write down a frame."""
+        key = self._key(frame.path)
+        if self.path is None or key is None:
+            return
+        try:
+            if self._stream is None:
+                self._stream = open(self.path, "a", encoding="utf-8")
+                # after a line that was cut off
+                self._stream.write("\n" if self._stream.tell() else "")
+            self._stream.write(json.dumps({"key": key, "frame": frame.to_dict()}) + "\n")
+            self._stream.flush()
+        except OSError as error:
+            raise ObservationError(f"{self.path}: cannot be written: {error.strerror}") from None
+
+    def close(self):
+        """Close the file."""
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None

@@ -1,0 +1,142 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Tables of fluxes that pyPolCal wrote, as observations.
+
+One CSV file a wavelength bin, one row a frame: ``filepath``, ``D_IMRANG``
+(derotator), ``RET-ANG1`` (commanded half-wave plate), ``LCOUNTS`` and
+``RCOUNTS``, their sum and difference ``single_sum`` and ``single_diff`` with
+errors ``sum_std`` and ``diff_std``, ``wavelength_bin`` (nm), and for stars ``p``
+and ``a`` (parallactic angle and altitude), all angles in degree.
+"""
+
+import csv
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.exceptions import ObservationError
+from astropolcal.observations import Observations
+
+__all__ = ["read_pypolcal"]
+
+_NEEDED = ("filepath", "D_IMRANG", "RET-ANG1", "LCOUNTS", "RCOUNTS", "wavelength_bin")
+_ANGLES = {"RET-ANG1": "hwp", "D_IMRANG": "derotator", "p": "parallactic", "a": "altitude"}
+_ERRORS = {"diff_std": "single_difference_err", "sum_std": "single_sum_err"}
+
+
+def read_pypolcal(files, meta=None, *, name=None):
+    r"""
+    Read the CSV files of pyPolCal for a run.
+
+    Parameters
+    ----------
+    files : path-like or sequence of path-like
+        One file a wavelength bin, or a folder of them.
+    meta : dict, optional
+        What the files do not say: ``instrument``, ``source``, ``date`` and so on; the
+        instrument is SCExAO/CHARIS unless given.
+    name : str, optional
+        By default that of the folder.
+
+    Returns
+    -------
+    Observations
+
+    Raises
+    ------
+    ObservationError
+        If a file cannot be read, lacks a column, or contradicts the others; the
+        message names it and the row.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from astropolcal.reduction import read_pypolcal
+    >>> columns = "filepath,D_IMRANG,RET-ANG1,LCOUNTS,RCOUNTS,sum_std,diff_std,wavelength_bin"
+    >>> rows = ["/a/CRSA00000001_cube.fits,45.0,0.0,5e5,1e6,1225,1225,1159.56",
+    ...         "/a/CRSA00000002_cube.fits,45.0,45.0,1e6,5e5,1225,1225,1159.56"]
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "bin0.csv"
+    ...     _ = path.write_text("\n".join([columns, *rows]))
+    ...     observations = read_pypolcal(path, {"source": "polarized"}, name="run")
+    >>> observations
+    <Observations 'run': SCExAO/CHARIS, polarized, 2 frames x 1 bin, 0 cells masked>
+    """
+    paths = _paths(files)
+    rows = [(path, i, row) for path in paths for i, row in enumerate(_rows(path), start=2)]
+    if not rows:
+        raise ObservationError(f"{paths[0]}: no rows")
+    wavelength = _numbers(rows, "wavelength_bin")
+    _, bins = np.unique(wavelength.round(4), return_inverse=True)
+    frames = _frame_numbers(rows, bins)
+    table = QTable({"file": [Path(row["filepath"]).name for _, _, row in rows]})
+    table["frame"], table["bin"], table["wavelength"] = frames, bins, wavelength * u.nm
+    for column, ours in _ANGLES.items():
+        if all(column in row for _, _, row in rows):
+            table[ours] = _numbers(rows, column) * u.deg
+    table["flux_right"] = _numbers(rows, "RCOUNTS") * u.adu
+    table["flux_left"] = _numbers(rows, "LCOUNTS") * u.adu
+    if all(column in row for column in _ERRORS for _, _, row in rows):
+        for column, ours in _ERRORS.items():
+            table[ours] = _numbers(rows, column) * u.adu
+    table.meta.update({"instrument": "SCExAO/CHARIS"} | dict(meta or {}))
+    folder = paths[0].parent.name
+    return Observations.from_table(
+        table, name=name or (folder if len(paths) > 1 else paths[0].stem)
+    )
+
+
+def _paths(files):
+    if isinstance(files, str | Path):
+        folder = Path(files)
+        files = sorted(folder.glob("*.csv")) if folder.is_dir() else [folder]
+        if not files:
+            raise ObservationError(f"{folder}: no CSV file in this folder")
+    paths = [Path(path) for path in files]
+    if not paths:
+        raise ObservationError("no files to read")
+    return paths
+
+
+def _rows(path):
+    try:
+        with open(path, encoding="utf-8", newline="") as stream:
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
+            if missing:
+                raise ObservationError(
+                    f"{path}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}"
+                )
+            return [row for row in reader if any(row.values())]
+    except FileNotFoundError:
+        raise ObservationError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ObservationError(f"{path}: cannot be read as CSV: {error}") from None
+
+
+def _numbers(rows, column):
+    values = np.empty(len(rows))
+    for k, (path, i, row) in enumerate(rows):
+        try:
+            values[k] = float(row[column])
+        except (TypeError, ValueError):
+            raise ObservationError(
+                f"{path}, line {i}: {column} = {row[column]!r}, a number is needed"
+            ) from None
+    return values
+
+
+def _frame_numbers(rows, bins):
+    """Number the cubes in the order in which the first file lists them."""
+    numbers = {}
+    seen = {}
+    for (path, i, row), b in zip(rows, bins.tolist(), strict=True):
+        cube = row["filepath"].strip()
+        numbers.setdefault(cube, len(numbers))
+        if (cube, b) in seen:
+            raise ObservationError(f"{path}, line {i}: {cube} is given already in {seen[cube, b]}")
+        seen[cube, b] = f"{path}, line {i}"
+    return np.array([numbers[row["filepath"].strip()] for _, _, row in rows])

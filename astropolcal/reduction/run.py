@@ -1,0 +1,460 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""From the cubes of a run to one table of observations."""
+
+import os
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+
+import numpy as np
+
+from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
+from astropolcal.observations import Observations
+from astropolcal.reduction.frames import Frame, reduce_frame
+from astropolcal.reduction.headers import check_sequence, raw_frames
+from astropolcal.reduction.journal import Journal
+from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
+
+__all__ = ["Reduction", "reduce_cubes", "reduce_run"]
+
+# below this number of files a process, its start costs more than it saves
+_FILES_A_WORKER = 100
+_AMBIGUOUS = (0.15, 0.4)
+
+
+@dataclass
+class Reduction:
+    """
+    A reduced run.
+
+    Attributes
+    ----------
+    instrument : Instrument
+        Whose files they are.
+    source : {"internal", "star"}
+        The photometry.
+    frames : list of Frame
+        The files in the table, in the order they were taken.
+    problems : dict of str to list of str
+        File to why it is not in the table.
+    doubts : dict of str to list of str
+        File to what is odd about it.
+    meta : dict
+        Of the table.
+    options : dict
+        Of the photometry.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction import Reduction
+    >>> Reduction(None, "star").problems
+    {}
+    """
+
+    instrument: object
+    source: str
+    frames: list = field(default_factory=list)
+    problems: dict = field(default_factory=dict)
+    doubts: dict = field(default_factory=dict)
+    meta: dict = field(default_factory=dict)
+    options: dict = field(default_factory=dict)
+
+    @property
+    def table(self):
+        """One row a frame and wavelength; a cell that failed is masked and has a reason."""
+        return reduced_table(self.frames, self.instrument, self.meta)
+
+    @property
+    def photometry(self):
+        """The same with centres, widths, radii and background levels."""
+        return photometry_table(self.frames, self.instrument)
+
+    @property
+    def observations(self):
+        """The `~astropolcal.observations.Observations`."""
+        return Observations.from_table(self.table, name="reduced")
+
+    @property
+    def flags(self):
+        """Number of cells by the reason why they are masked (dict)."""
+        reasons = Counter(r for frame in self.frames for r in frame.photometry.reasons if r)
+        return dict(reasons.most_common())
+
+    def write(self, path, overwrite=False):
+        """
+        Write the table as ECSV; masked cells are empty.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        ObservationError
+            If the file exists, or cannot be written.
+        """
+        write_table(self.table, path, overwrite)
+
+    def summary(self):
+        """Return what was reduced and what was not, as plain numbers and texts (dict)."""
+        cells = sum(len(frame.photometry.reasons) for frame in self.frames)
+        return {
+            "instrument": self.instrument.name,
+            "photometry": self.source,
+            "n_frames": len(self.frames),
+            "n_cells": cells,
+            "n_masked": sum(self.flags.values()),
+            "flags": self.flags,
+            "problems": self.problems,
+            "doubts": self.doubts,
+            "meta": {key: value for key, value in self.meta.items() if _is_plain(value)},
+        }
+
+
+def _is_plain(value):
+    return isinstance(value, str | int | float | bool)
+
+
+def reduce_cubes(files, instrument, **options):
+    """
+    Measure both beams in the cubes of a run.
+
+    Parameters
+    ----------
+    files : sequence of path-like
+        Cubes.
+    instrument : Instrument or str
+        Or its name.
+    **options
+        As for `reduce_run`: ``source``, ``raw``, ``workers`` and so on.
+
+    Returns
+    -------
+    Observations
+
+    Raises
+    ------
+    ObservationError
+        If no file can be used; the message says why.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction import reduce_cubes
+    >>> reduce_cubes(["nowhere_00000001.fits"], "charis")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: none of the 1 files can be used: nowhere_00000001.fits: no such file
+    """  # noqa: E501
+    return reduce_run(files, instrument, **options).observations
+
+
+def reduce_run(
+    files,
+    instrument,
+    *,
+    source="internal",
+    raw=None,
+    meta=None,
+    workers=None,
+    resume=None,
+    progress=None,
+    hwp_sequence=None,
+    keep_repeats=False,
+    **options,
+):
+    """
+    Measure both beams in the cubes of a run, and keep what was found on the way.
+
+    A file that cannot be used never stops the run: it is left out, and listed
+    with the reason.
+
+    Parameters
+    ----------
+    files : sequence of path-like
+        Cubes.
+    instrument : Instrument or str
+        Or its name.
+    source : str
+        ``"internal"`` or ``"star"`` choose the photometry. What the table says of
+        the source may be given at once: ``"polarized"``, ``"unpolarized"``,
+        ``"unpolarized standard star"``. With ``"internal"`` it is ``polarized`` or
+        ``unpolarized`` where the fluxes leave no doubt.
+    raw : path-like, optional
+        Folder of raw frames, whose headers are looked into by frame number.
+    meta : dict, optional
+        More for the table's meta, such as ``{"yjh50_dichroic": "in"}``.
+    workers : int, optional
+        Number of processes; by default one for 100 files, up to that of the CPUs.
+    resume : path-like, optional
+        Journal of what is done: files in it are not measured again.
+    progress : callable, optional
+        Called with the number of files done and of all.
+    hwp_sequence : sequence of float, optional
+        Commanded angles in degree, which replace those of the headers, in turn and
+        in the order of the frames; for headers that are known to be wrong.
+    keep_repeats : bool
+        Whether frames of an internal source are kept whose half-wave plate stands
+        90 deg from that of another frame at the same derotator angle.
+    **options
+        For `measure_internal` or `measure_stars`.
+
+    Returns
+    -------
+    Reduction
+
+    Raises
+    ------
+    ObservationError
+        If no file can be used; the message says why.
+    InstrumentError
+        If the instrument does not say how its files look.
+    ParameterError
+        If an option is wrong.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction import reduce_run
+    >>> reduce_run([], "charis")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: no files to reduce
+    """
+    instrument = _instrument(instrument)
+    photometry = "star" if "star" in source else "internal"
+    files = [str(path) for path in files]
+    if not files:
+        raise ObservationError("no files to reduce")
+    task = {
+        "layout": instrument.files,
+        "source": photometry,
+        "raw": None if raw is None else raw_frames(raw, instrument.files),
+        "options": options,
+    }
+    frames = _measure_all(files, task, workers, resume, progress)
+    reduction = Reduction(instrument, photometry, options=options)
+    frames = _set_aside(frames, reduction)
+    _replace_angles(frames, hwp_sequence)
+    frames = _consistent(frames, reduction, instrument.files, hwp_sequence is None)
+    if photometry == "internal" and not keep_repeats:
+        frames = _without_repeats(frames, reduction)
+    if not frames:
+        raise ObservationError(_nothing(len(files), reduction.problems))
+    reduction.frames = frames
+    reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
+    reduction.meta = _meta(frames, instrument, source, meta or {})
+    return reduction
+
+
+def _instrument(instrument):
+    from astropolcal import instruments
+
+    instrument = instruments.get(instrument) if isinstance(instrument, str) else instrument
+    if instrument.files is None:
+        raise InstrumentError(
+            f"{instrument.name}: nothing is known of its files; its class needs an attribute files"
+        )
+    if len(instrument.wavelength) != instrument.files.shape[0]:
+        raise InstrumentError(
+            f"{instrument.name}: {len(instrument.wavelength)} wavelengths, but cubes of "
+            f"{instrument.files.shape[0]} slices"
+        )
+    return instrument
+
+
+def _nothing(count, problems):
+    first, *rest = (f"{path}: {'; '.join(why)}" for path, why in problems.items())
+    more = f" (and {len(rest)} more)" if rest else ""
+    return f"none of the {count} files can be used: {first}{more}"
+
+
+# --- all files -------------------------------------------------------------------
+
+
+def _measure_all(files, task, workers, resume, progress):
+    """Return the frames of all files in their order, from the journal or measured now."""
+    settings = {name: repr(task[name]) for name in ("layout", "source", "options")}
+    journal = Journal(resume, settings | {"raw": task["raw"] is not None})
+    found = {path: journal.done(path) for path in files}
+    found = {path: frame for path, frame in found.items() if frame is not None}
+    todo = [path for path in dict.fromkeys(files) if path not in found]
+    done = len(found)
+    try:
+        for frame in _results(todo, task, _count(workers, len(todo))):
+            found[frame.path] = frame
+            journal.add(frame)
+            done += 1
+            if progress is not None:
+                progress(done, len(set(files)))
+    finally:
+        journal.close()
+    return [found[path] for path in dict.fromkeys(files)]
+
+
+def _count(workers, n_files):
+    if workers is None:
+        return max(1, min(os.cpu_count() or 1, n_files // _FILES_A_WORKER))
+    if not (isinstance(workers, int) and workers >= 1):
+        raise ParameterError(f"workers = {workers!r}; a whole number above zero is needed")
+    return min(workers, max(n_files, 1))
+
+
+def _results(files, task, workers):
+    """Yield the frames of files as they are done."""
+    if workers == 1:
+        yield from (reduce_frame(path, **task) for path in files)
+        return
+    lost = []
+    with _pool(workers) as pool:
+        futures = {pool.submit(reduce_frame, path, **task): path for path in files}
+        for future in as_completed(futures):
+            try:
+                yield future.result()
+            except BrokenProcessPool:
+                lost.append(futures[future])
+    # whichever file kills its process must not take the others with it
+    for path in lost:
+        with _pool(1) as pool:
+            try:
+                yield pool.submit(reduce_frame, path, **task).result()
+            except BrokenProcessPool:
+                yield Frame(path, errors=["the process that measured it died"])
+
+
+def _pool(workers):
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+
+
+# --- what belongs together ---------------------------------------------------------
+
+
+def _set_aside(frames, reduction):
+    """Leave out what cannot be used, copies, and frames of another kind than most."""
+    kept = []
+    seen = {}
+    for frame in frames:
+        if not frame.usable:
+            reduction.problems[frame.path] = frame.errors
+            continue
+        keys = [f"data {frame.digest}"]
+        keys += [f"number {frame.number}"] if frame.number is not None else []
+        first = next((seen[key] for key in keys if key in seen), None)
+        if first is not None:
+            same = "the same data as" if f"data {frame.digest}" in seen else "the same frame as"
+            reduction.problems[frame.path] = [f"{same} {first}"]
+            continue
+        seen.update(dict.fromkeys(keys, frame.name))
+        kept.append(frame)
+    for what, value in (("filter", _filter), ("unit", lambda frame: frame.unit)):
+        kept = _of_one_kind(kept, what, value, reduction)
+    return sorted(kept, key=_order)
+
+
+def _filter(frame):
+    return frame.values.get("filter")
+
+
+def _of_one_kind(frames, what, value, reduction):
+    counts = Counter(value(frame) for frame in frames if value(frame) is not None)
+    if len(counts) < 2:
+        return frames
+    usual = counts.most_common(1)[0][0]
+    for frame in frames:
+        if value(frame) not in (usual, None):
+            reduction.problems[frame.path] = [
+                f"{what} {value(frame)!r}, the others of the run have {usual!r}"
+            ]
+    return [frame for frame in frames if value(frame) in (usual, None)]
+
+
+def _order(frame):
+    """Order by frame number; what has none comes last, by time and name."""
+    if frame.number is not None:
+        return (0, frame.number, frame.name)
+    return (1, frame.values.get("mjd", np.inf), frame.name)
+
+
+def _replace_angles(frames, sequence):
+    if sequence is None:
+        return
+    sequence = [float(angle) for angle in sequence]
+    if not sequence or len(frames) % len(sequence):
+        raise ObservationError(
+            f"{len(frames)} frames cannot be cut into sequences of {len(sequence)} angles; "
+            "frames are missing, and it is unclear which"
+        )
+    for i, frame in enumerate(frames):
+        stated, frame.values["hwp"] = frame.values["hwp"], sequence[i % len(sequence)]
+        if abs(stated - frame.values["hwp"]) > 1e-3:
+            frame.doubts.append(
+                f"half-wave plate at {stated:g} deg in the header, replaced by "
+                f"{frame.values['hwp']:g} deg"
+            )
+
+
+def _consistent(frames, reduction, layout, check):
+    """Leave out frames whose commanded angle does not fit the sequence of the run."""
+    if not check or not frames:
+        return frames
+    angles = ([frame.values[name] for frame in frames] for name in ("hwp", "derotator"))
+    wrong = check_sequence(*angles, layout)
+    for i, why in wrong.items():
+        reduction.problems[frames[i].path] = [why]
+    return [frame for i, frame in enumerate(frames) if i not in wrong]
+
+
+def _without_repeats(frames, reduction):
+    """Leave out frames at 90 deg from another one, which measure the same again."""
+    kept = []
+    for frame in frames:
+        twin = next((other for other in kept if _repeats(frame, other)), None)
+        if twin is None:
+            kept.append(frame)
+        else:
+            reduction.problems[frame.path] = [
+                f"half-wave plate at {frame.values['hwp']:g} deg repeats that of {twin.name}"
+            ]
+    return kept
+
+
+def _repeats(frame, other):
+    hwp, derotator = (frame.values[k] - other.values[k] for k in ("hwp", "derotator"))
+    return abs(abs(hwp) - 90.0) < 0.3 and abs(derotator) < 0.5
+
+
+def _meta(frames, instrument, source, given):
+    """Return the meta of the table."""
+    values = [frame.values for frame in frames]
+    meta = {"instrument": (*instrument.aliases, instrument.name)[0]}
+    for key, column in (("mode", "filter"), ("object", "object"), ("date", "date")):
+        texts = [v[column] for v in values if v.get(column)]
+        if texts and (key != "object" or "star" in source):
+            meta[key] = Counter(texts).most_common(1)[0][0]
+    if "date" in meta:
+        meta["date"] = meta["date"][:10]
+    if source != "internal":
+        meta["source"] = source
+    elif "source" not in given and (seen := _seen_source(frames)):
+        meta["source"] = seen
+        meta["source_from"] = "the modulation of the fluxes"
+    return meta | dict(given)
+
+
+def _seen_source(frames):
+    """Return whether an internal source is polarized, as far as its fluxes leave no doubt."""
+    angles = {round(frame.values["hwp"], 1) for frame in frames}
+    if len(angles) < 4:
+        return None
+    fluxes = np.array([np.where(f.photometry.failed, np.nan, f.photometry.flux) for f in frames])
+    single = (fluxes[:, 0] - fluxes[:, 1]) / (fluxes[:, 0] + fluxes[:, 1])
+    known = np.isfinite(single).any(axis=0)
+    single = single[:, known]
+    # half the range over the run, of the usual wavelength: modulation without the offset
+    modulation = np.median(np.nanmax(single, axis=0) - np.nanmin(single, axis=0)) / 2
+    if modulation < _AMBIGUOUS[0]:
+        return "unpolarized"
+    return "polarized" if modulation > _AMBIGUOUS[1] else None

@@ -1,0 +1,325 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+A reduced target as `specutils.Spectrum` objects, and back.
+
+The table of a target has one row a wavelength: ``wavelength``, ``intensity``,
+``q``, ``u`` and, if measured, ``v``, each with its standard deviation in a column
+that ends in ``_err``. ``covariance_qu`` and ``mask`` (true where a row must not be
+used) are optional.
+"""
+
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.nddata import StdDevUncertainty
+from astropy.table import QTable
+
+from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.files import atomic_path
+from astropolcal.observations.reading import read_ecsv
+
+__all__ = ["read_spectra", "spectra_from_table", "table_from_spectra", "write_spectra"]
+
+_NAMES = {"I": "intensity", "q": "q", "u": "u", "v": "v"}
+_REQUIRED = ("I", "q", "u")
+_COVARIANCE = "covariance_qu"
+
+
+def spectra_from_table(table):
+    """
+    Return the spectra of a reduced target.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        Columns ``wavelength``, ``intensity``, ``q``, ``u``, optionally ``v``, and
+        their standard deviations (``intensity_err``, ...); optionally
+        ``covariance_qu`` and ``mask``.
+
+    Returns
+    -------
+    dict of str to `~specutils.Spectrum`
+        ``"I"``, ``"q"``, ``"u"`` and, if it is there, ``"v"``, on one spectral axis in
+        the order of the wavelengths. ``meta`` is that of the table; ``covariance_qu``,
+        one value a wavelength, stands in that of ``q`` and ``u``.
+
+    Raises
+    ------
+    ObservationError
+        If a column is missing or has the wrong unit, a value that is not masked is
+        not finite, an error is negative, or a wavelength is given twice.
+    AstropolcalError
+        If specutils is not installed.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal.reduction.spectrum import spectra_from_table
+    >>> table = QTable({"wavelength": [1.2, 1.6] * u.um, "intensity": [900, 800] * u.adu,
+    ...                 "intensity_err": [3, 3] * u.adu, "q": [0.010, 0.008],
+    ...                 "q_err": [2e-4, 2e-4], "u": [0.0, 0.001], "u_err": [2e-4, 2e-4]})
+    >>> spectra = spectra_from_table(table)
+    >>> print(spectra["q"].flux, spectra["q"].spectral_axis)
+    [0.01  0.008] [1.2 1.6] um
+    """
+    spectrum = _spectrum_class()
+    table, mask = _checked(table)
+    axis = table["wavelength"]
+    spectra = {}
+    for key in _present(table):
+        meta = dict(table.meta)
+        if key in ("q", "u") and _COVARIANCE in table.colnames:
+            meta[_COVARIANCE] = _plain(table[_COVARIANCE])
+        name = _NAMES[key]
+        spectra[key] = spectrum(
+            flux=u.Quantity(table[name]),
+            spectral_axis=axis,
+            uncertainty=StdDevUncertainty(u.Quantity(table[f"{name}_err"])),
+            mask=mask.copy(),
+            meta=meta,
+        )
+    return spectra
+
+
+def table_from_spectra(spectra):
+    """
+    Return the table of a target from its spectra, the inverse of `spectra_from_table`.
+
+    Parameters
+    ----------
+    spectra : dict of str to `~specutils.Spectrum`
+        ``"I"``, ``"q"``, ``"u"`` and optionally ``"v"``: one-dimensional, on the same
+        spectral axis (a wavelength, frequency or energy), each with an uncertainty of
+        any kind that has a standard deviation.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        A row is masked where one of the spectra is; meta are those of ``"I"``.
+
+    Raises
+    ------
+    ObservationError
+        If a spectrum is missing, has no uncertainty, or is on another axis.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal.reduction.spectrum import spectra_from_table, table_from_spectra
+    >>> table = QTable({"wavelength": [1.2, 1.6] * u.um, "intensity": [900, 800] * u.adu,
+    ...                 "intensity_err": [3, 3] * u.adu, "q": [0.010, 0.008],
+    ...                 "q_err": [2e-4, 2e-4], "u": [0.0, 0.001], "u_err": [2e-4, 2e-4]})
+    >>> table_from_spectra(spectra_from_table(table))["q"]
+    <Quantity [0.01 , 0.008]>
+    """
+    missing = [key for key in _REQUIRED if key not in spectra]
+    unknown = [str(key) for key in spectra if key not in _NAMES]
+    if missing or unknown:
+        raise ObservationError(
+            f"spectra: missing {', '.join(missing) or 'none'}, unknown "
+            f"{', '.join(unknown) or 'none'}; needed are I, q, u, and v if measured"
+        )
+    table = QTable({"wavelength": _common_axis(spectra)})
+    mask = np.zeros(len(table), dtype=bool)
+    for key in (key for key in _NAMES if key in spectra):
+        spectrum, name = spectra[key], _NAMES[key]
+        table[name] = u.Quantity(spectrum.flux)
+        table[f"{name}_err"] = _standard_deviation(key, spectrum)
+        if spectrum.mask is not None:
+            mask |= np.asarray(spectrum.mask, dtype=bool)
+    _take_covariance(table, spectra)
+    table["mask"] = mask
+    table.meta = {k: v for k, v in spectra["I"].meta.items() if k not in ("header", _COVARIANCE)}
+    return _checked(table)[0]
+
+
+def write_spectra(spectra, path, *, overwrite=False):
+    """
+    Write the spectra of a target to one ECSV file.
+
+    Parameters
+    ----------
+    spectra : dict of str to `~specutils.Spectrum`
+        As `spectra_from_table` returns them.
+    path : path-like
+        The file.
+    overwrite : bool
+        Whether a file that exists is replaced.
+
+    Raises
+    ------
+    ObservationError
+        If the spectra do not belong together, or the file exists or cannot be written.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction.spectrum import write_spectra
+    >>> write_spectra({}, "target.ecsv")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: spectra: missing I, q, u, ...
+    """
+    path, table = Path(path), table_from_spectra(spectra)
+    if path.exists() and not overwrite:
+        raise ObservationError(f"{path}: exists; overwriting it was not asked for")
+    with atomic_path(path, ObservationError) as temporary:
+        table.write(temporary, format="ascii.ecsv", overwrite=True)
+
+
+def read_spectra(path):
+    """
+    Read the spectra of a target.
+
+    Parameters
+    ----------
+    path : path-like
+        An ECSV file with the columns of `spectra_from_table`.
+
+    Returns
+    -------
+    dict of str to `~specutils.Spectrum`
+
+    Raises
+    ------
+    ObservationError
+        If the file is absent, unreadable or inconsistent.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction.spectrum import read_spectra
+    >>> read_spectra("nowhere.ecsv")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: nowhere.ecsv: no such file
+    """
+    try:
+        return spectra_from_table(QTable(read_ecsv(path)))
+    except ObservationError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ObservationError(f"{path}: {error}") from error
+
+
+def _spectrum_class():
+    try:
+        from specutils import Spectrum
+    except ImportError as error:
+        raise AstropolcalError(
+            "spectra of a target need the package specutils (2.0 or later): pip install specutils"
+        ) from error
+    return Spectrum
+
+
+def _present(table):
+    return [key for key, name in _NAMES.items() if name in table.colnames]
+
+
+def _plain(column):
+    return np.asarray(u.Quantity(column).to_value(u.one))
+
+
+def _checked(table):
+    """Return the table in the order of the wavelengths, and its mask, or refuse it."""
+    table = QTable(table, copy=True)
+    names = [_NAMES[key] for key in (*_REQUIRED, "v") if key in _REQUIRED or "v" in table.colnames]
+    needed = ["wavelength", *names, *(f"{name}_err" for name in names)]
+    missing = [name for name in needed if name not in table.colnames]
+    if missing:
+        raise ObservationError(f"target: missing columns {', '.join(missing)}")
+    if not len(table):
+        raise ObservationError("target: no rows")
+    table["wavelength"] = _with_unit(table, "wavelength", u.um)
+    table.sort("wavelength")
+    _check_wavelength(table["wavelength"])
+    mask = np.zeros(len(table), dtype=bool)
+    if "mask" in table.colnames:
+        mask = np.array(table["mask"], dtype=bool)
+    for name in names:
+        unit = u.Quantity(table[name]).unit if name == "intensity" else u.one
+        for column in (name, f"{name}_err"):
+            table[column] = _with_unit(table, column, unit)
+            _check_values(table, column, mask)
+    if _COVARIANCE in table.colnames:
+        table[_COVARIANCE] = _with_unit(table, _COVARIANCE, u.one)
+        _check_values(table, _COVARIANCE, mask)
+    return table, mask
+
+
+def _with_unit(table, column, unit):
+    """Return a column as a Quantity of the kind of the unit, NaN where it is masked."""
+    values = table[column]
+    if hasattr(values, "unmasked"):
+        values = values.filled(np.nan)
+    elif np.ma.isMaskedArray(values):
+        values = values.astype(float).filled(np.nan)
+    try:
+        values = u.Quantity(values, dtype=float)
+        values.to(unit)
+    except (TypeError, ValueError, u.UnitConversionError):
+        raise ObservationError(
+            f"target: column {column} must be numbers with a unit such as {unit or '1'}"
+        ) from None
+    return values
+
+
+def _check_wavelength(wavelength):
+    if not np.all(np.isfinite(wavelength) & (wavelength > 0)):
+        raise ObservationError("target: a wavelength is not positive")
+    twice = wavelength[1:][np.diff(wavelength) == 0]
+    if twice.size:
+        raise ObservationError(f"target: wavelength {twice[0]} is given twice")
+
+
+def _check_values(table, column, mask):
+    values = table[column].value
+    bad = ~np.isfinite(values)
+    if column.endswith("_err"):
+        bad |= values < 0
+    bad &= ~mask
+    if bad.any():
+        row = np.flatnonzero(bad)[0]
+        raise ObservationError(
+            f"target: {column} = {values[row]} at {table['wavelength'][row]}; "
+            f"{'a number not negative' if column.endswith('_err') else 'a finite number'} "
+            "is needed where the row is not masked"
+        )
+
+
+def _common_axis(spectra):
+    """Return the wavelengths of all spectra."""
+    axes = {}
+    for key, spectrum in spectra.items():
+        if np.ndim(spectrum.flux) != 1:
+            raise ObservationError(f"spectrum {key}: {np.ndim(spectrum.flux)} axes; 1 is needed")
+        axis = u.Quantity(spectrum.spectral_axis)
+        if not axis.unit.is_equivalent(u.um):
+            axis = axis.to(u.um, u.spectral())
+        axes[key] = axis
+    first = axes["I"]
+    for key, axis in axes.items():
+        if axis.shape != first.shape or not np.allclose(axis.to_value(first.unit), first.value):
+            raise ObservationError(f"spectrum {key}: is on another spectral axis than I")
+    return first
+
+
+def _standard_deviation(key, spectrum):
+    if spectrum.uncertainty is None:
+        raise ObservationError(f"spectrum {key}: has no uncertainty")
+    deviation = spectrum.uncertainty.represent_as(StdDevUncertainty)
+    return u.Quantity(deviation.array, deviation.unit or spectrum.flux.unit)
+
+
+def _take_covariance(table, spectra):
+    """Put the covariance of q and u into the table, if the spectra know it."""
+    covariance = spectra["q"].meta.get(_COVARIANCE)
+    if covariance is None:
+        return
+    if np.shape(covariance) != (len(table),):
+        raise ObservationError(
+            f"spectrum q: {_COVARIANCE} has shape {np.shape(covariance)} for {len(table)} "
+            "wavelengths; meta are not cut with a spectrum"
+        )
+    table[_COVARIANCE] = covariance

@@ -1,0 +1,435 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Photometry of stars in both Wollaston beams, at each wavelength.
+
+References
+----------
+McIntosh et al. 2026: a two-dimensional Gaussian gives centre and width, the
+aperture is three full widths in radius but at most 45 pixels, and the median
+of a ring of 5 pixels around it is the background.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from scipy import ndimage
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.reduction.errors import flux_variance, shared_pixels
+from astropolcal.reduction.finding import find_pair
+from astropolcal.reduction.gaussians import fit_gaussians
+from astropolcal.reduction.photometry import BEAMS, Photometry
+
+__all__ = ["choose_radius", "curve_of_growth", "measure_stars"]
+
+# a centre may be this far, in pixels or full widths, from those of its neighbours
+_OFF_TRACK = (1.5, 0.5)
+# a width may differ from the median by this factor
+_WIDTHS = 2.5
+_SIGNIFICANT = 5.0
+_FEWEST = 20
+
+
+def measure_stars(
+    cube,
+    good,
+    detector,
+    layout,
+    *,
+    radius="fwhm",
+    factor=3.0,
+    max_radius=45.0,
+    annulus=5.0,
+    aperture_correction=False,
+    companion=0.1,
+    max_masked=0.1,
+):
+    """
+    Measure a star in both beams in all slices of a cube.
+
+    The star is found in the mean of the slices. In each slice a Gaussian gives
+    centre and width in both beams; both are measured with the same radius, so
+    that light outside of it does not look like polarization. Pixels without a
+    value are filled with the Gaussian and what the pixels around them have
+    beyond it.
+
+    Parameters
+    ----------
+    cube : `~numpy.ndarray`
+        Shape (W, Y, X).
+    good : `~numpy.ndarray` of bool or None
+        Pixels that have a value; None if all have.
+    detector : Detector
+        In the unit of the cube.
+    layout : FileLayout
+        With ``star_offset``, ``edge`` and ``fwhm``.
+    radius : {"fwhm", "growth"} or float
+        Of the aperture: ``factor`` times the width; where the curve of growth of
+        the mean image reaches 99 %; or pixels.
+    factor, max_radius : float
+        For a radius that follows the image.
+    annulus : float
+        Width of the ring in pixels.
+    aperture_correction : bool
+        Whether fluxes are scaled to those within ``max_radius``, by the same factor
+        in both beams, smooth over wavelength.
+    companion : float
+        A second star brighter than this fraction of the first spoils a frame.
+    max_masked : float
+        Largest part of an aperture that may lack values.
+
+    Returns
+    -------
+    Photometry
+        With a reason in every slice that cannot be used: ``no star``, ``two
+        stars``, ``one beam missing``, ``empty slice``, ``lost star``, ``bad
+        centroid``, ``edge``, ``aperture masked``, ``no background``,
+        ``saturated``.
+
+    Raises
+    ------
+    ParameterError
+        If an option is unknown or out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.errors import detector_of
+    >>> from astropolcal.reduction.stars import measure_stars
+    >>> layout = instruments.get("charis").files
+    >>> rng, (y, x) = np.random.default_rng(1), np.indices(layout.shape[1:])
+    >>> image = sum(2000 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 8)
+    ...             for cx, cy in ((70, 85), (133.5, 118.1)))
+    >>> cube = image + rng.normal(0, 5, layout.shape)
+    >>> result = measure_stars(cube, None, detector_of(layout), layout)
+    >>> [round(float(v), 1) for v in result.flux[0, :1] / (2000 * 8 * np.pi)]
+    [1.0]
+    """
+    _check(radius, factor, max_radius, annulus, companion, max_masked)
+    result = Photometry.empty(len(cube))
+    good = np.isfinite(cube) if good is None else good
+    empty = ~good.any(axis=(1, 2))
+    result.flag(empty, "empty slice")
+    mean, known = _mean(cube, good)
+    pair = find_pair(mean, known, layout.star_offset, fwhm=layout.fwhm, companion=companion)
+    if pair.reason:
+        result.flag(True, pair.reason)
+        return result
+    images, there, origin = _cutouts(cube, good, pair)
+    starts = np.repeat(pair.positions - origin, len(cube), axis=0)
+    _check_light(result, images, there, starts, pair.fwhm, detector)
+    fits = fit_gaussians(images, there, x=starts[:, 0], y=starts[:, 1], fwhm=pair.fwhm)
+    _judge(result, fits, origin, pair)
+    result.radius[:] = _radii(result.fwhm, radius, factor, max_radius, mean, known, pair)
+    settings = _Settings(detector, layout.edge, annulus, max_masked)
+    _measure(result, fits, origin, cube, good, settings)
+    if aperture_correction:
+        _correct(result, fits, origin, cube, good, settings, max_radius)
+    distance = np.hypot(*(np.diff(axis, axis=0)[0] for axis in (result.x, result.y)))
+    pixel = detector.variance(result.background.mean(axis=0))
+    usable = ~result.failed
+    result.covariance[usable] = shared_pixels(distance, result.radius[0], pixel)[usable]
+    return result
+
+
+def _check(radius, factor, max_radius, annulus, companion, max_masked):
+    if isinstance(radius, str):
+        if radius not in ("fwhm", "growth"):
+            raise ParameterError(f"radius = {radius!r}; allowed are 'fwhm', 'growth' and pixels")
+    elif not 0 < radius < np.inf:
+        raise ParameterError(f"radius = {radius:g}; it must be above zero")
+    for name, value in (("factor", factor), ("max_radius", max_radius), ("annulus", annulus)):
+        if not 0 < value < np.inf:
+            raise ParameterError(f"{name} = {value:g}; it must be above zero")
+    for name, value in (("companion", companion), ("max_masked", max_masked)):
+        if not 0 <= value < 1:
+            raise ParameterError(f"{name} = {value:g}; allowed is 0 and above, below 1")
+
+
+def _mean(cube, good):
+    """Return the mean of the slices, and where at least one has a value."""
+    if good.all():
+        return cube.mean(axis=0, dtype=float), np.ones(cube.shape[1:], dtype=bool)
+    number = good.sum(axis=0)
+    total = np.where(good, cube, 0.0).sum(axis=0, dtype=float)
+    # a pixel known in few slices would show their level, not that of the rest
+    known = number > 0.5 * good.any(axis=(1, 2)).sum()
+    return np.where(known, total / np.maximum(number, 1), 0.0), known
+
+
+def _cutouts(cube, good, pair):
+    """Return the surroundings of the star in all slices of both beams, and their corners."""
+    half = int(np.clip(np.ceil(1.5 * pair.fwhm) + 3, 6, 30))
+    size = np.array(cube.shape[:0:-1])
+    if (size <= 2 * half).any():
+        half = int((size.min() - 1) // 2)
+    images, known, origin = [], [], []
+    for place in pair.positions:
+        corner = np.clip(np.rint(place).astype(int) - half, 0, size - 2 * half - 1)
+        box = (slice(None), *(slice(c, c + 2 * half + 1) for c in corner[::-1]))
+        images.append(cube[box])
+        known.append(good[box])
+        origin.append(corner)
+    return np.concatenate(images), np.concatenate(known), np.array(origin, dtype=float)
+
+
+def _check_light(result, images, there, starts, fwhm, detector):
+    """Flag slices that are saturated, or whose light at the star's place is not significant."""
+    n = len(result.reasons)
+    values = np.where(there, images, np.nan).reshape(2 * n, -1)
+    values[~there.any(axis=(1, 2))] = 0.0
+    bright = np.nanmax(values, axis=1).reshape(2, n) >= detector.saturation
+    result.flag(bright.any(axis=0), "saturated")
+    level = np.nanmedian(values, axis=1)[:, None]
+    noise = 1.4826 * np.nanmedian(np.abs(values - level), axis=1)
+    rows, columns = np.indices(images.shape[1:])
+    distance = (columns.ravel() - starts[:, :1]) ** 2 + (rows.ravel() - starts[:, 1:]) ** 2
+    shape = np.exp(-4.0 * np.log(2.0) * distance / fwhm**2) * there.reshape(2 * n, -1)
+    light = np.nansum((values - level) * shape, axis=1)
+    scale = np.maximum(noise, detector.read_noise) * np.sqrt((shape**2).sum(axis=1))
+    lost = ~(light > _SIGNIFICANT * scale).reshape(2, n)
+    for beam in range(2):
+        result.flag(lost[beam] & ~lost[1 - beam], f"{BEAMS[beam]} beam missing")
+    result.flag(lost.all(axis=0), "lost star")
+
+
+def _judge(result, fits, origin, pair):
+    """Store centres and widths, and flag slices where they cannot be right."""
+    n = len(result.reasons)
+    result.x[:] = fits.x.reshape(2, n) + origin[:, :1]
+    result.y[:] = fits.y.reshape(2, n) + origin[:, 1:]
+    result.fwhm[:] = fits.fwhm.reshape(2, n)
+    wild = ~fits.converged | (fits.elongation > 3.0) | (fits.amplitude <= 0)
+    wild = wild.reshape(2, n)
+    limit = max(_OFF_TRACK[0], _OFF_TRACK[1] * pair.fwhm)
+    usable = ~result.failed & ~wild.any(axis=0)
+    for values in (result.x, result.y):
+        for axis in values:
+            wild |= np.abs(axis - _track(axis, usable)) > limit
+    if usable.any():
+        typical = np.median(result.fwhm[:, usable], axis=1)[:, None]
+        wild |= (result.fwhm > _WIDTHS * typical) | (result.fwhm < typical / _WIDTHS)
+    result.flag(wild.any(axis=0), "bad centroid")
+    for values in (result.x, result.y, result.fwhm):
+        values[:, result.failed] = 0.0
+
+
+def _track(values, usable):
+    """Return what the neighbours of each slice have: a running median over the usable ones."""
+    if not usable.any():
+        return values
+    bins = np.arange(len(values))
+    kept = values[usable]
+    smooth = ndimage.median_filter(kept, size=min(7, len(kept)), mode="nearest")
+    return np.interp(bins, bins[usable], smooth)
+
+
+def _radii(fwhm, radius, factor, max_radius, mean, known, pair):
+    """Return the radius of each slice, the same for both beams."""
+    if radius == "fwhm":
+        typical = _track(fwhm.mean(axis=0), (fwhm > 0).all(axis=0))
+        return np.minimum(factor * typical, max_radius)
+    if radius == "growth":
+        image = np.where(known, mean, np.median(mean[known]))
+        radii = np.arange(1.0, max_radius + 0.5)
+        curves = [curve_of_growth(image, place, radii) for place in pair.positions]
+        return choose_radius(radii, np.mean(curves, axis=0))
+    return float(radius)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """What all apertures of a cube have in common."""
+
+    detector: object
+    edge: float
+    annulus: float
+    max_masked: float
+
+
+def _measure(result, fits, origin, cube, good, settings):
+    """Sum the apertures of all slices that have not failed."""
+    for k in np.flatnonzero(~result.failed):
+        for beam in range(2):
+            gauss = (fits, beam * len(cube) + k, origin[beam])
+            place = (result.x[beam, k], result.y[beam, k])
+            found = _aperture(cube[k], good[k], place, result.radius[beam, k], gauss, settings)
+            if isinstance(found, str):
+                result.flag(np.arange(len(cube)) == k, found)
+                break
+            result.flux[beam, k], result.variance[beam, k], result.background[beam, k] = found
+
+
+def _aperture(image, good, place, radius, gauss, settings):
+    """Return flux, variance and background of one aperture, or why it cannot be used."""
+    from photutils.aperture import CircularAperture
+
+    if _beyond_edge(place, radius, image.shape, settings.edge):
+        return "edge"
+    mask = CircularAperture(place, radius).to_mask(method="exact")
+    image, known, corner, inner = _cut(image, good, mask.bbox, settings.annulus)
+    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
+    distance = np.hypot(columns + corner[0] - place[0], rows + corner[1] - place[1])
+    ring = image[known & (distance >= radius) & (distance <= radius + settings.annulus)]
+    if ring.size < _FEWEST:
+        return "no background"
+    inside, there = image[inner], known[inner]
+    if mask.data[~there].sum() > settings.max_masked * mask.data.sum():
+        return "aperture masked"
+    if inside[(mask.data > 0) & there].max() >= settings.detector.saturation:
+        return "saturated"
+    if not there.all():
+        inside = _filled(image, known, gauss, corner)[inner]
+    return _flux(inside, mask.data, ring, settings.detector)
+
+
+def _flux(inside, weights, ring, detector):
+    """Return flux, variance and background from the pixels of an aperture and its ring."""
+    level = float(np.median(ring))
+    area = weights.sum()
+    flux = float((weights * inside).sum() - level * area)
+    if flux <= 0:
+        return "lost star"
+    spread = 1.4826 * np.median(np.abs(ring - level))
+    # what the ring shows, but never less than the detector's own noise
+    pixel = max(spread**2, float(detector.variance(level)))
+    photons = float((weights**2 * np.maximum(inside - level, 0.0)).sum()) / detector.gain
+    return flux, float(flux_variance(photons, area, pixel, ring.size)), level
+
+
+def _beyond_edge(place, radius, shape, edge):
+    x, y = place
+    inside = min(x - radius, y - radius, shape[1] - 1 - x - radius, shape[0] - 1 - y - radius)
+    return inside + 0.5 < edge
+
+
+def _cut(image, good, box, annulus):
+    """Return the image around an aperture with room for the ring, and where it begins."""
+    room = int(np.ceil(annulus)) + 1
+    y0, x0 = max(box.iymin - room, 0), max(box.ixmin - room, 0)
+    part = (slice(y0, box.iymax + room), slice(x0, box.ixmax + room))
+    inner = (slice(box.iymin - y0, box.iymax - y0), slice(box.ixmin - x0, box.ixmax - x0))
+    return np.asarray(image[part], dtype=float), good[part], (x0, y0), inner
+
+
+def _filled(image, known, gauss, corner):
+    """Return the image with the Gaussian, and what is beyond it nearby, where values lack."""
+    fits, k, origin = gauss
+    rows, columns = np.indices(image.shape)
+    model = fits.image(k, columns + corner[0] - origin[0], rows + corner[1] - origin[1])
+    beyond = np.where(known, image - model, 0.0)
+    weight = ndimage.gaussian_filter(known.astype(float), 1.0, mode="constant")
+    nearby = ndimage.gaussian_filter(beyond, 1.0, mode="constant") / np.maximum(weight, 1e-3)
+    return np.where(known, image, model + nearby)
+
+
+def _correct(result, fits, origin, cube, good, settings, reach):
+    """Scale fluxes to a larger radius by what both beams together have beyond their own."""
+    share = np.full(len(cube), np.nan)
+    for k in np.flatnonzero(~result.failed):
+        wide = [
+            _aperture(
+                cube[k],
+                good[k],
+                (result.x[beam, k], result.y[beam, k]),
+                reach,
+                (fits, beam * len(cube) + k, origin[beam]),
+                settings,
+            )
+            for beam in range(2)
+        ]
+        if not any(isinstance(found, str) for found in wide):
+            share[k] = result.flux[:, k].sum() / sum(found[0] for found in wide)
+    known = np.isfinite(share)
+    if known.sum() < 3:
+        result.flag(True, "no aperture correction")
+        return
+    # smooth over wavelength: the noise of the wide apertures must not enter the fluxes
+    bins = np.arange(len(cube))
+    smooth = Polynomial.fit(bins[known], share[known], deg=2, domain=[0, len(cube)])(bins)
+    result.flux /= smooth
+    result.variance /= smooth**2
+
+
+def curve_of_growth(image, place, radii):
+    """
+    Return the flux within circles around a star, as part of that within the largest.
+
+    Parameters
+    ----------
+    image : `~numpy.ndarray`
+        Shape (Y, X); the median of a ring beyond the largest circle is subtracted.
+    place : tuple of float
+        (x, y) of the star.
+    radii : `~numpy.ndarray`
+        Pixels, increasing.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape of the radii.
+
+    Raises
+    ------
+    ParameterError
+        If there is no light.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.reduction.stars import curve_of_growth
+    >>> y, x = np.indices((81, 81))
+    >>> image = np.exp(-((x - 40) ** 2 + (y - 40) ** 2) / (2 * 3.0**2))
+    >>> curve_of_growth(image, (40, 40), np.array([3.0, 6.0, 12.0, 24.0])).round(2).tolist()
+    [0.39, 0.86, 1.0, 1.0]
+    """
+    from photutils.profiles import CurveOfGrowth
+
+    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
+    distance = np.hypot(columns - place[0], rows - place[1])
+    ring = (distance > radii[-1]) & (distance < radii[-1] + 10)
+    level = np.median(image[ring]) if ring.any() else 0.0
+    curve = np.asarray(CurveOfGrowth(image - level, place, radii).profile, dtype=float)
+    if not curve[-1] > 0:
+        raise ParameterError(f"no light within {radii[-1]:g} pixels of {place}")
+    return curve / curve[-1]
+
+
+def choose_radius(radii, curve, fraction=0.99):
+    """
+    Return the radius within which a curve of growth reaches a fraction of its end.
+
+    Parameters
+    ----------
+    radii, curve : `~numpy.ndarray`
+        See `curve_of_growth`.
+    fraction : float
+        Between 0 and 1.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    ParameterError
+        If the fraction is out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.reduction.stars import choose_radius
+    >>> choose_radius(np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.98, 1.0]))
+    2.5
+    """
+    if not 0 < fraction < 1:
+        raise ParameterError(f"fraction = {fraction:g}; allowed is between 0 and 1")
+    curve = np.maximum.accumulate(curve / curve[-1])
+    first = int(np.argmax(curve >= fraction))
+    if first == 0:
+        return float(radii[0])
+    below, above = curve[first - 1 : first + 1]
+    step = (fraction - below) / (above - below)
+    return float(radii[first - 1] + step * (radii[first] - radii[first - 1]))

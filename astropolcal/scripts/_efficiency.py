@@ -1,0 +1,214 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""``astropolcal efficiency``: how much of the polarization an observation measures."""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.exceptions import InstrumentError, ParameterError
+from astropolcal.scripts._common import check_outputs, write_json
+
+_EPILOG = """\
+examples:
+  astropolcal efficiency                                published values of CHARIS
+  astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o efficiency.png
+  astropolcal efficiency cal.asdf --derotator 45 70 90 --wavelength 1.2 1.6 2.2
+  astropolcal efficiency cal.asdf --target 75.2,28.3 --night 2025-11-03T08:00/2025-11-03T12:00
+"""
+
+
+def add_parser(commands):
+    """Add the subcommand to what ``add_subparsers`` returned."""
+    import argparse
+
+    parser = commands.add_parser(
+        "efficiency",
+        help="polarimetric efficiency over wavelength, derotator angle and pointing",
+        description="Share of the linear polarization that an observation measures, over "
+        "wavelength, derotator angle, altitude and parallactic angle; and the derotator offset "
+        "that loses least of it. Without a calibration the published values are taken.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("file", nargs="?", metavar="CAL.asdf", help="calibration")
+    parser.add_argument("--instrument", metavar="NAME", help="default: that of the file, or charis")
+    parser.add_argument("--altitude", type=float, default=60.0, metavar="DEG", help="default: 60")
+    parser.add_argument("--parallactic", type=float, default=0.0, metavar="DEG", help="default: 0")
+    parser.add_argument(
+        "--derotator",
+        type=float,
+        nargs="+",
+        metavar="DEG",
+        help="angles of the table (default: 0 to 90 in steps of 15)",
+    )
+    parser.add_argument(
+        "--wavelength",
+        type=float,
+        nargs="+",
+        metavar="UM",
+        help="wavelengths of the table in micrometre, the nearest calibrated ones",
+    )
+    parser.add_argument(
+        "--target",
+        metavar="RA,DEC",
+        help="for the best derotator offset: position in degree",
+    )
+    parser.add_argument("--night", metavar="START/END", help="times in UTC, with --target")
+    parser.add_argument(
+        "--law", choices=("pupil", "field"), default="pupil", help="what the derotator keeps still"
+    )
+    parser.add_argument("-o", "--output", metavar="FILE", help="save the figure (PNG, PDF, SVG)")
+    parser.add_argument("--json", metavar="FILE", help="summary for machines (- for stdout)")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    parser.set_defaults(run=run)
+
+
+def run(arguments):
+    """Print the table, draw the figure and write what was asked for."""
+    check_outputs(arguments.output, arguments.json)
+    instrument, chain, grid = _chain(arguments)
+    content = _table(arguments, instrument, chain, grid)
+    if arguments.target or arguments.night:
+        content["best_derotator"] = _best(arguments, instrument, chain, grid)
+    if arguments.output:
+        _draw(arguments, instrument, chain, grid)
+    if arguments.json:
+        write_json(content, arguments.json)
+    if not arguments.quiet and arguments.json != "-":
+        print(_text(content))
+        written = [path for path in (arguments.output, arguments.json) if path]
+        if written:
+            print("\nWritten: " + "\n         ".join(written))
+
+
+def _chain(arguments):
+    """Return instrument, chain from the sky and wavelengths."""
+    from astropolcal import Calibration, instruments
+
+    if arguments.file is None:
+        instrument = instruments.get(arguments.instrument or "charis")
+        return instrument, instrument.on_sky(instrument.published()), instrument.wavelength
+    calibration = Calibration.read(arguments.file)
+    name = arguments.instrument or calibration.instrument
+    if name is None:
+        raise InstrumentError(f"{arguments.file}: names no instrument; give --instrument NAME")
+    instrument = instruments.get(name)
+    # a chain that has the telescope already is better than the published one
+    chains = sorted(calibration.chains, key=lambda chain: "m3" not in chain.submodel_names)
+    return instrument, instrument.on_sky(chains[0]), calibration.wavelength
+
+
+def _table(arguments, instrument, chain, grid):
+    from astropolcal.calibration import polarimetric_efficiency
+
+    derotator = np.array(arguments.derotator or np.arange(0, 91, 15), dtype=float)
+    rows = _rows(arguments.wavelength, grid)
+    values = polarimetric_efficiency(
+        chain,
+        grid,
+        derotator=derotator * u.deg,
+        altitude=arguments.altitude * u.deg,
+        parallactic=arguments.parallactic * u.deg,
+    )
+    return {
+        "instrument": instrument.name,
+        "altitude_deg": arguments.altitude,
+        "parallactic_deg": arguments.parallactic,
+        "derotator_deg": derotator.tolist(),
+        "wavelength_nm": grid.to_value(u.nm)[rows].tolist(),
+        "efficiency": values[:, rows].tolist(),
+    }
+
+
+def _rows(wanted, grid):
+    lam = grid.to_value(u.um)
+    if wanted is None:
+        return np.unique(np.linspace(0, lam.size - 1, min(8, lam.size)).astype(int))
+    wanted = np.array(wanted)
+    outside = (wanted < 0.98 * lam.min()) | (wanted > 1.02 * lam.max())
+    if outside.any():
+        raise ParameterError(
+            f"--wavelength {wanted[outside][0]:g}: allowed are {lam.min():.3f} to "
+            f"{lam.max():.3f} um"
+        )
+    return np.unique(np.abs(wanted[:, None] - lam).argmin(axis=1))
+
+
+def _best(arguments, instrument, chain, grid):
+    from astropolcal.calibration import best_derotator
+
+    altitude, parallactic = _track(arguments, instrument)
+    best = best_derotator(chain, grid, altitude, parallactic, law=arguments.law)
+    row = int(np.argmax(best.table["least"]))
+    return {
+        "law": best.law,
+        "offset_deg": float(best.offset.to_value(u.deg)),
+        "least": float(best.table["least"][row]),
+        "mean": float(best.table["mean"][row]),
+        "least_of_any_offset": float(np.min(best.table["least"])),
+        "altitude_deg": [float(f(altitude.value)) for f in (np.min, np.max)],
+        "parallactic_deg": [float(f(parallactic.value)) for f in (np.min, np.max)],
+    }
+
+
+def _track(arguments, instrument):
+    """Return altitude and parallactic angle over the observation."""
+    from astropy.coordinates import SkyCoord
+    from astropy.time import Time
+
+    from astropolcal.observations import pointing
+
+    if not (arguments.target and arguments.night):
+        raise ParameterError("--target and --night belong together")
+    location = instrument._location()
+    if location is None:
+        raise InstrumentError(f"{instrument.name}: its site is not known")
+    try:
+        coord = SkyCoord(*(float(x) for x in arguments.target.split(",")), unit=u.deg)
+        start, end = (Time(text, scale="utc") for text in arguments.night.split("/"))
+    except (TypeError, ValueError) as error:
+        raise ParameterError(
+            f"--target {arguments.target} --night {arguments.night}: write RA,DEC in degree and "
+            f"START/END such as 2025-11-03T08:00/2025-11-03T12:00 ({error})"
+        ) from None
+    return pointing(coord, start + (end - start) * np.linspace(0, 1, 25), location)
+
+
+def _draw(arguments, instrument, chain, grid):
+    from astropolcal.files import atomic_path
+    from astropolcal.plotting.efficiency import plot_polarimetric_efficiency
+
+    figure = plot_polarimetric_efficiency(
+        chain,
+        grid,
+        altitude=arguments.altitude * u.deg,
+        parallactic=arguments.parallactic * u.deg,
+        derotator=(arguments.derotator or [90.0])[-1] * u.deg,
+        shown=None if arguments.wavelength is None else arguments.wavelength * u.um,
+        title=f"Polarimetric efficiency of {instrument.name}",
+    )
+    with atomic_path(arguments.output) as temporary:
+        figure.savefig(temporary, dpi=150)
+
+
+def _text(content):
+    lines = [
+        f"Polarimetric efficiency of {content['instrument']} at altitude "
+        f"{content['altitude_deg']:g} deg, parallactic angle {content['parallactic_deg']:g} deg",
+        "",
+        "derotator" + "".join(f"{lam:8.0f}" for lam in content["wavelength_nm"]) + " nm",
+    ]
+    for angle, row in zip(content["derotator_deg"], content["efficiency"], strict=True):
+        lines.append(f"{angle:8.2f} " + "".join(f"{value:8.3f}" for value in row))
+    best = content.get("best_derotator")
+    if best:
+        (low, high), (east, west) = best["altitude_deg"], best["parallactic_deg"]
+        lines += [
+            "",
+            f"Target at altitude {low:.1f} to {high:.1f} deg, parallactic angle {east:.1f} to "
+            f"{west:.1f} deg",
+            f"Best derotator offset, {best['law']} still: {best['offset_deg']:g} deg; at the worst "
+            f"moment,",
+            f"wavelength and angle of polarization {best['least']:.3f} are measured (mean "
+            f"{best['mean']:.3f}, worst offset {best['least_of_any_offset']:.3f})",
+        ]
+    return "\n".join(lines)

@@ -1,0 +1,356 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""``astropolcal standards``: standard stars, and which of them to observe."""
+
+import math
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.scripts._common import check_outputs, write_json
+
+# more stars than this make a figure unreadable
+_DRAWN = 5
+
+
+def add_parser(commands):
+    """Add the subcommand to what ``add_subparsers`` returned."""
+    parser = commands.add_parser(
+        "standards",
+        help="list polarimetric standard stars and when they are observable",
+        description="List the polarimetric standard stars of the catalogue. With a site and a "
+        "night, those that rise above the limit, the best for the diattenuation of the telescope "
+        "first. With a name, all that is known of that star.",
+    )
+    add = parser.add_argument
+    add("name", nargs="?", metavar="NAME", help="a star, such as 'HD 293396'")
+    add("--kind", choices=("polarized", "unpolarized"), help="only stars of this kind")
+    add("--band", metavar="BAND", help="magnitude and polarization in this band, such as H")
+    add("--magnitude", metavar="LO,HI", help="brightest and faintest magnitude")
+    add("--near", metavar="RA,DEC", help="degrees, or 05:26:06,+16:42:00")
+    add("--radius", metavar="DEG", type=float, help="goes with --near (default: 15)")
+    add("--site", metavar="SITE", help="subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT")
+    add("--night", metavar="YYYY-MM-DD", help="date of the evening at the site")
+    add(
+        "--min-altitude",
+        metavar="DEG",
+        type=float,
+        default=30.0,
+        help="lowest altitude (default: 30)",
+    )
+    add("--json", metavar="FILE", help="write it for machines (- for stdout)")
+    add("--plot", metavar="FILE", help="draw altitude and parallactic angle over the night")
+    parser.set_defaults(run=run)
+
+
+def run(arguments):
+    """Print the stars."""
+    _check(arguments)
+    check_outputs(arguments.json, arguments.plot)
+    text, content, seen = (_one if arguments.name else _many)(arguments)
+    if arguments.plot:
+        _plot(seen, arguments.plot)
+    if arguments.json:
+        write_json(content, arguments.json)
+    if arguments.json != "-":
+        print(text)
+
+
+def _check(arguments):
+    """Refuse options that lack their companion or do nothing."""
+    if (arguments.site is None) != (arguments.night is None):
+        raise ParameterError("--site and --night go together")
+    if arguments.plot and arguments.night is None:
+        raise ParameterError("--plot needs --site and --night")
+    if arguments.radius is not None and arguments.near is None:
+        raise ParameterError("--radius goes with --near RA,DEC")
+    for option in ("kind", "magnitude", "near"):
+        if arguments.name and getattr(arguments, option) is not None:
+            raise ParameterError(f"--{option} selects among stars; it does not go with a NAME")
+
+
+# ---- one star -----------------------------------------------------------------------
+
+
+def _one(arguments):
+    from astropolcal import standards
+
+    star = standards.get(arguments.name)
+    content = _facts(star)
+    lines = _describe(star)
+    if arguments.night is None:
+        return "\n".join(lines), content, []
+    seen = _observability(star.name, arguments)
+    content |= {"site": arguments.site, "night": seen.night} | _angles(seen)
+    lines += ["", f"Night of {seen.night}, {arguments.site}, above {arguments.min_altitude:g} deg"]
+    lines += _night_lines(seen, content)
+    return "\n".join(lines), content, [seen]
+
+
+def _observability(name, arguments):
+    import astropy.units as u
+
+    from astropolcal import standards
+
+    limit = arguments.min_altitude * u.deg
+    return standards.observability(name, _site(arguments.site), arguments.night, min_altitude=limit)
+
+
+def _describe(star):
+    """Return the lines that say what is known of a star."""
+    place = star.coord.to_string("hmsdms", sep=":", precision=1)
+    lines = [f"{star.name}: {star.kind} standard star"]
+    lines.append(f"  position    {place} (ICRS, +-{star.position_error.value:g} arcsec)")
+    if star.aliases:
+        lines.append(f"  also        {', '.join(star.aliases)}")
+    bright = "  ".join(f"{b} {m.value:g}" for b, m in star.magnitudes.items())
+    lines.append(f"  magnitudes  {bright or 'not known'}")
+    if star.spectral_type:
+        lines.append(f"  type        {star.spectral_type}")
+    if star.note:
+        lines.append(f"  note        {star.note}")
+    lines += _law_lines(star)
+    if len(star.polarization):
+        lines += ["", "  band      um     p (%)         theta (deg)   source"]
+    lines += [_measurement(row) for row in star.polarization]
+    if not star.checked:
+        lines.append("  * partly from memory: compare with the source before use")
+    return lines
+
+
+def _law_lines(star):
+    if star.law is None:
+        return []
+    law, errors = star.law, star.law_errors
+    texts = [
+        ("p_max", 100 * law.p_max.value, errors.get("p_max"), " %"),
+        ("lambda_max", law.lambda_max.value, errors.get("lambda_max"), " um"),
+        ("K", law.K.value, errors.get("K"), ""),
+        ("theta", law.theta.value, errors.get("theta"), " deg"),
+    ]
+    lines = ["", f"  Serkowski law ({star.law_reference})"]
+    for name, value, error, unit in texts:
+        spread = "" if error is None else f" +- {getattr(error, 'value', error):.3g}"
+        lines.append(f"    {name:<10}  {value:.4g}{spread}{unit}")
+    return lines
+
+
+def _measurement(row):
+    mark = " " if row["checked"] else "*"
+    degree = _pair(row["p"].value, row["p_err"].value, ".3f")
+    angle = _pair(row["theta"].value, row["theta_err"].value, ".1f")
+    where = row["wavelength"].value
+    return f"{mark} {row['band']:<8}  {where:.2f}   {degree:<13} {angle:<13} {row['reference']}"
+
+
+def _pair(value, error, form):
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:{form}}" + (f" +- {error:{form}}" if math.isfinite(error) else "")
+
+
+def _night_lines(seen, content):
+    start, end = (seen.table["time"][seen.table["observable"]][i].iso[11:16] for i in (0, -1))
+    low, high = content["altitude_deg"]
+    first, last = content["parallactic_deg"]
+    return [
+        f"  observable   {start} to {end} UTC, {content['hours']:.1f} h",
+        f"  highest      {seen.transit.iso[:16]} UTC",
+        f"  altitude     {low:.1f} to {high:.1f} deg",
+        f"  parallactic  {first:.1f} to {last:.1f} deg",
+        f"  M3 error     {_number(content['m3_error'], '.3f')} of one frame's error (32 frames)",
+    ]
+
+
+# ---- many stars ---------------------------------------------------------------------
+
+
+def _many(arguments):
+    from astropolcal import standards
+
+    site = None if arguments.site is None else _site(arguments.site)
+    found = standards.search(
+        **_where(arguments),
+        kind=arguments.kind,
+        band=arguments.band,
+        magnitude=_numbers(arguments.magnitude, "--magnitude", 2),
+        site=site,
+        night=arguments.night,
+        min_altitude=_degrees(arguments.min_altitude),
+    )
+    if not len(found):
+        limit = f" above {arguments.min_altitude:g} deg" if arguments.night else ""
+        raise ParameterError(f"no standard star{limit} fits what was asked")
+    content = {"site": arguments.site, "night": arguments.night}
+    content["stars"] = [_row(row) for row in found]
+    lines = _night_table(found) if arguments.night else _table(found)
+    best = found["name"][:_DRAWN] if arguments.plot else []
+    return "\n".join(lines), content, [_observability(str(n), arguments) for n in best]
+
+
+def _where(arguments):
+    if arguments.near is None:
+        return {}
+    return {
+        "center": _position(arguments.near),
+        "radius": _degrees(15.0 if arguments.radius is None else arguments.radius),
+    }
+
+
+def _table(found):
+    near = "separation" in found.colnames
+    lines = ["name            kind         RA (ICRS)  dec     mag     p (%)"]
+    lines[0] += "            deg" if near else ""
+    for row in found:
+        hours = row["ra"].value / 15
+        clock = f"{int(hours):02d} {60 * (hours % 1):04.1f}"
+        away = f"  {row['separation'].value:5.1f}" if near else ""
+        lines.append(
+            f"{row['name']:<15} {row['kind']:<11}  {clock}  {row['dec'].value:+6.1f}   "
+            f"{_magnitude(row):<7} {_pair(row['p'].value, row['p_err'].value, '.3f'):<15}{away}"
+        )
+    return [line.rstrip() for line in lines]
+
+
+def _night_table(found):
+    lines = ["name            kind         mag     altitude  parallactic hours     M3   score"]
+    for row in found:
+        low, high, first, last = (
+            row[f"{what}_{end}"].value
+            for what in ("altitude", "parallactic")
+            for end in ("min", "max")
+        )
+        lines.append(
+            f"{row['name']:<15} {row['kind']:<11}  {_magnitude(row):<7} {low:2.0f} to "
+            f"{high:2.0f}  {first:4.0f} to {last:4.0f}  {row['hours'].value:4.1f} "
+            f"{_number(row['m3_error'], '6.3f'):>6}  {_number(row['m3_score'], '6.3f'):>6}"
+        )
+    lines += [
+        "",
+        "Altitude and parallactic angle in deg. M3: error of the diattenuation of the",
+        "telescope from 32 frames, in errors of one frame. score: M3 times the photon",
+        "noise against that of magnitude 10; the smaller the better.",
+    ]
+    return lines
+
+
+def _magnitude(row):
+    value = row["magnitude"].value
+    return f"{value:4.1f} {row['magnitude_band']}" if math.isfinite(value) else "   -"
+
+
+def _number(value, form):
+    return "-" if value is None or not math.isfinite(value) else f"{value:{form}}"
+
+
+# ---- machines -----------------------------------------------------------------------
+
+
+def _facts(star):
+    law = None
+    if star.law is not None:
+        law = {
+            "p_max_percent": 100 * float(star.law.p_max.value),
+            "lambda_max_um": float(star.law.lambda_max.value),
+            "K": float(star.law.K.value),
+            "theta_deg": float(star.law.theta.value),
+            "reference": star.law_reference,
+            "doi": star.law_doi or None,
+        }
+    return {
+        "name": star.name,
+        "kind": star.kind,
+        "ra_deg": float(star.coord.ra.deg),
+        "dec_deg": float(star.coord.dec.deg),
+        "magnitudes": {band: float(m.value) for band, m in star.magnitudes.items()},
+        "law": law,
+        "measurements": [_row(row) for row in star.polarization],
+        "checked": star.checked,
+    }
+
+
+_UNITS = {"deg": "deg", "%": "percent", "um": "um", "mag": "", "h": ""}
+
+
+def _row(row):
+    """Return a row of a table for JSON: unit in the name, None for what is not known."""
+    content = {}
+    for name in row.colnames:
+        value = row[name]
+        unit = _UNITS.get(str(getattr(value, "unit", "")), "")
+        value = getattr(value, "value", value)
+        value = value.item() if hasattr(value, "item") else value
+        if isinstance(value, float) and not math.isfinite(value):
+            value = None
+        content[f"{name}_{unit}" if unit else name] = value
+    return content
+
+
+def _angles(seen):
+    error = seen.information(32).diattenuation
+    return {
+        "hours": float(seen.hours.value),
+        "transit": seen.transit.iso,
+        "altitude_deg": [float(a) for a in seen.altitude.value],
+        "parallactic_deg": [float(a) for a in seen.parallactic.value],
+        "m3_error": error if math.isfinite(error) else None,
+    }
+
+
+# ---- what the options mean ----------------------------------------------------------
+
+
+def _degrees(value):
+    import astropy.units as u
+
+    return value * u.deg
+
+
+def _numbers(text, option, count):
+    if text is None:
+        return None
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise ParameterError(f"{option} {text}: give {count} numbers with commas between them")
+    return values
+
+
+def _position(text):
+    import astropy.units as u
+    from astropy.coordinates import SkyCoord
+
+    try:
+        ra, dec = text.split(",")
+        unit = (u.hourangle if ":" in ra else u.deg, u.deg)
+        return SkyCoord(ra, dec, unit=unit)
+    except (ValueError, u.UnitsError):
+        raise ParameterError(
+            f"--near {text}: give RA,DEC in degrees, or as 05:26:06,+16:42:00"
+        ) from None
+
+
+def _site(text):
+    """Return the place, by name or as LON,LAT,HEIGHT."""
+    if "," not in text:
+        return text
+    import astropy.units as u
+    from astropy.coordinates import EarthLocation
+
+    lon, lat, height = _numbers(text, "--site", 3)
+    try:
+        return EarthLocation.from_geodetic(lon * u.deg, lat * u.deg, height * u.m)
+    except ValueError as error:
+        raise ParameterError(f"--site {text}: {error}") from None
+
+
+def _plot(seen, path):
+    from astropolcal.exceptions import AstropolcalError
+    from astropolcal.files import atomic_path
+    from astropolcal.plotting.standards import plot_observability
+
+    figure = plot_observability(seen)
+    with atomic_path(path) as temporary:
+        try:
+            figure.savefig(temporary, dpi=150)
+        except ValueError as error:
+            raise AstropolcalError(f"{path}: {error}") from None

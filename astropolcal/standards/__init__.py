@@ -1,0 +1,33 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Polarimetric standard stars, the Serkowski law, and which star to observe.
+
+`get` and `search` look into the catalogue that comes with the package,
+`observability` says when a star is up and at which angles, and
+`telescope_information` how well it then fixes the diattenuation of the
+telescope. `SerkowskiLaw` is the wavelength dependence of interstellar
+polarization as an astropy model.
+"""
+
+from astropolcal.standards.catalogue import KINDS, MAGNITUDES, StandardStar, catalogue, get, names
+from astropolcal.standards.information import TelescopeInformation, telescope_information
+from astropolcal.standards.law import LinearStokes, SerkowskiLaw, whittet_width
+from astropolcal.standards.searching import search
+from astropolcal.standards.visibility import Observability, observability
+
+__all__ = [
+    "KINDS",
+    "MAGNITUDES",
+    "LinearStokes",
+    "Observability",
+    "SerkowskiLaw",
+    "StandardStar",
+    "TelescopeInformation",
+    "catalogue",
+    "get",
+    "names",
+    "observability",
+    "search",
+    "telescope_information",
+    "whittet_width",
+]

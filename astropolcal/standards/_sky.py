@@ -1,0 +1,153 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Where a star stands over a site: altitude, parallactic angle, the hours of a night."""
+
+import difflib
+import warnings
+from contextlib import contextmanager
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_sun
+from astropy.table import QTable
+from astropy.time import Time
+from astropy.utils import iers
+from astropy.utils.exceptions import AstropyWarning
+from erfa import ErfaWarning
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.units import angle_to_rad
+
+LIMIT = 30 * u.deg
+TWILIGHT = -12 * u.deg
+STEP = 10 * u.min
+_LARGEST_STEP = 60 * u.min
+
+# east longitude and latitude in degree, height in metre
+SITES = {
+    "gemini_south": (-70.7367, -30.2407, 2738),
+    "keck": (-155.4750, 19.8264, 4145),
+    "paranal": (-70.4033, -24.6253, 2635),
+    "subaru": (-155.4760, 19.8255, 4139),
+}
+
+
+@contextmanager
+def offline():
+    """Use the Earth orientation that astropy brings along; never the network."""
+    with (
+        iers.conf.set_temp("auto_download", False),
+        iers.conf.set_temp("auto_max_age", None),
+        iers.conf.set_temp("iers_degraded_accuracy", "warn"),
+        warnings.catch_warnings(),
+    ):
+        # a second of time is 15 arcsec, which does not matter here
+        warnings.simplefilter("ignore", AstropyWarning)
+        warnings.simplefilter("ignore", ErfaWarning)
+        yield
+
+
+def location(site):
+    """Return the place on Earth that a name or an EarthLocation means."""
+    if isinstance(site, EarthLocation):
+        return site
+    key = str(site).strip().lower().replace(" ", "_").replace("-", "_")
+    if key in SITES:
+        return EarthLocation.from_geodetic(*SITES[key])
+    near = difflib.get_close_matches(key, SITES, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ParameterError(
+        f"site = {site!r} is not known{hint} (known: {', '.join(SITES)}; any other as an "
+        "EarthLocation)"
+    )
+
+
+def pointing(coord: SkyCoord, time: Time, location: EarthLocation):
+    """
+    Return altitude and parallactic angle, without refraction.
+
+    Parameters
+    ----------
+    coord : `~astropy.coordinates.SkyCoord`
+        The star; broadcasts with ``time``.
+    time : `~astropy.time.Time`
+        When.
+    location : `~astropy.coordinates.EarthLocation`
+        Where.
+
+    Returns
+    -------
+    altitude, parallactic : `~astropy.units.Quantity`
+        In degree. The parallactic angle is that from the north celestial pole
+        of date to the zenith, through east; negative before the transit of a
+        star that culminates south of the zenith.
+    """
+    with offline():
+        local = coord.transform_to(AltAz(obstime=time, location=location))
+    return local.alt.to_value(u.deg) * u.deg, parallactic_angle(local.alt, local.az, location.lat)
+
+
+def parallactic_angle(altitude, azimuth, latitude):
+    """Return the parallactic angle (deg) of a direction given by altitude and azimuth."""
+    sine = -np.sin(azimuth) * np.cos(latitude)
+    cosine = np.sin(latitude) * np.cos(altitude)
+    cosine = cosine - np.cos(latitude) * np.sin(altitude) * np.cos(azimuth)
+    return u.Quantity(np.arctan2(sine, cosine), u.deg, subok=False)
+
+
+def night_times(site, night, *, twilight, step):
+    """Return the times of a night with the Sun below ``twilight``, ``step`` apart."""
+    with offline():
+        times = _evening_noon(site, night) + np.arange(0, 1, step.to_value(u.day)) * u.day
+        sun = get_sun(times).transform_to(AltAz(obstime=times, location=site)).alt
+    dark = sun < twilight
+    if not np.any(dark):
+        raise ParameterError(
+            f"night = {night!s}: the Sun does not go below {twilight.to_value(u.deg):g} deg "
+            f"at this site; it gets to {sun.min().to_value(u.deg):.1f} deg"
+        )
+    return times[dark]
+
+
+def _evening_noon(site, night):
+    """Return the local mean noon of the date on which the night begins."""
+    text = date_of(night)
+    try:
+        date = Time(text, scale="utc", format="iso", out_subfmt="date")
+        if date.to_value("iso", "date") != text:
+            raise ValueError
+    except (ValueError, TypeError):
+        raise ParameterError(
+            f"night = {night!r} must be the date of the evening, such as '2025-11-03'"
+        ) from None
+    # a time of its own, which is not printed as a date
+    noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
+    return noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day
+
+
+def date_of(night):
+    """Return the date of a night as text."""
+    return night.to_value("iso", "date") if isinstance(night, Time) else str(night).strip()
+
+
+def checked(min_altitude, twilight, step):
+    """Return limits and step, or raise."""
+    limit = np.rad2deg(float(angle_to_rad(min_altitude, "min_altitude"))) * u.deg
+    dark = np.rad2deg(float(angle_to_rad(twilight, "twilight"))) * u.deg
+    if not 0 <= limit.value < 90:
+        raise ParameterError(f"min_altitude = {limit:g} must be from 0 to below 90 deg")
+    if not -90 <= dark.value <= 0:
+        raise ParameterError(f"twilight = {dark:g} must be from -90 to 0 deg")
+    if not (isinstance(step, u.Quantity) and step.unit.is_equivalent(u.s)):
+        raise ParameterError(f"step = {step!r} needs a unit of time")
+    if not 0 * u.s < step <= _LARGEST_STEP:
+        raise ParameterError(f"step = {step:g} must be positive and at most {_LARGEST_STEP:g}")
+    return limit, dark, step
+
+
+def night_table(times, altitude, parallactic, limit):
+    """Return the table of one star over the dark hours."""
+    smooth, up = np.unwrap(parallactic, period=360 * u.deg), altitude >= limit
+    lowest = np.min(smooth[up]) if np.any(up) else smooth[0]
+    # from -180 deg on, so that a star that culminates in the north passes +180
+    smooth = smooth - np.floor((lowest + 180 * u.deg) / (360 * u.deg)) * 360 * u.deg
+    return QTable({"time": times, "altitude": altitude, "parallactic": smooth, "observable": up})

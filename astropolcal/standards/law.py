@@ -1,0 +1,416 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The wavelength dependence of interstellar polarization."""
+
+from typing import NamedTuple
+
+import astropy.units as u
+import numpy as np
+from astropy.modeling import Fittable1DModel, Parameter
+
+from astropolcal.exceptions import ParameterError, WavelengthRangeError
+from astropolcal.units import angle_to_rad, length_to_um, to_unit
+
+__all__ = ["LinearStokes", "SerkowskiLaw", "whittet_width"]
+
+# Whittet et al. (1992): K = intercept + slope * lambda_max / um
+_INTERCEPT, _SLOPE = 0.01, 1.66
+_TURN = u.deg / u.um
+# lets the ends of a range survive the conversion of their unit
+_EDGE = 1e-9
+_CANONICAL = {"p_max": u.dimensionless_unscaled, "lambda_max": u.um, "theta": u.rad}
+_CANONICAL |= {"K": u.dimensionless_unscaled, "rotation": u.rad / u.um}
+
+
+class LinearStokes(NamedTuple):
+    """
+    Normalized linear Stokes parameters and their covariance.
+
+    Parameters
+    ----------
+    q, u : float or `~numpy.ndarray`
+        One value a wavelength.
+    covariance : `~numpy.ndarray` or None
+        Shape (..., 2, 2), in the order q, u; None if no errors are known.
+
+    Examples
+    --------
+    >>> from astropolcal.standards import LinearStokes
+    >>> LinearStokes(0.01, 0.0, None).q
+    0.01
+    """
+
+    q: np.ndarray
+    u: np.ndarray
+    covariance: np.ndarray | None
+
+
+def whittet_width(lambda_max):
+    r"""
+    Return the width that goes with a wavelength of maximum polarization.
+
+    :math:`K = 0.01 + 1.66\,\lambda_\mathrm{max}/\mathrm{um}`, an average over
+    sight lines; the K of single stars scatter by about 0.1 around it.
+
+    Parameters
+    ----------
+    lambda_max : `~astropy.units.Quantity` or SerkowskiLaw
+        A wavelength; or a law, so that the function can tie its K.
+
+    Returns
+    -------
+    float
+
+    References
+    ----------
+    Wilking, Lebofsky & Rieke 1982, AJ 87, 695, doi:10.1086/113147;
+    Whittet et al. 1992, ApJ 386, 562, doi:10.1086/171039.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.standards import SerkowskiLaw, whittet_width
+    >>> round(float(whittet_width(550 * u.nm)), 3)
+    0.923
+    >>> law = SerkowskiLaw()
+    >>> law.K.tied = whittet_width
+    """
+    if isinstance(lambda_max, SerkowskiLaw):
+        return _INTERCEPT + _SLOPE * lambda_max.lambda_max.value
+    return _INTERCEPT + _SLOPE * length_to_um(lambda_max, "lambda_max")
+
+
+class SerkowskiLaw(Fittable1DModel):
+    r"""
+    Degree of interstellar linear polarization against wavelength.
+
+    .. math:: p(\lambda) = p_\mathrm{max}
+              \exp\left[-K \ln^2(\lambda_\mathrm{max} / \lambda)\right], \qquad
+              \theta(\lambda) = \theta + \rho\,(\lambda - \lambda_\mathrm{max})
+
+    The model returns the degree; `q`, `u` and `stokes` also use the angle.
+    ``theta`` and ``rotation`` are fixed by default, because a fit to degrees
+    says nothing about them.
+
+    Parameters
+    ----------
+    p_max : float or `~astropy.units.Quantity`
+        Largest degree of polarization, as a number or in percent.
+    lambda_max : `~astropy.units.Quantity`
+        Wavelength of the largest polarization.
+    K : float, optional
+        Width of the curve; by default that of `whittet_width`. To keep it there in
+        a fit, set ``law.K.tied = whittet_width``.
+    theta : `~astropy.units.Quantity`
+        Angle at ``lambda_max``, from north through east.
+    rotation : `~astropy.units.Quantity`
+        Change of the angle with wavelength.
+    **kwargs
+        Whatever an `astropy.modeling.Model` takes, such as ``name``.
+
+    Raises
+    ------
+    ParameterError
+        If a parameter has a wrong unit.
+    WavelengthRangeError
+        If a wavelength lies outside ``valid_range``. The law was measured from
+        U to K (``measured_range``); beyond 2.5 um a power law holds instead.
+
+    References
+    ----------
+    Serkowski, Mathewson & Ford 1975, ApJ 196, 261, doi:10.1086/153410;
+    Wilking et al. 1980, ApJ 235, 905; Whittet et al. 1992, ApJ 386, 562,
+    doi:10.1086/171039.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.standards import SerkowskiLaw
+    >>> law = SerkowskiLaw(p_max=3.9 * u.percent, lambda_max=520 * u.nm, K=0.99)
+    >>> print(law([0.52, 1.25] * u.um).to(u.percent).round(2))
+    [3.9  1.82] %
+    """
+
+    # no upper bound: astropy does not convert bounds, and data may be in percent
+    p_max = Parameter(default=0.05, bounds=(0, None), description="largest degree of polarization")
+    lambda_max = Parameter(
+        default=0.55, unit=u.um, bounds=(0.1, 2.5), description="wavelength of the maximum"
+    )
+    K = Parameter(default=0.923, bounds=(0, 5), description="width of the curve")
+    theta = Parameter(default=0.0, unit=u.deg, fixed=True, description="angle at lambda_max")
+    rotation = Parameter(
+        default=0.0, unit=_TURN, fixed=True, description="change of the angle with wavelength"
+    )
+
+    measured_range = [0.36, 2.04] * u.um
+    valid_range = [0.28, 2.5] * u.um
+    input_units_strict = True
+    _input_units_allow_dimensionless = False
+
+    def __init__(
+        self,
+        p_max=0.05,
+        lambda_max=0.55 * u.um,
+        K=None,
+        theta=0 * u.deg,
+        rotation=0 * _TURN,
+        **kwargs,
+    ):
+        longest = length_to_um(lambda_max, "lambda_max")
+        super().__init__(
+            p_max=to_unit(p_max, None, "p_max"),
+            lambda_max=longest * u.um,
+            K=_INTERCEPT + _SLOPE * longest if K is None else to_unit(K, None, "K"),
+            theta=angle_to_rad(theta, "theta") * u.rad.to(u.deg) * u.deg,
+            rotation=to_unit(rotation, _TURN, "rotation") * _TURN,
+            **kwargs,
+        )
+
+    @property
+    def input_units(self):
+        """Unit of the input: micrometre, or none in a fit."""
+        return None if self.lambda_max.unit is None else {self.inputs[0]: u.um}
+
+    def _parameter_units_for_data_units(self, inputs_unit, outputs_unit):
+        angle = (u.deg, u.deg / inputs_unit[self.inputs[0]])
+        units = (outputs_unit[self.outputs[0]], inputs_unit[self.inputs[0]], None, *angle)
+        return {name: unit for name, unit in zip(self.param_names, units, strict=True) if unit}
+
+    def evaluate(self, x, p_max, lambda_max, K, theta, rotation):
+        """Return the degree of polarization; astropy calls it."""
+        log = _log_ratio(_in_range(x, self.valid_range), lambda_max)
+        degree = p_max * np.exp(-u.Quantity(K).value * log**2)
+        # a model with units must not mix plain numbers with quantities
+        return degree << u.dimensionless_unscaled if hasattr(x, "unit") else degree
+
+    @property
+    def fit_deriv(self):
+        """Derivatives by the parameters, or None if a tie of the user's makes them wrong."""
+        ties = {name: tie for name, tie in self.tied.items() if tie}
+        if not ties:
+            return self._columns
+        return self._tied_columns if ties == {"K": whittet_width} else None
+
+    @staticmethod
+    def _columns(x, p_max, lambda_max, K, theta, rotation):
+        log = _log_ratio(np.asarray(x, dtype=float), lambda_max)
+        shape = np.exp(-K * log**2)
+        degree = p_max * shape
+        none = np.zeros_like(shape)
+        return [shape, -2 * K * log / lambda_max * degree, -(log**2) * degree, none, none]
+
+    @classmethod
+    def _tied_columns(cls, x, *parameters):
+        columns = cls._columns(x, *parameters)
+        columns[1] = columns[1] + _SLOPE * columns[2]
+        return columns
+
+    def angle(self, wavelength):
+        """
+        Return the angle of polarization.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Any shape.
+
+        Returns
+        -------
+        `~astropy.units.Quantity`
+            In degree, from north through east, in [0, 180).
+
+        Raises
+        ------
+        WavelengthRangeError
+            If the law does not hold at a wavelength.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.standards import SerkowskiLaw
+        >>> law = SerkowskiLaw(theta=58 * u.deg, rotation=2 * u.deg / u.um)
+        >>> law.angle(1.55 * u.um)
+        <Quantity 60. deg>
+        """
+        x = _in_range(length_to_um(wavelength, "wavelength"), self.valid_range)
+        return np.mod(np.rad2deg(self._angle_rad(x)), 180) * u.deg
+
+    def _angle_rad(self, x):
+        values = self._values()
+        return values["theta"] + values["rotation"] * (x - values["lambda_max"])
+
+    def _values(self):
+        """Return the parameters in canonical units, as a dictionary of floats."""
+        return {
+            name: float(u.Quantity(p.value, p.unit).to_value(_CANONICAL[name]))
+            for name, p in ((n, getattr(self, n)) for n in self.param_names)
+        }
+
+    def q(self, wavelength):
+        """
+        Return Stokes q, positive along north.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Any shape.
+
+        Returns
+        -------
+        float or `~numpy.ndarray`
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.standards import SerkowskiLaw
+        >>> float(SerkowskiLaw(p_max=0.04, theta=90 * u.deg).q(550 * u.nm))
+        -0.04
+        """
+        return self.stokes(wavelength).q
+
+    def u(self, wavelength):
+        """
+        Return Stokes u, positive towards north-east.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Any shape.
+
+        Returns
+        -------
+        float or `~numpy.ndarray`
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.standards import SerkowskiLaw
+        >>> float(SerkowskiLaw(p_max=0.04, theta=45 * u.deg).u(550 * u.nm))
+        0.04
+        """
+        return self.stokes(wavelength).u
+
+    def stokes(self, wavelength, covariance=None):
+        """
+        Return q and u, with the covariance that errors of the parameters give them.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Any shape.
+        covariance : mapping or array-like, optional
+            Standard errors by the names of parameters, as quantities where the
+            parameter has a unit; or a covariance matrix in the parameters' units,
+            of all five in the order of ``param_names`` or of those that are
+            neither fixed nor tied, as a fitter returns it.
+
+        Returns
+        -------
+        LinearStokes
+            ``q``, ``u`` and ``covariance``, of shape (..., 2, 2) or None.
+
+        Raises
+        ------
+        ParameterError
+            If the covariance does not belong to the parameters.
+        WavelengthRangeError
+            If the law does not hold at a wavelength.
+
+        Notes
+        -----
+        The covariance is that at each wavelength; those of two wavelengths are
+        correlated, because the parameters are common.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.standards import SerkowskiLaw
+        >>> law = SerkowskiLaw(p_max=0.04, theta=90 * u.deg)
+        >>> errors = {"p_max": 0.1 * u.percent, "theta": 1 * u.deg}
+        >>> q, stokes_u, covariance = law.stokes(550 * u.nm, errors)
+        >>> print((covariance.diagonal() ** 0.5).round(5))
+        [0.001  0.0014]
+        """
+        x = _in_range(length_to_um(wavelength, "wavelength"), self.valid_range)
+        values = self._values()
+        degree_columns = self._columns(x, *values.values())
+        degree = values["p_max"] * degree_columns[0]
+        angle = 2 * self._angle_rad(x)
+        along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        q_u = degree[..., None] * along
+        if covariance is None:
+            return LinearStokes(q_u[..., 0], q_u[..., 1], None)
+        across = 2 * degree[..., None] * np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+        one = np.ones_like(x)
+        turns = [0 * one, -values["rotation"] * one, 0 * one, one, x - values["lambda_max"]]
+        pairs = zip(degree_columns, turns, strict=True)
+        jacobian = np.stack([d[..., None] * along + t[..., None] * across for d, t in pairs], -1)
+        matrix = self._canonical_covariance(covariance)
+        return LinearStokes(
+            q_u[..., 0], q_u[..., 1], jacobian @ matrix @ np.swapaxes(jacobian, -1, -2)
+        )
+
+    def _canonical_covariance(self, covariance):
+        """Return the covariance of all five parameters in canonical units."""
+        if hasattr(covariance, "keys"):
+            return np.diag([v**2 for v in self._canonical_errors(covariance)])
+        matrix = np.asarray(covariance, dtype=float)
+        free = [n for n in self.param_names if not (self.fixed[n] or self.tied[n])]
+        square = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1]
+        if not (square and np.all(np.isfinite(matrix))):
+            raise ParameterError("the covariance must be a square matrix of finite numbers")
+        names = {len(self.param_names): self.param_names, len(free): free}.get(len(matrix))
+        if names is None:
+            raise ParameterError(
+                f"the covariance has {len(matrix)} rows; it must have {len(self.param_names)} "
+                f"({', '.join(self.param_names)}) or {len(free)} (free: {', '.join(free)})"
+            )
+        scale = [self._scale(name) for name in names]
+        place = [self.param_names.index(name) for name in names]
+        full = np.zeros((len(self.param_names),) * 2)
+        full[np.ix_(place, place)] = matrix * np.outer(scale, scale)
+        return self._spread_tie(full) if "K" not in names else full
+
+    def _spread_tie(self, full):
+        """Give a K that is tied to lambda_max its part of the covariance."""
+        if self.tied["K"] is not whittet_width:
+            return full
+        spread = np.eye(len(full))
+        spread[self.param_names.index("K"), self.param_names.index("lambda_max")] = _SLOPE
+        return spread @ full @ spread.T
+
+    def _scale(self, name):
+        unit = getattr(self, name).unit
+        return (unit or u.dimensionless_unscaled).to(_CANONICAL[name])
+
+    def _canonical_errors(self, errors):
+        unknown = sorted(set(errors) - set(self.param_names))
+        if unknown:
+            raise ParameterError(
+                f"the law has no parameter {unknown[0]!r}; it has {', '.join(self.param_names)}"
+            )
+        values = [
+            to_unit(errors.get(n, 0 * _CANONICAL[n]), _CANONICAL[n], f"error of {n}")
+            for n in self.param_names
+        ]
+        if not np.all(np.isfinite(values)) or np.min(values) < 0:
+            raise ParameterError(f"errors = {dict(errors)!r} must be finite and not negative")
+        return values
+
+
+def _log_ratio(x, lambda_max):
+    """Return ln(lambda_max / x), both in micrometre, with or without units."""
+    value = [v.to_value(u.um) if hasattr(v, "unit") and v.unit else v for v in (lambda_max, x)]
+    return np.log(np.asarray(value[0], dtype=float) / np.asarray(value[1], dtype=float))
+
+
+def _in_range(x, valid):
+    """Return the wavelengths, or raise where the law does not hold."""
+    value = np.asarray(x.to_value(u.um) if hasattr(x, "unit") else x, dtype=float)
+    low, high = valid.to_value(u.um)
+    good = (value >= low * (1 - _EDGE)) & (value <= high * (1 + _EDGE))
+    if not np.all(good):
+        bad = value[~good].ravel()[0] if value.ndim else float(value)
+        raise WavelengthRangeError(
+            f"wavelength = {bad:g} um; the Serkowski law holds from {low:g} to {high:g} um"
+        )
+    return value

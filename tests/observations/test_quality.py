@@ -1,0 +1,183 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Frames that no calibration should use: found, masked with a reason, and said."""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import instruments
+from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.observations import (
+    Observations,
+    brightness,
+    cycle_numbers,
+    is_star,
+    mask_incomplete_cycles,
+    mask_saturated,
+    mask_unstable_lamp,
+)
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+CHARIS = instruments.get("charis")
+FEW = [1200, 1600, 2200] * u.nm
+DEROTATOR = np.linspace(45, 132.5, 8) * u.deg
+CRITICAL = [0, 45, 22.5, 67.5] * u.deg
+
+
+def internal(lamp=None, derotator=DEROTATOR, source="unpolarized", **options):
+    chain = CHARIS.chain(source, wavelength=FEW)
+    frames = half_wave_plate_cycles(derotator=derotator)
+    return simulate(chain, FEW, frames, lamp=lamp, seed=3, meta={"source": source}, **options)
+
+
+def cycles(n=3, drop=(), saturated=None):
+    frames = half_wave_plate_cycles(CRITICAL, np.full(n, 90) * u.deg)
+    if saturated is not None:
+        frames["saturated"] = saturated
+    frames = frames[np.setdiff1d(np.arange(len(frames)), drop)]
+    return simulate(CHARIS.chain("unpolarized", wavelength=FEW), FEW, frames, seed=1, name="star")
+
+
+@pytest.mark.parametrize(
+    ("source", "star"),
+    [
+        ("unpolarized standard star", True),
+        ("polarized standard-star", True),
+        ("Star", True),
+        ("sky", True),
+        ("polarized", False),
+        ("starting lamp", False),
+        (None, False),
+    ],
+)
+def test_which_sources_are_stars(source, star):
+    assert is_star(source) == star
+
+
+# --- cycles ---------------------------------------------------------------------------------------
+
+
+def test_cycles_are_numbered_by_returning_angles():
+    assert cycle_numbers(cycles()).tolist() == np.repeat([0, 1, 2], 4).tolist()
+
+
+def test_cycles_may_be_given():
+    observations = cycles()
+    table = observations.to_table()
+    table["cycle"] = np.asarray(table["frame"]) // 2
+    assert cycle_numbers(Observations.from_table(table)).max() == 5
+
+
+def test_complete_cycles_stay_untouched():
+    observations = cycles()
+    assert mask_incomplete_cycles(observations) is observations
+
+
+def test_incomplete_cycle_is_masked_with_reason_and_reported():
+    with pytest.warns(AstropolcalWarning, match=r"3 of 11 frames masked, incomplete half-wave"):
+        masked = mask_incomplete_cycles(cycles(drop=[6]))
+    assert masked.mask_reasons == {"incomplete half-wave-plate cycle": 3 * len(FEW)}
+    assert np.flatnonzero(masked.mask.all(axis=1)).tolist() == [4, 5, 6]
+
+
+def test_cycle_whose_frame_is_masked_is_incomplete():
+    observations = cycles().with_mask(np.arange(12) == 9, "cloud")
+    with pytest.warns(AstropolcalWarning, match=r"3 of 12 frames masked"):
+        masked = mask_incomplete_cycles(observations)
+    assert masked.mask_reasons["cloud"] == len(FEW)
+    assert masked.mask.all(axis=1).sum() == 4
+
+
+def test_no_complete_cycle_is_an_error():
+    with pytest.raises(ObservationError, match=r"star: none of its 1 half-wave-plate cycles"):
+        mask_incomplete_cycles(cycles(n=1, drop=[3]))
+
+
+# --- saturation and negative sums -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("flag", [np.arange(12) == 4, 7 * (np.arange(12) == 4)])
+def test_saturated_frames_are_masked(flag):
+    with pytest.warns(AstropolcalWarning, match=r"1 of 12 frames masked, saturated: frame 4"):
+        masked = mask_saturated(cycles(saturated=flag))
+    assert masked.mask_reasons == {"saturated": len(FEW)}
+
+
+def test_flag_that_is_no_flag_is_an_error():
+    with pytest.raises(ObservationError, match="column saturated has type"):
+        mask_saturated(cycles(saturated=np.full(12, "yes")))
+
+
+def test_negative_sums_after_background_are_masked_when_read():
+    table = cycles().to_table()
+    table["flux_right"][5] = -3 * u.adu
+    with pytest.warns(AstropolcalWarning, match="flux not positive"):
+        observations = Observations.from_table(table)
+    assert observations.mask_reasons == {"flux not positive": 1}
+
+
+# --- lamp ---------------------------------------------------------------------------------------
+
+
+def test_brightness_is_relative_to_the_median_frame():
+    lamp = np.ones(64)
+    lamp[7] = 0.5
+    found = brightness(internal(lamp, noise=False))
+    np.testing.assert_allclose(found, lamp, rtol=0.03)
+
+
+def test_warming_lamp_is_masked():
+    lamp = np.ones(64)
+    lamp[:8] = np.linspace(0.2, 0.9, 8)
+    with pytest.warns(AstropolcalWarning, match=r"8 of 64 frames masked, unstable lamp"):
+        masked = mask_unstable_lamp(internal(lamp))
+    assert np.flatnonzero(masked.mask.all(axis=1)).tolist() == list(range(8))
+
+
+def test_single_dim_frame_is_masked_alone():
+    lamp = np.ones(64)
+    lamp[20] = 0.7
+    with pytest.warns(AstropolcalWarning, match=r"1 of 64 frames masked, unstable lamp: frame 20"):
+        mask_unstable_lamp(internal(lamp))
+
+
+@pytest.mark.parametrize(
+    "lamp",
+    [
+        np.ones(64),
+        np.linspace(0.5, 1.5, 64),
+        1 + 0.3 * np.linspace(-1, 1, 64) ** 2,
+        np.random.default_rng(1).normal(1, 0.05, 64),
+    ],
+    ids=["steady", "drift", "curved drift", "flicker"],
+)
+@pytest.mark.parametrize("source", ["polarized", "unpolarized"])
+def test_good_lamps_keep_all_frames(lamp, source):
+    assert mask_unstable_lamp(internal(lamp, source=source)).mask.sum() == 0
+
+
+@pytest.mark.parametrize("options", [{"limit": 0}, {"sigma": -1}, {"limit": np.nan}])
+def test_limits_must_be_positive(options):
+    with pytest.raises(ObservationError, match="both must be above zero"):
+        mask_unstable_lamp(internal(), **options)
+
+
+@pytest.mark.parametrize(("name", "masked"), [("dataset1", 0), ("dataset3", 0), ("dataset4", 8)])
+def test_unstable_lamp_of_the_real_runs(shared_data, name, masked):
+    """The paper leaves out derotator 45 deg of Dataset 4, and nothing else."""
+    (path,) = (shared_data / "data" / "charis").glob(f"{name}*.ecsv")
+    observations = Observations.read(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropolcalWarning)
+        lost = mask_unstable_lamp(observations).mask.all(axis=1)
+    assert lost.sum() == masked
+    derotator = np.rad2deg(observations.position("derotator"))[lost]
+    np.testing.assert_allclose(derotator, 45, atol=1)
+
+
+def test_simulated_runs_of_others_keep_all_frames(shared_data):
+    folders = sorted((shared_data / "gap-cases").glob("case*"))[::4]
+    for path in (p for folder in folders for p in folder.glob("*.ecsv")):
+        assert mask_unstable_lamp(Observations.read(path)).mask.sum() == 0, path

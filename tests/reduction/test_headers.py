@@ -1,0 +1,194 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Headers: matching, units, angles that cannot be right."""
+
+from dataclasses import replace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord
+from astropy.io import fits
+from astropy.time import Time
+from hypothesis import given
+from hypothesis import strategies as st
+from reduction_lab import HEADER, write_cube
+
+from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.instruments import CHARIS
+from astropolcal.instruments.layout import FileLayout
+from astropolcal.reduction.headers import (
+    check_sequence,
+    frame_number,
+    pointing,
+    raw_frames,
+    read_header,
+    tracking_error,
+)
+
+LAYOUT = CHARIS.files
+CYCLE = [0, 11.25, 22.5, 33.75, 45, 56.25, 67.5, 78.75, 90]
+
+
+def header(**changes):
+    return fits.Header(list((HEADER | changes).items()))
+
+
+@pytest.mark.parametrize(
+    ("name", "origname", "number"),
+    [
+        ("CRSA00170808_cube.fits", None, 170808),
+        ("20251005_CRSA00170808_cube.fits", None, 170808),
+        ("n0001e_skysub.fits", "CRSA00171001.fits", 171001),
+        ("n0001e_skysub.fits", None, None),
+        ("CRSA001708081_cube.fits", None, None),
+    ],
+)
+def test_frame_number(name, origname, number):
+    cards = fits.Header() if origname is None else fits.Header({"ORIGNAME": origname})
+    assert frame_number(name, LAYOUT, cards) == number
+
+
+def test_values_come_in_the_units_of_the_columns():
+    values = read_header("CRSA00000001_cube.fits", LAYOUT, header=header()).values
+    assert values["hwp"] == 0.0
+    assert values["hwp_true"] == 80.0
+    assert values["exposure_time"] == 10.0
+    assert values["object"] == "HD 293396"
+
+
+def test_transformations_and_units_are_applied():
+    layout = replace(
+        LAYOUT,
+        units={"exposure_time": "ms", "hwp": "rad"},
+        transforms={"derotator": (-1.0, 180.0)},
+    )
+    values = read_header("a.fits", layout, header=header(**{"RET-ANG1": np.pi / 4})).values
+    assert values["hwp"] == pytest.approx(45.0)
+    assert values["exposure_time"] == pytest.approx(0.01)
+    assert values["derotator"] == pytest.approx(83.0)
+
+
+@pytest.mark.parametrize("missing", ["unavailable", "", "NaN"])
+def test_placeholders_count_as_missing(missing):
+    values = read_header("a.fits", LAYOUT, header=header(PARANG=missing)).values
+    assert "parallactic" not in values
+
+
+def test_alternative_keywords_are_tried_in_turn():
+    cards = header()
+    del cards["UTC-DATE"]
+    cards["DATE-OBS"] = "2025-11-04"
+    assert read_header("a.fits", LAYOUT, header=cards).values["date"] == "2025-11-04"
+
+
+@pytest.mark.parametrize(
+    ("keyword", "value"),
+    [("ALTITUDE", 95.0), ("ALTITUDE", -3.0), ("RET-ANG1", 1e5), ("D_IMRANG", "x"), ("EXPTIME", 0)],
+)
+def test_impossible_values_are_errors_that_name_the_keyword(keyword, value):
+    frame = read_header("a.fits", LAYOUT, header=header(**{keyword: value}))
+    assert len(frame.errors) == 1
+    assert keyword in frame.errors[0]
+    assert str(value) in frame.errors[0]
+
+
+def test_raw_frame_of_the_same_number_gives_what_the_cube_lacks(tmp_path):
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    write_cube(raw / "CRSA00000007.fits", None, RET__ANG1=33.75)
+    write_cube(raw / "CRSA00000008.fits", None, RET__ANG1=45.0)
+    (raw / "notes_00000007.txt").write_text("no frame")
+    found = raw_frames(raw, LAYOUT)
+    assert sorted(found) == [7, 8]
+    cards = fits.Header({"PARANG": 1.0, "ALTITUDE": 60.0})
+    frame = read_header("CRSA00000007_cube.fits", LAYOUT, header=cards, raw=found)
+    assert frame.values["hwp"] == 33.75
+    # what the cube has itself stays
+    assert frame.values["altitude"] == 60.0
+    lost = read_header("CRSA00000009_cube.fits", LAYOUT, header=cards, raw=found)
+    assert lost.errors == ["no raw frame of number 9"]
+    nameless = read_header("cube.fits", LAYOUT, header=cards, raw=found)
+    assert "no frame number" in nameless.errors[0]
+
+
+def test_raw_folder_without_frames(tmp_path):
+    with pytest.raises(ObservationError, match="no FITS file with a frame number"):
+        raw_frames(tmp_path, LAYOUT)
+
+
+@pytest.mark.parametrize("mjd", [60250.5, 60250.6, 60982.55])
+def test_pointing_agrees_with_astropy(mjd):
+    values = {"right_ascension": "05:05:05", "declination": "+10:00:00", "mjd": mjd}
+    altitude, parallactic = pointing(values, LAYOUT.site)
+    place = EarthLocation.from_geodetic(*LAYOUT.site[:2])
+    time = Time(mjd, format="mjd")
+    time.delta_ut1_utc = 0.0
+    star = SkyCoord(values["right_ascension"], values["declination"], unit=(u.hourangle, u.deg))
+    with _offline():
+        frame = AltAz(obstime=time, location=place)
+        seen = star.transform_to(frame)
+        pole = SkyCoord(0 * u.deg, 90 * u.deg, frame="icrs").transform_to(frame)
+    zenith = SkyCoord(0 * u.deg, 90 * u.deg, frame=frame)
+    # azimuth runs the other way round than right ascension
+    angle = seen.position_angle(pole) - seen.position_angle(zenith)
+    assert altitude == pytest.approx(seen.alt.deg, abs=0.03)
+    assert parallactic == pytest.approx(angle.wrap_at(180 * u.deg).deg, abs=0.3)
+
+
+def _offline():
+    from astropy.utils import iers
+
+    return iers.conf.set_temp("auto_download", False)
+
+
+def test_pointing_needs_place_and_time():
+    with pytest.raises(ObservationError, match="right_ascension"):
+        pointing({"mjd": 60000.0}, LAYOUT.site)
+    with pytest.raises(ObservationError, match="time"):
+        pointing({"date": "2025-01-01"}, LAYOUT.site)
+    with pytest.raises(ObservationError, match="right ascension"):
+        pointing({"right_ascension": "??", "declination": "1", "mjd": 60000.0}, LAYOUT.site)
+
+
+@given(
+    hwp=st.sampled_from([0.0, 45.0, 22.5, 67.5]),
+    parallactic=st.floats(-180, 180),
+    altitude=st.floats(0, 90),
+    off=st.floats(-80, 80),
+    turns=st.integers(-2, 2),
+)
+def test_tracking_error_is_the_deviation_modulo_half_a_turn(hwp, parallactic, altitude, off, turns):
+    true = hwp + 0.5 * parallactic + altitude + off + 180.0 * turns
+    values = {"hwp": hwp, "hwp_true": true, "parallactic": parallactic, "altitude": altitude}
+    assert tracking_error(values, LAYOUT) == pytest.approx(off, abs=1e-9)
+
+
+def test_sequence_without_fault():
+    derotator = np.repeat(np.arange(45, 135, 12.5), len(CYCLE))
+    assert check_sequence(CYCLE * 8, derotator, LAYOUT) == {}
+
+
+def test_sequence_with_missing_frames_is_not_blamed():
+    derotator = np.repeat(np.arange(45, 135, 12.5), len(CYCLE))
+    keep = np.ones(72, dtype=bool)
+    keep[[3, 20, 21, 60]] = False
+    assert check_sequence(np.array(CYCLE * 8)[keep], derotator[keep], LAYOUT) == {}
+
+
+def test_corrupted_angles_are_found_with_what_belongs_there():
+    hwp = np.array(CYCLE * 8)
+    hwp[20], hwp[30] = 3.7, hwp[29]
+    found = check_sequence(hwp, np.repeat(np.arange(45, 135, 12.5), len(CYCLE)), LAYOUT)
+    assert sorted(found) == [20, 30]
+    assert "3.7 deg" in found[20]
+    assert "the sequence has 22.5 deg" in found[20]
+    assert "the sequence has 33.75 deg" in found[30]
+
+
+def test_layout_refuses_nonsense():
+    with pytest.raises(InstrumentError, match="gain"):
+        FileLayout(keywords={}, shape=(1, 2, 3), gain=0.0)
+    with pytest.raises(InstrumentError, match="read_noise"):
+        FileLayout(keywords={}, shape=(1, 2, 3), read_noise=-1.0)
+    with pytest.raises(InstrumentError, match="shape"):
+        FileLayout(keywords={}, shape=(2, 3))

@@ -1,0 +1,357 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Runs: what is left out and why, resuming, processes, the table, other people's tables."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+from reduction_lab import Small, expose, pair, star_image, write_cube
+
+from astropolcal import instruments
+from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
+from astropolcal.observations import Observations
+from astropolcal.reduction import read_pypolcal, reduce_cubes, reduce_run
+from astropolcal.reduction.apertures import rectangles
+from astropolcal.reduction.cubes import simulate_cubes
+from astropolcal.reduction.frames import Frame, reduce_frame
+from astropolcal.reduction.journal import Journal
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+LAYOUT = Small.files
+CYCLE = [0.0, 45.0, 22.5, 67.5]
+
+
+def star_frames(folder, count=4, **changes):
+    """Write good frames of a star, as the tracking law wants them."""
+    paths = []
+    for i in range(count):
+        hwp = CYCLE[i % 4]
+        cube = expose(star_image(pair(LAYOUT)), LAYOUT, seed=i)
+        path = folder / f"CRSA{i + 1:08d}_cube.fits"
+        paths.append(write_cube(path, cube, RET__ANG1=hwp, RET__POS1=hwp + 80.0, **changes))
+    return paths
+
+
+def flat_frames(folder, angles=(*CYCLE, 90.0), derotator=45.0, start=1):
+    paths = []
+    for i, hwp in enumerate(angles):
+        cube = expose(np.full((201, 201), 400.0), LAYOUT, seed=start + i)
+        path = folder / f"CRSA{start + i:08d}_cube.fits"
+        paths.append(write_cube(path, cube, RET__ANG1=hwp, D_IMRANG=derotator))
+    return paths
+
+
+# --- from cubes to truth ---------------------------------------------------------
+
+
+def test_internal_run_recovers_the_fluxes_and_calibrates(tmp_path):
+    charis = instruments.get("charis")
+    frames = half_wave_plate_cycles(derotator=[45, 70] * u.deg)
+    paths = simulate_cubes(tmp_path, charis.published(), charis, frames, flux=1e7, seed=1)
+    reduction = reduce_run(paths, charis, raw=tmp_path / "raw", meta={"yjh50_dichroic": "in"})
+    obs = reduction.observations
+    assert reduction.problems == {}
+    assert obs.source == "polarized"
+    assert charis.setup(obs) == ("polarized", ("dichroic", "nbs"))
+    true = simulate(charis.published(), charis.wavelength, frames, flux=1e7, noise=False)
+    pulls = (obs.flux_right - true.flux_right) / np.sqrt(obs.variance_right)
+    assert abs(pulls.mean()) < 0.25
+    assert pulls.std() == pytest.approx(1.0, abs=0.15)
+    np.testing.assert_allclose(obs.flux_left.sum(), true.flux_left.sum(), rtol=1e-4)
+    assert len(obs.pairs()) == 8
+
+
+def test_star_run(tmp_path, small):
+    reduction = reduce_run(star_frames(tmp_path), small, source="unpolarized standard star")
+    obs = reduction.observations
+    assert reduction.problems == {}
+    assert obs.n_frames == 4
+    assert obs.meta["object"] == "HD 293396"
+    assert obs.meta["date"] == "2025-11-03"
+    assert obs.source == "unpolarized standard star"
+    np.testing.assert_allclose(np.rad2deg(obs.position("hwp")), CYCLE)
+    np.testing.assert_allclose(np.rad2deg(obs.position("parallactic")), 20.0)
+    np.testing.assert_allclose(obs.flux_right, 2e5, rtol=0.01)
+    table = reduction.photometry
+    assert {"x_right", "fwhm_left", "background_right"} <= set(table.colnames)
+
+
+def test_unpolarized_source_is_recognized_and_a_statement_wins(tmp_path, small):
+    paths = flat_frames(tmp_path, CYCLE)
+    assert reduce_cubes(paths, small).source == "unpolarized"
+    assert reduce_cubes(paths, small, meta={"source": "lamp"}).source == "lamp"
+    assert reduce_cubes(paths, small, source="polarized").source == "polarized"
+    # too few angles to tell
+    assert reduce_cubes(paths[:2], small).source is None
+
+
+# --- the table -------------------------------------------------------------------
+
+
+def test_masked_cells_have_a_reason_and_no_nan_in_the_file(tmp_path, small):
+    paths = star_frames(tmp_path)
+    with fits.open(paths[1], mode="update", memmap=False) as hdus:
+        hdus[1].data[2] = np.nan
+    reduction = reduce_run(paths, small, source="star")
+    assert reduction.flags == {"empty slice": 1}
+    target = tmp_path / "obs.ecsv"
+    reduction.write(target)
+    assert "nan" not in target.read_text().lower()
+    again = Observations.read(target)
+    assert again.mask_reasons == {"empty slice": 1}
+    assert again.content_hash == reduction.observations.content_hash
+    with pytest.raises(ObservationError, match="exists already"):
+        reduction.write(target)
+    reduction.write(target, overwrite=True)
+
+
+def test_shared_noise_goes_into_the_errors_of_difference_and_sum(tmp_path, small):
+    image = np.full((201, 201), 40.0)
+    for rows, columns, weights in rectangles(LAYOUT.internal_apertures, (201, 201)):
+        image[rows, columns] += 300.0 * weights
+    paths = [
+        write_cube(tmp_path / f"CRSA{i:08d}_cube.fits", expose(image, LAYOUT, i), RET__ANG1=hwp)
+        for i, hwp in enumerate(CYCLE)
+    ]
+    own = reduce_cubes(paths, small)
+    shared = reduce_cubes(paths, small, background="outside")
+    assert (own.covariance == 0).all()
+    assert (shared.covariance > 0).all()
+
+
+# --- bad input -------------------------------------------------------------------
+
+
+def bad_files(folder):
+    """Write every kind of bad file; return path and what its reason must say."""
+    good = expose(star_image(pair(LAYOUT)), LAYOUT)
+    cut = write_cube(folder / "CRSA00000101_cube.fits", good)
+    cut.write_bytes(cut.read_bytes()[:200000])
+    noise = folder / "CRSA00000102_cube.fits"
+    noise.write_bytes(b"this is not FITS" * 300)
+    two = pair(LAYOUT) + pair(LAYOUT, 45.0, 60.0, 0.6)
+    made = {
+        "103": (write_cube(folder / "CRSA00000103_cube.fits", good[:2]), "shape"),
+        "104": (write_cube(folder / "CRSA00000104_cube.fits", None), "extension 1"),
+        "105": (write_cube(folder / "CRSA00000105_cube.fits", good, drop=["RET-ANG1"]), "RET-ANG1"),
+        "106": (write_cube(folder / "CRSA00000106_cube.fits", good * np.nan), "no pixel"),
+        "107": (write_cube(folder / "CRSA00000107_cube.fits", good, INSTRUME="HICIAO"), "HICIAO"),
+        "108": (
+            write_cube(folder / "CRSA00000108_cube.fits", expose(star_image(two), LAYOUT)),
+            "two stars",
+        ),
+        "109": (
+            write_cube(folder / "CRSA00000109_cube.fits", expose(star_image([]), LAYOUT)),
+            "no star",
+        ),
+        "110": (write_cube(folder / "CRSA00000110_cube.fits", good, ALTITUDE=99.0), "ALTITUDE"),
+        "111": (write_cube(folder / "CRSA00000111_cube.fits", good, RET__POS1=50.0), "tracking"),
+        "112": (write_cube(folder / "CRSA00000112_cube.fits", good, PARANG="x"), "PARANG"),
+        "113": (write_cube(folder / "CRSA00000113_cube.fits", good, BUNIT="Jy"), "Jy"),
+    }
+    listed = dict(made.values())
+    listed |= {cut: "", noise: "not a readable FITS", folder / "CRSA00000114.fits": "no such file"}
+    return listed
+
+
+def test_bad_files_are_listed_and_do_not_stop_the_run(tmp_path, small):
+    good = star_frames(tmp_path)
+    listed = bad_files(tmp_path)
+    reduction = reduce_run([*listed, *good], small, source="star")
+    assert len(reduction.frames) == 4
+    assert set(reduction.problems) == {str(path) for path in listed}
+    for path, words in listed.items():
+        assert words in "; ".join(reduction.problems[str(path)])
+
+
+def test_copies_other_modes_and_other_units_are_left_out(tmp_path, small):
+    good = star_frames(tmp_path)
+    folder = tmp_path / "more"
+    folder.mkdir()
+    other = expose(star_image(pair(LAYOUT)), LAYOUT, seed=50)
+    copy = folder / "copy_CRSA00000099_cube.fits"
+    copy.write_bytes(good[0].read_bytes())
+    again = write_cube(folder / "CRSA00000002_cube.fits", other)
+    mode = write_cube(folder / "CRSA00000090_cube.fits", other * 1.01, FILTNAME="H")
+    unit = write_cube(folder / "CRSA00000091_cube.fits", other * 1.02, BUNIT="electron")
+    reduction = reduce_run([*good, copy, again, mode, unit], small, source="star")
+    why = {path: "; ".join(reasons) for path, reasons in reduction.problems.items()}
+    assert "the same data as CRSA00000001_cube.fits" in why[str(copy)]
+    assert "the same frame as CRSA00000002_cube.fits" in why[str(again)]
+    assert "filter 'H'" in why[str(mode)]
+    assert "unit 'electron'" in why[str(unit)]
+    assert len(reduction.frames) == 4
+
+
+def test_nothing_usable_is_an_error_that_says_why(tmp_path, small):
+    with pytest.raises(ObservationError, match=r"none of the 2 files .*no such file.*1 more"):
+        reduce_cubes([tmp_path / "a.fits", tmp_path / "b.fits"], small)
+    with pytest.raises(ObservationError, match="no files"):
+        reduce_cubes([], small)
+
+
+def test_wrong_options_are_errors_at_once(tmp_path, small):
+    paths = star_frames(tmp_path, 1)
+    with pytest.raises(ParameterError, match="radius"):
+        reduce_cubes(paths, small, source="star", radius="best")
+    with pytest.raises(ParameterError, match="workers"):
+        reduce_cubes(paths, small, source="star", workers=0)
+    bare = type("Bare", (Small,), {"files": None, "name": "bare"})
+    with pytest.raises(InstrumentError, match="bare"):
+        reduce_cubes(paths, bare())
+    short = type("Short", (Small,), {"wavelength": [1.0] * u.um})
+    with pytest.raises(InstrumentError, match="1 wavelengths"):
+        reduce_cubes(paths, short())
+
+
+# --- angles ----------------------------------------------------------------------
+
+
+def test_ninety_degrees_repeats_zero(tmp_path, small):
+    paths = flat_frames(tmp_path)
+    reduction = reduce_run(paths, small)
+    assert reduction.observations.n_frames == 4
+    assert "repeats that of CRSA00000001" in reduction.problems[str(paths[-1])][0]
+    assert reduce_run(paths, small, keep_repeats=True).observations.n_frames == 5
+
+
+def test_corrupted_angles_are_left_out_or_replaced(tmp_path, small):
+    paths = flat_frames(tmp_path, CYCLE)
+    paths += flat_frames(tmp_path, [0.0, 45.0, 31.0, 67.5], derotator=70.0, start=5)
+    reduction = reduce_run(paths, small)
+    assert list(reduction.problems) == [str(paths[6])]
+    assert "31 deg" in reduction.problems[str(paths[6])][0]
+    told = reduce_run(paths, small, hwp_sequence=CYCLE)
+    assert told.problems == {}
+    assert "replaced by 22.5 deg" in told.doubts[str(paths[6])][0]
+    with pytest.raises(ObservationError, match="sequences of 3"):
+        reduce_run(paths, small, hwp_sequence=[0, 45, 22.5])
+
+
+def test_pointing_is_computed_where_the_header_lacks_it(tmp_path, small):
+    where = {"RA": "05:05:05", "DEC": "+10:00:00", "drop": ("PARANG", "ALTITUDE", "RET-POS1")}
+    reduction = reduce_run(star_frames(tmp_path, 1, **where), small, source="star")
+    frame = reduction.frames[0]
+    assert frame.values["altitude"] == pytest.approx(76.85, abs=0.05)
+    assert any("computed" in doubt for doubt in frame.doubts)
+    assert any("tracking" in doubt for doubt in frame.doubts)
+
+
+# --- many files ------------------------------------------------------------------
+
+
+def test_journal_is_used_and_survives_a_line_cut_off(tmp_path, small, monkeypatch):
+    paths = star_frames(tmp_path)
+    journal = tmp_path / "run.journal"
+    first = reduce_run(paths[:2], small, source="star", resume=journal)
+    assert first.observations.n_frames == 2
+    with open(journal, "a") as stream:
+        stream.write('{"key": "cut o')
+    seen = []
+    monkeypatch.setattr(
+        "astropolcal.reduction.run.reduce_frame",
+        lambda path, **task: seen.append(path) or reduce_frame(path, **task),
+    )
+    whole = reduce_run(paths, small, source="star", resume=journal)
+    assert seen == [str(path) for path in paths[2:]]
+    fresh = reduce_run(paths, small, source="star")
+    assert whole.observations.content_hash == fresh.observations.content_hash
+    seen.clear()
+    reduce_run(paths, small, source="star", resume=journal)
+    assert seen == []
+    # other options, other results
+    reduce_run(paths, small, source="star", resume=journal, radius=10.0)
+    assert len(seen) == 4
+
+
+def test_journal_refuses_other_files(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("my notes\n")
+    with pytest.raises(ObservationError, match="not a journal"):
+        Journal(path, {})
+    assert path.read_text() == "my notes\n"
+
+
+def test_frames_survive_the_journal(tmp_path, small):
+    frame = reduce_frame(star_frames(tmp_path, 1)[0], LAYOUT, source="star")
+    again = Frame.from_dict(frame.to_dict())
+    np.testing.assert_array_equal(again.photometry.flux, frame.photometry.flux)
+    assert again.values == frame.values
+
+
+def test_processes_give_the_same_and_report_progress(tmp_path, small):
+    paths = star_frames(tmp_path)
+    counts = []
+    many = reduce_cubes(
+        paths, small, source="star", workers=2, progress=lambda done, n: counts.append((done, n))
+    )
+    one = reduce_cubes(paths, small, source="star", workers=1)
+    assert many.content_hash == one.content_hash
+    assert counts == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+# --- pyPolCal --------------------------------------------------------------------
+
+COLUMNS = "filepath,D_IMRANG,RET-ANG1,single_sum,single_diff,LCOUNTS,RCOUNTS,sum_std,diff_std"
+
+
+def write_csv(path, wavelength, *, extra="", values=(), angle=0.0):
+    rows = [f"{COLUMNS},wavelength_bin{',p,a' if extra else ''}"]
+    for i, hwp in enumerate(CYCLE):
+        rows.append(
+            f"/d/CRSA{i:08d}_cube.fits, 45.0, {hwp + angle}, 300.0, 100.0, 100.0, 200.0, 17.3, "
+            f"17.3, {wavelength}{extra}"
+        )
+    path.write_text("\n".join([*rows, *values]) + "\n")
+    return path
+
+
+def test_pypolcal_tables(tmp_path):
+    for k, wavelength in enumerate((1159.5614, 1199.6970)):
+        write_csv(tmp_path / f"bin{k}.csv", wavelength, extra=", 20.5, 67.0")
+    obs = read_pypolcal(tmp_path, {"source": "unpolarized standard star"})
+    assert (obs.n_frames, obs.n_bins) == (4, 2)
+    assert obs.flux_right[0, 0] == 200.0
+    assert obs.flux_left[0, 0] == 100.0
+    np.testing.assert_allclose(np.rad2deg(obs.position("altitude")), 67.0)
+    np.testing.assert_allclose(np.rad2deg(obs.position("hwp")), CYCLE)
+    assert len(obs.pairs()) == 2
+    np.testing.assert_allclose(obs.variance_right + obs.variance_left, 17.3**2)
+
+
+def test_pypolcal_errors_name_file_and_line(tmp_path):
+    path = write_csv(tmp_path / "bin0.csv", 1159.5614, values=["x, 45.0, ?, 1,1,1,1,1,1,1159.5614"])
+    with pytest.raises(ObservationError, match=r"bin0.csv, line 6: RET-ANG1 = '\?'"):
+        read_pypolcal(path)
+    row = path.read_text().splitlines()[1]
+    with pytest.raises(ObservationError, match=r"line 6: .* is given already in .*line 2"):
+        read_pypolcal(write_csv(tmp_path / "twice.csv", 1159.5614, values=[row]))
+    bare = tmp_path / "bare.csv"
+    bare.write_text("filepath,D_IMRANG\na,1\n")
+    with pytest.raises(ObservationError, match="missing columns RET-ANG1, LCOUNTS"):
+        read_pypolcal(bare)
+    with pytest.raises(ObservationError, match="no such file"):
+        read_pypolcal(tmp_path / "none.csv")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(ObservationError, match="no CSV file"):
+        read_pypolcal(empty)
+
+
+def test_pypolcal_agrees_with_the_table_made_of_it(tmp_path, shared_data):
+    theirs = Observations.read(shared_data / "data/charis/dataset3_polarized_2025-10-05.ecsv")
+    table = QTable(theirs.to_table())
+    for k in range(2):
+        part = table[table["bin"] == k]
+        rows = [f"{COLUMNS},wavelength_bin"]
+        rows += [
+            f"/x/{r['file']},{r['derotator'].value},{r['hwp'].value},0,0,{r['flux_left'].value},"
+            f"{r['flux_right'].value},{r['single_sum_err'].value},"
+            f"{r['single_difference_err'].value},{r['wavelength'].value}"
+            for r in part
+        ]
+        (tmp_path / f"bin{k}.csv").write_text("\n".join(rows))
+    ours = read_pypolcal(tmp_path, {"source": "polarized"})
+    np.testing.assert_allclose(ours.flux_right, theirs.flux_right[:, :2], rtol=1e-9)
+    np.testing.assert_array_equal(ours.pairs(), theirs.pairs())

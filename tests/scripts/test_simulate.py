@@ -1,0 +1,109 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""astropolcal simulate: image cubes and stars."""
+
+import json
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from astropolcal import Observations, instruments
+from astropolcal.reduction.cubes import simulate_cubes
+from astropolcal.scripts.main import main
+from astropolcal.simulation import half_wave_plate_cycles
+
+CHARIS = instruments.get("charis")
+STAR = ["--source", "star", "--altitude", "67,64", "--parallactic", "24,30"]
+TWO = ["--hwp", "0,45", "--derotator", "60"]
+
+
+def simulated(*argv):
+    return main(["simulate", *(str(a) for a in argv)])
+
+
+def test_cubes_are_those_of_the_published_chain(tmp_path, capsys):
+    argv = ["--cubes", tmp_path / "cli", *TWO, "--seed", 5, "--bad-pixels", 0.01, "--json", "-"]
+    assert simulated(*argv) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["output"], summary["n_frames"]) == (None, 2)
+    paths = sorted((tmp_path / "cli").glob("*.fits"))
+    frames = half_wave_plate_cycles([0, 45] * u.deg, 60 * u.deg)
+    again = simulate_cubes(
+        tmp_path / "api", CHARIS.published(), CHARIS, frames, flux=4e6, seed=5, bad_pixels=0.01
+    )
+    for path, same in zip(paths, again, strict=True):
+        assert path.name == same.name
+        np.testing.assert_array_equal(fits.getdata(path, 1), fits.getdata(same, 1))
+    assert len(list((tmp_path / "cli" / "raw").glob("*.fits"))) == 2
+
+
+def test_beside_cubes_the_table_holds_the_truth(tmp_path, capsys):
+    table, plain = tmp_path / "true.ecsv", tmp_path / "plain.ecsv"
+    assert simulated("--cubes", tmp_path / "cubes", "-o", table, *TWO) == 0
+    assert "(2 cubes)" in capsys.readouterr().out
+    assert simulated("-o", plain, *TWO, "--no-noise") == 0
+    np.testing.assert_array_equal(
+        Observations.read(table).flux_left, Observations.read(plain).flux_left
+    )
+
+
+def test_star_stands_before_the_published_optics(tmp_path):
+    table = tmp_path / "star.ecsv"
+    argv = ["-o", table, *STAR, "--derotator", "97", "--flux", 1e6, "--fix", "star.q=0.01"]
+    assert simulated(*argv) == 0
+    observations = Observations.read(table)
+    assert observations.source == "star"
+    assert observations.frames["hwp"].value.tolist() == [0, 45, 22.5, 67.5]
+    np.testing.assert_allclose(observations.frames["altitude"].value, [67, 66, 65, 64])
+    np.testing.assert_allclose(observations.frames["hwp_true"][0].value, 0 + 12 + 67)
+    assert observations.has_errors
+
+
+def test_cubes_of_a_star_show_two_images(tmp_path):
+    argv = ["--cubes", tmp_path / "c", *STAR, "--hwp", "0", "--derotator", "97", "--flux", 1e6]
+    assert simulated(*argv, "--no-noise", "--psf", "gaussian", "--fwhm", 4) == 0
+    (path,) = (tmp_path / "c").glob("*.fits")
+    image = fits.getdata(path, 1)[12]
+    y, x = np.unravel_index(image.argmax(), image.shape)
+    image[y - 9 : y + 10, x - 9 : x + 10] = 0
+    other = np.unravel_index(image.argmax(), image.shape)
+    dx, dy = CHARIS.files.star_offset
+    assert abs(other[1] - x) == pytest.approx(dx, abs=1)
+    assert abs(other[0] - y) == pytest.approx(dy, abs=1)
+
+
+def test_calibration_of_the_internal_source_serves_for_a_star(tmp_path):
+    lamp, cal, table = (tmp_path / name for name in ("lamp.ecsv", "cal.asdf", "star.ecsv"))
+    assert simulated("-o", lamp) == 0
+    assert main(["calibrate", str(lamp), "-q", "-o", str(cal)]) == 0
+    assert simulated("-o", table, "--calibration", cal, *STAR, "--derotator", "97") == 0
+    assert Observations.read(table).n_bins == 22
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], "nothing to write"),
+        (["-o", "x.ecsv", "--source", "star", "--altitude", "60"], "needs --parallactic"),
+        (["-o", "x.ecsv", *STAR, "--altitude", "1,2,3"], "needs --altitude"),
+        (["-o", "x.ecsv", "--altitude", "60"], "is for --source star"),
+        (["--cubes", "missing/cubes", *TWO], "no folder"),
+        (["--cubes", "cubes", *TWO, "--halo", "2"], "halo = 2"),
+        (["--cubes", "cubes", *TWO, "--fwhm", "0"], "fwhm = 0"),
+        (["--cubes", "cubes", *STAR, "--flux", "-1"], "flux"),
+    ],
+)
+def test_nonsense_is_refused_with_one_line(tmp_path, monkeypatch, capsys, argv, words):
+    monkeypatch.chdir(tmp_path)
+    assert simulated(*argv) == 2
+    (complaint,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert words in complaint
+    assert not list(tmp_path.iterdir())
+
+
+def test_cubes_are_not_written_over_others(tmp_path, capsys):
+    argv = ["--cubes", tmp_path / "cubes", *TWO]
+    assert simulated(*argv) == 0
+    assert simulated(*argv) == 2
+    assert "exists" in capsys.readouterr().err

@@ -1,0 +1,136 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""``astropolcal standards``."""
+
+import argparse
+import json
+
+import pytest
+
+from astropolcal import standards
+from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.scripts import _standards
+
+NIGHT = ["--site", "subaru", "--night", "2025-11-03"]
+
+
+def call(*argv):
+    parser = argparse.ArgumentParser(prog="astropolcal", exit_on_error=False)
+    _standards.add_parser(parser.add_subparsers())
+    arguments = parser.parse_args(["standards", *argv])
+    arguments.run(arguments)
+
+
+def printed(capsys, *argv):
+    call(*argv)
+    return capsys.readouterr().out
+
+
+def test_everything_is_listed_in_80_columns(capsys):
+    lines = printed(capsys).splitlines()
+    assert len(lines) == 1 + len(standards.names())
+    assert max(map(len, lines)) <= 80
+
+
+def test_selection_by_kind_magnitude_and_position(capsys):
+    text = printed(capsys, "--kind", "unpolarized", "--magnitude", "9,10", "--band", "H")
+    assert "HD 293396" in text
+    assert " polarized" not in text
+    near = printed(capsys, "--near", "05:26:06,+16:42:00", "--radius", "3").splitlines()
+    assert near[1].startswith("HD 35532")
+    assert near[1].endswith("0.0")
+    assert near == printed(capsys, "--near", "81.525,16.7", "--radius", "3").splitlines()
+
+
+def test_a_night_adds_angles_and_the_score(capsys):
+    text = printed(capsys, "--kind", "unpolarized", "--magnitude", "9,10", *NIGHT)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert lines[0].split()[-3:] == ["hours", "M3", "score"]
+    scores = [float(line.split()[-1]) for line in lines[1:3]]
+    assert scores == sorted(scores)
+    assert lines[1].startswith("HD 14069")
+
+
+def test_one_star_with_all_that_is_known(capsys):
+    text = printed(capsys, "hd30675", *NIGHT)
+    assert max(map(len, text.splitlines())) <= 80
+    for words in ("3.9 +- 0.03 %", "0.52 +- 0.01 um", "Whittet et al. 1992", "highest", "M3 error"):
+        assert words in text
+
+
+def test_numbers_from_memory_are_marked(capsys):
+    assert "partly from memory" in printed(capsys, "HD 212311")
+    assert "memory" not in printed(capsys, "HD 293396")
+
+
+def test_json_of_one_star(capsys, tmp_path):
+    path = tmp_path / "star.json"
+    call("HD 30675", *NIGHT, "--json", str(path))
+    content = json.loads(path.read_text())
+    seen = standards.observability("HD 30675", "subaru", "2025-11-03")
+    assert content["law"]["p_max_percent"] == pytest.approx(3.9)
+    assert content["measurements"][0]["p_percent"] == 3.37
+    assert content["altitude_deg"] == pytest.approx(list(seen.altitude.value))
+    assert content["m3_error"] == pytest.approx(seen.information(32).diattenuation)
+    assert content["night"] == "2025-11-03"
+
+
+def test_json_of_many_to_the_standard_output(capsys):
+    text = printed(capsys, "--kind", "unpolarized", *NIGHT, "--json", "-")
+    content = json.loads(text)
+    names = [star["name"] for star in content["stars"]]
+    assert names == list(
+        standards.search(kind="unpolarized", site="subaru", night="2025-11-03")["name"]
+    )
+    # what is not determined is null, not a number
+    assert None in [star["m3_error"] for star in content["stars"]]
+    assert {"altitude_min_deg", "parallactic_max_deg", "hours"} <= set(content["stars"][0])
+
+
+def test_plot_is_written(capsys, tmp_path):
+    path = tmp_path / "night.png"
+    call("--kind", "unpolarized", "--magnitude", "9,10", *NIGHT, "--plot", str(path))
+    assert path.read_bytes()[:4] == b"\x89PNG"
+    assert "HD 14069" in capsys.readouterr().out
+
+
+def test_a_site_may_be_a_place(capsys):
+    text = printed(capsys, "HD 293396", "--site=-155.476,19.8255,4139", "--night", "2025-11-03")
+    assert "above 30 deg" in text
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["HD 30676"], "did you mean HD 30675"),
+        (["HD 30675", "--kind", "polarized"], "--kind selects among stars"),
+        (["HD 30675", "--site", "subaru"], "go together"),
+        (["HD 30675", "--plot", "x.png"], "--plot needs --site and --night"),
+        (["HD 30675", "--site", "subaru", "--night", "2025-02-30"], "night = '2025-02-30'"),
+        (["HD 30675", "--site", "atlantis", "--night", "2025-11-03"], "site = 'atlantis'"),
+        (["HD 30675", "--site", "1,2,three", "--night", "2025-11-03"], "--site 1,2,three"),
+        (["HD 30675", "--site=10,95,0", "--night", "2025-11-03"], "--site 10,95,0"),
+        (["Cha F7", *NIGHT], "does not rise above 30 deg"),
+        (["--magnitude", "30,31"], "no standard star fits"),
+        (["--near=0,-80", *NIGHT], "no standard star above 30 deg"),
+        (["--magnitude", "5"], "--magnitude 5: give 2 numbers"),
+        (["--magnitude", "5,nan"], "--magnitude"),
+        (["--radius", "5"], "--radius goes with --near"),
+        (["--near", "north"], "--near north"),
+        (["--band", "Z"], "band = 'Z'"),
+        ([*NIGHT, "--min-altitude", "91"], "min_altitude = 91 deg"),
+    ],
+)
+def test_bad_input_is_refused_with_what_is_allowed(argv, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ParameterError, match=words):
+        call(*argv)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_format_or_folder_leaves_no_file(tmp_path):
+    with pytest.raises(AstropolcalError, match=r"night\.xyz"):
+        call("HD 30675", *NIGHT, "--plot", str(tmp_path / "night.xyz"))
+    with pytest.raises(AstropolcalError, match="no folder"):
+        call("HD 30675", "--json", str(tmp_path / "no" / "star.json"))
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,200 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The chain of a star: source, telescope, tertiary mirror, and what the tables say of it."""
+
+import sys
+import warnings
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).parent))
+
+from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
+
+from astropolcal import instruments, mueller
+from astropolcal.chain import leaves, stages, system_mueller
+from astropolcal.exceptions import AstropolcalWarning, InstrumentError, ObservationError
+from astropolcal.instruments.telescope import (
+    M3_MODELS,
+    published_mirror,
+    star_source,
+    telescope,
+    tertiary_mirror,
+)
+from astropolcal.measurement import FreeParameters
+from astropolcal.observations import Observations
+from astropolcal.optics import PolarizedSource
+
+BINS = 22
+
+
+def names(chain):
+    return [leaf.name for leaf in leaves(chain)]
+
+
+# --- chain ----------------------------------------------------------------------------------------
+
+
+def test_light_goes_from_the_star_to_the_wollaston():
+    chain = star_chain()
+    assert names(chain) == ["star", "parallactic", "m3", "altitude", "hwp", "derotator",
+                            "dichroic", "nbs", "wollaston"]  # fmt: skip
+    assert stages(chain) == ["parallactic", "altitude", "hwp", "derotator"] or set(
+        stages(chain)
+    ) == {"parallactic", "altitude", "hwp", "derotator"}
+
+
+def test_telescope_is_the_equation_of_the_paper():
+    """T(-a) M_M3 T(p), multiplied out with the functions of `mueller`."""
+    from astropolcal.chain import join
+
+    a, p, eps = 62 * u.deg, -25 * u.deg, 0.013
+    mirror = tertiary_mirror("free", WAVELENGTH[:1])
+    mirror.diattenuation, mirror.retardance = [eps], [175] * u.deg
+    found = system_mueller(
+        join(telescope(mirror)), WAVELENGTH[:1], {"altitude": a, "parallactic": p}
+    )
+    expected = (
+        mueller.rotation_matrix(-a)
+        @ mueller.diattenuator_retarder(eps, 175 * u.deg)
+        @ mueller.rotation_matrix(p)
+    )
+    np.testing.assert_allclose(np.squeeze(found), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("model", M3_MODELS)
+def test_models_of_the_tertiary_mirror(model):
+    mirror = tertiary_mirror(model, WAVELENGTH)
+    free = {key for key in mirror.param_names if not getattr(mirror, key).fixed}
+    assert (
+        free
+        == {
+            "free": {"diattenuation"},
+            "power law": {"b1", "m1", "b2", "m2"},
+            "metal": {"film_thickness", "n_scale", "k_scale"},
+        }[model]
+    )
+    chain = star_chain(m3=model)
+    assert FreeParameters([chain], len(WAVELENGTH)).size > 0
+
+
+def test_bounds_of_the_power_law_are_the_papers():
+    mirror = tertiary_mirror("power law", WAVELENGTH)
+    assert mirror.b1.value == 13.70
+    assert mirror.b1.bounds == pytest.approx((6.85, 27.4))
+
+
+def test_published_mirror_falls_from_1_7_to_1_2_percent():
+    diattenuation = published_mirror().diattenuation(CHARIS.wavelength)
+    assert diattenuation[0] == pytest.approx(0.0174, abs=1e-4)
+    assert diattenuation[-1] == pytest.approx(0.0120, abs=1e-4)
+
+
+def test_internal_chain_is_taken_to_the_sky():
+    sky = CHARIS.on_sky(CHARIS.published())
+    assert names(sky) == ["parallactic", "m3", "altitude", "hwp", "derotator", "dichroic", "nbs",
+                          "wollaston"]  # fmt: skip
+    assert CHARIS.on_sky(sky) is sky
+
+
+def test_instrument_without_a_telescope_says_so():
+    class Bench(instruments.Instrument):
+        name = "bench"
+
+        def chain(self, source="polarized", optics_in=(), *, wavelength=None):
+            return PolarizedSource(name="lamp")
+
+        def setup(self, observations):
+            return "polarized", ()
+
+    with pytest.raises(InstrumentError, match="bench: no chain from the sky"):
+        Bench().on_sky(CHARIS.published())
+
+
+# --- sources --------------------------------------------------------------------------------------
+
+
+def test_unpolarized_standard_is_fixed_at_zero():
+    star = star_source("unpolarized standard star", WAVELENGTH)
+    assert star.q.fixed
+    assert star.u.fixed
+    assert star.q.value == 0 == star.u.value
+
+
+def test_polarized_standard_starts_with_the_catalogue_and_its_prior():
+    star = star_source("polarized standard star", WAVELENGTH, target="HD 30675")
+    degree = np.hypot(star.q.value, star.u.value)
+    angle = np.rad2deg(0.5 * np.arctan2(star.u.value, star.q.value))
+    # Whittet et al. 1992: J 1.90 %, H 1.10 %, 58 to 61 deg
+    assert degree[0] == pytest.approx(0.019, abs=0.002)
+    assert degree[1] == pytest.approx(0.011, abs=0.002)
+    np.testing.assert_allclose(angle, 59, atol=3)
+    assert star.q.prior is not None
+    assert not star.q.fixed
+
+
+@pytest.mark.parametrize("target", [None, "no such star"])
+def test_star_that_no_catalogue_knows_is_free(target):
+    star = star_source("star", WAVELENGTH, target=target)
+    assert star.q.prior is None
+    assert not star.q.fixed
+    assert star.q.value.shape == (3,)
+
+
+def test_every_star_has_its_own_source():
+    tables = [observe_star(star_chain(), 2, target=t, noise=False) for t in ("HD 1", "HD-2")]
+    chains = CHARIS.chains_for(tables)
+    assert [names(chain)[0] for chain in chains] == ["star_HD1", "star_HD2"]
+    assert [names(chain)[2] for chain in chains] == ["m3", "m3"]
+
+
+@pytest.mark.parametrize("source", ["unpolarized standard star", "polarized standard star", "star"])
+def test_table_of_a_star_leads_to_its_chain(source):
+    table = observe_star(star_chain(), 2, source=source, noise=False)
+    assert CHARIS.setup(table) == (source, ("dichroic", "nbs"))
+
+
+# --- prepare --------------------------------------------------------------------------------------
+
+
+def test_star_is_prepared_by_its_cycles():
+    star = observe_star(star_chain(), 4, noise=False).select(np.arange(15))
+    with pytest.warns(AstropolcalWarning, match="incomplete half-wave-plate cycle"):
+        assert CHARIS.prepare(star).mask.all(axis=1).sum() == 3
+
+
+def test_star_may_fade_behind_clouds():
+    lamp = np.ones(16)
+    lamp[4:8] = 0.3
+    star = observe_star(star_chain(), 4, lamp=lamp, noise=False)
+    assert not CHARIS.prepare(star).mask.any()
+
+
+def test_star_without_pointing_is_refused():
+    table = observe_star(star_chain(), 4, noise=False).to_table()
+    table.remove_columns(["altitude", "parallactic"])
+    with pytest.raises(ObservationError, match="a star needs its pointing"):
+        CHARIS.prepare(Observations.from_table(table, name="lost"))
+
+
+def test_pointing_from_time_and_target_takes_the_instruments_site():
+    table = observe_star(star_chain(), 2, altitude=(60, 60.5), noise=False).to_table()
+    table.remove_columns(["altitude", "parallactic"])
+    seconds = np.asarray(table["frame"]) * 12
+    start = np.datetime64("2025-11-03T11:00:00")
+    table["time"] = (start + seconds.astype("timedelta64[s]")).astype(str)
+    table.meta |= {"right_ascension": 107.25, "declination": -1.0}
+    star = Observations.from_table(table, name="star")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        positions = CHARIS.positions(CHARIS.prepare(star), star_chain())
+    assert set(positions) == {"hwp", "derotator", "parallactic", "altitude"}
+    assert 0 < np.rad2deg(positions["altitude"]).min() < 75
+
+
+def test_positions_of_an_exposure_have_nodes():
+    star = observe_star(star_chain(), 2, noise=False)
+    positions = CHARIS.positions(star, star_chain(), nodes=3, duty=0.9)
+    assert {angle.shape for angle in positions.values()} == {(3, 8)}
