@@ -137,10 +137,13 @@ def simulate(
 
 def _expected(chain, wavelength, frames, source):
     """Return the noiseless fluxes of both beams for unit source, (n_wavelengths, n_frames)."""
+    # where the true angle of a stage is known, it is that at which it stands
+    known = {stage: f"{stage}_true" for stage in stages(chain)}
+    columns = {s: true if true in frames.colnames else s for s, true in known.items()}
     positions = {
-        stage: finite_position(frames[stage], stage)
-        for stage in stages(chain)
-        if stage in frames.colnames
+        stage: finite_position(frames[column], column)
+        for stage, column in columns.items()
+        if column in frames.colnames
     }
     propagator = Propagator(chain, length_to_um(wavelength), positions, source)
     shape = (len(wavelength), len(frames))

@@ -113,6 +113,12 @@ def test_instrument_without_a_telescope_says_so():
         Bench().on_sky(CHARIS.published())
 
 
+def test_option_that_a_chain_does_not_have_is_an_error():
+    table = observe_star(star_chain(), 2, noise=False)
+    with pytest.raises(InstrumentError, match="charis: its chain has no option colour"):
+        CHARIS.chains_for([table], colour="red")
+
+
 # --- sources --------------------------------------------------------------------------------------
 
 

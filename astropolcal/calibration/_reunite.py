@@ -1,11 +1,13 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Bring a calibration that was read from a file and its observations together again."""
 
+import warnings
+
 import numpy as np
 
 from astropolcal import instruments
 from astropolcal.calibration.accuracy import accuracy_table
-from astropolcal.exceptions import CalibrationFileError, InstrumentError
+from astropolcal.exceptions import CalibrationFileError, InstrumentError, ObservationError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
 
@@ -37,6 +39,7 @@ def measurement_of_all(calibration, observations, positions=None):
     positions = [positions] if isinstance(positions, dict) else positions
     if positions is not None and len(positions) != len(given):
         raise CalibrationFileError(f"{len(positions)} positions for {len(given)} tables")
+    given = [_prepared(calibration, table) for table in given]
     order = _order(calibration.datasets, given)
     tables = [given[i] for i in order]
     if positions is None:
@@ -53,6 +56,29 @@ def measurement_of_all(calibration, observations, positions=None):
     )
     _check_residuals(calibration, measurement)
     return measurement
+
+
+def _instrument(calibration):
+    """Return the instrument; None without one, or for a name that somebody chose."""
+    try:
+        return None if calibration.instrument is None else instruments.get(calibration.instrument)
+    except InstrumentError:
+        return None
+
+
+def _prepared(calibration, table):
+    """Return a table with the masks of the instrument, if the calibration was made with them."""
+    wanted = {record.content_hash for record in calibration.datasets}
+    instrument = _instrument(calibration)
+    if table.content_hash in wanted or instrument is None:
+        return table
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            masked = instrument.prepare(table)
+    except ObservationError:
+        return table
+    return masked if masked.content_hash in wanted else table
 
 
 def _order(records, given):
@@ -75,12 +101,8 @@ def _order(records, given):
 
 def _positions(calibration, tables):
     """Return the positions that the instrument reads; None, the columns, without one."""
-    if calibration.instrument is None:
-        return None
-    try:
-        instrument = instruments.get(calibration.instrument)
-    except InstrumentError:
-        # a name that somebody chose; the residuals tell whether the columns will do
+    instrument = _instrument(calibration)
+    if instrument is None:
         return None
     return [instrument.positions(*pair) for pair in zip(tables, calibration.chains, strict=True)]
 

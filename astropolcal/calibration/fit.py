@@ -28,9 +28,17 @@ from astropolcal.calibration.goodness import lack_of_fit
 from astropolcal.calibration.identifiability import complete, finding_of
 from astropolcal.calibration.noise import noise_from_errors, noise_from_null_channel
 from astropolcal.calibration.result import Calibration, DatasetRecord
+from astropolcal.calibration.robust import LOSSES, outlying_data, robust_sigma
 from astropolcal.calibration.starts import BinProblem, search_branches
-from astropolcal.calibration.weighting import ROUNDS, around, describe, first_weighting
-from astropolcal.chain import join, leaves
+from astropolcal.calibration.steps import sequential, two_step
+from astropolcal.calibration.weighting import (
+    ROUNDS,
+    Weighting,
+    around,
+    describe,
+    first_weighting,
+    noise_of,
+)
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.units import to_unit
@@ -38,9 +46,10 @@ from astropolcal.version import version
 
 __all__ = ["calibrate"]
 
-STRATEGIES = ("joint", "two-step")
+STRATEGIES = ("joint", "two-step", "sequential")
 _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
+_ROBUST_ROUNDS = 50
 # a fitter without bounds may leave them by this share of a value
 _OUTSIDE = 1e-5
 
@@ -58,6 +67,7 @@ def calibrate(
     wavelength=None,
     search=None,
     gauge="minimal",
+    loss="linear",
     fix=None,
     instrument=None,
     cross_validate=True,
@@ -74,8 +84,10 @@ def calibrate(
         The datasets.
     fitter : `~astropy.modeling.fitting.Fitter`, optional
         Any non-linear astropy fitter, by default ``TRFLSQFitter()``.
-    strategy : {"joint", "two-step"}
-        All parameters at once, or the paper's procedure.
+    strategy : {"joint", "two-step", "sequential"}
+        All parameters at once; or the paper's procedure for the polarized source; or
+        the paper's order of datasets: polarized source, unpolarized source, stars, each
+        step holding what the ones before have found.
     observable : str or Observable
         What is fitted; see `astropolcal.observations.OBSERVABLES`.
     weights : {None, "wavelength", "errors"}, NoiseEstimate or array_like
@@ -101,6 +113,10 @@ def calibrate(
         Which solution to take where the data leave a choice: that with the
         least change of the parameters common to all wavelengths, or wherever
         the fit happens to end. The choice is recorded in ``settings``.
+    loss : {"linear", "huber", "cauchy", "bisquare"}
+        With another loss than the linear one, which is least squares, data that depart far
+        from the model count less, see `~astropolcal.calibration.robust_sigma`. It sets the
+        noise of each datum, so ``weights`` counts for the first fit only.
     fix : dict of str to `~astropy.units.Quantity` or None, optional
         Parameters to hold, ``"optic.parameter"``, at a value or (None) at
         that of the chain: another way to choose a gauge.
@@ -138,7 +154,9 @@ def calibrate(
     """
     if strategy not in STRATEGIES:
         raise FitError(f"strategy = {strategy!r}; allowed are {', '.join(STRATEGIES)}")
-    search = strategy == "joint" if search is None else search
+    if loss not in LOSSES:
+        raise FitError(f"loss = {loss!r}; allowed are {', '.join(LOSSES)}")
+    search = strategy != "two-step" if search is None else search
     started = time.perf_counter()
     fitter = TRFLSQFitter() if fitter is None else fitter
     options = {"observable": observable, "positions": positions, "wavelength": wavelength}
@@ -147,10 +165,10 @@ def calibrate(
     weighting = first_weighting(measurement, weights)
     _check(measurement)
     origin = measurement.vector()
-    if strategy == "joint":
-        (outcome, weighting), stages = _joint(measurement, weighting, fitter, search), []
-    else:
-        outcome, weighting, stages = _two_step(measurement, weighting, fitter, search, options)
+    how = _Strategy(fitter, search, weights, options)
+    outcome, weighting, stages = how.fit(strategy, measurement, weighting)
+    if loss != "linear":
+        outcome, weighting = _robust(measurement, fitter, loss, outcome)
     if not outcome["converged"]:
         warnings.warn(
             f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
@@ -167,6 +185,7 @@ def calibrate(
             "fitter": type(fitter).__name__,
             "strategy": strategy,
             "weights": weighting.choice,
+            "loss": loss,
             "noise": describe(measurement, weighting),
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
         },
@@ -307,74 +326,47 @@ def _first_search(measurement, weighting, origin):
     return search_branches(problem, origin)[0]
 
 
-# ---- the paper's procedure -----------------------------------------------------
+class _Strategy:
+    """How a measurement is fitted: fitter, search of branches, and the order of steps."""
+
+    def __init__(self, fitter, search, weights, options):
+        self.fitter, self.search, self.weights, self.options = fitter, search, weights, options
+
+    def fit(self, strategy, measurement, weighting):
+        """Fit in place; return how it went, the noise, and the values after each step."""
+        if strategy == "joint":
+            return *self._joint(measurement, weighting), []
+        if strategy == "two-step":
+            return two_step(measurement, weighting, self._joint, self._run, self.options)
+        outcome, stages = sequential(measurement, self._first, self._joint, self._run, self.options)
+        return outcome, noise_of(measurement, self.weights), stages
+
+    def _joint(self, measurement, weighting):
+        return _joint(measurement, weighting, self.fitter, self.search)
+
+    def _run(self, measurement, weighting):
+        return _run(measurement, weighting, self.fitter)
+
+    def _first(self, measurement):
+        if self.weights is not None and not isinstance(self.weights, str):
+            raise FitError(
+                "strategy='sequential' fits the datasets one by one, so the noise cannot be given "
+                "for all data; allowed are weights = None, 'wavelength', 'errors'"
+            )
+        return first_weighting(measurement, self.weights)
 
 
-def _two_step(measurement, weighting, fitter, search, options):
-    """Per wavelength with misalignments held, then global, then per wavelength again."""
-    parts = [dataset.observations for dataset in measurement.datasets]
-    single = {slot.name for slot in measurement.free.slots if not slot.per_wavelength}
-    several = {slot.name for slot in measurement.free.slots if slot.per_wavelength}
-    ties = measurement.free.ties
-    measurement.put_back()
-    options = options | {"wavelength": measurement.wavelength * u.um}
-    stages = []
-
-    loose = [_loosened(chain, measurement.wavelength * u.um) for chain in measurement.chains]
-    first = _step_of(loose, single, parts, ties, options)
-    outcome, weighting = _joint(first, weighting, fitter, search)
-    outcomes = [outcome]
-    stages.append(_stage("per wavelength, misalignments held", first))
-    _copy_values(first.put_back(), measurement.chains)
-
-    for title, held in (("global", several), ("per wavelength, global parameters held", single)):
-        step = _step_of(measurement.chains, held, parts, ties, options)
-        if step.free.size:
-            outcome, weighting = _run(step, weighting, fitter)
-            outcomes.append(outcome)
-        stages.append(_stage(title, step))
-        _copy_values(step.put_back(), measurement.chains)
-    measurement.parameters = measurement.free.start()
-    # the first step that did not arrive spoils those behind it
-    return next((o for o in outcomes if not o["converged"]), outcomes[-1]), weighting, stages
-
-
-def _step_of(chains, held, parts, ties, options):
-    """Return the measurement of one step; what follows a held parameter is held too."""
-    known = set(parameter_table(chains))
-    live = {n: tie for n, tie in ties.items() if n in known and tie.source in known - held}
-    return Measurement(_held(chains, held | (set(ties) - set(live))), parts, ties=live, **options)
-
-
-def _loosened(chain, wavelength):
-    return join(leaf.loosened(wavelength) for leaf in leaves(chain.copy()))
-
-
-def _held(chains, names):
-    """Return copies of the chains with more parameters fixed."""
-    copies = [chain.copy() for chain in chains]
-    for name, parameters in parameter_table(copies).items():
-        if name in names:
-            for parameter in parameters:
-                parameter.fixed = True
-    return copies
-
-
-def _copy_values(origin, target):
-    """Copy the values of parameters that both have, name by name."""
-    known = parameter_table(origin)
-    for name, parameters in parameter_table(target).items():
-        for parameter in parameters:
-            if name in known and np.shape(known[name][0].value) == np.shape(parameter.value):
-                parameter.value = known[name][0].value
-
-
-def _stage(title, measurement):
-    """Record the values of one stage, with units, and its residuals."""
-    measurement.put_back()
-    values = {slot.name: measurement.free.values_of(slot.name) for slot in measurement.free.slots}
-    rms = float(np.sqrt(np.mean(measurement.residuals() ** 2)))
-    return {"title": title, "parameters": values, "residual_rms": rms}
+def _robust(measurement, fitter, loss, outcome):
+    """Fit with the weights of a robust loss until they settle."""
+    before = None
+    for _ in range(_ROBUST_ROUNDS):
+        weighting = Weighting("given", robust_sigma(measurement, loss))
+        if before is not None and weighting.agrees(before):
+            return outcome, weighting
+        outcome = _fit(measurement, weighting, fitter)
+        before = weighting
+    message = f"the weights of the robust fit did not settle in {_ROBUST_ROUNDS} fits"
+    return outcome | {"converged": False, "message": message}, weighting
 
 
 # ---- the result ------------------------------------------------------------------
@@ -401,15 +393,16 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
         provenance=_provenance(),
     )
     calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
+    calibration.fit["outliers"] = _outliers(calibration)
     return calibration.cross_validate() if cross_validate else calibration
 
 
 def _lack_of_fit(calibration):
     """Hold the residuals against the noise that the table states, and that the data show."""
     found = []
-    for noise_of in (noise_from_errors, _smooth_null):
+    for method in (noise_from_errors, _smooth_null):
         try:
-            noise = noise_of(calibration.measurement)
+            noise = method(calibration.measurement)
             test = lack_of_fit(calibration.measurement, calibration, noise)
         except AstropolcalError:
             continue  # no errors in the table, or no pairs: nothing to hold against
@@ -422,6 +415,21 @@ def _lack_of_fit(calibration):
             }
         )
     return found
+
+
+def _outliers(calibration):
+    """Return the pairs of frames at odds with the fit, for summary, JSON and file."""
+    table = outlying_data(calibration)
+    return [
+        {
+            "dataset": str(row["dataset"]),
+            "frames": str(row["frames"]),
+            "residual_percent": float(row["residual"].to_value("percent")),
+            "sigma": float(row["sigma"]),
+            "brightness": float(row["brightness"]),
+        }
+        for row in table
+    ]
 
 
 def _smooth_null(measurement):

@@ -6,6 +6,7 @@ Groups of data that cross-validation leaves out together.
 import numpy as np
 
 from astropolcal.exceptions import FitError
+from astropolcal.observations import cycle_numbers
 
 __all__ = ["GROUPS", "groups_by", "leave_out_groups", "what_is_left_out"]
 
@@ -17,12 +18,16 @@ GROUPS = {
 }
 # derotator angles that differ by less belong to one group
 _SAME_ANGLE = np.deg2rad(0.5)
-_PLATE_STEPS = np.deg2rad(0.3)
+# runs into which the cycles of a star are divided
+_RUNS = 8
 
 
 def leave_out_groups(measurement):
     """
     Return the group of each datum for cross-validation: its derotator angle.
+
+    On sky the derotator turns slowly, so there a group is one of eight runs of
+    consecutive cycles of the half-wave plate, or one cycle where there are fewer.
 
     Parameters
     ----------
@@ -50,6 +55,11 @@ def leave_out_groups(measurement):
     """
     groups, first = [], 0
     for dataset in measurement.datasets:
+        if "parallactic" in dataset.positions:
+            group = _star_runs(dataset)
+            groups.append(first + group[dataset.group_of_datum])
+            first += int(group.max()) + 1
+            continue
         angle = dataset.observations.position("derotator")[dataset.frames[:, 0]]
         order = np.argsort(angle)
         new = np.concatenate([[0], np.cumsum(np.diff(angle[order]) > _SAME_ANGLE)])
@@ -58,6 +68,14 @@ def leave_out_groups(measurement):
         groups.append(first + group[dataset.group_of_datum])
         first += int(new[-1]) + 1
     return np.concatenate(groups)
+
+
+def _star_runs(dataset):
+    """Return the run of consecutive cycles of each group of frames, shape (n_groups,)."""
+    cycle = cycle_numbers(dataset.observations)[dataset.frames[:, 0]]
+    rank = np.unique(cycle, return_inverse=True)[1]
+    runs = min(_RUNS, int(rank.max()) + 1)
+    return rank * runs // (int(rank.max()) + 1)
 
 
 def groups_by(measurement, by="derotator"):
@@ -69,8 +87,8 @@ def groups_by(measurement, by="derotator"):
     measurement : Measurement
         The measurement.
     by : {"derotator", "cycle", "dataset"}
-        A group is a derotator angle of a dataset; a cycle of the half-wave
-        plate; or a whole dataset (a night). A cycle is the column ``cycle`` of the
+        A group is a derotator angle of a dataset (of a star: a run of cycles); a cycle of
+        the half-wave plate; or a whole dataset (a night). A cycle is the column ``cycle`` of the
         frames where there is one; otherwise it ends where a plate angle
         (of one state of a modulator) comes again or the derotator moves. A
         datum belongs to the cycle of its plus frame.
@@ -120,30 +138,11 @@ def _groups(measurement, by):
     for part in measurement.datasets:
         number = np.zeros(len(part.frames), dtype=int)
         if by == "cycle":
-            number = _cycles(part.observations)[part.frames[:, 0]]
+            number = cycle_numbers(part.observations)[part.frames[:, 0]]
         number = np.unique(number, return_inverse=True)[1]
         groups.append(first + number[part.group_of_datum])
         first += int(number.max()) + 1
     return np.concatenate(groups)
-
-
-def _cycles(observations):
-    """Return the number of the half-wave-plate cycle of every frame."""
-    frames = observations.frames
-    if "cycle" in frames.colnames:
-        return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
-    plate = np.rint(np.mod(observations.position("hwp"), np.pi) / _PLATE_STEPS).astype(int)
-    # 180 deg is 0 deg again
-    plate %= round(np.pi / _PLATE_STEPS)
-    state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
-    moved = np.abs(np.diff(observations.position("derotator"), prepend=0.0)) > _SAME_ANGLE
-    cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
-    for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
-        if i and (moved[i] or key in seen):
-            number, seen = number + 1, set()
-        seen.add(key)
-        cycle[i] = number
-    return cycle
 
 
 def _members(measurement, groups, by):

@@ -18,6 +18,7 @@ from astropolcal.calibration._directions import (
     sky_words,
     step_of,
 )
+from astropolcal.calibration._telescope import telescope_words
 from astropolcal.calibration._whitened import Whitened, decompose
 from astropolcal.calibration.harmonics import harmonic_words
 from astropolcal.calibration.mirrors import mirror_solutions
@@ -57,7 +58,8 @@ class Identifiability:
         For each null direction its ``words``, the ``parameters`` that move, and
         what it does to the ``sky``, see `sky_consequences`.
     sampling : list of str
-        Harmonics that the half-wave-plate angles cannot separate.
+        Harmonics that the half-wave-plate angles cannot separate, and what stars leave open
+        of the telescope.
     mirrors : list of str
         Discrete mirror solutions within the bounds.
     near_null : list of dict
@@ -285,6 +287,7 @@ def complete(finding, measurement, vector, whitened=None, level=1.0):
         for angle in dataset.observations.position("hwp")
     }
     finding.sampling = harmonic_words(np.array(sorted(angles)))
+    finding.sampling += telescope_words(finding, measurement)
     finding.mirrors = mirror_solutions(measurement, vector)
     return finding
 

@@ -314,6 +314,6 @@ def _prior(slot, prior):
         "parameter": slot.name,
         "unit": str(slot.unit or ""),
         "distribution": name,
-        "mean": float(frozen.mean()),
-        "std": float(frozen.std()),
+        "mean": np.asarray(frozen.mean(), dtype=float).tolist(),
+        "std": np.asarray(frozen.std(), dtype=float).tolist(),
     }

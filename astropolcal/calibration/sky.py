@@ -58,7 +58,10 @@ def sky_consequences(measurement, vector, directions):
     >>> [round(change, 1) for change in sky["aolp_deg"]]
     [2.0, 2.0]
     """
-    dataset = measurement.datasets[0]
+    # a lamp's chain where there is one: the telescope's own angles are not the question
+    on_sky = ["parallactic" in part.positions for part in measurement.datasets]
+    index = int(np.argmin(on_sky))
+    dataset = measurement.datasets[index]
     if "hwp" not in dataset.positions:
         return [None] * len(directions)
     live = measurement.copy()
@@ -67,11 +70,14 @@ def sky_consequences(measurement, vector, directions):
         for stage, angle in dataset.positions.items()
         if stage != "hwp"
     }
-    rows = _rows(live, vector, derotators)
+    low, high = measurement.free.bounds()
+    rows = _rows(live, vector, derotators, index)
     inverse = np.linalg.pinv(rows)
     found = []
     for direction in directions:
-        up, down = (_rows(live, vector + s * _STEP * direction, derotators) for s in (1, -1))
+        # beyond its bounds an optic may not exist
+        ends = (np.clip(vector + s * _STEP * direction, low, high) for s in (1, -1))
+        up, down = (_rows(live, end, derotators, index) for end in ends)
         # the recovered s obeys (A + dA) s = A s_true
         change = -inverse @ ((up - down) / (2 * _STEP))
         turn = np.rad2deg((change[:, 1, 0] - change[:, 0, 1]) / 4)
@@ -85,9 +91,9 @@ def _span(values):
     return [round(float(values.min()), 4) + 0.0, round(float(values.max()), 4) + 0.0]
 
 
-def _rows(measurement, vector, derotators):
+def _rows(measurement, vector, derotators, index):
     """Return what the double differences see of q and u, (n_wavelengths, n_data, 2)."""
-    chain = measurement.put_back(vector)[0]
+    chain = measurement.put_back(vector)[index]
     optics = leaves(chain)
     first = next(i for i, leaf in enumerate(optics) if leaf.stage not in (None, *COORDINATES))
     sky = join(optics[first:])

@@ -12,6 +12,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, FitError, ObservationError
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.optics import PolarizedSource
 
 __all__ = ["add_standard", "refuse_fitted", "standard_accuracy"]
 
@@ -141,6 +142,12 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     return table
 
 
+def predicted_chain(calibration, chain, observations):
+    """Return the chain with the calibration's values at the wavelengths of the observations."""
+    rows = _rows_on_grid(calibration, observations)
+    return _calibrated_chain(calibration, chain, rows, observations.name, sources=True)
+
+
 def _rows_on_grid(calibration, observations):
     """Return the calibration's wavelength (index) of each of the observations'."""
     grid, own = (w.to_value(u.nm) for w in (calibration.wavelength, observations.wavelength))
@@ -155,20 +162,24 @@ def _rows_on_grid(calibration, observations):
     return nearest
 
 
-def _calibrated_chain(calibration, chain, rows, name):
+def _calibrated_chain(calibration, chain, rows, name, sources=False):
     """Return the chain with the calibration's values, bounds and flags where it has the optic."""
     fitted = {leaf.name: leaf for item in calibration.chains[::-1] for leaf in leaves(item)}
     train, unknown = [], []
     for leaf in leaves(chain):
-        own = fitted.get(leaf.name)
-        if own is None:
-            unknown += [f"{leaf.name}.{k}" for k in leaf.param_names if not getattr(leaf, k).fixed]
+        is_source = sources and isinstance(leaf, PolarizedSource)
+        own = None if is_source else fitted.get(leaf.name)
+        if is_source:
+            pass
+        elif own is None:
+            unknown += [f"{leaf.name}.{key}" for key in leaf.param_names if _is_open(leaf, key)]
         elif type(own) is not type(leaf):
             raise ChainError(
                 f"{name}: {leaf.name} is of class {type(leaf).__name__}, but that of the "
                 f"calibration is of class {type(own).__name__}"
             )
-        train.append(_at_rows(leaf, leaf if own is None else own, rows, calibration.wavelength))
+        origin = leaf if own is None else own
+        train.append(_at_rows(leaf, origin, rows, calibration.wavelength, free=is_source))
     if unknown:
         raise FitError(
             f"{name}: nothing determines {', '.join(unknown)}: the calibration has no such "
@@ -177,12 +188,18 @@ def _calibrated_chain(calibration, chain, rows, name):
     return join(train)
 
 
+def _is_open(leaf, key):
+    """Return whether a parameter is free and nothing is known of it."""
+    parameter = getattr(leaf, key)
+    return not parameter.fixed and parameter.prior is None
+
+
 def _not_calibrated(calibration, chain):
     fitted = {leaf.name for item in calibration.chains for leaf in leaves(item)}
     return [leaf.name for leaf in leaves(chain) if leaf.name not in fitted]
 
 
-def _at_rows(leaf, source, rows, grid):
+def _at_rows(leaf, source, rows, grid, free=False):
     """Return the optic with the source's values at some wavelengths of the grid."""
     values = {}
     for key in leaf.param_names:
@@ -193,8 +210,9 @@ def _at_rows(leaf, source, rows, grid):
         values[key] = value if parameter.unit is None else value * parameter.unit
     new = leaf.with_parameters(**values)
     for key in leaf.param_names:
-        # with the calibration's flags its open directions can be followed
-        getattr(new, key).fixed = getattr(source, key).fixed
+        # with the calibration's flags its open directions can be followed; what only a
+        # catalogue knows stays as it is
+        getattr(new, key).fixed = getattr(source, key).fixed or (source is leaf and not free)
         getattr(new, key).bounds = getattr(source, key).bounds
         getattr(new, key).prior = None
     return new

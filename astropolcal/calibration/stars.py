@@ -54,7 +54,22 @@ def star_stokes(calibration, chain, observations, positions=None):
 
     Examples
     --------
-    See the page on stars.
+    Frames of a star behind a telescope that does nothing, seen as they are:
+
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments, optics
+    >>> from astropolcal.calibration import star_stokes
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> lam = [1.2, 1.6, 2.2] * u.um
+    >>> chain = charis.chain(derotator="linear", wavelength=lam)
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, lam, frames, seed=2))
+    >>> star = optics.PolarizedSource(q=0.02, u=0.01, name="star")
+    >>> sky = star | chain["hwp"] | chain["derotator"] | chain["wollaston"]
+    >>> table = star_stokes(cal, sky, simulate(sky, lam, frames, seed=3))
+    >>> table["q"].round(1)
+    <Quantity [2., 2., 2.] %>
     """
     chain = _with_free_star(chain)
     predicted = predicted_chain(calibration, chain, observations)

@@ -74,7 +74,16 @@ def two_step(measurement, weighting, joint, run, options):
 
     Examples
     --------
-    ``calibrate(chain, observations, strategy="two-step")`` is the way to it.
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> data = simulate(chain, charis.wavelength, frames, seed=2)
+    >>> cal = calibrate(chain, data, strategy="two-step", cross_validate=False)
+    >>> [stage["title"] for stage in cal.stages][:2]
+    ['per wavelength, misalignments held', 'global']
     """
     parts = [dataset.observations for dataset in measurement.datasets]
     single = {slot.name for slot in measurement.free.slots if not slot.per_wavelength}
@@ -128,7 +137,18 @@ def sequential(measurement, weights, joint, run, options):
 
     Examples
     --------
-    ``calibrate(chains, datasets, strategy="sequential")`` is the way to it.
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> sources = ["polarized", "unpolarized"]
+    >>> chains = [charis.chain(source, derotator="linear") for source in sources]
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> data = [simulate(chain, charis.wavelength, frames, seed=2, meta={"source": source})
+    ...         for chain, source in zip(chains, sources)]
+    >>> cal = calibrate(chains, data, strategy="sequential", cross_validate=False)
+    >>> [stage["title"] for stage in cal.stages]
+    ['polarized', 'unpolarized, what came before held']
     """
     measurement.put_back()
     ties, chains = measurement.free.ties, measurement.chains

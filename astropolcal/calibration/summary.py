@@ -14,6 +14,8 @@ __all__ = ["summary", "to_dict"]
 _WIDTH = 80
 _N_COLUMNS = 5
 _ACCURACIES = ("s_res", "s_mean", "s_cv", "s_standard")
+# pairs of frames at odds with the fit that a summary names
+_MOST_OUTLIERS = 5
 
 
 def summary(calibration, targets=TARGETS):
@@ -242,7 +244,20 @@ def _by_wavelength(accuracy):
 def _goodness_lines(calibration):
     found = calibration.fit.get("lack_of_fit") or []
     lines = [f"  - {test['words']}" for test in found]
+    lines += _outlier_lines(calibration.fit.get("outliers") or [])
     return list(_wrap(["Goodness of fit", *lines])) if lines else []
+
+
+def _outlier_lines(outliers):
+    """Name the pairs of frames at odds with the fit, which are not left out."""
+    lines = [
+        f"  - frames {one['frames']} of {one['dataset']} are at odds with the fit, by "
+        f"{one['residual_percent']:+.2g} % ({one['sigma']:.0f} robust sigma, brightness "
+        f"{one['brightness']:.2f}); they are not left out"
+        for one in outliers[:_MOST_OUTLIERS]
+    ]
+    more = len(outliers) - _MOST_OUTLIERS
+    return lines + ([f"  - and {more} more pairs at odds with the fit"] if more > 0 else [])
 
 
 def _gauge_lines(calibration):
@@ -313,6 +328,7 @@ def to_dict(calibration, targets=TARGETS):
         "n_free": len(calibration.covariance),
         "rank": calibration.identifiability.rank,
         "lack_of_fit": _plain(fit.get("lack_of_fit") or []),
+        "outliers": _plain(fit.get("outliers") or []),
         "datasets": [_dataset(record) for record in calibration.datasets],
         "left_out": what_is_left_out(calibration),
         "standards": [_standard(entry) for entry in fit.get("standards", [])],

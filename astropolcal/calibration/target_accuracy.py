@@ -234,8 +234,10 @@ def target_accuracies(calibration, targets=TARGETS, column="s_mean"):
     """
     Return the accuracy of a calibration for several targets, per wavelength.
 
-    Which datasets give s_rel, s_unpol and s_sky follows from their sources; several
-    of one kind count by the rms of their accuracies.
+    Which datasets give s_rel, s_unpol and s_sky follows from their sources: s_sky is that of
+    unpolarized standard stars. Several of one kind count by the rms of their accuracies. Where no
+    dataset of a kind was fitted, a standard of that kind counts that was predicted, see
+    `~astropolcal.calibration.add_standard`.
 
     Parameters
     ----------
@@ -295,6 +297,8 @@ def _kind(source, chain):
         return "on_sky" if "unpolarized" in words else None
     if "polarized" in words:
         return "unpolarized" if "unpolarized" in words else "polarized"
+    if chain is None:
+        return None
     # a table that does not say it; a polarizer in front does
     return "polarized" if isinstance(leaves(chain)[0], LinearPolarizer) else None
 
@@ -312,10 +316,34 @@ def _tables_of_kinds(calibration, column):
         row = np.full(grid.size, np.nan)
         row[np.abs(own[:, None] - grid).argmin(axis=1)] = value**2
         squares.setdefault(kind, []).append(row)
+    for kind, row in _standards_of_kinds(calibration, column):
+        if kind not in {_kind(r.source, c) for r, c in _fitted(calibration)}:
+            squares.setdefault(kind, []).append(row)
     return {
         kind: QTable({"wavelength": grid, column: np.sqrt(_mean(rows)) * u.percent})
         for kind, rows in squares.items()
     }
+
+
+def _fitted(calibration):
+    return zip(calibration.datasets, calibration.chains, strict=True)
+
+
+def _standards_of_kinds(calibration, column):
+    """Yield kind and squared accuracy at each wavelength of the standards that were predicted."""
+    grid = calibration.wavelength.to_value(u.nm)
+    # a diagnosis asks with what has no fit
+    for entry in getattr(calibration, "fit", {}).get("standards", []):
+        kind = _kind(entry["source"], None)
+        if kind is None:
+            continue
+        own, n = np.array(entry["wavelength_nm"]), np.array(entry["n"], dtype=float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = 1 / n if column == "s_mean" else 1.0
+        row = np.full(grid.size, np.nan)
+        at = np.abs(own[:, None] - grid).argmin(axis=1)
+        row[at] = np.array(entry["s_standard_percent"], dtype=float) ** 2 * share
+        yield kind, row
 
 
 def _mean(rows):

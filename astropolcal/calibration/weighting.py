@@ -251,6 +251,11 @@ def weighting_of(calibration):
 
 def _from_settings(measurement, settings):
     """Return a noise given to a fit of the same data, as far as `describe` has kept it."""
+    if settings.get("loss", "linear") != "linear":
+        # robust imports the noise, as this module does
+        from astropolcal.calibration.robust import robust_sigma
+
+        return Weighting(GIVEN, robust_sigma(measurement, settings["loss"]))
     _, _, rows = data_by_wavelength(measurement)
     kept = [value for part in settings["noise"] for value in part["sigma_percent"]]
     sigma = np.empty(measurement.n_data)

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What an instrument is to astropolcal: its chain, its stages, its tables."""
 
+import inspect
 from abc import ABC, abstractmethod
 
 import astropy.units as u
@@ -133,6 +134,7 @@ class Instrument(ABC):
             If a table belongs to another instrument, or does not say what it is.
         """
         datasets = list(datasets)
+        self._check_options(options)
         for observations in datasets:
             self.check(observations)
         grid = (common_wavelengths(datasets) * u.um).to(u.nm)
@@ -153,6 +155,12 @@ class Instrument(ABC):
             If the instrument has no telescope's chain.
         """
         raise InstrumentError(f"{self.name}: no chain from the sky is known")
+
+    def _check_options(self, options):
+        known = inspect.signature(self.chain).parameters
+        unknown = sorted(set(options) - set(known))
+        if unknown and not any(p.kind is p.VAR_KEYWORD for p in known.values()):
+            raise InstrumentError(f"{self.name}: its chain has no option {', '.join(unknown)}")
 
     def particulars(self, observations):
         """
@@ -193,10 +201,12 @@ class Instrument(ABC):
         observations = mask_saturated(observations)
         if not is_star(observations.source):
             return mask_unstable_lamp(observations)
-        sky_angles(observations, self._location())
+        sky_angles(observations, self.location)
         return mask_incomplete_cycles(observations)
 
-    def _location(self):
+    @property
+    def location(self):
+        """Site of the telescope, an `~astropy.coordinates.EarthLocation`, or None."""
         return None if self.files is None else location_of(self.files.site)
 
     def check(self, observations):
@@ -242,7 +252,7 @@ class Instrument(ABC):
         if {"parallactic", "altitude"} & set(wanted):
             if self.files is not None:
                 exposure = {"law": self.files.tracking} | exposure
-            sky = sky_positions(observations, self._location(), **exposure)
+            sky = sky_positions(observations, self.location, **exposure)
         return {s: sky[s] if s in sky else observations.position(s) for s in wanted}
 
     def __repr__(self):

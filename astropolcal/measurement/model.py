@@ -35,7 +35,9 @@ class Measurement(FittableModel):
         What is compared; see `astropolcal.observations.OBSERVABLES`.
     positions : sequence of dict, optional
         For each dataset the position of every stage in radian, shape
-        (n_frames,); by default the columns of the observations.
+        (n_frames,), or (nodes, n_frames) at the Gauss-Legendre nodes of each
+        exposure; by default as the instrument that the table names reads it
+        (of a star with the tracking of the half-wave plate), or the columns.
     ties : dict of str to Tie, optional
         Parameters that follow others.
     wavelength : `~astropy.units.Quantity`, optional

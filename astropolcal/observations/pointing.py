@@ -9,11 +9,14 @@ a frame is then the mean over a few nodes of Gauss and Legendre.
 """
 
 import warnings
+from contextlib import contextmanager
 
 import astropy.units as u
 import numpy as np
 from astropy.time import Time
+from astropy.utils import iers
 from astropy.utils.exceptions import AstropyWarning
+from erfa import ErfaWarning
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.observations.coordinates import clock
@@ -28,6 +31,21 @@ TRACKING = (0.5, 1.0)
 
 _WHEN = {"start": 0.5, "middle": 0.0, "end": -0.5}
 _MOST_NODES = 32
+
+
+@contextmanager
+def offline():
+    """Use the Earth orientation that astropy brings along; never the network."""
+    with (
+        iers.conf.set_temp("auto_download", False),
+        iers.conf.set_temp("auto_max_age", None),
+        iers.conf.set_temp("iers_degraded_accuracy", "warn"),
+        warnings.catch_warnings(),
+    ):
+        # a second of time is 15 arcsec, which does not matter here
+        warnings.simplefilter("ignore", AstropyWarning)
+        warnings.simplefilter("ignore", ErfaWarning)
+        yield
 
 
 def pointing(coord, time, location):
@@ -64,15 +82,8 @@ def pointing(coord, time, location):
     (<Quantity 69.1 deg>, <Quantity 6. deg>)
     """
     from astropy.coordinates import HADec
-    from astropy.utils import iers
 
-    with (
-        warnings.catch_warnings(),
-        iers.conf.set_temp("auto_download", False),
-        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
-    ):
-        # of times that the tables do not cover; an arcsecond is nothing here
-        warnings.filterwarnings("ignore", "Tried to get polar motions", AstropyWarning)
+    with offline():
         seen = coord.transform_to(HADec(obstime=time, location=location))
     hour, dec = seen.ha.rad, seen.dec.rad
     latitude = location.to_geodetic().lat.rad

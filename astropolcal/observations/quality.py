@@ -57,7 +57,7 @@ def is_star(source):
 # ---- cycles of the half-wave plate ---------------------------------------------------------------
 
 
-def cycle_numbers(observations):
+def cycle_numbers(observations, start=None):
     """
     Return the number of the half-wave-plate cycle of every frame.
 
@@ -68,6 +68,9 @@ def cycle_numbers(observations):
     ----------
     observations : Observations
         The dataset.
+    start : `~astropy.units.Quantity`, optional
+        Commanded angle with which a cycle begins, so that a run whose first frames are lost
+        is not cut at another place.
 
     Returns
     -------
@@ -83,18 +86,24 @@ def cycle_numbers(observations):
     frames = observations.frames
     if "cycle" in frames.colnames:
         return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
-    plate = np.rint(np.mod(observations.position("hwp"), np.pi) / _PLATE_STEPS).astype(int)
-    # 180 deg is 0 deg again
-    plate %= round(np.pi / _PLATE_STEPS)
+    plate = _step_of(observations.position("hwp"))
     state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
     moved = np.abs(np.diff(observations.position("derotator"), prepend=0.0)) > _SAME_ANGLE
+    first = None if start is None else _step_of(angle_to_rad(start, "start"))
     cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
     for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
-        if i and (moved[i] or key in seen):
+        begins = key[0] == first and any(angle != first for angle, _ in seen)
+        if i and (moved[i] or begins or key in seen):
             number, seen = number + 1, set()
         seen.add(key)
         cycle[i] = number
     return cycle
+
+
+def _step_of(angle):
+    """Return the number of the step at which a plate stands; 180 deg is 0 deg again."""
+    step = np.rint(np.mod(angle, np.pi) / _PLATE_STEPS).astype(int)
+    return step % round(np.pi / _PLATE_STEPS)
 
 
 def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
@@ -109,7 +118,7 @@ def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
     observations : Observations
         The dataset.
     angles : `~astropy.units.Quantity`
-        Commanded angles that a cycle has, modulo 180 deg.
+        Commanded angles that a cycle has, modulo 180 deg; it begins with the first.
 
     Returns
     -------
@@ -132,7 +141,7 @@ def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
     {}
     """
     wanted = np.mod(np.atleast_1d(angle_to_rad(angles, "angles")), np.pi)
-    plate, cycle = observations.position("hwp"), cycle_numbers(observations)
+    plate, cycle = observations.position("hwp"), cycle_numbers(observations, wanted[0] * u.rad)
     lost = observations.mask.all(axis=1)
     apart = np.abs(np.mod(plate[:, None] - wanted + np.pi / 2, np.pi) - np.pi / 2)
     there = (apart < _PLATE_STEPS) & ~lost[:, None]

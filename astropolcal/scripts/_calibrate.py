@@ -17,6 +17,7 @@ examples:
   astropolcal calibrate run.ecsv --fix hwp.theta=0 --fix derotator.theta=0
   astropolcal calibrate run.ecsv --standard other.ecsv --groups cycle
   astropolcal calibrate run.ecsv --target 5,30   for 5 % at 30 deg
+  astropolcal calibrate polarized.ecsv unpolarized.ecsv star.ecsv --strategy sequential
 """
 
 
@@ -60,6 +61,18 @@ def _add_model_options(parser):
         help="physical (default), or those of the paper",
     )
     parser.add_argument(
+        "--m3",
+        metavar="MODEL",
+        help="tertiary mirror of stars: free (default, a diattenuation a wavelength), "
+        "'power law' (the paper's permittivity) or metal (silver with a film)",
+    )
+    _add_fit_options(parser)
+    _add_parameter_options(parser)
+
+
+def _add_fit_options(parser):
+    """Add what says how the model is fitted."""
+    parser.add_argument(
         "--observable",
         metavar="NAME",
         default="normalized_double_difference",
@@ -69,7 +82,20 @@ def _add_model_options(parser):
         "--strategy",
         metavar="HOW",
         default="joint",
-        help="joint (default), or two-step as in the paper",
+        help="joint (default), two-step (the paper's fit of a polarized source), or sequential: "
+        "polarized source, unpolarized source, stars, each step holding what came before",
+    )
+    parser.add_argument(
+        "--loss",
+        metavar="NAME",
+        default="linear",
+        help="linear (default: least squares), huber, cauchy or bisquare: data far off count less",
+    )
+    parser.add_argument(
+        "--keep-all",
+        action="store_true",
+        help="mask nothing by itself: neither an unstable lamp, nor saturated frames, nor "
+        "incomplete half-wave-plate cycles",
     )
     parser.add_argument(
         "--weights",
@@ -78,6 +104,10 @@ def _add_model_options(parser):
         help="equal weights (default), one over the residuals' scatter at each wavelength, or one "
         "over the tables' errors",
     )
+
+
+def _add_parameter_options(parser):
+    """Add what says which parameters are free."""
     parser.add_argument(
         "--fix",
         action="append",
@@ -154,9 +184,14 @@ def run(arguments):
     files = arguments.files or [_example(say)]
     datasets, standards = read_datasets(files), read_datasets(arguments.standard)
     _check_standards(arguments.standard, standards, files, datasets)
-    tables, n = [*datasets, *standards], len(datasets)
+    n = len(datasets)
     instrument = instruments.get(arguments.instrument or _stated(datasets))
+    if not arguments.keep_all:
+        datasets = [instrument.prepare(table) for table in datasets]
+        standards = [instrument.prepare(table) for table in standards]
+    tables = [*datasets, *standards]
     options = {"derotator": arguments.derotator, "bounds": arguments.bounds}
+    options |= {"m3": arguments.m3} if arguments.m3 else {}
     chains = instrument.chains_for(datasets, **options)
     # each on its own wavelengths
     chains += [instrument.chains_for([table], **options)[0] for table in standards]
@@ -169,6 +204,7 @@ def run(arguments):
         strategy=arguments.strategy,
         observable=arguments.observable,
         weights=None if arguments.weights == "none" else arguments.weights,
+        loss=arguments.loss,
         positions=positions[:n],
         gauge=None if arguments.gauge == "none" else arguments.gauge,
         fix=_held(arguments, chains[:n]),

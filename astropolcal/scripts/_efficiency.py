@@ -159,7 +159,7 @@ def _track(arguments, instrument):
 
     if not (arguments.target and arguments.night):
         raise ParameterError("--target and --night belong together")
-    location = instrument._location()
+    location = instrument.location
     if location is None:
         raise InstrumentError(f"{instrument.name}: its site is not known")
     try:

@@ -2,20 +2,18 @@
 """Where a star stands over a site: altitude, parallactic angle, the hours of a night."""
 
 import difflib
-import warnings
-from contextlib import contextmanager
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_sun
+from astropy.coordinates import AltAz, EarthLocation, get_sun
 from astropy.table import QTable
 from astropy.time import Time
-from astropy.utils import iers
-from astropy.utils.exceptions import AstropyWarning
-from erfa import ErfaWarning
 
 from astropolcal.exceptions import ParameterError
+from astropolcal.observations.pointing import offline, pointing
 from astropolcal.units import angle_to_rad
+
+__all__ = ["offline", "pointing"]
 
 LIMIT = 30 * u.deg
 TWILIGHT = -12 * u.deg
@@ -31,21 +29,6 @@ SITES = {
 }
 
 
-@contextmanager
-def offline():
-    """Use the Earth orientation that astropy brings along; never the network."""
-    with (
-        iers.conf.set_temp("auto_download", False),
-        iers.conf.set_temp("auto_max_age", None),
-        iers.conf.set_temp("iers_degraded_accuracy", "warn"),
-        warnings.catch_warnings(),
-    ):
-        # a second of time is 15 arcsec, which does not matter here
-        warnings.simplefilter("ignore", AstropyWarning)
-        warnings.simplefilter("ignore", ErfaWarning)
-        yield
-
-
 def location(site):
     """Return the place on Earth that a name or an EarthLocation means."""
     if isinstance(site, EarthLocation):
@@ -59,39 +42,6 @@ def location(site):
         f"site = {site!r} is not known{hint} (known: {', '.join(SITES)}; any other as an "
         "EarthLocation)"
     )
-
-
-def pointing(coord: SkyCoord, time: Time, location: EarthLocation):
-    """
-    Return altitude and parallactic angle, without refraction.
-
-    Parameters
-    ----------
-    coord : `~astropy.coordinates.SkyCoord`
-        The star; broadcasts with ``time``.
-    time : `~astropy.time.Time`
-        When.
-    location : `~astropy.coordinates.EarthLocation`
-        Where.
-
-    Returns
-    -------
-    altitude, parallactic : `~astropy.units.Quantity`
-        In degree. The parallactic angle is that from the north celestial pole
-        of date to the zenith, through east; negative before the transit of a
-        star that culminates south of the zenith.
-    """
-    with offline():
-        local = coord.transform_to(AltAz(obstime=time, location=location))
-    return local.alt.to_value(u.deg) * u.deg, parallactic_angle(local.alt, local.az, location.lat)
-
-
-def parallactic_angle(altitude, azimuth, latitude):
-    """Return the parallactic angle (deg) of a direction given by altitude and azimuth."""
-    sine = -np.sin(azimuth) * np.cos(latitude)
-    cosine = np.sin(latitude) * np.cos(altitude)
-    cosine = cosine - np.cos(latitude) * np.sin(altitude) * np.cos(azimuth)
-    return u.Quantity(np.arctan2(sine, cosine), u.deg, subok=False)
 
 
 def night_times(site, night, *, twilight, step):

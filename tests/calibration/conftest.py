@@ -1,12 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """A CHARIS-like truth, away from all bounds, and what it measures."""
 
+import sys
+from pathlib import Path
+
 import astropy.units as u
 import numpy as np
 import pytest
 
 from astropolcal import instruments
 from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+# star_data.py, which several folders use
+sys.path.append(str(Path(__file__).parents[1]))
 
 CHARIS = instruments.get("charis")
 DEROTATOR = np.linspace(45, 132.5, 8) * u.deg

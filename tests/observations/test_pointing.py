@@ -112,7 +112,7 @@ def test_angles_are_computed_from_time_target_and_site(text):
 
 def test_star_without_pointing_is_an_error_that_says_what_is_needed():
     with pytest.raises(
-        ObservationError, match=r"night: a star needs its pointing.*no a column tim"
+        ObservationError, match=r"night: a star needs its pointing.*missing: a column tim"
     ):
         sky_angles(on_sky(altitude=None))
 

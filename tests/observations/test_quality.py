@@ -63,6 +63,15 @@ def test_cycles_are_numbered_by_returning_angles():
     assert cycle_numbers(cycles()).tolist() == np.repeat([0, 1, 2], 4).tolist()
 
 
+def test_run_whose_first_frame_is_lost_is_cut_at_the_right_place():
+    observations = cycles(drop=[0])
+    assert cycle_numbers(observations).tolist() == [0] * 4 + [1] * 4 + [2] * 3
+    assert cycle_numbers(observations, 0 * u.deg).tolist() == [0] * 3 + [1] * 4 + [2] * 4
+    with pytest.warns(AstropolcalWarning, match=r"3 of 11 frames masked"):
+        masked = mask_incomplete_cycles(observations)
+    assert np.flatnonzero(masked.mask.all(axis=1)).tolist() == [0, 1, 2]
+
+
 def test_cycles_may_be_given():
     observations = cycles()
     table = observations.to_table()

@@ -245,3 +245,63 @@ def test_a_prior_on_what_was_fixed_frees_it_again(tables, tmp_path):
     summary = run(tmp_path, tables["first"], *both)
     assert summary["gauge"].startswith("held: derotator.theta; prior on hwp.theta")
     assert not summary["parameters"]["hwp.theta"]["fixed"]
+
+
+# ---- lamps and stars ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def star_table(tables):
+    """A star through the same optics, whose first cycle is incomplete."""
+    chain = CHARIS.chain("unpolarized standard star", ["nbs"], wavelength=WAVELENGTH)
+    chain["m3"].diattenuation = [0.017, 0.014, 0.012]
+    frames = half_wave_plate_cycles([0, 45, 22.5, 67.5] * u.deg, np.full(8, 97) * u.deg)[1:]
+    frames["parallactic"] = np.linspace(20, 35, 31) * u.deg
+    frames["altitude"] = np.linspace(67, 64, 31) * u.deg
+    commanded = frames["hwp"].copy()
+    frames["hwp"] = commanded + 0.5 * frames["parallactic"] + frames["altitude"]
+    meta = CHARIS.published_meta() | {"yjh50_dichroic": "out", "object": "HD 293396"}
+    meta |= {"source": "unpolarized standard star"}
+    table = simulate(chain, WAVELENGTH, frames, seed=9, meta=meta).to_table()
+    table["hwp"] = np.repeat(commanded, 3)
+    path = tables["first"].parent / "star.ecsv"
+    Observations.from_table(table).write(path)
+    return path
+
+
+@pytest.mark.filterwarnings("ignore:.*frames (masked|left out)")
+@pytest.mark.parametrize("options", [[], ["--strategy", "sequential"], ["--loss", "huber"]])
+def test_lamps_and_star_together(tables, star_table, tmp_path, options):
+    content = run(tmp_path, tables["first"], tables["dark"], star_table, *HELD, *options)
+    assert [one["source"] for one in content["datasets"]] == [
+        "polarized", "unpolarized", "unpolarized standard star",
+    ]  # fmt: skip
+    found = content["parameters"]["m3.diattenuation"]["value"]
+    np.testing.assert_allclose(found, [0.017, 0.014, 0.012], atol=5e-4)
+    assert content["targets"][0]["missing"] == []
+    # three frames of the first cycle cannot be used
+    assert content["datasets"][2]["n"] == [14, 14, 14]
+
+
+@pytest.mark.filterwarnings("ignore:.*frames left out")
+def test_nothing_is_masked_where_all_is_to_be_kept(tables, star_table, tmp_path):
+    content = run(tmp_path, star_table, tables["first"], *HELD, "--keep-all")
+    assert content["datasets"][0]["n"] == [15, 15, 15]
+
+
+@pytest.mark.filterwarnings("ignore:.*frames (masked|left out)")
+def test_model_of_the_tertiary_mirror(tables, star_table, tmp_path):
+    content = run(tmp_path, star_table, tables["first"], *HELD, "--m3", "metal")
+    free = {k for k, v in content["parameters"].items() if k.startswith("m3.") and not v["fixed"]}
+    assert free == {"m3.film_thickness", "m3.n_scale", "m3.k_scale"}
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--m3", "glass"], "m3 = 'glass'; allowed are free, power law, metal"),
+        (["--loss", "l3"], "loss = 'l3'; allowed are linear, huber, cauchy, bisquare"),
+    ],
+)
+def test_unknown_models_get_one_line(tables, capsys, options, words):
+    assert words in complaint(capsys, tables["first"], *options)

@@ -1,0 +1,147 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Polarimetric efficiency: closed forms, the paper's dips, and planning."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from star_data import CHARIS
+
+from astropolcal import optics
+from astropolcal.calibration import best_derotator, polarimetric_efficiency
+from astropolcal.calibration.efficiency import DEROTATOR_LAWS, sky_path
+from astropolcal.chain import leaves
+from astropolcal.exceptions import ChainError, ObservationError, ParameterError
+
+LAM = [1.6] * u.um
+
+
+def bench(retardance, efficiency=0.7, analyser=0.0):
+    """An ideal half-wave plate and a derotator behind a lamp."""
+    return (
+        optics.LinearPolarizer(name="polarizer")
+        | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+        | optics.LinearRetarder(retardance=retardance * u.deg, mount="derotator", name="derotator")
+        | optics.WollastonPrism(efficiency=efficiency, theta=analyser * u.deg, name="wollaston")
+    )
+
+
+@given(st.floats(-180, 180), st.floats(0, 360), st.floats(0, 180))
+def test_linear_retarder_has_a_closed_form(derotator, retardance, aolp):
+    found = polarimetric_efficiency(
+        bench(retardance), LAM, derotator=derotator * u.deg, aolp=aolp * u.deg
+    )
+    d, delta = np.deg2rad([2 * derotator, retardance])
+    assert found[0] == pytest.approx(np.hypot(np.cos(d), np.sin(d) * np.cos(delta)), abs=1e-9)
+
+
+@given(st.floats(-180, 180), st.floats(0, 360))
+def test_worst_angle_is_no_better_than_any(derotator, retardance):
+    kwargs = {"derotator": derotator * u.deg}
+    worst = polarimetric_efficiency(bench(retardance), LAM, aolp=None, **kwargs)
+    any_ = polarimetric_efficiency(bench(retardance), LAM, aolp=20 * u.deg, **kwargs)
+    assert worst[0] <= any_[0] + 1e-9
+
+
+def test_beam_splitter_does_not_count_but_its_orientation_does():
+    kwargs = {"derotator": 30 * u.deg}
+    a, b = (polarimetric_efficiency(bench(120, eta), LAM, **kwargs) for eta in (0.5, 1.0))
+    np.testing.assert_allclose(a, b)
+    turned = polarimetric_efficiency(bench(120, analyser=30), LAM, **kwargs)
+    straight = polarimetric_efficiency(bench(120), LAM, derotator=0 * u.deg)
+    np.testing.assert_allclose(turned, straight)
+
+
+def test_path_ends_before_the_beam_splitter():
+    assert [leaf.name for leaf in leaves(sky_path(bench(90)))] == ["hwp", "derotator"]
+    with pytest.raises(ChainError, match="no optic on a stage"):
+        sky_path(optics.WollastonPrism(name="wollaston"))
+
+
+# --- CHARIS -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return CHARIS.on_sky(CHARIS.published())
+
+
+@pytest.mark.parametrize(("parallactic", "altitude"), [(32, 48), (94, 60), (126, 60), (24, 67)])
+def test_least_near_45_and_135_deg_whatever_the_pointing(sky, parallactic, altitude):
+    """Paper, Fig. of the efficiency, at the four pointings that it shows."""
+    angles = np.arange(0, 180, 3)
+    found = polarimetric_efficiency(
+        sky,
+        CHARIS.wavelength,
+        derotator=angles * u.deg,
+        altitude=altitude * u.deg,
+        parallactic=parallactic * u.deg,
+    )
+    # where the derotator is a quarter-wave plate
+    column = found[:, np.abs(CHARIS.wavelength.to_value(u.nm) - 1575).argmin()]
+    first, second = angles[column[:30].argmin()], angles[30 + column[30:].argmin()]
+    assert abs(first - 45) <= 6
+    assert abs(second - 135) <= 6
+    assert column.min() < 0.35
+    assert found[[0, 30]].min() > 0.95
+
+
+def test_pointing_changes_it_by_a_few_percent(sky):
+    kwargs = {"derotator": 70 * u.deg, "altitude": 60 * u.deg}
+    angles = np.arange(-180, 180, 20) * u.deg
+    found = polarimetric_efficiency(sky, CHARIS.wavelength, parallactic=angles, **kwargs)
+    assert found.shape == (18, 22)
+    assert 0.005 < np.ptp(found, axis=0).max() < 0.3
+
+
+def test_angles_broadcast(sky):
+    found = polarimetric_efficiency(
+        sky,
+        CHARIS.wavelength,
+        derotator=[45, 90] * u.deg,
+        altitude=[[30], [50], [70]] * u.deg,
+        parallactic=0 * u.deg,
+    )
+    assert found.shape == (3, 2, 22)
+    assert np.all((found >= 0) & (found <= 1 + 1e-9))
+
+
+def test_impossible_requests_are_errors(sky):
+    kwargs = {"derotator": 45 * u.deg, "parallactic": 0 * u.deg}
+    with pytest.raises(ObservationError, match=r"altitude = 95 deg; allowed is above 0 to 90"):
+        polarimetric_efficiency(sky, CHARIS.wavelength, altitude=95 * u.deg, **kwargs)
+    with pytest.raises(ParameterError, match="needs altitude= and parallactic="):
+        polarimetric_efficiency(sky, CHARIS.wavelength, **kwargs)
+    with pytest.raises(ParameterError, match="too many"):
+        polarimetric_efficiency(bench(90), LAM, derotator=np.zeros(3_000_000) * u.deg, aolp=None)
+    chain = optics.LinearRetarder(mount="other", name="x") | bench(90)
+    with pytest.raises(ChainError, match="no position of the stages other"):
+        polarimetric_efficiency(chain, LAM, derotator=0 * u.deg)
+
+
+# --- planning ---------------------------------------------------------------------------------
+
+
+def test_best_offset_keeps_the_derotator_off_the_dips(sky):
+    altitude, parallactic = [60, 62, 64] * u.deg, [-10, 0, 10] * u.deg
+    best = best_derotator(sky, CHARIS.wavelength, altitude, parallactic)
+    assert len(best.table) == 180
+    derotator = np.mod((best.offset + 0.5 * altitude).to_value(u.deg), 90)
+    assert np.all(np.minimum(derotator, 90 - derotator) < 8)
+    least = best.table["least"]
+    assert least.max() > 0.9
+    assert least.min() < 0.1
+    assert best.table["offset"][least.argmax()] == best.offset
+
+
+def test_laws_of_the_derotator(sky):
+    kwargs = {"offsets": [60, 70] * u.deg}
+    pointing = [40, 60] * u.deg, [-60, 60] * u.deg
+    found = [
+        best_derotator(sky, CHARIS.wavelength, *pointing, law=law, **kwargs).table["least"]
+        for law in DEROTATOR_LAWS
+    ]
+    assert np.abs(found[0] - found[1]).max() > 0.05
+    with pytest.raises(ParameterError, match=r"law = 'sky'.*allowed are pupil, field"):
+        best_derotator(sky, CHARIS.wavelength, *pointing, law="sky")

@@ -1,0 +1,260 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Sequential calibration, joint calibration of lamps and stars, and robust losses."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from star_data import CHARIS, META, WAVELENGTH, observe_star, star_chain
+
+from astropolcal import Calibration, calibrate
+from astropolcal.calibration import outlying_data, robust_sigma
+from astropolcal.calibration.robust import LOSSES
+from astropolcal.calibration.steps import kind_of_source
+from astropolcal.exceptions import FitError
+from astropolcal.observations import Observations
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+DEROTATOR = [45, 57.5, 82.5, 107.5, 132.5] * u.deg
+OPTICS = ["dichroic", "nbs"]
+M3, FOLD = [0.017, 0.014, 0.012], [0.012, 0.010, 0.008]
+
+
+def truth(chain):
+    """Values away from where the fit starts, in all chains alike."""
+    chain = chain.copy()
+    chain["hwp"].w_sio2, chain["hwp"].w_mgf2 = 1.6542 * u.mm, 1.2919 * u.mm
+    chain["wollaston"].efficiency = [0.97, 0.98, 0.975]
+    for name, key, value in (
+        ("m3", "diattenuation", M3),
+        ("fold_mirror", "diattenuation", FOLD),
+        ("calibration_polarizer", "theta", 90.4 * u.deg),
+    ):
+        if name in chain.submodel_names:
+            setattr(chain[name], key, value)
+    return chain
+
+
+def chains(**options):
+    options = {"wavelength": WAVELENGTH, "derotator": "linear"} | options
+    made = [CHARIS.chain(s, OPTICS, **options) for s in ("polarized", "unpolarized")]
+    made.append(star_chain(**{k: v for k, v in options.items() if k != "wavelength"}))
+    for chain in made:
+        # the gauge is not what is tested here
+        chain["derotator"].theta.fixed = True
+    return made
+
+
+def lamps(start, seed=0, **options):
+    frames = half_wave_plate_cycles(derotator=DEROTATOR)
+    return [
+        simulate(truth(chain), WAVELENGTH, frames, seed=seed + i, name=source,
+                 meta=META | {"source": source}, **options)
+        for i, (chain, source) in enumerate(zip(start, ("polarized", "unpolarized"), strict=False))
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data():
+    start = chains()
+    star = observe_star(truth(start[2]), 12, seed=5)
+    return start, [*lamps(start), star]
+
+
+@pytest.fixture(scope="module")
+def fitted(data):
+    return {
+        strategy: calibrate(*data, strategy=strategy, instrument="charis", cross_validate=False)
+        for strategy in ("joint", "sequential")
+    }
+
+
+# --- what calibrates what -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "kind"),
+    [
+        ("polarized", "polarized"),
+        ("unpolarized", "unpolarized"),
+        ("unpolarized standard star", "star"),
+        ("polarized standard star", "star"),
+        (None, "polarized"),
+    ],
+)
+def test_kind_of_a_source(source, kind):
+    assert kind_of_source(source) == kind
+
+
+# --- joint and sequential -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("strategy", ["joint", "sequential"])
+def test_truth_comes_back(fitted, strategy):
+    values = fitted[strategy].parameter_values()
+    assert fitted[strategy].converged
+    for name, expected in (("m3.diattenuation", M3), ("fold_mirror.diattenuation", FOLD)):
+        np.testing.assert_allclose(values[name]["value"], expected, atol=3e-4)
+    assert values["calibration_polarizer.theta"]["value"] == pytest.approx(90.4, abs=0.1)
+
+
+def test_joint_fit_has_one_covariance_of_all(fitted):
+    names = fitted["joint"].covariance.names
+    for stem in ("m3.diattenuation[0]", "fold_mirror.diattenuation[0]", "hwp.w_sio2"):
+        assert stem in names
+    errors = dict(zip(names, fitted["joint"].covariance.stds, strict=True))
+    assert 0 < errors["m3.diattenuation[0]"] < 3e-4
+
+
+def test_steps_are_told_in_the_papers_order(fitted):
+    stages = fitted["sequential"].stages
+    assert [stage["title"].split(",")[0] for stage in stages] == [
+        "polarized", "unpolarized", "star",
+    ]  # fmt: skip
+    assert set(stages[1]["parameters"]) == {"fold_mirror.diattenuation"}
+    assert set(stages[2]["parameters"]) == {"m3.diattenuation"}
+
+
+def test_later_steps_hold_what_came_before(data, fitted):
+    start, observations = data
+    alone = calibrate(start[0], observations[0], cross_validate=False)
+    both = [cal.parameter_values() for cal in (alone, fitted["sequential"])]
+    for name in ("derotator.retardance", "wollaston.efficiency"):
+        np.testing.assert_allclose(*(v[name]["value"] for v in both), atol=1e-5)
+
+
+def test_order_of_the_datasets_does_not_matter(data, fitted):
+    start, observations = data
+    turned = calibrate(start[::-1], observations[::-1], strategy="sequential", cross_validate=False)
+    both = [cal.parameter_values() for cal in (turned, fitted["sequential"])]
+    for name in both[0]:
+        np.testing.assert_allclose(*(v[name]["value"] for v in both), rtol=1e-4, atol=1e-6)
+
+
+def test_sequential_fit_takes_no_noise_for_all_data(data):
+    with pytest.raises(FitError, match="strategy='sequential' fits the datasets one by one"):
+        calibrate(*data, strategy="sequential", weights=1e-3)
+
+
+def test_joint_result_survives_its_file(fitted, data, tmp_path):
+    fitted["joint"].write(tmp_path / "joint.asdf")
+    again = Calibration.read(tmp_path / "joint.asdf").with_observations(data[1])
+    np.testing.assert_allclose(again.residuals, fitted["joint"].residuals, atol=1e-12)
+
+
+def test_tables_as_written_are_masked_again_when_they_come_back(tmp_path):
+    start = chains()[:2]
+    frames = 8 * len(DEROTATOR)
+    lamp = np.where(np.arange(frames) < 4, 0.3, 1.0)
+    lamp[:8] *= np.linspace(0.5, 0.9, 8)
+    raw = lamps(start, lamp=lamp)
+    with pytest.warns(match="unstable lamp"):
+        tables = [CHARIS.prepare(table) for table in raw]
+    cal = calibrate(start, tables, instrument="charis", cross_validate=False)
+    cal.write(tmp_path / "masked.asdf")
+    again = Calibration.read(tmp_path / "masked.asdf").with_observations(raw)
+    assert again.residuals.size == cal.residuals.size
+
+
+def _instrument_held(chain):
+    """Return the chain with all that the lamps calibrate fixed, and the mirror to be found."""
+    for name in ("hwp", "derotator", "wollaston"):
+        for key in chain[name].param_names:
+            getattr(chain[name], key).fixed = True
+    chain["m3"].diattenuation = [0.01, 0.01, 0.01]
+    return chain
+
+
+def test_two_stars_share_the_mirror_and_not_their_polarization():
+    first = star_chain(star="star_a")
+    second = star_chain("star", star="star_b")
+    known = np.array([0.010, 0.008, 0.006])
+    seen = truth(second)
+    seen["star_b"].q, seen["star_b"].u = known, -known
+    first, second = (_instrument_held(truth(chain)) for chain in (first, second))
+    stars = [
+        observe_star(truth(first), 10, seed=1),
+        observe_star(seen, 10, source="star", target="B", parallactic=(-70, 60), seed=2),
+    ]
+    cal = calibrate([first, second], stars, cross_validate=False)
+    values = cal.parameter_values()
+    np.testing.assert_allclose(values["m3.diattenuation"]["value"], M3, atol=5e-4)
+    np.testing.assert_allclose(values["star_b.q"]["value"], known, atol=1e-3)
+    np.testing.assert_allclose(values["star_b.u"]["value"], -known, atol=1e-3)
+    assert "star_a.q" not in cal.covariance.names
+
+
+# --- cross-validation on sky ----------------------------------------------------------------------
+
+
+def test_stars_are_left_out_in_runs_of_cycles(fitted):
+    cal = fitted["joint"].cross_validate()
+    for record in cal.datasets:
+        s_cv, s_res = record.accuracy["s_cv"], record.accuracy["s_res"]
+        assert np.isfinite(s_cv).all()
+        assert (s_cv < 3 * s_res).all()
+
+
+# --- robust ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def spoiled(data):
+    """The star with a pair in which something passed by one beam."""
+    start, observations = data
+    table = observations[2].to_table()
+    row = np.isin(np.asarray(table["frame"]), [20, 21])
+    table["flux_right"][row] *= np.where(np.asarray(table["frame"])[row] == 20, 1.06, 0.95)
+    return start, [*observations[:2], Observations.from_table(table, name="star")]
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "bisquare"])
+def test_robust_loss_is_not_pulled(spoiled, loss):
+    def error(**options):
+        cal = calibrate(*spoiled, cross_validate=False, **options)
+        return np.abs(cal.parameter_values()["m3.diattenuation"]["value"] - M3).max()
+
+    assert error(loss=loss) < 0.6 * error()
+
+
+def test_outlying_pair_is_reported_and_kept(spoiled):
+    cal = calibrate(*spoiled, loss="bisquare", cross_validate=False)
+    table = outlying_data(cal)
+    assert isinstance(table, QTable)
+    assert table["frames"][0] == "20, 21"
+    assert table["residual"].unit == u.percent
+    assert table["residual"][0] > 1 * u.percent
+    assert cal.datasets[2].n_masked == 0
+    assert cal.settings["loss"] == "bisquare"
+    assert cal.to_dict()["outliers"][0]["frames"] == "20, 21"
+    words = " ".join(cal.summary().split())
+    assert "frames 20, 21 of star are at odds with the fit" in words
+    assert "they are not left out" in words
+
+
+def test_good_data_have_no_outliers(fitted):
+    assert len(outlying_data(fitted["joint"])) == 0
+
+
+def test_robust_noise_is_found_again_from_the_file(spoiled, tmp_path):
+    from astropolcal.calibration import weighting_of
+
+    cal = calibrate(*spoiled, loss="huber", instrument="charis", cross_validate=False)
+    cal.write(tmp_path / "robust.asdf")
+    again = Calibration.read(tmp_path / "robust.asdf").with_observations(spoiled[1])
+    np.testing.assert_allclose(weighting_of(again).sigma, weighting_of(cal).sigma, rtol=2e-2)
+
+
+def test_weights_of_the_losses():
+    residuals = np.array([0.0, 0.5, 3.0, 10.0])
+    assert LOSSES["linear"](residuals).tolist() == [1, 1, 1, 1]
+    np.testing.assert_allclose(LOSSES["huber"](residuals), [1, 1, 1.345 / 3, 0.1345])
+    assert LOSSES["bisquare"](residuals)[3] == 0
+    assert np.all(np.diff(LOSSES["cauchy"](residuals)) < 0)
+
+
+def test_unknown_loss_is_an_error(data, fitted):
+    with pytest.raises(FitError, match=r"loss = 'l3'; allowed are linear, huber, cauchy, bisquare"):
+        calibrate(*data, loss="l3")
+    with pytest.raises(FitError, match=r"loss = 'l3'"):
+        robust_sigma(fitted["joint"].measurement, "l3")

@@ -1,0 +1,58 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The figure of the polarimetric efficiency."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from astropolcal import instruments
+from astropolcal.calibration import polarimetric_efficiency
+from astropolcal.plotting import plot_polarimetric_efficiency
+
+CHARIS = instruments.get("charis")
+
+
+@pytest.fixture(scope="module")
+def figure():
+    return plot_polarimetric_efficiency(
+        CHARIS.on_sky(CHARIS.published()),
+        CHARIS.wavelength,
+        altitude=60 * u.deg,
+        parallactic=94 * u.deg,
+        shown=[1.2, 1.58, 2.3] * u.um,
+        title="CHARIS",
+    )
+
+
+def test_lines_are_the_wavelengths_asked_for(figure):
+    lines = figure.axes[0].get_lines()
+    assert [line.get_label() for line in lines] == ["1200 nm", "1575 nm", "2290 nm"]
+    derotator = lines[1].get_xdata()
+    expected = polarimetric_efficiency(
+        CHARIS.on_sky(CHARIS.published()),
+        CHARIS.wavelength,
+        derotator=derotator * u.deg,
+        altitude=60 * u.deg,
+        parallactic=94 * u.deg,
+    )
+    np.testing.assert_allclose(lines[1].get_ydata(), expected[:, 9])
+    assert lines[1].get_ydata().min() < 0.4
+
+
+def test_axes_are_labelled_with_units(figure):
+    labels = [(ax.get_xlabel(), ax.get_ylabel()) for ax in figure.axes[:3]]
+    assert labels == [
+        ("derotator angle (deg)", "measured share of the polarization"),
+        ("derotator angle (deg)", "wavelength (nm)"),
+        ("parallactic angle (deg)", "altitude (deg)"),
+    ]
+    assert figure.get_suptitle() == "CHARIS"
+    assert "altitude 60°, parallactic angle 94°" in figure.axes[0].get_title()
+
+
+def test_internal_chain_has_no_map_of_pointings():
+    figure = plot_polarimetric_efficiency(CHARIS.published(), CHARIS.wavelength, figure=Figure())
+    # two panels and a colour bar
+    assert len(figure.axes) == 3
+    assert figure.axes[0].get_title() == "behind the internal source"

@@ -1,0 +1,82 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""``astropolcal efficiency``."""
+
+import argparse
+import json
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import calibrate, instruments
+from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
+from astropolcal.scripts import _efficiency
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+NIGHT = "2025-11-03T10:00/2025-11-03T13:00"
+
+
+def run(*argv):
+    parser = argparse.ArgumentParser()
+    _efficiency.add_parser(parser.add_subparsers())
+    arguments = parser.parse_args(["efficiency", *(str(word) for word in argv)])
+    arguments.run(arguments)
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory):
+    charis = instruments.get("charis")
+    chain = charis.chain(derotator="linear", wavelength=[1.2, 1.6, 2.2] * u.um)
+    frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    data = simulate(chain, [1.2, 1.6, 2.2] * u.um, frames, seed=1)
+    path = tmp_path_factory.mktemp("cal") / "cal.asdf"
+    calibrate(chain, data, instrument="charis", cross_validate=False).write(path)
+    return path
+
+
+def test_published_values_without_a_file(capsys):
+    run("--derotator", 45, 90, "--wavelength", 1.58, 2.3)
+    out = capsys.readouterr().out
+    assert "Polarimetric efficiency of charis at altitude 60 deg" in out
+    rows = [line.split() for line in out.splitlines() if line.strip()[:2] in ("45", "90")]
+    assert [row[0] for row in rows] == ["45.00", "90.00"]
+    assert float(rows[0][1]) < 0.4 < 0.95 < float(rows[1][1])
+
+
+def test_calibration_of_a_lamp_is_taken_to_the_sky(calibration, tmp_path):
+    out = tmp_path / "out.json"
+    run(calibration, "--altitude", 50, "--parallactic", -30, "--json", out, "-q")
+    content = json.loads(out.read_text())
+    assert content["wavelength_nm"] == pytest.approx([1200, 1600, 2200])
+    assert np.shape(content["efficiency"]) == (7, 3)
+    assert content["derotator_deg"] == [0, 15, 30, 45, 60, 75, 90]
+
+
+def test_best_offset_for_a_night(capsys):
+    run("--target", "72.7,28.3", "--night", NIGHT)
+    out = capsys.readouterr().out
+    assert "Best derotator offset, pupil still:" in out
+    assert "Target at altitude" in out
+
+
+def test_figure_is_written(tmp_path):
+    run("-o", tmp_path / "efficiency.png", "-q")
+    assert (tmp_path / "efficiency.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("argv", "error", "words"),
+    [
+        (["--target", "72.7,28.3"], ParameterError, "--target and --night belong together"),
+        (["--target", "x", "--night", NIGHT], ParameterError, "write RA,DEC in degree"),
+        (["--target", "1,2", "--night", "yesterday"], ParameterError, "START/END"),
+        (["--wavelength", "5"], ParameterError, r"--wavelength 5: allowed are 1.160 to 2.369 um"),
+        (["--altitude", "95"], AstropolcalError, "altitude = 95 deg"),
+        (["--instrument", "nothing"], InstrumentError, "unknown instrument 'nothing'"),
+        (["-o", "/nowhere/x.png"], AstropolcalError, "there is no folder"),
+        (["missing.asdf"], AstropolcalError, "missing.asdf"),
+    ],
+)
+def test_bad_input_is_one_error(argv, error, words):
+    with pytest.raises(error, match=words):
+        run(*argv)
