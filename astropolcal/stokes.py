@@ -13,7 +13,6 @@ Bad input (a NaN, an intensity that is not positive, a negative error) raises
 
 import astropy.units as u
 import numpy as np
-from scipy.special import exprel, ndtr, owens_t
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import angle_to_rad, to_unit
@@ -388,6 +387,8 @@ def _asymptotic(dolp, sigma):
 
 def _modified_asymptotic(dolp, sigma):
     """Return the estimate of Plaszczynski et al. with b = sigma."""
+    from scipy.special import exprel
+
     # exprel(-x) = (1 - exp(-x)) / x, which holds at any signal-to-noise ratio
     return dolp * (1 - exprel(-(_signal_to_noise(dolp, sigma) ** 2)) / 2)
 
@@ -453,6 +454,8 @@ def _wedge_probability(half_angle, snr):
     """
     distance = snr * np.sin(half_angle)
     slope = np.cos(half_angle) / np.sin(half_angle)
+    from scipy.special import ndtr, owens_t
+
     return 1 - 2 * owens_t(distance, slope) - ndtr(-distance)
 
 

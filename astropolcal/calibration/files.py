@@ -17,9 +17,10 @@ import asdf
 import asdf.util
 from asdf.exceptions import AsdfConversionWarning, AsdfWarning, ValidationError
 
-from astropolcal.converters.calibration import CALIBRATION_TAG
+from astropolcal.converters.calibration import CALIBRATION_TAG, CALIBRATION_TAGS
 from astropolcal.exceptions import CalibrationFileError
 from astropolcal.files import atomic_path
+from astropolcal.version import version as our_version
 
 __all__ = ["read_calibration", "write_calibration"]
 
@@ -28,7 +29,8 @@ _ALLOWED_TAGS = re.compile(
     r"tag:stsci\.edu:asdf/(core/(asdf|software|extension_metadata|history_entry|ndarray)"
     r"|unit/(quantity|unit))-[0-9.]+"
     r"|tag:astropy\.org:astropy/units/unit-[0-9.]+"
-    r"|tag:astropolcal\.org:astropolcal/(calibration|optics/[a-z_0-9]+)-1\.0\.0"
+    rf"|{'|'.join(map(re.escape, CALIBRATION_TAGS))}"
+    r"|tag:astropolcal\.org:astropolcal/optics/[a-z_0-9]+-1\.0\.0"
     r"|tag:yaml\.org,2002:[a-z]+"
 )
 # arrays of more numbers go into binary blocks, the others are readable
@@ -198,15 +200,26 @@ def _check_tree(content):
 
 
 def _check_version(tag):
-    if tag == CALIBRATION_TAG:
+    if tag in CALIBRATION_TAGS:
         return
-    ours, _, known = CALIBRATION_TAG.rpartition("-")
+    ours = CALIBRATION_TAG.rpartition("-")[0]
     kind, _, version = tag.rpartition("-")
     if kind != ours:
         raise CalibrationFileError(f"not an astropolcal calibration: {_KEY!r} has {tag}")
+    known = [tag.rpartition("-")[2] for tag in CALIBRATION_TAGS]
+    advice = f": update {our_version}, the file is newer" if _newer(version, known[-1]) else ""
     raise CalibrationFileError(
-        f"calibration of version {version}; this astropolcal reads version {known}"
+        f"calibration of version {version}; this astropolcal reads version "
+        f"{', '.join(known)}{advice}"
     )
+
+
+def _newer(version, known):
+    numbers = [re.fullmatch(r"(\d+)\.(\d+)\.(\d+)", text) for text in (version, known)]
+    if not all(numbers):
+        return False
+    first, second = (tuple(map(int, match.groups())) for match in numbers)
+    return first > second
 
 
 def _check_nodes(tree):

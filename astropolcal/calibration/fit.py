@@ -12,11 +12,11 @@ import platform
 import time
 import warnings
 from datetime import UTC, datetime
+from importlib.metadata import version as installed
 
 import astropy
 import astropy.units as u
 import numpy as np
-import scipy
 from astropy.modeling import Model
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
@@ -30,7 +30,7 @@ from astropolcal.calibration.noise import noise_from_errors, noise_from_null_cha
 from astropolcal.calibration.result import Calibration, DatasetRecord
 from astropolcal.calibration.robust import LOSSES, outlying_data, robust_sigma
 from astropolcal.calibration.starts import BinProblem, search_branches
-from astropolcal.calibration.steps import sequential, two_step
+from astropolcal.calibration.steps import copy_fitted, sequential, telescope_alone, two_step
 from astropolcal.calibration.weighting import (
     ROUNDS,
     Weighting,
@@ -50,6 +50,8 @@ STRATEGIES = ("joint", "two-step", "sequential")
 _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
 _ROBUST_ROUNDS = 50
+# branches are searched in so many groups of frames of a dataset, if it has several times as many
+_FEW, _LONG = 256, 4
 # a fitter without bounds may leave them by this share of a value
 _OUTSIDE = 1e-5
 
@@ -296,22 +298,36 @@ def _outside_bounds(measurement):
     return [measurement.free.names[i] for i in np.flatnonzero(outside)]
 
 
-def _joint(measurement, weighting, fitter, search):
+def _joint(measurement, weighting, fitter, search, prepare):
     """Fit everything; go on as long as some bin finds a better mirror branch."""
     origin = measurement.vector()
+    small, noise = _thinned(measurement, weighting)
     if search:
-        measurement.parameters = _first_search(measurement, weighting, origin)
+        small.parameters = _first_search(small, noise, origin)
+    prepare(small)
+    if small is not measurement:
+        _run(small, noise, fitter)
+        measurement.parameters = small.vector()
     for left in reversed(range(_MAX_ROUNDS)):
         outcome, weighting = _run(measurement, weighting, fitter)
         # the last word belongs to the fit of all parameters, not to a search by bin
         if not search or not left:
             break
-        problem = BinProblem(measurement, weighting.weight, _level(weighting))
-        better, moved = search_branches(problem, measurement.vector(), origin)
+        small, noise = _thinned(measurement, weighting)
+        problem = BinProblem(small, noise.weight, _level(noise))
+        better, moved = search_branches(problem, small.vector(), origin)
         if not moved.any():
             break
         measurement.parameters = better
     return outcome, weighting
+
+
+def _thinned(measurement, weighting):
+    """Return a few hundred frames of each dataset, and their noise; short tables as they are."""
+    if max(d.frames.shape[0] for d in measurement.datasets) <= _LONG * _FEW:
+        return measurement, weighting
+    small, kept = measurement.thinned(_FEW)
+    return small, Weighting(weighting.choice, weighting.sigma[kept])
 
 
 def _first_search(measurement, weighting, origin):
@@ -335,14 +351,20 @@ class _Strategy:
     def fit(self, strategy, measurement, weighting):
         """Fit in place; return how it went, the noise, and the values after each step."""
         if strategy == "joint":
-            return *self._joint(measurement, weighting), []
+            return *self._joint(measurement, weighting, self._stars), []
         if strategy == "two-step":
             return two_step(measurement, weighting, self._joint, self._run, self.options)
         outcome, stages = sequential(measurement, self._first, self._joint, self._run, self.options)
         return outcome, noise_of(measurement, self.weights), stages
 
-    def _joint(self, measurement, weighting):
-        return _joint(measurement, weighting, self.fitter, self.search)
+    def _joint(self, measurement, weighting, prepare=lambda _: None):
+        return _joint(measurement, weighting, self.fitter, self.search, prepare)
+
+    def _stars(self, measurement):
+        alone = telescope_alone(measurement, self.options)
+        if alone is not None:
+            self._run(alone, first_weighting(alone, None))
+            copy_fitted(alone, measurement)
 
     def _run(self, measurement, weighting):
         return _run(measurement, weighting, self.fitter)
@@ -392,6 +414,8 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
         measurement=measurement,
         provenance=_provenance(),
     )
+    observations = (dataset.observations for dataset in measurement.datasets)
+    calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
     calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
     calibration.fit["outliers"] = _outliers(calibration)
     return calibration.cross_validate() if cross_validate else calibration
@@ -455,6 +479,6 @@ def _provenance():
         "astropolcal": version,
         "astropy": astropy.__version__,
         "numpy": np.__version__,
-        "scipy": scipy.__version__,
+        "scipy": installed("scipy"),
         "python": platform.python_version(),
     }

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.table import QTable
-from scipy.special import fdtrc, gammaincc
 
 from astropolcal.calibration.covariance import prior_noise
 from astropolcal.calibration.noise import data_by_wavelength, noise_from_errors
@@ -168,6 +167,8 @@ def _test_by_wavelength(measurement, vector, noise, left, right):
             own = noise.dof[i] if replicates else 0.0
             chi2[i] = np.sum((residuals[row] / sigma[row]) ** 2) - own
             mean[i], dof[i] = _moments(left[row], right[row], own)
+    from scipy.special import fdtrc
+
     with np.errstate(invalid="ignore"):
         reduced = chi2 / np.where(mean > _LEAST_FREEDOM, mean, np.nan)
         known = np.isinf(noise.dof)
@@ -205,8 +206,12 @@ def _low_rank(measurement, vector, sigma, weights, fitted):
     slope = slope[~free.at_bounds(vector)].T
     scale = np.sqrt(np.sum((slope * weights[:, None]) ** 2, axis=0))
     slope = slope[:, scale > 0] / scale[scale > 0]
-    basis, values, _ = np.linalg.svd(slope * weights[:, None], full_matrices=False)
-    basis = basis[:, values > _RANK * values.max(initial=0.0)]
+    slope *= weights[:, None]
+    # the triangular factor has the same right vectors, and there are far more data than columns
+    triangle = np.linalg.qr(slope, mode="r") if len(slope) > slope.shape[1] else slope
+    _, values, right = np.linalg.svd(triangle, full_matrices=False)
+    some = values > _RANK * values.max(initial=0.0)
+    basis = slope @ (right[some] / values[some, None]).T
     # in units of the noise the hat matrix is a b^T
     known = np.append(np.where(np.isfinite(sigma), sigma, 1.0), np.ones(measurement.n_priors))
     by_noise = (weights * known)[:, None]
@@ -216,6 +221,8 @@ def _low_rank(measurement, vector, sigma, weights, fitted):
 
 def _chi2_above(chi2, dof):
     """Return the probability of a larger chi-square; `scipy.stats` takes long to import."""
+    from scipy.special import gammaincc
+
     return gammaincc(dof / 2, np.maximum(chi2, 0) / 2)
 
 

@@ -347,6 +347,34 @@ class Calibration:
         types = (str, float, float, str, bool, bool)
         return QTable(rows=rows or None, names=names, dtype=None if rows else types)
 
+    # ---- for pipelines ---------------------------------------------------------
+
+    @property
+    def validity(self):
+        """For what it holds, a `~astropolcal.calibration.Validity`."""
+        from astropolcal.calibration.validity import validity_of
+
+        return validity_of(self)
+
+    def system_mueller(self, header=None, **options):
+        """
+        Return the system Mueller matrix of frames, with its covariance.
+
+        Parameters
+        ----------
+        header : `~astropy.io.fits.Header`, mapping, or sequence of those
+            Primary header of a frame, or those of several.
+        **options
+            See `~astropolcal.calibration.LoadedCalibration.system_mueller`.
+
+        Returns
+        -------
+        SystemMueller
+        """
+        from astropolcal.calibration.loading import load
+
+        return load(self).system_mueller(header, **options)
+
     # ---- in words and files ----------------------------------------------------
 
     def summary(self):

@@ -16,7 +16,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.observations import is_star
 
-__all__ = ["kind_of_source", "sequential", "two_step"]
+__all__ = ["copy_fitted", "kind_of_source", "sequential", "telescope_alone", "two_step"]
 
 _ORDER = ("polarized", "unpolarized", "star")
 
@@ -172,6 +172,90 @@ def sequential(measurement, weights, joint, run, options):
         held |= {slot.name for slot in step.free.slots}
     measurement.parameters = measurement.free.start()
     return _worst(outcomes), stages
+
+
+def telescope_alone(measurement, options):
+    """
+    Return the fit of what stars alone see and all wavelengths share, such as a law of M3.
+
+    Such parameters can be nearly degenerate, so that a fit takes hundreds of steps. With all
+    others held these are cheap, and bring the fit of everything near its end.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Of all datasets.
+    options : dict
+        As for `two_step`.
+
+    Returns
+    -------
+    Measurement or None
+        None where there is nothing of the kind.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration.steps import telescope_alone
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
+    >>> lamp = Measurement(charis.chain(), simulate(charis.chain(), charis.wavelength, frames))
+    >>> telescope_alone(lamp, {"positions": None}) is None
+    True
+    """
+    chains, parts = measurement.put_back(), [d.observations for d in measurement.datasets]
+    seen = [kind_of_source(part.source) == "star" for part in parts]
+    rows = [i for i, star in enumerate(seen) if star]
+    if not rows or all(seen):
+        return None
+    lamps = {name for i, star in enumerate(seen) if not star for name in parameter_table(chains[i])}
+    own = {s.name for s in measurement.free.slots if not s.per_wavelength} - lamps
+    if not own:
+        return None
+    held = {slot.name for slot in measurement.free.slots} - own
+    positions = options["positions"]
+    options = options | {
+        "wavelength": measurement.wavelength * u.um,
+        "positions": None if positions is None else [positions[i] for i in rows],
+    }
+    stars = [chains[i] for i in rows]
+    return _step_of(stars, held, [parts[i] for i in rows], measurement.free.ties, options)
+
+
+def copy_fitted(origin, target):
+    """
+    Give a measurement the values that another one has found, name by name.
+
+    Parameters
+    ----------
+    origin, target : Measurement
+        The second is changed.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration.steps import copy_fitted
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
+    >>> data = simulate(charis.chain(), charis.wavelength, frames)
+    >>> first, second = (Measurement(charis.chain(), data) for _ in range(2))
+    >>> first.parameters = 1.01 * first.vector()
+    >>> copy_fitted(first, second)
+    >>> bool((first.vector() == second.vector()).all())
+    True
+    """
+    vector = target.vector()
+    for slot in origin.free.slots:
+        known = target.free.by_name.get(slot.name)
+        if known is not None and known.size == slot.size:
+            vector[known.slice] = origin.vector()[slot.slice]
+    target.parameters = vector
 
 
 def _worst(outcomes):

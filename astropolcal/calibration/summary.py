@@ -6,6 +6,7 @@ import textwrap
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration._sky_summary import mirror_lines, mirrors, star_lines
 from astropolcal.calibration.groups import what_is_left_out
 from astropolcal.calibration.target_accuracy import TARGETS, target_accuracies
 
@@ -53,11 +54,16 @@ def summary(calibration, targets=TARGETS):
     parts = [
         _heading(calibration),
         _global_lines(known),
-        *(_accuracy_lines(record) for record in calibration.datasets),
+        *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
         *(_standard_lines(entry) for entry in calibration.fit.get("standards", [])),
+        *(
+            [*star_lines(entry), *_wrap([f"  {entry['words']}"])]
+            for entry in calibration.fit.get("stars", [])
+        ),
         _target_lines(calibration, targets),
         _wavelength_lines(calibration, known),
+        mirror_lines(calibration),
         _goodness_lines(calibration),
         list(_wrap([str(calibration.identifiability)])),
         _gauge_lines(calibration),
@@ -106,14 +112,22 @@ def _global_lines(known):
     return ["Parameters for all wavelengths", *lines] if lines else []
 
 
-def _accuracy_lines(record):
+def _accuracy_lines(record, reasons):
     table = record.accuracy
     masked = f", {record.n_masked} cells masked" if record.n_masked else ""
+    why = "; ".join(f"{reason}: {count}" for reason, count in reasons.items())
+    counts = f"  ({record.n_frames} frames x {len(table)} wavelengths{masked}"
     return [
         f"Accuracy on {record.name}, in percent of polarization",
         *_rows({name: _percent(table, name) for name in _ACCURACIES}),
-        f"  ({record.n_frames} frames x {len(table)} wavelengths{masked})",
+        *_wrap([f"{counts}; {why})" if why else f"{counts})"]),
     ]
+
+
+def _masked(calibration):
+    """Return why cells of each dataset are masked; a file of before does not say."""
+    reasons, count = calibration.fit.get("masked") or [], len(calibration.datasets)
+    return reasons if len(reasons) == count else [{}] * count
 
 
 def _accuracy_words(calibration):
@@ -215,7 +229,8 @@ def _wavelength_lines(calibration, known):
     left_out = (
         f"; not shown: {', '.join(list(several)[_N_COLUMNS:])}" if len(several) > len(shown) else ""
     )
-    rows = [f"Parameters for each wavelength (* at a bound{left_out})", *_table_head(shown)]
+    title = f"Parameters for each wavelength (* at a bound{left_out})"
+    rows = [*_wrap([title]), *_table_head(shown)]
     s_mean = _by_wavelength(calibration.datasets[0].accuracy)
     for i, wavelength in enumerate(calibration.wavelength.to_value(u.nm)):
         mean = s_mean.get(round(wavelength, 2), np.nan)
@@ -329,8 +344,13 @@ def to_dict(calibration, targets=TARGETS):
         "rank": calibration.identifiability.rank,
         "lack_of_fit": _plain(fit.get("lack_of_fit") or []),
         "outliers": _plain(fit.get("outliers") or []),
-        "datasets": [_dataset(record) for record in calibration.datasets],
+        "datasets": [
+            _dataset(record) | {"masked": _plain(reasons)}
+            for record, reasons in zip(calibration.datasets, _masked(calibration), strict=True)
+        ],
         "left_out": what_is_left_out(calibration),
+        "stars": [_plain(entry) for entry in fit.get("stars", [])],
+        "mirrors": _plain(mirrors(calibration)),
         "standards": [_standard(entry) for entry in fit.get("standards", [])],
         "targets": [_target(table) for table in target_accuracies(calibration, targets)],
         "parameters": {

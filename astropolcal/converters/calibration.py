@@ -6,6 +6,9 @@ The node holds everything of a `~astropolcal.calibration.Calibration` but the
 measurement, so the observations themselves stay outside. Its checksum covers
 all numbers and words, so that a file either gives back what was written or is
 refused.
+
+A file of an older version of the schema is checked against that version and its
+checksum, and then carried to the newest one step by step, see ``MIGRATIONS``.
 """
 
 from asdf.extension import Converter
@@ -14,12 +17,18 @@ from astropolcal.exceptions import CalibrationFileError
 
 __all__ = [
     "CALIBRATION_TAG",
+    "CALIBRATION_TAGS",
+    "MIGRATIONS",
     "CalibrationConverter",
     "calibration_from_node",
     "node_from_calibration",
 ]
 
-CALIBRATION_TAG = "tag:astropolcal.org:astropolcal/calibration-1.0.0"
+#: Versions of the schema that can be read, oldest first; the newest is written.
+CALIBRATION_TAGS = tuple(
+    f"tag:astropolcal.org:astropolcal/calibration-{version}" for version in ("1.0.0", "1.1.0")
+)
+CALIBRATION_TAG = CALIBRATION_TAGS[-1]
 
 # what is written for those who look into the file, and worked out again on reading
 _DERIVED = ("checksum", "validity", "written_with")
@@ -38,13 +47,17 @@ class CalibrationConverter(Converter):
 
     @property
     def tags(self):
-        """Tags of a calibration."""
-        return [CALIBRATION_TAG]
+        """Tags of a calibration, of all versions."""
+        return list(CALIBRATION_TAGS)
 
     @property
     def types(self):
         """Full name of the class, which is imported only when it is needed."""
         return ["astropolcal.calibration.result.Calibration"]
+
+    def select_tag(self, obj, tags, ctx):
+        """Return the tag of the newest version, whatever was read before."""
+        return CALIBRATION_TAG
 
     def to_yaml_tree(self, obj, tag, ctx):
         """Return the node of a calibration, see `node_from_calibration`."""
@@ -52,7 +65,7 @@ class CalibrationConverter(Converter):
 
     def from_yaml_tree(self, node, tag, ctx):
         """Return the calibration of a node, see `calibration_from_node`."""
-        return calibration_from_node(node)
+        return calibration_from_node(node, tag)
 
 
 # ---- writing ---------------------------------------------------------------------
@@ -70,7 +83,7 @@ def node_from_calibration(calibration):
     Returns
     -------
     dict
-        As the schema ``calibration-1.0.0`` describes it.
+        As the schema ``calibration-1.1.0`` describes it.
 
     Raises
     ------
@@ -153,11 +166,12 @@ def _versions():
 
 def _validity(calibration):
     """Return what tells whether a frame may be reduced with the calibration."""
+    from astropolcal.calibration.validity import validity_of
     from astropolcal.chain import leaves
 
     dates = {str(record.meta["date"]) for record in calibration.datasets if "date" in record.meta}
     return {
-        "instrument": calibration.instrument,
+        **validity_of(calibration).to_dict(),
         "dates": sorted(dates),
         "optics_in_beam": [[leaf.name for leaf in leaves(chain)] for chain in calibration.chains],
     }
@@ -257,7 +271,7 @@ def _stage_node(stage):
 # ---- reading ---------------------------------------------------------------------
 
 
-def calibration_from_node(node):
+def calibration_from_node(node, tag=CALIBRATION_TAG):
     """
     Return the calibration that a node stores.
 
@@ -265,6 +279,8 @@ def calibration_from_node(node):
     ----------
     node : dict
         Its node, which obeys the schema, with its optics restored.
+    tag : str
+        Version of the schema that it obeys, one of ``CALIBRATION_TAGS``.
 
     Returns
     -------
@@ -291,6 +307,7 @@ def calibration_from_node(node):
     True
     """
     from astropolcal.calibration import Calibration
+    from astropolcal.calibration.validity import validity_of
     from astropolcal.converters.consistency import check_calibration
     from astropolcal.converters.nodes import plain, value_from_node
     from astropolcal.converters.posterior import check_posterior, posterior_from_node
@@ -300,6 +317,8 @@ def calibration_from_node(node):
         raise CalibrationFileError(
             "the content does not match its checksum: it was changed after it was written"
         )
+    for step in CALIBRATION_TAGS[CALIBRATION_TAGS.index(tag) : -1]:
+        node = MIGRATIONS[step](node)
     chains = [_chain(entry) for entry in node["chains"]]
     restore_priors(chains, node.get("priors", []))
     calibration = Calibration(
@@ -318,7 +337,18 @@ def calibration_from_node(node):
     )
     check_calibration(calibration)
     check_posterior(calibration.posterior, calibration.covariance)
+    validity_of(calibration)
     return calibration
+
+
+def _to_1_1(node):
+    """Version 1.0.0 knew no statement of validity: an entry of that name meant nothing."""
+    settings = {key: value for key, value in node["settings"].items() if key != "validity"}
+    return {**node, "settings": settings}
+
+
+#: Tag of an older version to the function that carries a node of it to the next one.
+MIGRATIONS = {CALIBRATION_TAGS[0]: _to_1_1}
 
 
 def _chain(node):

@@ -1,78 +1,155 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Numbers of a report: sizes of effects per wavelength, and accuracies of a model."""
 
+from functools import cached_property
 from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration import accuracy_table, target_accuracies
+from astropolcal.gap.model import _neutral
 from astropolcal.gap.shrinkage import _STEPS, frame_groups
 
 ACCURACIES = ("s_res", "s_mean", "s_cv")
 # what a singular value must be of the largest to count
 _OPEN = 1e-7
+_TOUCHES = 1e-3
+# parameters correlated more than this with what is uncertain are named
+_STRONG, _MOST_TRADES = 0.5, 3
 
 
 # ---- sizes ---------------------------------------------------------------------------------
 
 
-def sizes(model, name):
+class Fitted:
     """
-    Return the fitted parameters of an added effect, ready for JSON.
+    What a model says of the sizes of its effects.
 
-    Each is a dictionary of ``value`` and ``std`` (a number, or one a wavelength),
-    ``unit`` and ``limit``, the largest size that is physical. The errors are those
-    of the noise, or of the scatter of the residuals where it is larger.
+    Parameters
+    ----------
+    model : Model
+        A fitted model with effects.
     """
-    found = {}
-    if not model.added.get(name):
-        return found
-    covariance, is_open = _covariance(model)
-    for parameter in model.added[name]:
-        slot = model.problem.free.by_name[parameter.name]
-        where = model.problem.slices[parameter.name]
+
+    def __init__(self, model):
+        self.model, self.problem = model, model.problem
+
+    def sizes(self, name):
+        """
+        Return the fitted parameters of an added effect, ready for JSON.
+
+        Each is a dictionary of ``value`` and ``std`` (a number, or one a wavelength),
+        ``unit`` and ``limit``, the largest size that is physical. The errors are those
+        of the noise, or of the scatter of the residuals where it is larger.
+        """
+        return {p.name: self._size(p) for p in self.model.added.get(name) or ()}
+
+    def _size(self, parameter):
+        slot = self.problem.free.by_name[parameter.name]
+        where = self.problem.slices[parameter.name]
         block = parameter.basis if slot.per_wavelength else None
         block = np.eye(where.stop - where.start) if block is None else block
-        value = block @ model.fit.coefficients[where] / slot.factor
-        std = np.sqrt(np.einsum("ij,jk,ik->i", block, covariance[where, where], block))
-        std = np.where(is_open[where].any(), np.nan, std / slot.factor)
-        found[parameter.name] = {
+        value = block @ self.model.fit.coefficients[where] / slot.factor
+        std = np.sqrt(np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block))
+        std = np.where(self.is_open[where].any(), np.nan, std / slot.factor)
+        return {
             "value": _number(value),
             "std": _number(std),
             "unit": str(slot.unit or ""),
             "limit": float(u.Quantity(parameter.limit).to_value(slot.unit or u.one)),
         }
-    return found
 
+    def significance(self, name):
+        """Return the size of an effect as a whole in units of its error, or None."""
+        if not self.model.added.get(name):
+            return None
+        rows = self._rows(name)
+        rows = rows[~self.is_open[rows]]
+        # the centre of the prior is where the last fit began, not where the effect is absent
+        absent = np.concatenate([self._absent(p) for p in self.model.added[name]])
+        moved = self.model.fit.coefficients[self._rows(name)] - absent
+        moved = moved[~self.is_open[self._rows(name)]]
+        block = self.covariance[np.ix_(rows, rows)]
+        error = np.sqrt(np.diag(block))
+        # of unit diagonal, so that units do not matter
+        left, inverse = (
+            moved / error,
+            np.linalg.pinv(block / np.outer(error, error), hermitian=True),
+        )
+        return float(np.sqrt(max(left @ inverse @ left, 0.0)))
 
-def significance(model, name):
-    """Return the size of an effect as a whole in units of its error, or None."""
-    if not model.added.get(name):
-        return None
-    covariance, is_open = _covariance(model)
-    rows = [np.arange(model.problem.size)[model.problem.slices[p.name]] for p in model.added[name]]
-    rows = np.concatenate(rows)
-    rows = rows[~is_open[rows]]
-    moved = (model.fit.coefficients - model.problem.centre)[rows]
-    block = covariance[np.ix_(rows, rows)]
-    error = np.sqrt(np.diag(block))
-    # of unit diagonal, so that units do not matter
-    left, inverse = moved / error, np.linalg.pinv(block / np.outer(error, error), hermitian=True)
-    return float(np.sqrt(max(left @ inverse @ left, 0.0)))
+    def _absent(self, parameter):
+        """Return the coefficients at which an effect is absent."""
+        where = self.problem.slices[parameter.name]
+        neutral, size = _neutral(parameter), where.stop - where.start
+        if not self.problem.free.by_name[parameter.name].per_wavelength:
+            return np.broadcast_to(neutral, size)
+        basis = np.eye(size) if parameter.basis is None else parameter.basis
+        neutral = np.broadcast_to(neutral, len(basis))
+        return np.linalg.lstsq(basis, neutral, rcond=None)[0]
 
+    def trades(self, name):
+        """
+        Return the other parameters that move with the least certain direction of an effect.
 
-def _covariance(model):
-    """Return the covariance of the coefficients, and which of them the data leave open."""
-    problem = model.problem
-    table = np.concatenate([problem.jacobian(model.fit.coefficients), np.diag(problem.tight)])
-    scale = np.linalg.norm(table, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    _, singular, right = np.linalg.svd(table / scale, full_matrices=False)
-    good = singular > _OPEN * singular[0]
-    half = right[good] / singular[good, None] / scale
-    scatter = max(1.0, model.fit.chi2 / max(problem.n_data - problem.size, 1))
-    return scatter * (half.T @ half), np.sum(right[~good] ** 2, axis=0) > 1e-6
+        At most three names, the strongest first.
+        """
+        rows = self._rows(name)
+        error = np.sqrt(np.diag(self.covariance))
+        error = np.where(error > 0, error, 1.0)
+        correlation = self.covariance / np.outer(error, error)
+        weakest = np.linalg.eigh(self.covariance[np.ix_(rows, rows)])[1][:, -1] * error[rows]
+        strength = np.abs(correlation[:, rows] @ weakest)
+        strength /= np.sqrt(weakest @ correlation[np.ix_(rows, rows)] @ weakest) or 1.0
+        if self.is_open[rows].any():
+            # what the data leave open altogether is worse than what they know badly
+            touching = self.null[np.abs(self.null[:, rows]).max(axis=1) > _TOUCHES]
+            strength = np.linalg.norm(touching, axis=0)
+        own = {p.name for p in self.model.added[name]}
+        others = {
+            other: float(strength[where].max())
+            for other, where in self.problem.slices.items()
+            if other not in own
+        }
+        found = sorted((o for o in others if others[o] > _STRONG), key=lambda o: -others[o])
+        return found[:_MOST_TRADES]
+
+    def _rows(self, name):
+        slices = [self.problem.slices[p.name] for p in self.model.added.get(name) or ()]
+        return np.concatenate([np.arange(s.start, s.stop) for s in slices])
+
+    @cached_property
+    def _decomposed(self):
+        """Singular values and vectors of the slopes, of unit columns, and the length of these."""
+        problem = self.problem
+        slopes = problem.jacobian(self.model.fit.coefficients)
+        table = np.concatenate([slopes, np.diag(problem.tight)])
+        scale = np.linalg.norm(table, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        _, singular, right = np.linalg.svd(table / scale, full_matrices=False)
+        return singular, right, scale
+
+    @cached_property
+    def covariance(self):
+        """Covariance of the coefficients, without what the data leave open."""
+        singular, right, scale = self._decomposed
+        good = singular > _OPEN * singular[0]
+        half = right[good] / singular[good, None] / scale
+        problem = self.problem
+        scatter = self.model.fit.chi2 / max(problem.n_data - problem.size, 1)
+        return max(1.0, scatter) * (half.T @ half)
+
+    @property
+    def null(self):
+        """Directions of unit columns that the data leave open, shape (n, n_coefficients)."""
+        singular, right, _ = self._decomposed
+        return right[singular <= _OPEN * singular[0]]
+
+    @property
+    def is_open(self):
+        """Which coefficients the data leave open."""
+        return np.sum(self.null**2, axis=0) > _TOUCHES**2
 
 
 def _number(values):

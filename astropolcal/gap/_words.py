@@ -1,6 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The words of a report."""
 
+import re
+import textwrap
+
 import numpy as np
 
 # a size is determined if the data narrow it to this share of its physical limit
@@ -8,6 +11,12 @@ _DETERMINED = 0.1
 _TINY = 1e-99
 # below this the residuals are more than noise
 _REMAINDER = 1e-4
+_WIDTH = 80
+# the longest name of an effect in a table
+_LONGEST = 26
+# so many effects are named in a sentence, and in a title
+_NAMED, _IN_TITLE = 3, 2
+_ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 
 
 # ---- numbers ---------------------------------------------------------------------------------
@@ -18,6 +27,13 @@ def number(value, digits=3):
     if value is None or not np.isfinite(value):
         return "-"
     return f"{value:.{digits}g}"
+
+
+def percent(value, digits=3):
+    """Return a number with so many digits, zeros at its end included."""
+    if value is None or not np.isfinite(value):
+        return "-"
+    return f"{value:.0f}" if abs(value) >= 10**digits else f"{value:#.{digits}g}".removesuffix(".")
 
 
 def p(value):
@@ -32,12 +48,41 @@ def p_is(value):
 
 def share(value):
     """Return a share as percent."""
-    return f"{100 * value:.0f} %"
+    return "less than 1 %" if 0 < value < 0.005 else f"{100 * value:.0f} %"
+
+
+def short_share(value):
+    """Return a share as percent, for a column of a table."""
+    return share(value).replace("less than", "<")
 
 
 def change(old, new, digits=2):
     """Return a value before and after."""
-    return f"{number(old, digits)} -> {number(new, digits)}"
+    return f"{percent(old, digits)} -> {percent(new, digits)}"
+
+
+# ---- names -----------------------------------------------------------------------------------
+
+
+def listed(texts, word="and", most=None):
+    """Return texts as a list in words; beyond ``most`` their number."""
+    texts = list(texts)
+    if most is not None and len(texts) > most:
+        return f"{', '.join(texts[:most])} {word} {len(texts) - most} more"
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} {word} {texts[-1]}"
+
+
+def in_title(texts):
+    """Return the first texts, as many as a title holds, and the number of the others."""
+    return listed(texts, most=_IN_TITLE) if texts else ""
+
+
+def shortened(name, width):
+    """Return a name of at most so many characters, its middle left out."""
+    if len(name) <= width:
+        return name
+    tail = (width - 1) // 2
+    return f"{name[: width - 1 - tail]}{_ELLIPSIS}{name[len(name) - tail :]}"
 
 
 # ---- sizes -----------------------------------------------------------------------------------
@@ -55,14 +100,17 @@ def _size(value, std, unit, limit):
     good = [(v, s) for v, s in pairs if is_determined(s, limit)]
     if not good:
         return "not determined by these data" + (" at any wavelength" if several else "")
-    digits = _digits(min(s for _, s in good))
+    values, errors = np.array(good).T
+    digits = _digits(np.median(errors))
     if not several:
         return f"{value:.{digits}f} +- {std:.{digits}f}{ends}"
-    (low, high), errors = ([f(x) for f in (min, max)] for x in zip(*good, strict=True))
-    text = f"{low:.{digits}f} to {high:.{digits}f}{ends}"
-    text += f", errors {errors[0]:.{digits}f} to {errors[1]:.{digits}f}"
+    middle, low, high = (f"{f(values):.{digits}f}" for f in (np.median, np.min, np.max))
+    least, most = (percent(f(errors), 2) for f in (np.min, np.max))
+    text = f"median {middle}, from {low} to {high}{ends}; errors {least} to {most}{ends}"
+    if low == high and least == most:
+        text = f"{middle} +- {errors[0]:.{digits}f}{ends} at every wavelength"
     if len(good) < len(value):
-        text += f", determined at {len(good)} of {len(value)} wavelengths"
+        text += f"; determined at {len(good)} of {len(value)} wavelengths"
     return text
 
 
@@ -76,38 +124,83 @@ def _digits(std):
     return max(0, 1 - int(np.floor(np.log10(std)))) if std > 0 else 3
 
 
+def has_sizes(entry):
+    """Return whether the data determine each parameter of a cause somewhere, a list."""
+    return [
+        any(is_determined(std, one["limit"]) for std in np.ravel(np.array(one["std"], object)))
+        for one in entry["parameters"].values()
+    ]
+
+
 # ---- a cause ---------------------------------------------------------------------------------
 
 
-def cause(entry):
+def cause(entry, ranks):
     """Return what is to be said of one cause, in a few sentences."""
     title = entry["title"][0].upper() + entry["title"][1:]
     parts = [f"{title} ({entry['place']})."]
     parts.append(f"It explains {share(entry['explained'])} of what exceeds the noise.")
-    if entry["kind"] != "discrete":
-        parts.append(f"In the scan, corrected for the number of effects: {p_is(entry['p_value'])}.")
     if None not in (entry["gap_cv_before_percent"], entry["gap_cv_after_percent"]):
         parts.append(
-            f"Left-out frames: {number(entry['gap_cv_before_percent'])} % without it, "
-            f"{number(entry['gap_cv_after_percent'])} % with it."
+            f"Left-out frames: {percent(entry['gap_cv_before_percent'])} % without it, "
+            f"{percent(entry['gap_cv_after_percent'])} % with it."
         )
-    if entry["aliases"]:
-        parts.append(f"These data cannot tell it from: {'; '.join(entry['alias_titles'])}.")
-    return " ".join([*parts, *_of_size(entry)])
+    if entry["kind"] != "discrete":
+        parts.append(f"Scan, corrected for the number of effects: {p_is(entry['p_value'])}.")
+    return " ".join([*parts, *details(entry, ranks)])
+
+
+def details(entry, ranks):
+    """
+    Return what a table does not say of a cause, a list of sentences.
+
+    ``ranks`` gives the rank of every cause by its name: an alias may be a cause too.
+    """
+    return [*_of_aliases(entry, ranks), *_of_size(entry)]
+
+
+def open_aliases(entry, ranks):
+    """Return the titles of the aliases of a cause that are no causes themselves."""
+    pairs = zip(entry["aliases"], entry["alias_titles"], strict=True)
+    return [title for name, title in pairs if name not in ranks]
+
+
+def _of_aliases(entry, ranks):
+    found, others = [], open_aliases(entry, ranks)
+    if others:
+        found.append(f"These data cannot tell it from: {'; '.join(others)}.")
+    both = [f"cause {ranks[name]}" for name in entry["aliases"] if name in ranks]
+    if both:
+        found.append(
+            f"It resembles {listed(both)}: the data ask for both, "
+            "but how much belongs to which is uncertain."
+        )
+    return found
 
 
 def _of_size(entry):
     if entry["kind"] == "discrete":
         return ["It is an alternative to the model and has no size."]
-    found = []
-    if entry["significance"] is not None:
-        found.append(f"Its size as a whole is {entry['significance']:.0f} times its error.")
-    if entry["physical"]:
-        return [*found, "The size is physically possible."]
-    return [
-        *found,
-        "The size is physically impossible: it stands for something that the library lacks.",
-    ]
+    found, strength = [], entry["significance"]
+    if strength is not None:
+        found.append(f"Its size as a whole is {strength:.0f} standard errors from zero.")
+    found.append(
+        "The size is physically possible."
+        if entry["physical"]
+        else "The size is physically impossible: it stands for something that the library lacks."
+    )
+    known = has_sizes(entry)
+    if not all(known):
+        others = entry.get("trades_with")
+        found.append(
+            f"The data need the effect but do not tell {'all of ' if any(known) else ''}its size: "
+            f"a part of it {_exchanged(others) if others else 'hardly changes them'}."
+        )
+    return found
+
+
+def _exchanged(others):
+    return f"can be exchanged for changes of {listed(others)}"
 
 
 # ---- three sentences -------------------------------------------------------------------------
@@ -125,7 +218,7 @@ def _of_frames(content):
 def _how_large(content):
     frames = "the frames" if content["exchanged"] else _of_frames(content)
     chance = p_is(content["gap_p_value"])
-    before, noise = (number(content[f"{key}_percent"]) for key in ("gap_before", "noise_floor"))
+    before, noise = (percent(content[f"{key}_percent"]) for key in ("gap_before", "noise_floor"))
     if content["verdict"] == "none":
         return (
             f"The model agrees with the measurements: it predicts {frames} to {before} % of "
@@ -151,22 +244,37 @@ def _what(content):
             "the cause is not in the library."
         )
     explained = share(sum(entry["explained"] for entry in causes))
+    largest = sorted(causes, key=lambda entry: -entry["explained"])
+    named = listed([entry["title"] for entry in largest], most=_NAMED)
     if content["verdict"] == "unexplained":
         return (
-            f"The effects that help ({_listed([_named(c) for c in causes])}) explain only "
+            f"The effects that help ({named}) explain only "
             f"{explained} of what exceeds the noise: the cause is not in the library."
         )
+    ends = f"{explained} of what exceeds the noise"
     if len(causes) > 1:
-        texts = [f"({i}) {_named(entry)}" for i, entry in enumerate(causes, 1)]
-        return (
-            f"The model misses {len(causes)} effects, {_listed(texts)}, which explain "
-            f"{explained} of what exceeds the noise."
+        return f"The model lacks {len(causes)} effects, which explain {ends}: {named}" + (
+            f"{_doubt(causes)}."
         )
-    ends = f", which explains {explained} of what exceeds the noise"
     if causes[0]["aliases"]:
-        several = _listed([causes[0]["title"], *causes[0]["alias_titles"]], "or")
-        return f"The model misses one of these, which the data cannot tell apart: {several}{ends}."
-    return f"The model misses one effect: {causes[0]['title']}{ends}."
+        group = [causes[0]["title"], *causes[0]["alias_titles"]]
+        several = listed(group, "or", _NAMED)
+        return (
+            "The model lacks one of these, which the data cannot tell apart: "
+            f"{several}, which explains {ends}."
+        )
+    return f"The model lacks one effect: {causes[0]['title']}, which explains {ends}."
+
+
+def _doubt(causes):
+    """Return how many of several causes may as well be other effects."""
+    names = {entry["effect"] for entry in causes}
+    several = sum(bool(open_aliases(entry, names)) for entry in causes)
+    if not several:
+        return ""
+    one = "one of them may as well be another effect"
+    many = f"{several} of them may as well be other effects"
+    return f" ({one if several == 1 else many}, as listed)"
 
 
 def _clearest(content):
@@ -174,17 +282,6 @@ def _clearest(content):
         return ""
     first = content["where"][0]
     return f"; the clearest part of it is {first['detail']} ({share(first['share'])} of the gap)"
-
-
-def _named(entry):
-    if not entry["aliases"]:
-        return entry["title"]
-    several = _listed(entry["alias_titles"], "or")
-    return f"{entry['title']} (the data cannot tell it from {several})"
-
-
-def _listed(texts, word="and"):
-    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} {word} {texts[-1]}"
 
 
 def _nothing(content):
@@ -214,9 +311,113 @@ def _what_is_left(content):
         details.append(f"68 % interval {shrunk['low']:.0f} to {shrunk['high']:.0f} %")
     rest = "is noise" if left > _REMAINDER else "is more than noise and unexplained"
     strange = [entry["title"] for entry in causes if not entry["physical"]]
-    doubt = f"; physically impossible is the size of {_listed(strange)}" if strange else ""
+    doubt = f"; physically impossible is the size of {listed(strange)}" if strange else ""
     return (
         f"With {'it' if len(causes) == 1 else 'them'} the model predicts {_of_frames(content)} to "
-        f"{number(content['gap_after_percent'])} %{' (' if details else ''}{', '.join(details)}"
+        f"{percent(content['gap_after_percent'])} %{' (' if details else ''}{', '.join(details)}"
         f"{')' if details else ''}, and what remains {rest} ({p_is(left)}){doubt}."
     )
+
+
+# ---- for the terminal ------------------------------------------------------------------------
+
+
+def text(content, accuracies):
+    """Return a report as text of at most 80 columns."""
+    parts = [
+        content["sentences"],
+        _table_lines(content),
+        *(_cause_lines(cause, called(content)) for cause in content["causes"]),
+        _numbered("What to observe next", [e["words"] for e in content["next_observations"]]),
+        _where_lines(content["where"]),
+        _accuracy_lines(content, accuracies),
+        [f"Nominal model: {content['nominal']}"],
+    ]
+    return "\n\n".join("\n".join(_wrapped(part)) for part in parts if part)
+
+
+def _wrapped(lines):
+    for line in lines:
+        indent = len(re.match(r"\s*(?:- |\d+\. |\d+ %  )?", line).group())
+        ends = " " * indent
+        yield from textwrap.wrap(
+            line, _WIDTH, subsequent_indent=ends, break_on_hyphens=False, drop_whitespace=True
+        ) or [""]
+
+
+def called(content):
+    """Return what the causes are called: they are none where they leave the gap unexplained."""
+    return "Effect" if content["verdict"] == "unexplained" else "Cause"
+
+
+def _table_lines(content):
+    """Return a line a cause: rank, name, place, share, errors on left-out frames."""
+    causes = content["causes"]
+    if not causes:
+        return []
+    rows = [("effect", "place", "explains", "left-out (%)")]
+    for entry in causes:
+        errors = (entry["gap_cv_before_percent"], entry["gap_cv_after_percent"])
+        told = "-" if errors == (None, None) else " -> ".join(map(percent, errors))
+        rows.append((entry["effect"], entry["place"], short_share(entry["explained"]), told))
+    a, _, c, d = (max(map(len, column)) for column in zip(*rows, strict=True))
+    a = min(a, _LONGEST)
+    b = _WIDTH - a - c - d - 6
+    lines = [
+        f"{i or '':>2} {shortened(one, a):<{a}} {shortened(two, b):<{b}} {three:>{c}} {four:>{d}}"
+        for i, (one, two, three, four) in enumerate(rows)
+    ]
+    title = "Causes" if called(content) == "Cause" else "Effects that help"
+    return [f"{title}; prediction errors on left-out frames without -> with each", *lines]
+
+
+def _cause_lines(entry, called):
+    lines = [f"  {sentence}" for sentence in entry["details"]]
+    if entry["kind"] != "discrete":
+        lines = [f"  Scan, corrected for the number of effects: {p_is(entry['p_value'])}.", *lines]
+    return [
+        f"{called} {entry['rank']}: {entry['title']} ({entry['effect']})",
+        *lines,
+        *(f"  - {line}" for line in sizes(entry["parameters"])),
+    ]
+
+
+def _numbered(title, texts):
+    lines = [f"{i:>3}. {words}" for i, words in enumerate(texts, 1)]
+    return [title, *lines] if lines else []
+
+
+def _where_lines(where):
+    lines = [
+        f"{share(e['share']):>6}  {e['detail']}"
+        + ("" if e["p_value"] < _TINY else f" ({p_is(e['p_value'])})")
+        for e in where
+    ]
+    title = "Where the gap of the nominal model lies, share of the excess over the noise"
+    title += f" (p < {_TINY:g} where no p is given)"
+    return [title, *lines] if lines else []
+
+
+def _accuracy_lines(content, keys):
+    """Return the accuracies of each dataset and for targets, before and after."""
+    heads = "".join(f"{key:^19}" for key in keys).rstrip()
+    rows = ["Accuracy of single differences before -> after, percent, median over wavelengths"]
+    rows.append(f"  {'':<20}{heads}")
+    for old, new in _pairs(content, "datasets"):
+        cells = (_arrow(old[f"{key}_percent"], new[f"{key}_percent"]) for key in keys)
+        rows.append(f"  {shortened(old['name'], 19):<20}{''.join(cells)}".rstrip())
+    for old, new in _pairs(content, "targets"):
+        rows.append(
+            f"  target of {old['dolp_percent']:g} % by {old['column']}: s_p "
+            f"{change(old['s_p_percent'], new['s_p_percent'])} %, s_chi "
+            f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
+        )
+    return rows
+
+
+def _pairs(content, key):
+    return zip(content["accuracy_before"][key], content["accuracy_after"][key], strict=True)
+
+
+def _arrow(old, new):
+    return f"{percent(old):>7} -> {percent(new):<8}"

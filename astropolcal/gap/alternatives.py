@@ -21,6 +21,8 @@ __all__ = ["starting_model", "thinned"]
 
 # alternatives are tried where double differences are off by more than this
 _WRONG_SIGN = 0.02
+# or by more than this share of the signal and so many times the noise, as those of stars are
+_WRONG_SHARE, _ABOVE_NOISE = 0.3, 3.0
 # an alternative must lower the residuals to this share, and those within a tenth are aliases
 _FAR_BETTER, _ALIKE = 0.5, 1.1
 _FEW = 5
@@ -77,7 +79,7 @@ def starting_model(calibration, observations, library, say):
         given = nominal_calibration(chains, observations)
     elif given.measurement is None:
         given = given.with_observations(observations)
-    if _misfit(given) > _WRONG_SIGN:
+    if _may_be_wrong(given):
         discrete = [e for e in library if e.kind == "discrete" and e.applies(chains)]
         found = _tried(chains, observations, discrete, say)
         if found and found[0][0] < _FAR_BETTER * _misfit(given):
@@ -104,6 +106,18 @@ def _tried(chains, observations, effects, say):
 def _misfit(calibration):
     """Return the root mean square residual of the double differences, in polarization."""
     return float(np.sqrt(np.mean(np.square(calibration.measurement.residuals()))))
+
+
+def _may_be_wrong(calibration):
+    """Return whether the double differences are so far off that a sign may be wrong."""
+    misfit, datasets = _misfit(calibration), calibration.measurement.datasets
+    signal, noise = (
+        float(np.sqrt(np.mean(np.concatenate([np.square(part(d)) for d in datasets]))))
+        for part in (lambda d: d.observed, lambda d: d.sigma)
+    )
+    # what has no stated errors has no noise to compare with
+    clear = not misfit < _ABOVE_NOISE * noise
+    return misfit > _WRONG_SIGN or (misfit > _WRONG_SHARE * signal and clear)
 
 
 def _with_alternative(chains, observations, given, best, found):

@@ -129,7 +129,7 @@ class Channels:
         out = np.empty(array.shape)
         out[..., 0, :, :] = array[..., 0, :, :] * weight[0]
         sums = self._sum_whitened(array[..., 1, :, :])
-        flat = sums.reshape(*sums.shape[:-2], -1)
+        flat = sums.reshape(*sums.shape[:-2], sums.shape[-2] * sums.shape[-1])
         flat = flat - (flat @ self._nuisance) @ self._nuisance.T
         out[..., 1, :, :] = flat.reshape(sums.shape)
         return out

@@ -14,7 +14,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap.effects import Context
 from astropolcal.gap.problem import Fit, GapProblem
-from astropolcal.measurement import parameter_table
+from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.units import canonical_factor
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
@@ -125,6 +125,7 @@ class Model:
             ties=self.problem.ties | edit.ties,
             laws=self.problem.laws | _laws(edit.parameters),
             priors=self.problem.priors | _priors(edit),
+            neutral=self.problem.neutral | {p.name: _neutral(p) for p in edit.parameters},
             like=self.problem,
         )
         return problem, edit.parameters
@@ -150,7 +151,7 @@ class Model:
         fit = problem.fit(problem.start, **settings)
         return Model(problem, fit, self.added | {effect.name: parameters})
 
-    def with_effects(self, effects):
+    def with_effects(self, effects, like=None):
         """
         Return the model with several effects added, and fitted once.
 
@@ -158,6 +159,9 @@ class Model:
         ----------
         effects : sequence of tuple
             Effect and context each, the latter None for that of the data.
+        like : Model, optional
+            A model from whose solution the fit starts, where the two share
+            parameters.
 
         Returns
         -------
@@ -168,7 +172,19 @@ class Model:
             problem, parameters = model.edited(effect, context)
             added = model.added | {effect.name: parameters}
             model = Model(problem, Fit(problem.start, np.inf, False), added)
+        if like is not None:
+            model = Model(model.problem, like.start_of(model.problem), model.added)
         return self if model is self else model.polished()
+
+    def start_of(self, problem):
+        """Return a start for another problem: this solution where the two share parameters."""
+        mine, theirs = self.problem, problem.vector(problem.start)
+        vector = mine.vector(self.fit.coefficients)
+        for slot in problem.free.slots:
+            known = mine.free.by_name.get(slot.name)
+            if known is not None and known.size == slot.size:
+                theirs[slot.slice] = vector[known.slice]
+        return Fit(problem._coefficients(theirs), np.inf, False)
 
     def polished(self):
         """Return the model with its fit carried on to the end."""
@@ -316,6 +332,20 @@ def _no_convergence():
     )
 
 
+class _AsGiven:
+    """What stands for a calibration where every parameter is held: the chains as they are."""
+
+    converged = True
+
+    def __init__(self, measurement):
+        self.measurement = measurement
+
+    @property
+    def chains(self):
+        """The chains."""
+        return self.measurement.chains
+
+
 def nominal_calibration(chains, observations):
     """
     Calibrate chains without cross-validation, for a diagnosis.
@@ -344,6 +374,9 @@ def nominal_calibration(chains, observations):
     >>> nominal_calibration([chain], [simulate(chain, charis.wavelength, frames, seed=1)]).converged
     True
     """
+    measurement = Measurement(chains, observations)
+    if not measurement.free.size:
+        return _AsGiven(measurement)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropolcalWarning)
         return calibrate(list(chains), list(observations), cross_validate=False)

@@ -9,6 +9,9 @@ __all__ = ["SAME_ANGLE", "badly_separated", "frame_blocks", "frame_patterns"]
 _PLATE = (0, 4, 2, 8, 1, 3, 5, 6, 7, 12)
 _DEROTATOR = (2, 4, 1)
 _POOR = 10.0
+_ORDER = "the order of frames within a block at one derotator angle"
+_SAME_ORDER = "the plate angles come in the same order in every block"
+_NOTE = "these angles hardly tell it from a constant and harmonic 4"
 #: Angles closer than this (radian) are the same.
 SAME_ANGLE = np.deg2rad(0.5)
 
@@ -53,7 +56,7 @@ def frame_patterns(observations):
         found["time x hwp", words] = plate4 * time
     order = _order(observations)
     if order is not None:
-        found["time", "the order of frames within a block at one derotator angle"] = order
+        found["time", _ORDER] = order
     return {
         key: columns
         for key, columns in found.items()
@@ -88,7 +91,7 @@ def _within(columns, spans, n):
 
 def badly_separated(observations):
     """
-    Return the harmonics of the plate angle that the angles taken separate badly.
+    Return the patterns that the plate angles taken separate badly from simpler ones.
 
     Parameters
     ----------
@@ -98,8 +101,9 @@ def badly_separated(observations):
     Returns
     -------
     dict of str to str
-        Words of `frame_patterns` to a note with the condition number of the
-        harmonic together with 0 and 4.
+        Words of `frame_patterns` to a note, for harmonics whose condition number
+        together with a constant and harmonic 4 is large, and for the order of
+        frames where the angles always come in the same one.
 
     Examples
     --------
@@ -110,16 +114,26 @@ def badly_separated(observations):
     >>> charis = instruments.get("charis")
     >>> data = simulate(charis.chain(), charis.wavelength, half_wave_plate_cycles(), seed=1)
     >>> badly_separated([data])["harmonic 2 of the half-wave-plate angle"]
-    'separated badly from 0 and 4 by these angles: condition 27'
+    'these angles hardly tell it from a constant and harmonic 4'
     """
     angles = [o.position("hwp") for o in observations if "hwp" in o.frames.colnames]
     found = {}
     for k in _PLATE[2:] if angles else ():
         poor = min(_condition(angle, (0, 4, k)) for angle in angles)
         if poor > _POOR:
-            note = f"separated badly from 0 and 4 by these angles: condition {poor:.2g}"
-            found[f"harmonic {k} of the half-wave-plate angle"] = note
+            found[f"harmonic {k} of the half-wave-plate angle"] = _NOTE
+    if angles and all(map(_same_order, observations)):
+        found[_ORDER] = _SAME_ORDER
     return found
+
+
+def _same_order(observations):
+    """Whether the place of a frame in its block tells the plate angle."""
+    if "hwp" not in observations.frames.colnames:
+        return True
+    angle, place = observations.position("hwp"), _places(observations)
+    first = np.array([angle[place == p][0] for p in range(place.max() + 1)])
+    return bool(np.all(np.abs(np.sin(angle - first[place])) < SAME_ANGLE))
 
 
 def _condition(angle, orders):
@@ -152,8 +166,14 @@ def _order(observations):
     size = np.bincount(blocks)[blocks]
     if size.max() < 3:
         return None
-    place = np.arange(blocks.size) - np.searchsorted(blocks, blocks)
+    place = _places(observations)
     return _legendre(2 * place / np.maximum(size - 1, 1) - 1) * (size > 1)
+
+
+def _places(observations):
+    """Return the place of each frame in its block, from 0."""
+    blocks = frame_blocks(observations)
+    return np.arange(blocks.size) - np.searchsorted(blocks, blocks)
 
 
 def frame_blocks(observations):

@@ -21,13 +21,13 @@ from scipy.linalg import qr
 
 from astropolcal.chain import leaves, remove_optic, stages
 from astropolcal.exceptions import GapError
-from astropolcal.gap.effects import Roles, get_effect
+from astropolcal.gap.effects import EFFECTS, Roles, get_effect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem, orthonormal
 from astropolcal.optics import COORDINATES
 from astropolcal.simulation import simulate
 
-__all__ = ["Exposure", "exposures", "plan"]
+__all__ = ["Exposure", "exposures", "few", "plan"]
 
 _TURN = tuple(float(a) for a in np.mod(np.arange(8) * 56.25, 360))
 _DEROTATOR = tuple(float(a) for a in np.arange(0, 180, 20))
@@ -39,7 +39,10 @@ _OPEN = 1e-6
 _WANTED = 0.01
 # what cannot be seen to one standard deviation is not worth an exposure
 _LEAST_GAIN = 1.0
-_ALIKE = 2
+# exposures of different kinds for the same purpose, and the gain that each deviation from the
+# set-up of the data must bring
+_SAME_PURPOSE, _WORTH_A_CHANGE = 2, 1.1
+_FULL_TURN = 270.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class Exposure:
     --------
     >>> from astropolcal.gap.planning import Exposure
     >>> Exposure(0, (0.0, 22.5, 45.0, 67.5), (("derotator", 100.0),), polarizer_turned=45.0).words
-    '4 half-wave-plate angles (0 to 67.5 deg) at derotator 100 deg with the polarizer turned \
+    '4 half-wave-plate angles from 0 to 67.5 deg, derotator at 100 deg, the polarizer turned \
 by 45 deg'
     """
 
@@ -83,18 +86,35 @@ by 45 deg'
         return self.dataset, self.polarizer_turned, self.lamp, self.without
 
     @property
+    def kind(self):
+        """What it changes: exposures of one kind differ by their angles alone."""
+        return self.polarizer_turned != 0, self.lamp != 1, self.without
+
+    @property
+    def effort(self):
+        """Number of things to change in the set-up of the data, apart from the derotator."""
+        return sum(map(bool, self.kind)) + self._turns
+
+    @property
+    def _turns(self):
+        return max(self.hwp) - min(self.hwp) > _FULL_TURN
+
+    @property
     def words(self):
         """The exposure in words."""
-        span = f"{min(self.hwp):g} to {max(self.hwp):g} deg"
-        text = f"{len(self.hwp)} half-wave-plate angles ({span})"
-        text += "".join(f" at {name} {angle:g} deg" for name, angle in self.positions)
+        span = f"from {min(self.hwp):.4g} to {max(self.hwp):.4g} deg"
+        if self._turns:
+            steps = ", ".join(f"{angle:g}" for angle in self.hwp[:3])
+            span = f"over a full turn ({steps}, ... deg)"
+        parts = [f"{len(self.hwp)} half-wave-plate angles {span}"]
+        parts += [f"{name} at {angle:g} deg" for name, angle in self.positions]
         if self.polarizer_turned:
-            text += f" with the polarizer turned by {self.polarizer_turned:g} deg"
-        if self.without:
-            text += f" without {', '.join(self.without)}"
+            parts.append(f"the polarizer turned by {self.polarizer_turned:g} deg")
+        parts += [f"{name} taken out" for name in self.without]
         if self.lamp != 1:
-            text += f" with the lamp {self.lamp:g} times as bright"
-        return text
+            level = "half" if self.lamp == 0.5 else f"{self.lamp:g} times"
+            parts.append(f"the lamp {level} as bright")
+        return ", ".join(parts)
 
 
 def exposures(model, *, flux_matters=False):
@@ -155,7 +175,7 @@ def _settings(chain):
     return [((moved, angle), *rest) for angle in angles]
 
 
-def plan(model, effects=(), *, members=None, candidates=None, limit=5):
+def plan(model, effects=(), *, members=None, candidates=None, limit=4):
     """
     Rank exposures by how well they tell effects apart or fix what is open.
 
@@ -178,8 +198,8 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=5):
         ``words``; ``separates``, the two effects, or the parameters of the open
         direction that is seen best; ``gain``, the standard deviations at which
         they come apart, or at which a change of that direction by 0.01 (rad)
-        shows. Best first;
-        empty if nothing is to be told apart or no exposure does.
+        shows. Best first, at most two a pair of effects, which differ in more than
+        angles; empty if nothing is to be told apart or no exposure does.
 
     Raises
     ------
@@ -219,10 +239,14 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=5):
         for j, exposure in enumerate(group):
             for a, b in pairs:
                 gain = min(_separation(old, new, a, b, j), _separation(old, new, b, a, j))
-                _note(lists[a, b], exposure, (a, b), gain, f"separates {a} from {b}")
+                purpose = f"tells {_titled(a)} from {_titled(b)}"
+                _note(lists[a, b], exposure, (a, b), gain, purpose)
             if n_open:
                 names, gain, count = old[None].fixes(new[None].columns(j))
-                purpose = f"fixes {count} of {n_open} open directions, {' with '.join(names)}"
+                purpose = (
+                    f"fixes {count} of {n_open} open directions of the parameters, the clearest "
+                    f"that of {' with '.join(names)},"
+                )
                 _note(fixing, exposure, names, gain, purpose)
     return _best([*lists.values(), fixing], limit)
 
@@ -256,26 +280,85 @@ def _groups(candidates):
     return list(setups.values())
 
 
+def _titled(name):
+    return f"{EFFECTS[name].title} ({name})" if name in EFFECTS else name
+
+
 def _note(rows, exposure, names, gain, purpose):
     if gain >= _LEAST_GAIN:
-        words = f"Take {exposure.words}: {purpose} at {gain:.2g} sigma"
+        words = f"Take {exposure.words}: {purpose} at {_sigmas(gain)} standard deviations"
         entry = {"words": words, "separates": list(names), "gain": float(gain)}
-        rows.append((gain, exposure, entry))
+        rows.append((gain / _WORTH_A_CHANGE**exposure.effort, exposure, entry))
+
+
+def _sigmas(gain):
+    return f"{gain:.2g}" if gain < 100 else f"{gain:.0f}"
 
 
 def _best(lists, limit):
-    """Return the best of each list in turn, few of a kind, sorted by gain."""
-    queues = []
+    """Return the best of each kind of each list in turn, sorted by gain."""
+    found = []
     for rows in lists:
-        rows, kinds, queue = sorted(rows, key=lambda row: -row[0]), {}, []
-        for _, exposure, entry in rows:
-            kind = exposure.setup
-            kinds[kind] = kinds.get(kind, 0) + 1
-            if kinds[kind] <= _ALIKE:
-                queue.append(entry)
-        queues.append(queue)
-    chosen = [queue[i] for i in range(limit) for queue in queues if i < len(queue)]
+        kinds = {}
+        for _, exposure, entry in sorted(rows, key=lambda row: -row[0]):
+            kinds.setdefault(exposure.kind, entry)
+        found.append(list(kinds.values())[:_SAME_PURPOSE])
+    return _in_turn(found, limit)
+
+
+def _in_turn(lists, limit):
+    chosen = [one[i] for i in range(limit) for one in lists if i < len(one)]
     return sorted(chosen[:limit], key=lambda entry: -entry["gain"])
+
+
+def few(entries, limit=4):
+    """
+    Return the best of several plans: few, and of different purposes.
+
+    Parameters
+    ----------
+    entries : sequence of dict
+        As `plan` gives them, of several calls.
+    limit : int
+        Most exposures to return.
+
+    Returns
+    -------
+    list of dict
+        At most two for the same purpose, and the best of every purpose before
+        the second of any; an exposure that serves several is named once. Largest
+        gain first.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.planning import few
+    >>> words = [f"Take {x}: tells a from b" for x in ("this", "that", "other")]
+    >>> both = {"separates": ["a", "b"], "gain": 5.0}
+    >>> plans = [both | {"words": w, "gain": 5.0 - i} for i, w in enumerate(words)]
+    >>> [entry["gain"] for entry in few(plans)]
+    [5.0, 4.0]
+    """
+    purposes = {}
+    for entry in sorted(entries, key=lambda entry: -entry["gain"]):
+        found = purposes.setdefault(frozenset(entry["separates"]), {})
+        found.setdefault(_exposure(entry), entry)
+    best = [list(found.values())[:_SAME_PURPOSE] for found in purposes.values()]
+    exposed = {}
+    for entry in _in_turn(best, limit):
+        exposed.setdefault(_exposure(entry), []).append(entry)
+    return [_merged(exposure, found) for exposure, found in exposed.items()]
+
+
+def _exposure(entry):
+    return entry["words"].partition(": ")[0]
+
+
+def _merged(exposure, entries):
+    """Return one entry of an exposure that serves several purposes; the best gain counts."""
+    purposes = [entry["words"].partition(": ")[2] for entry in entries]
+    names = dict.fromkeys(name for entry in entries for name in entry["separates"])
+    words = f"{exposure}: {'; '.join(purposes)}"
+    return entries[0] | {"words": words, "separates": list(names)}
 
 
 # ---- what the data know already -------------------------------------------------------------

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import lsq_linear
 
-from astropolcal.chain import stages
 from astropolcal.exceptions import FitError
 from astropolcal.gap.channels import Channels
 from astropolcal.measurement import Measurement
+from astropolcal.measurement.datasets import _positions as _read_positions
 
 __all__ = ["Fit", "GapProblem", "law_basis", "orthonormal"]
 
@@ -79,8 +79,11 @@ class GapProblem:
     laws : dict of str to `~numpy.ndarray`, optional
         Basis (W, k) of parameters given per wavelength, ``"optic.parameter"``.
     priors : dict of str to float, optional
-        Standard deviation (canonical) of a normal prior about zero on the
-        coefficients of a parameter.
+        Standard deviation (canonical) of a normal prior on the coefficients of
+        a parameter.
+    neutral : dict of str to float, optional
+        Value (canonical) about which a parameter's prior is, by default 0: that
+        at which an effect is absent.
     like : GapProblem, optional
         Another problem of the same data whose noise, lamp and fluxes are taken
         over; by default `settle_noise` must be called.
@@ -103,9 +106,19 @@ class GapProblem:
     """
 
     def __init__(
-        self, chains, observations, *, ties=None, laws=None, priors=None, like=None, copy=True
+        self,
+        chains,
+        observations,
+        *,
+        ties=None,
+        laws=None,
+        priors=None,
+        neutral=None,
+        like=None,
+        copy=True,
     ):
         self.ties, self.laws, self.priors = dict(ties or {}), dict(laws or {}), dict(priors or {})
+        self.neutral = dict(neutral or {})
         chains, observations = list(chains), list(observations)
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
         self.measurement = Measurement(
@@ -132,7 +145,14 @@ class GapProblem:
         self.tight = np.zeros(self.size)
         for name, sigma in self.priors.items():
             self.tight[self.slices[name]] = 1 / sigma
-        self.centre = np.where(self.tight > 0, self.start, 0.0)
+        self.centre = np.where(self.tight > 0, self._coefficients(self._absent()), 0.0)
+
+    def _absent(self):
+        """Return the vector of values about which the priors are."""
+        vector = np.zeros(self.free.size)
+        for slot in self.free.slots:
+            vector[slot.slice] = self.neutral.get(slot.name, 0.0)
+        return vector
 
     def _set_laws(self, laws):
         """Note the linear map from the coefficients to the flat vector."""
@@ -191,7 +211,7 @@ class GapProblem:
         for channel, dataset, rows in zip(self.channels, self.datasets, self.segments, strict=True):
             slopes = self._slopes(channel, dataset, vector)
             slopes = channel.whiten(slopes) if whitened else slopes
-            out[:, rows] = slopes.reshape(self.size, -1)
+            out[:, rows] = slopes.reshape(self.size, rows.stop - rows.start)
         return out.T
 
     def _slopes(self, channel, dataset, vector):
@@ -228,8 +248,9 @@ class GapProblem:
         for channel, dataset, residual in zip(
             self.channels, self.datasets, self.differences(q), strict=True
         ):
-            settings = _settings(dataset.observations)
-            noise = _noise(channel, residual, dataset.observations)
+            angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
+            settings = _settings(angles, dataset.observations.n_frames)
+            noise = _noise(channel, residual, angles)
             channel.set_noise(noise, residual, settings)
         self.fluxes = [
             _expected_fluxes(channel, dataset.forward(self.vector(q)))
@@ -345,7 +366,8 @@ class GapProblem:
         good = singular > 1e-7 * singular[0]
         variance = np.sum((right[good] / singular[good, None]) ** 2, axis=0)
         is_open = np.sum(right[~good] ** 2, axis=0) > 1e-6
-        return np.where(is_open, np.inf, np.sqrt(variance) / scale)
+        prior = np.divide(1, self.tight, out=np.full(self.size, np.inf), where=self.tight > 0)
+        return np.minimum(np.where(is_open, np.inf, np.sqrt(variance) / scale), prior)
 
 
 def _triangle(matrix, target):
@@ -432,34 +454,31 @@ def _expected_fluxes(channel, sweep):
 
 def _positions(chain, observations, fluxes):
     """Return the positions of all stages, fluxes as expected where they are known."""
-    found = {}
-    for stage in stages(chain):
-        if fluxes is not None and stage == "flux":
-            found[stage] = fluxes
-        elif fluxes is not None and stage == "total_flux":
-            found[stage] = np.stack([fluxes.sum(axis=0)] * 2)
-        elif fluxes is not None and stage == "previous_flux":
-            before = np.concatenate([fluxes[..., :1], fluxes[..., :-1]], axis=-1)
-            found[stage] = fluxes / before
-        else:
-            found[stage] = observations.position(stage)
-    return found
+    found = _read_positions(chain, observations, None)
+    if fluxes is None:
+        return found
+    before = np.concatenate([fluxes[..., :1], fluxes[..., :-1]], axis=-1)
+    expected = {
+        "flux": fluxes,
+        "total_flux": np.stack([fluxes.sum(axis=0)] * 2),
+        "previous_flux": fluxes / before,
+    }
+    return found | {stage: expected[stage] for stage in expected.keys() & found.keys()}
 
 
-def _settings(observations):
+def _settings(angles, n):
     """
     Return what optics could do to the sums: columns of the plate angle, (F, k).
 
     Not of the derotator angle alone, which changes as slowly as a lamp drifts.
     """
-    n = observations.n_frames
-    if "hwp" not in observations.frames.colnames:
+    if "hwp" not in angles:
         return np.zeros((n, 0))
-    plate = observations.position("hwp")
+    plate = angles["hwp"]
     waves = [np.exp(1j * k * plate) for k in (2, 4)]
     columns = list(waves)
-    if "derotator" in observations.frames.colnames:
-        turn = np.exp(2j * observations.position("derotator"))
+    if "derotator" in angles:
+        turn = np.exp(2j * angles["derotator"])
         columns += [wave * other for wave in waves for other in (turn, turn.conj())]
     columns += [np.exp(1j * k * plate) for k in (1, 3, 6, 8)]
     columns = columns[: n // 6]
@@ -468,7 +487,7 @@ def _settings(observations):
     )
 
 
-def _noise(channel, residual, observations):
+def _noise(channel, residual, angles):
     """
     Return the noise of every datum: the stated errors, or more where the data say so.
 
@@ -477,7 +496,7 @@ def _noise(channel, residual, observations):
     is smooth in wavelength. So noise is what is left without either.
     """
     sigma = np.sqrt(channel.variance)
-    basis = _turning(observations, channel.valid)
+    basis = _turning(angles, channel.valid)
     for i in range(2):
         rough = _roughness(residual[i], channel.valid, basis)
         stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & channel.valid
@@ -492,13 +511,12 @@ def _noise(channel, residual, observations):
     return sigma
 
 
-def _turning(observations, valid):
+def _turning(angles, valid):
     """Return an orthonormal basis of the harmonics of the stages, (F, k); k may be 0."""
-    n = observations.n_frames
-    waves = [np.ones(n, dtype=complex)]
+    waves = [np.ones(valid.shape[1], dtype=complex)]
     for stage, orders in (("hwp", (2, 4)), ("derotator", (2, 4))):
-        if stage in observations.frames.colnames:
-            turns = [np.exp(1j * k * observations.position(stage)) for k in orders]
+        if stage in angles:
+            turns = [np.exp(1j * k * angles[stage]) for k in orders]
             waves += [wave * t for wave in waves for turn in turns for t in (turn, turn.conj())]
     whole = valid.all(axis=0)
     columns = np.concatenate([part(np.array(waves)) for part in (np.real, np.imag)]).T

@@ -7,7 +7,6 @@ All of them say the same: `to_dict` works it out, and the others show it.
 
 import base64
 import io
-import textwrap
 
 import astropy.units as u
 import numpy as np
@@ -17,13 +16,14 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import GapError
 from astropolcal.files import atomic_path
 from astropolcal.gap import _numbers, _words
-from astropolcal.gap.planning import plan
+from astropolcal.gap.planning import few, plan
 from astropolcal.gap.residuals import locate
 
 __all__ = ["causes_table", "summary", "to_dict", "write_html"]
 
-_WIDTH = 80
 _DPI = 130
+# pixels of a page to an inch
+_CSS = 96
 _MOST_SCORES = 8
 
 
@@ -69,6 +69,12 @@ def to_dict(diagnosis):
     same = diagnosis.improved is diagnosis.nominal
     before = _numbers.accuracies(diagnosis.nominal, crossed and not exchanged)
     after = before if same else _numbers.accuracies(diagnosis.improved, crossed)
+    fitted = _numbers.Fitted(diagnosis.improved)
+    causes = [_cause(diagnosis, i, fitted) for i in range(len(diagnosis.causes))]
+    ranks = {cause["effect"]: cause["rank"] for cause in causes}
+    for cause in causes:
+        cause["details"] = _words.details(cause, ranks)
+        cause["words"] = _words.cause(cause, ranks)
     content = {
         "verdict": diagnosis.verdict,
         "nominal": _nominal(diagnosis.nominal),
@@ -84,7 +90,7 @@ def to_dict(diagnosis):
         "gap_p_value": diagnosis.gap_p_value,
         "remainder_p_value": diagnosis.remainder_p_value,
         "where": _where(diagnosis),
-        "causes": [_cause(diagnosis, i) for i in range(len(diagnosis.causes))],
+        "causes": causes,
         "scores": [_score(score) for score in diagnosis.scores[:_MOST_SCORES]],
         "n_effects": len(diagnosis.scores),
         "alpha": diagnosis.settings.get("alpha"),
@@ -92,8 +98,6 @@ def to_dict(diagnosis):
         "accuracy_after": after,
         "next_observations": _next(diagnosis),
     }
-    for cause in content["causes"]:
-        cause["words"] = _words.cause(cause)
     return _plain(content | {"sentences": _words.sentences(content)})
 
 
@@ -114,13 +118,13 @@ def _shrinkage(diagnosis, before, after):
     return found
 
 
-def _cause(diagnosis, i):
+def _cause(diagnosis, i, fitted):
     cause = diagnosis.causes[i]
     before, after = cause.before, cause.after
     if cause.effect.kind == "discrete" and diagnosis.held_out:
         # what an exchanged optic leaves is what the next step begins with
         after = diagnosis.held_out[0]
-    return {
+    entry = {
         "rank": i + 1,
         "effect": cause.name,
         "title": cause.effect.title,
@@ -135,10 +139,12 @@ def _cause(diagnosis, i):
         "evidence": cause.evidence,
         "gap_cv_before_percent": before.percent if before else None,
         "gap_cv_after_percent": after.percent if after else None,
-        "parameters": _numbers.sizes(diagnosis.improved, cause.name),
-        "significance": _numbers.significance(diagnosis.improved, cause.name),
+        "parameters": fitted.sizes(cause.name),
+        "significance": fitted.significance(cause.name),
         "physical": bool(cause.physical),
     }
+    open_size = not all(_words.has_sizes(entry))
+    return entry | {"trades_with": fitted.trades(cause.name) if open_size else []}
 
 
 def _title(name):
@@ -175,7 +181,7 @@ def _next(diagnosis):
         if cause.aliases:
             found += plan(model, [cause.name, *cause.aliases], members={cause.name: fresh})
         model = fresh
-    return sorted(found, key=lambda entry: -entry["gain"]) or plan(diagnosis.improved)
+    return few(found) or plan(diagnosis.improved)
 
 
 def _plain(value):
@@ -256,8 +262,9 @@ def summary(diagnosis, content=None):
     Returns
     -------
     str
-        Three sentences, and below them the causes with their sizes, where the gap
-        lies, the accuracies before and after, and what to observe next.
+        Three sentences, and below them a table of the causes, each with its
+        sizes, what to observe next, where the gap lies, and the accuracies before
+        and after.
 
     Examples
     --------
@@ -274,74 +281,13 @@ def summary(diagnosis, content=None):
     The model agrees with the measurements: it predicts frames left out of the fit
     """
     content = to_dict(diagnosis) if content is None else content
-    parts = [
-        [" ".join(content["sentences"])],
-        [f"Nominal model: {content['nominal']}"],
-        *(_cause_lines(cause) for cause in content["causes"]),
-        _where_lines(content["where"]),
-        _accuracy_lines(content),
-        _next_lines(content["next_observations"]),
-    ]
-    return "\n\n".join("\n".join(_wrap(part)) for part in parts if part)
-
-
-def _wrap(lines):
-    for line in lines:
-        if len(line) <= _WIDTH:
-            yield line
-            continue
-        indent = " " * (len(line) - len(line.lstrip(" -")))
-        yield from textwrap.wrap(line, _WIDTH, subsequent_indent=indent) or [""]
-
-
-def _cause_lines(cause):
-    sizes = [f"  - {line}" for line in _words.sizes(cause["parameters"])]
-    return [f"Cause {cause['rank']}: {cause['words']}", *sizes]
-
-
-def _where_lines(where):
-    lines = [
-        f"  - {e['detail']}: {_words.share(e['share'])} of the gap, {_words.p_is(e['p_value'])}"
-        for e in where
-    ]
-    return ["Where the gap of the nominal model lies", *lines] if lines else []
-
-
-def _accuracy_lines(content):
-    """Return the accuracies of each dataset and for targets, before and after."""
-    keys = _numbers.ACCURACIES
-    heads = "".join(f"{key:^20}" for key in keys).rstrip()
-    rows = ["Accuracy of single differences before -> after, percent, median over wavelengths"]
-    rows.append(f"  {'':<16}{heads}")
-    for old, new in _pairs(content, "datasets"):
-        cells = (_arrow(old[f"{key}_percent"], new[f"{key}_percent"]) for key in keys)
-        rows.append(f"  {old['name'][:16]:<16}{''.join(cells)}".rstrip())
-    for old, new in _pairs(content, "targets"):
-        rows.append(
-            f"  target of {old['dolp_percent']:g} % by {old['column']}: s_p "
-            f"{_words.change(old['s_p_percent'], new['s_p_percent'])} %, s_chi "
-            f"{_words.change(old['s_chi_deg'], new['s_chi_deg'])} deg"
-        )
-    return rows
-
-
-def _pairs(content, key):
-    return zip(content["accuracy_before"][key], content["accuracy_after"][key], strict=True)
-
-
-def _arrow(old, new):
-    return "{:>8} -> {:<8}".format(*("-" if v is None else f"{v:.4f}" for v in (old, new)))
-
-
-def _next_lines(entries):
-    lines = [f"  - {entry['words']}" for entry in entries]
-    return ["What to observe next", *lines] if lines else []
+    return _words.text(content, _numbers.ACCURACIES)
 
 
 # ---- a page ------------------------------------------------------------------------------------
 
 
-def write_html(diagnosis, path, *, figures=None, content=None):
+def write_html(diagnosis, path, *, figures=None, size_figures=None, content=None):
     """
     Write a diagnosis as one self-contained page.
 
@@ -354,6 +300,8 @@ def write_html(diagnosis, path, *, figures=None, content=None):
     figures : dict of str to `~matplotlib.figure.Figure`, optional
         Figures by caption, such as those of `astropolcal.plotting`. They
         become part of the page.
+    size_figures : dict of str to `~matplotlib.figure.Figure`, optional
+        Figures by the name of an effect, shown with that cause.
     content : dict, optional
         What `to_dict` returned for the diagnosis, if it is known already.
 
@@ -384,11 +332,13 @@ def write_html(diagnosis, path, *, figures=None, content=None):
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": _words.number, "p": _words.p, "share": _words.share}
+    for name in ("number", "percent", "p", "short_share", "in_title", "shortened"):
+        environment.filters[name] = getattr(_words, name)
     page = environment.get_template("report.html").render(
         content=to_dict(diagnosis) if content is None else content,
         datasets=_about(diagnosis),
-        figures={caption: _image(figure) for caption, figure in (figures or {}).items()},
+        figures=_images(figures),
+        size_figures=_images(size_figures),
         sizes=_words.sizes,
         is_determined=_words.is_determined,
         accuracies=_numbers.ACCURACIES,
@@ -411,11 +361,17 @@ def _about(diagnosis):
     ]
 
 
+def _images(figures):
+    return {name: _image(figure) for name, figure in (figures or {}).items()}
+
+
 def _image(figure):
-    """Return a figure as a data URI."""
+    """Return a figure as a data URI, with its width and height in CSS pixels."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=_DPI)
-    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+    width, height = (round(_CSS * inches) for inches in figure.get_size_inches())
+    source = "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+    return {"source": source, "width": width, "height": height}
 
 
 def _version():

@@ -10,7 +10,7 @@ the wavelength, free: they are taken in one after the other, the most telling
 first, and each has the share that those before it have left. *Places* are sets
 of data (a range of wavelengths, a derotator angle, a dataset) in which the
 residuals are larger than elsewhere, found by a scan statistic (Kulldorff 1997,
-doi:10.1080/03610929708831995).
+doi:10.1080/03610929708831995), and the null channel, which holds several patterns.
 """
 
 from dataclasses import dataclass, field
@@ -32,8 +32,9 @@ _SMOOTH = 2
 # a direction of which the model takes up more than this is none of the axis
 _ABSORBED = 1e-3
 _MOST_TERMS = 12
-# what the angles hardly tell from other harmonics has to explain this much more than they
-_DOUBT = 0.7
+# a harmonic that the angles hardly tell from simpler ones gives way to the simplest that has
+# this share of its evidence
+_DOUBT = 0.5
 _DRAWS = 1000
 _RELIABLE = 20
 _MOST_BLOCKS = 24
@@ -145,9 +146,9 @@ def locate(model, *, alpha=ALPHA):
     'No axis stands out from the noise.'
     """
     data = _Whitened(model)
-    patterns = _sequence(data, *_terms(model), alpha)
+    patterns, null = _sequence(data, *_terms(model), alpha)
     places = [found for scan in _places(model) for found in _scan(data, *scan)]
-    rows = patterns + sorted(places, key=lambda row: -row["evidence"])
+    rows = [*patterns, *sorted(places, key=lambda row: -row["evidence"]), null]
     corrected = false_discovery([row["p_single"] for row in rows])
     for row, p in zip(rows, corrected, strict=True):
         row["p_value"] = p
@@ -272,15 +273,15 @@ def _flux(problem):
 
 
 def _sequence(data, terms, null, alpha):
-    """Take in patterns while they are significant; return one row a pattern."""
+    """Take in patterns while they are significant; return one row a pattern, and the null's."""
     gram, target, slices = _normal_equations(data, [*terms, null])
     total, freedom, own = data.total, data.n_freedom, slices.pop()
     # the null channel holds other patterns and is no rival to them
-    found = [(null, _test(gram, target, own, total, freedom))]
+    whole = _test(gram, target, own, total, freedom)
     taken, left = [], list(range(len(terms)))
     while left:
         tested = {i: _test(gram, target, slices[i], total, freedom) for i in left}
-        best = max(left, key=lambda i: tested[i].evidence * (_DOUBT if terms[i].doubtful else 1))
+        best = _simplest(terms, tested, max(left, key=lambda i: tested[i].evidence))
         looks = false_discovery([tested[i].p_single for i in left])
         small = tested[best].excess < _LEAST_SHARE * data.scale
         if len(taken) == _MOST_TERMS or looks[left.index(best)] >= alpha or small:
@@ -292,9 +293,24 @@ def _sequence(data, terms, null, alpha):
         left.remove(best)
     # what a few patterns explain is a better measure of a small gap than the sum of squares
     data.scale = max(data.scale, sum(one.excess for _, one in taken))
-    found += [(terms[i], tested[i]) for i in left if tested[i].rank]
+    found = [(terms[i], tested[i]) for i in left if tested[i].rank]
     found.sort(key=lambda item: item[1].log_p)
-    return [_row(term, one, data.scale) for term, one in taken + found]
+    rows = [_row(term, one, data.scale) for term, one in taken + found]
+    return rows, _row(null, whole, data.scale) | {"kind": "place"}
+
+
+def _simplest(terms, tested, best):
+    """Return the simplest pattern of the plate angle that may be what a doubtful one shows."""
+    if not terms[best].doubtful:
+        return best
+    axes = ("hwp", terms[best].axis)
+    most = tested[best].evidence
+    enough = min(_DOUBT * most, most)
+    rivals = [
+        i for i in tested if terms[i].axis in axes and terms[i].channel == terms[best].channel
+    ]
+    # in the order of their simplicity
+    return min(i for i in rivals if tested[i].evidence >= enough)
 
 
 def _normal_equations(data, terms):

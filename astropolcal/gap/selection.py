@@ -8,7 +8,7 @@ others were missing: next to all the others, each effect is then exchanged if
 another one explains the data clearly better, and dropped if it is not needed.
 """
 
-from operator import is_
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,6 +29,9 @@ _STRUCTURED = 1.5
 # so many are fitted in full where an effect might be exchanged
 _RIVALS = 4
 _EXCHANGED_AT = (2, 3)
+# an effect that explains this share gives way to one other alone, and only if what is left
+# falls to this share
+_MAIN, _CLEARLY = 0.5, 2 / 3
 
 
 def select(base, scores, library, alpha, groups, say):
@@ -101,8 +104,14 @@ def _forward(base, scores, library, alpha, groups, say):
         if scatter > _STRUCTURED and len(selected) in _EXCHANGED_AT:
             selected, history = _exchanged(base, selected, history, library, alpha, groups, say)
         model = selected[-1].model
-        scores = scan(model, library)
+        scores = scan(model, _without_aliases(library, selected))
     return selected, history
+
+
+def _without_aliases(library, chosen):
+    """Return the library less what cannot be told from an effect that is in the model."""
+    known = {alias.name for candidate in chosen for alias in candidate.aliases}
+    return [effect for effect in library if effect.name not in known]
 
 
 def _worthy(model, candidate):
@@ -131,29 +140,53 @@ def _errors(model, groups):
 
 def _exchanged(base, selected, history, library, alpha, groups, say):
     """Return the candidates, each the best next to all the others, and held-out errors."""
-    chosen, i = list(selected), 0
-    # the last one was chosen next to all the others already
-    while i < len(chosen) - 1:
+    chosen, now = list(selected), selected[-1].model if selected else base
+    # the last one was chosen next to all the others already; the first ones explain the most
+    # and are the last to be dropped
+    for i in reversed(range(len(chosen) - 1)):
         say(f"in exchange for: {chosen[i].score.effect.title}")
-        better = _rival(base, chosen, i, library, alpha)
-        chosen[i : i + 1] = better
-        i += len(better)
-    if len(chosen) == len(selected) and all(map(is_, chosen, selected)):
+        others = chosen[:i] + chosen[i + 1 :]
+        model = base.with_effects([c.recipe for c in others], like=now)
+        main = _is_main(base, selected, chosen[i])
+        if _advantage(model, now) > 0 and not main:
+            chosen, now = others, model
+            continue
+        if chosen[i].context is None:
+            # a law that was stiff enough while others were missing need not be so now
+            chosen[i] = freed(model, replace(chosen[i], model=now))
+            now = chosen[i].model
+        rival = _rival(model, chosen[i], others, library, alpha)
+        if rival is None or (main and rival.model.fit.chi2 > _CLEARLY * now.fit.chi2):
+            continue
+        if _advantage(rival.model, now) > SAME_EVIDENCE:
+            chosen[i], now = rival, rival.model
+    if _outline(chosen) == _outline(selected):
         return selected, history
-    return _retraced(base, chosen, groups, history[0])
+    return _retraced(base, chosen, now, groups, history[0])
 
 
-def _rival(base, chosen, i, library, alpha):
-    """Return what belongs in the place of a candidate, a list: itself, another, or nothing."""
-    now = base.with_effects([c.recipe for c in chosen])
-    model = base.with_effects([c.recipe for c in chosen[:i] + chosen[i + 1 :]])
-    if _advantage(model, now) > 0:
-        return []
-    rival = choose(model, scan(model, library), alpha=alpha, most=_RIVALS)
-    if rival is None or rival.name == chosen[i].name or not rival.physical:
-        return [chosen[i]]
-    rival = freed(model, rival)
-    return [rival if _advantage(rival.model, now) > SAME_EVIDENCE else chosen[i]]
+def _outline(chosen):
+    return [(candidate.name, candidate.context is None) for candidate in chosen]
+
+
+def _is_main(base, selected, candidate):
+    """Whether an effect explained most of the gap: that is not left to several others."""
+    names = [one.name for one in selected]
+    if candidate.name not in names:
+        return False
+    i = names.index(candidate.name)
+    before = selected[i - 1].model if i else base
+    lowered = before.fit.chi2 - candidate.model.fit.chi2
+    return lowered > _MAIN * (base.fit.chi2 - selected[-1].model.fit.chi2)
+
+
+def _rival(model, candidate, others, library, alpha):
+    """Return the best effect next to the others, None if that is the candidate."""
+    scores = scan(model, _without_aliases(library, others))
+    rival = choose(model, scores, alpha=alpha, most=_RIVALS)
+    if rival is None or rival.name == candidate.name or not rival.physical:
+        return None
+    return freed(model, rival)
 
 
 def _advantage(new, old):
@@ -164,11 +197,11 @@ def _advantage(new, old):
     return (old.fit.chi2 - new.fit.chi2) / scale - cost
 
 
-def _retraced(base, chosen, groups, first):
+def _retraced(base, chosen, last, groups, first):
     """Return candidates and held-out errors as if they had been added in this order."""
     model, selected, history = base, [], [first]
     for i, candidate in enumerate(chosen):
-        fresh = base.with_effects([c.recipe for c in chosen[: i + 1]])
+        fresh = base.with_effects([c.recipe for c in chosen[: i + 1]], like=last)
         freedom = max(fresh.problem.n_data - fresh.problem.size, 1)
         gain = (model.fit.chi2 - fresh.fit.chi2) / max(1.0, fresh.mean_square)
         cost = (fresh.problem.size - model.problem.size) * np.log(freedom)

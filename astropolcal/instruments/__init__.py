@@ -12,8 +12,17 @@ from importlib.metadata import entry_points
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.charis import CHARIS
+from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
 
-__all__ = ["CHARIS", "Instrument", "get", "names", "register"]
+__all__ = [
+    "CHARIS",
+    "Instrument",
+    "add_nuisance",
+    "get",
+    "names",
+    "register",
+    "without_nuisance",
+]
 
 _REGISTRY = {}
 

@@ -8,6 +8,7 @@ import astropy.units as u
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError
+from astropolcal.instruments.nuisance import add_nuisance
 from astropolcal.observations import (
     common_wavelengths,
     is_star,
@@ -17,6 +18,7 @@ from astropolcal.observations import (
     sky_angles,
     sky_positions,
 )
+from astropolcal.observations.coordinates import angle_change
 from astropolcal.observations.pointing import location_of
 
 __all__ = ["Instrument"]
@@ -113,7 +115,11 @@ class Instrument(ABC):
         """Return the meta of a table taken with the chain of `published`."""
         return {"instrument": self.name}
 
-    def chains_for(self, datasets, **options):
+    def published_mirrors(self):
+        """Return published mirrors to compare with: name of the optic to label to optic."""
+        return {}
+
+    def chains_for(self, datasets, *, nuisance=(), **options):
         """
         Return one chain a dataset, all on the common wavelength grid.
 
@@ -121,6 +127,9 @@ class Instrument(ABC):
         ----------
         datasets : sequence of Observations
             The datasets.
+        nuisance : sequence of str
+            What to add to the chain of each dataset, see `~astropolcal.instruments.add_nuisance`:
+            ``"background"``, ``"beam_gain"``, ``"lamp"``.
         **options
             Passed to `chain`.
 
@@ -140,10 +149,11 @@ class Instrument(ABC):
         grid = (common_wavelengths(datasets) * u.um).to(u.nm)
         setups = [self.setup(observations) for observations in datasets]
         particulars = [self.particulars(observations) for observations in datasets]
-        return [
+        chains = [
             self.chain(source, optics_in, wavelength=grid, **own, **options)
             for (source, optics_in), own in zip(setups, particulars, strict=True)
         ]
+        return add_nuisance(chains, datasets, nuisance)
 
     def on_sky(self, chain):
         """
@@ -253,6 +263,9 @@ class Instrument(ABC):
             if self.files is not None:
                 exposure = {"law": self.files.tracking} | exposure
             sky = sky_positions(observations, self.location, **exposure)
+            # the table need not have the parallactic angle as a column
+            steady = sky["parallactic"].reshape(-1, observations.n_frames).mean(axis=0)
+            sky["parallactic_rate"] = angle_change(observations, steady)
         return {s: sky[s] if s in sky else observations.position(s) for s in wanted}
 
     def __repr__(self):

@@ -22,8 +22,10 @@ from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.layout import FileLayout
+from astropolcal.instruments.nuisance import without_nuisance
 from astropolcal.instruments.telescope import (
     M3_MODELS,
+    k_mirror,
     published_mirror,
     star_source,
     telescope,
@@ -165,8 +167,10 @@ class CHARIS(Instrument):
             is fixed until you free it).
         wavelength : `~astropy.units.Quantity`, optional
             Grid, by default the 22 broadband bins.
-        derotator : {"elliptical", "linear"}
-            Elliptical as in the paper, or linear as in the calibrations before.
+        derotator : {"elliptical", "linear", "kmirror"}
+            Elliptical as in the paper, linear as in the calibrations before, or three silver
+            mirrors with films of silica: their thickness and factors on n and k of silver are
+            free, the factors with normal priors of 0.5 and 0.1 around 1.
         bounds : {"physical", "paper"}
             Retardances within one turn of either sign, or within the paper's
             bounds (0 to 360 deg in the published signs). Either way
@@ -196,7 +200,7 @@ class CHARIS(Instrument):
         >>> chain["derotator"].retardance.shape
         (22,)
         """
-        _choice("derotator", derotator, ("elliptical", "linear"))
+        _choice("derotator", derotator, ("elliptical", "linear", "kmirror"))
         _choice("bounds", bounds, tuple(_BOUNDS))
         _choice("source", source, self.sources)
         unknown = set(optics_in) - {"nbs", "dichroic"}
@@ -233,7 +237,7 @@ class CHARIS(Instrument):
         Parameters
         ----------
         chain : `~astropy.modeling.CompoundModel`
-            A chain; one with the telescope already is returned as it is.
+            A chain; one with the telescope already only loses the nuisance optics of its dataset.
 
         Returns
         -------
@@ -246,6 +250,7 @@ class CHARIS(Instrument):
         >>> [optic.name for optic in charis.on_sky(charis.published())][:4]
         ['parallactic', 'm3', 'altitude', 'hwp']
         """
+        chain = without_nuisance(chain)
         found = leaves(chain)
         if "parallactic" in stages(chain):
             return chain
@@ -297,6 +302,10 @@ class CHARIS(Instrument):
             "yjh50_dichroic": "in",
             "nasmyth_beam_switcher": "installed",
         }
+
+    def published_mirrors(self):
+        """Return the law of M3 that is published, see `published_mirror`."""
+        return {"m3": {"McIntosh et al. (2026)": published_mirror()}}
 
     def setup(self, observations):
         """
@@ -397,6 +406,8 @@ def _derotator(grid, kind, bounds):
     nm = CHARIS.wavelength.to_value(u.nm)
     start = -np.interp(grid.to_value(u.nm), nm, _DEROTATOR_HORIZONTAL) * u.deg
     settings = _misaligned(0) | {"mount": "derotator", "name": "derotator"}
+    if kind == "kmirror":
+        return k_mirror(**settings)
     if kind == "linear":
         settings["bounds"] |= {"retardance": bounds["horizontal"]}
         return optics.LinearRetarder(retardance=start, **settings)

@@ -1,13 +1,22 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What stands before the half-wave plate on sky: a star, and the telescope's tertiary mirror."""
 
+import warnings
+
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics, standards
-from astropolcal.exceptions import AstropolcalError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, InstrumentError
 
-__all__ = ["M3_MODELS", "published_mirror", "star_source", "telescope", "tertiary_mirror"]
+__all__ = [
+    "M3_MODELS",
+    "k_mirror",
+    "published_mirror",
+    "star_source",
+    "telescope",
+    "tertiary_mirror",
+]
 
 #: How the tertiary mirror may be modelled.
 M3_MODELS = ("free", "power law", "metal")
@@ -17,6 +26,8 @@ M3_MODELS = ("free", "power law", "metal")
 _PUBLISHED = {"b1": 15.56, "m1": 3.186, "b2": 9.69, "m2": 1.040}
 _START = {"b1": 13.70, "m1": 1.94, "b2": 13.89, "m2": 2.08}
 _FILM_START = 60 * u.nm
+# 't Hart et al. 2021, the film on the derotator
+_DEROTATOR_FILM = 262.56 * u.nm
 # what measured silver films differ by from one another (n by far more than k)
 _N_SPREAD, _K_SPREAD = 0.5, 0.1
 # no catalogue polarization is known better than this, so that no datum weighs without limit
@@ -61,14 +72,51 @@ def tertiary_mirror(model, wavelength, name="m3"):
         mirror = optics.MetalMirror(
             material="silver", film_thickness=_FILM_START, name=name, fixed=free, bounds=bounds
         )
-        mirror.n_scale.prior, mirror.k_scale.prior = _normal(1, _N_SPREAD), _normal(1, _K_SPREAD)
-        return mirror
+        return _with_metal_priors(mirror)
     return optics.DiattenuatorRetarder(
         diattenuation=np.full(wavelength.size, 0.01),
         retardance=optics.PowerLawMirror(**_PUBLISHED).retardance(wavelength),
         name=name,
         fixed={"retardance": True},
     )
+
+
+def k_mirror(*, fixed, bounds, **settings):
+    """
+    Return a derotator of three silver mirrors with films of silica, ready to be calibrated.
+
+    Free are the thickness of the films and factors on n and k of silver, with normal
+    priors of 0.5 and 0.1 around 1.
+
+    Parameters
+    ----------
+    fixed, bounds : dict
+        What else is free, as `astropy.modeling` takes it.
+    **settings
+        Of the optic, such as ``name`` and ``mount``.
+
+    Returns
+    -------
+    KMirror
+
+    Examples
+    --------
+    >>> from astropolcal.instruments.telescope import k_mirror
+    >>> derotator = k_mirror(fixed={}, bounds={}, name="derotator", mount="derotator")
+    >>> derotator.film_thickness.quantity
+    <Quantity 262.56 nm>
+    """
+    free = dict.fromkeys(("film_thickness", "n_scale", "k_scale"), False)
+    limits = {"film_thickness": (0, 600), "n_scale": (0.05, 20), "k_scale": (0.5, 2)}
+    mirror = optics.KMirror(
+        film_thickness=_DEROTATOR_FILM, fixed=free | fixed, bounds=limits | bounds, **settings
+    )
+    return _with_metal_priors(mirror)
+
+
+def _with_metal_priors(mirror):
+    mirror.n_scale.prior, mirror.k_scale.prior = _normal(1, _N_SPREAD), _normal(1, _K_SPREAD)
+    return mirror
 
 
 def published_mirror(name="m3"):
@@ -147,6 +195,17 @@ def star_source(source, wavelength, name="star", target=None):
     -------
     PolarizedSource
 
+    Raises
+    ------
+    InstrumentError
+        If the catalogue does not have a polarized standard star, or has it as unpolarized, or
+        the other way round.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If the catalogue does not have an unpolarized standard star.
+
     Examples
     --------
     >>> import astropy.units as u
@@ -155,6 +214,8 @@ def star_source(source, wavelength, name="star", target=None):
     >>> star.u.value.round(3).tolist()
     [0.016, 0.009]
     """
+    if target and source.endswith("standard star"):
+        _check_standard(source, target)
     if source == "unpolarized standard star":
         return optics.PolarizedSource(name=name, fixed={"q": True, "u": True})
     known = _catalogued(target, wavelength)
@@ -168,6 +229,29 @@ def star_source(source, wavelength, name="star", target=None):
             mean = np.asarray(getattr(known, key))
             getattr(star, key).prior = _normal(mean, np.maximum(error, _LEAST_ERROR))
     return star
+
+
+def _check_standard(source, target):
+    """Refuse a polarized standard that nobody knows; warn of an unpolarized one."""
+    try:
+        known = standards.get(target)
+    except AstropolcalError as error:
+        if source.startswith("polarized"):
+            raise InstrumentError(
+                f"{target} as a polarized standard star: {error}; with the source 'star' its "
+                "polarization is fitted without a prior"
+            ) from error
+        warnings.warn(
+            f"{error}; it is unpolarized because the table says so",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
+        return
+    if not source.startswith(known.kind):
+        raise InstrumentError(
+            f"{target} is {known.kind} according to the catalogue, but the table's source is "
+            f"{source!r}"
+        )
 
 
 def _catalogued(target, wavelength):

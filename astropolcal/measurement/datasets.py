@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """One dataset of a measurement: a chain, its observations, and its Jacobian."""
 
+import copy
+
 import astropy.units as u
 import numpy as np
 from astropy.modeling import Model
@@ -105,7 +107,7 @@ class Dataset:
         self.bins = _bins_on_grid(observations, wavelength)
         self.frames = self._frames_of_data()
         columns = self.frames.T.ravel()
-        given = _positions(chain, observations, positions)
+        given = self._given = _positions(chain, observations, positions)
         self._node_weights = _node_weights(given, observations)
         #: Position of each stage in the frames of each datum, radian,
         #: (frames_per_datum, n_groups); the mean over the nodes of an exposure.
@@ -114,16 +116,43 @@ class Dataset:
             for stage, angle in given.items()
             if stage not in COORDINATES
         }
-        n_nodes = self._node_weights.size
-        placed = {stage: _at_nodes(angle, columns, n_nodes) for stage, angle in given.items()}
-        # where nothing moves all frames are alike, but there are as many
-        placed = placed or {"frame": np.zeros(n_nodes * columns.size)}
-        try:
-            self.propagator = Propagator(chain, observations.wavelength.to_value(u.um), placed)
-        except WavelengthRangeError as error:
-            raise WavelengthRangeError(f"{observations.name}: {error}") from None
+        self._place(chain, columns)
         self._plan(chain, free)
         self._observe(columns)
+
+    def _place(self, chain, columns):
+        n_nodes = self._node_weights.size
+        placed = {stage: _at_nodes(angle, columns, n_nodes) for stage, angle in self._given.items()}
+        # where nothing moves all frames are alike, but there are as many
+        placed = placed or {"frame": np.zeros(n_nodes * columns.size)}
+        obs = self.observations
+        try:
+            self.propagator = Propagator(chain, obs.wavelength.to_value(u.um), placed)
+        except WavelengthRangeError as error:
+            raise WavelengthRangeError(f"{obs.name}: {error}") from None
+
+    def thinned(self, chain, groups):
+        """
+        Return the dataset with some of its groups of frames, for a quick first look.
+
+        Parameters
+        ----------
+        chain : Optic or `~astropy.modeling.CompoundModel`
+            The dataset's chain.
+        groups : `~numpy.ndarray` of int
+            Numbers of the groups, ascending.
+
+        Returns
+        -------
+        Dataset
+        """
+        new = copy.copy(self)
+        new.frames = self.frames[groups]
+        new.positions = {stage: angle[:, groups] for stage, angle in self.positions.items()}
+        columns = new.frames.T.ravel()
+        new._place(chain, columns)
+        new._observe(columns)
+        return new
 
     # ---- data ----------------------------------------------------------------
 

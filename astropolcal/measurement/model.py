@@ -197,6 +197,48 @@ class Measurement(FittableModel):
         self._chains_are_shared = True
         return new
 
+    def thinned(self, most):
+        """
+        Return the measurement with fewer frames, for searches that need not see them all.
+
+        Parameters
+        ----------
+        most : int
+            Number of groups of frames that a dataset keeps at most; they are drawn at random,
+            always the same ones.
+
+        Returns
+        -------
+        measurement : Measurement
+            With the same free parameters and current values.
+        kept : `~numpy.ndarray` of bool
+            The data that it keeps, shape (n_data,).
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> from astropolcal.measurement import Measurement
+        >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+        >>> import astropy.units as u
+        >>> charis = instruments.get("charis")
+        >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
+        >>> whole = Measurement(charis.chain(), simulate(charis.chain(), charis.wavelength, frames))
+        >>> fewer, kept = whole.thinned(5)
+        >>> fewer.n_data, int(kept.sum()), whole.n_data
+        (110, 110, 176)
+        """
+        chosen = [_drawn(dataset.frames.shape[0], most) for dataset in self.datasets]
+        new = copy_module.deepcopy(self)
+        new.datasets = list(self.datasets)
+        for i, groups in enumerate(chosen):
+            if len(groups) < self.datasets[i].frames.shape[0]:
+                new.datasets[i] = self.datasets[i].thinned(self._chains[i], groups)
+        new._finish(self.name)
+        new.parameters = self.vector()
+        parts = zip(self.datasets, chosen, strict=True)
+        kept = [np.isin(dataset.group_of_datum, groups) for dataset, groups in parts]
+        return new, np.concatenate(kept)
+
     @property
     def chains(self):
         """The chain of each dataset; `put_back` writes the values into them."""
@@ -337,6 +379,13 @@ class Measurement(FittableModel):
     def residuals(self, vector=None):
         """Return observed minus predicted data, shape (n_data,)."""
         return self.observed - self.predict(self.vector() if vector is None else vector)
+
+
+def _drawn(count, most):
+    """Return which of so many groups to keep."""
+    if count <= most:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
 
 
 def _vector(parameters):

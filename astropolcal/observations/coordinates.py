@@ -7,7 +7,7 @@ from astropy.time import Time
 from astropolcal.exceptions import ObservationError
 from astropolcal.optics import COORDINATES
 
-__all__ = ["clock", "frame_coordinate"]
+__all__ = ["angle_change", "clock", "frame_coordinate"]
 
 
 def frame_coordinate(observations, name):
@@ -18,10 +18,15 @@ def frame_coordinate(observations, name):
     ----------
     observations : Observations
         The dataset.
-    name : {"sequence", "flux", "total_flux", "previous_flux"}
+    name : str
+        One of `~astropolcal.optics.COORDINATES`.
+
         ``"sequence"`` runs from 0 in the first frame to 1 in the last, by the
         column ``time`` if it gives the time of every frame (see `clock`), else
         by the order of the frames; it is 0 where all are at one time.
+
+        ``"parallactic_rate"`` and ``"derotator_rate"`` are the changes of that angle from
+        one frame to the next, in radian, in the order in which the frames were taken.
 
         ``"flux"`` is the flux of each beam in the unit of the table, 0 where it
         is masked.
@@ -35,12 +40,12 @@ def frame_coordinate(observations, name):
     Returns
     -------
     `~numpy.ndarray`
-        Shape (F,) for the sequence, (2, B, F) for the fluxes, the right beam first.
+        Shape (F,) for the sequence and the rates, (2, B, F) for the fluxes, the right beam first.
 
     Raises
     ------
     ObservationError
-        If the name is another.
+        If the name is another, or there is no such angle.
 
     Notes
     -----
@@ -63,6 +68,8 @@ def frame_coordinate(observations, name):
     if name == "sequence":
         passed = time - time.min()
         return passed / passed.max() if passed.max() > 0 else passed
+    if name.endswith("_rate"):
+        return angle_change(observations, observations.position(name.removesuffix("_rate")))
     fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
     if name == "flux":
         return np.where(observations.mask.T, 0.0, fluxes)
@@ -73,6 +80,38 @@ def frame_coordinate(observations, name):
     ratio = np.ones_like(fluxes)
     ratio[..., order[1:]] = fluxes[..., order[1:]] / fluxes[..., order[:-1]]
     return np.where(np.isnan(ratio), 1.0, ratio)
+
+
+def angle_change(observations, angle):
+    """
+    Return by how much an angle changes from one frame to the next.
+
+    Parameters
+    ----------
+    observations : Observations
+        The dataset: its frames are taken in the order of their times.
+    angle : `~numpy.ndarray`
+        The angle of every frame, radian, shape (F,).
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Radian, shape (F,): half the change from the frame before to the one after.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.observations import Observations, example_table
+    >>> from astropolcal.observations.coordinates import angle_change
+    >>> obs = Observations.from_table(example_table())
+    >>> angle_change(obs, np.array([0.0, 0.1, 0.3, 0.4])).round(2).tolist()
+    [0.1, 0.15, 0.15, 0.1]
+    """
+    order = np.argsort(_time_or_order(observations), kind="stable")
+    out = np.zeros_like(angle)
+    if len(angle) > 1:
+        out[order] = np.gradient(np.unwrap(angle[order]))
+    return out
 
 
 def clock(frames):

@@ -19,6 +19,8 @@ __all__ = ["pair_frames"]
 
 _QUARTER, _HALF, _TURN = np.deg2rad([45.0, 90.0, 180.0])
 _MAX_NAMED = 10
+# tables up to this length are searched as a whole, longer ones within so many frames first
+_SMALL, _WINDOW = 1000, 64
 
 
 def pair_frames(
@@ -85,26 +87,10 @@ def pair_frames(
     tolerance = float(angle_to_rad(tolerance, "tolerance"))
     derotator_tolerance = float(angle_to_rad(derotator_tolerance, "derotator_tolerance"))
     labels = range(len(hwp)) if labels is None else labels
-    phase = np.mod(hwp + tolerance, _HALF)
-    apart = _apart(hwp[:, None], hwp[None, :] + _QUARTER) <= tolerance
-    apart |= apart.T
-    _check_partners(apart, hwp, rows, name)
-
-    same, drift = _same_setting(len(hwp), derotator, flc_state, derotator_tolerance)
-    plus, minus = np.nonzero(apart & same & (phase[:, None] < phase[None, :]))
+    _check_partners(hwp, tolerance, rows, name)
     steps = np.arange(len(hwp)) if time is None else np.asarray(time, dtype=float)
-    # a partner at +45 degrees is preferred to the equivalent one at -45
-    backwards = _apart(hwp[minus], hwp[plus] + _QUARTER) > tolerance
-    order = np.lexsort(
-        (
-            np.minimum(plus, minus),
-            np.abs(plus - minus),
-            np.abs(steps[plus] - steps[minus]),
-            drift[plus, minus],
-            backwards,
-        )
-    )
-    pairs, left = _choose(plus[order], minus[order], len(hwp), share)
+    setting = _Setting(hwp, derotator, flc_state, steps, tolerance, derotator_tolerance)
+    pairs, left = _paired(setting, share)
     if left:
         _warn_left_over(left, hwp, labels, name)
     return pairs
@@ -115,23 +101,93 @@ def _apart(first, second):
     return np.abs(np.mod(first - second + _HALF, _TURN) - _HALF)
 
 
-def _same_setting(n_frames, derotator, flc_state, tolerance):
-    """Return which frames agree in everything but the plate, and a coarse drift (0 or 1)."""
-    same = np.ones((n_frames, n_frames), dtype=bool)
-    drift = np.zeros((n_frames, n_frames), dtype=int)
-    if derotator is not None:
-        angle = np.atleast_1d(angle_to_rad(derotator, "derotator"))
-        distance = _apart(angle[:, None], angle[None, :])
-        same &= distance <= tolerance
-        drift += distance > 0.5 * tolerance
-    if flc_state is not None:
-        state = np.asarray(flc_state)
-        same &= state[:, None] == state[None, :]
-    return same, drift
+class _Setting:
+    """What the frames of a pair must agree in, and how good a pair they make."""
+
+    def __init__(self, hwp, derotator, flc_state, steps, tolerance, derotator_tolerance):
+        self.hwp, self.steps, self.tolerance = hwp, steps, tolerance
+        self.phase = np.mod(hwp + tolerance, _HALF)
+        self.derotator_tolerance = derotator_tolerance
+        self.derotator = None
+        if derotator is not None:
+            self.derotator = np.atleast_1d(angle_to_rad(derotator, "derotator"))
+        self.state = None if flc_state is None else np.asarray(flc_state)
+
+    def candidates(self, frames, width):
+        """
+        Return plus and minus frame of all possible pairs, the best first.
+
+        Only frames that are at most ``width`` places apart in ``frames`` count.
+        """
+        first, second = _neighbours(frames, width)
+        gap = self.hwp[second] - self.hwp[first]
+        # 45 and 135 degrees are alike for a pair: both are 45 from a multiple of 90
+        good = np.abs(np.mod(gap, _HALF) - _QUARTER) <= self.tolerance
+        good &= self.phase[first] != self.phase[second]
+        if self.state is not None:
+            good &= self.state[first] == self.state[second]
+        first, second = first[good], second[good]
+        drift = np.zeros(first.size, dtype=bool)
+        if self.derotator is not None:
+            distance = _apart(self.derotator[first], self.derotator[second])
+            close = distance <= self.derotator_tolerance
+            first, second = first[close], second[close]
+            drift = distance[close] > 0.5 * self.derotator_tolerance
+        forward = self.phase[first] < self.phase[second]
+        plus, minus = np.where(forward, (first, second), (second, first))
+        order = self._preference(plus, minus, drift)
+        return plus[order], minus[order]
+
+    def _preference(self, plus, minus, drift):
+        # a partner at +45 degrees is preferred to the equivalent one at -45
+        backwards = _apart(self.hwp[minus], self.hwp[plus] + _QUARTER) > self.tolerance
+        return np.lexsort(
+            (
+                np.minimum(plus, minus),
+                np.abs(plus - minus),
+                np.abs(self.steps[plus] - self.steps[minus]),
+                drift,
+                backwards,
+            )
+        )
 
 
-def _check_partners(apart, hwp, rows, name):
-    lonely = ~apart.any(axis=1)
+def _neighbours(frames, width):
+    """Return all pairs of frames that are at most ``width`` places apart."""
+    ahead = np.arange(1, min(width, frames.size - 1) + 1)
+    place = np.arange(frames.size)[:, None] + ahead
+    here, there = np.nonzero(place < frames.size)
+    return frames[here], frames[place[here, there]]
+
+
+def _paired(setting, share):
+    """
+    Return the pairs, and the frames left over.
+
+    In long tables partners are sought among the neighbours in time first, and farther away for
+    the frames that found none, so that the work grows as the number of frames.
+    """
+    left = np.argsort(setting.steps, kind="stable")
+    n_frames, width, chosen = left.size, _WINDOW, []
+    while left.size:
+        everything = share or left.size <= _SMALL or width >= left.size
+        reach = left.size if everything else width
+        pairs, used = _choose(*setting.candidates(left, reach), n_frames, share)
+        chosen += pairs
+        left = left[~used[left]]
+        if everything:
+            break
+        width *= 4
+    return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2), sorted(left.tolist())
+
+
+def _check_partners(hwp, tolerance, rows, name):
+    there = np.sort(np.mod(hwp, _HALF))
+    there = np.concatenate([there - _HALF, there, there + _HALF])
+    wanted = np.mod(hwp + _QUARTER, _HALF)
+    place = np.searchsorted(there, wanted)
+    nearest = np.minimum(wanted - there[place - 1], there[place] - wanted)
+    lonely = nearest > tolerance
     if lonely.any():
         frame = int(np.argmax(lonely))
         where = f"frame index {frame}" if rows is None else f"row {rows[frame]}"
@@ -147,15 +203,14 @@ def _choose(plus, minus, n_frames, share):
     chosen = []
     for p, m in zip(plus.tolist(), minus.tolist(), strict=True):
         if not (used[p] or used[m]):
-            used[[p, m]] = True
+            used[p] = used[m] = True
             chosen.append((p, m))
     if share:
         for p, m in zip(plus.tolist(), minus.tolist(), strict=True):
             if not (used[p] and used[m]):
                 used[[p, m]] = True
                 chosen.append((p, m))
-    pairs = np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2)
-    return pairs, np.flatnonzero(~used).tolist()
+    return chosen, used
 
 
 def _warn_left_over(left, hwp, labels, name):

@@ -312,7 +312,9 @@ class Observations:
             A column with the unit of an angle, such as ``"hwp"``; or one of
             `~astropolcal.optics.COORDINATES`: ``"sequence"``, how far the run has
             come, from 0 in the first frame to 1 in the last (by the column ``time``
-            if it gives the time of every frame, else by the order); ``"flux"``, the
+            if it gives the time of every frame, else by the order);
+            ``"parallactic_rate"`` and ``"derotator_rate"``, by how much that angle
+            changes from one frame to the next, in radian; ``"flux"``, the
             fluxes of the beams in the unit of the table, 0 where masked;
             ``"total_flux"``, the sum of both, once for each; ``"previous_flux"``, the
             fluxes over those of the frame taken before, 1 for the

@@ -32,8 +32,12 @@ FLUXES = ("flux", "total_flux", "previous_flux")
 # what a copy of an optic may share with it
 _SHARED = (str, bool, int, float, type(None), u.UnitBase)
 
-#: Positions that are numbers, not angles: how far the run has come (0 to 1), and the fluxes.
-COORDINATES = ("sequence", *FLUXES)
+#: By how much an angle changes from one frame to the next.
+RATES = ("parallactic_rate", "derotator_rate")
+
+#: Positions that are numbers, not angles: how far the run has come (0 to 1), the change of an
+#: angle from frame to frame, and the fluxes.
+COORDINATES = ("sequence", *RATES, *FLUXES)
 
 
 def rotation_generator(matrix):

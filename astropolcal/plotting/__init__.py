@@ -13,11 +13,14 @@ from astropolcal.plotting.differences import plot_double_differences
 from astropolcal.plotting.efficiency import plot_polarimetric_efficiency
 from astropolcal.plotting.gap import (
     plot_effect_scores,
+    plot_effect_sizes,
     plot_gap_maps,
     plot_gap_spectrum,
     plot_where,
 )
+from astropolcal.plotting.history import plot_history
 from astropolcal.plotting.identifiability import plot_identifiability
+from astropolcal.plotting.mirrors import plot_mirrors
 from astropolcal.plotting.parameters import (
     plot_efficiency,
     plot_parameters,
@@ -27,6 +30,8 @@ from astropolcal.plotting.posterior import plot_corner, plot_traces
 from astropolcal.plotting.residuals import plot_residuals
 from astropolcal.plotting.saving import save_all
 from astropolcal.plotting.standards import plot_observability
+from astropolcal.plotting.star_check import plot_star_check
+from astropolcal.plotting.targets import plot_target_accuracy
 
 __all__ = [
     "plot_accuracy",
@@ -34,15 +39,20 @@ __all__ = [
     "plot_correlations",
     "plot_double_differences",
     "plot_effect_scores",
+    "plot_effect_sizes",
     "plot_efficiency",
     "plot_gap_maps",
     "plot_gap_spectrum",
+    "plot_history",
     "plot_identifiability",
+    "plot_mirrors",
     "plot_observability",
     "plot_parameters",
     "plot_polarimetric_efficiency",
     "plot_residuals",
     "plot_retardances",
+    "plot_star_check",
+    "plot_target_accuracy",
     "plot_traces",
     "plot_where",
     "save_all",

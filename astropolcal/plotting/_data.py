@@ -7,6 +7,7 @@ import numpy as np
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
+from astropolcal.observations import is_star
 from astropolcal.optics import COORDINATES
 from astropolcal.plotting._style import (
     MINUS,
@@ -52,7 +53,15 @@ class DataGrid:
         self.residual = self._grid(residuals[measurement.segments[dataset]])
         self.sigma = self._grid(self.part.sigma)
         self.calibrated_um = measurement.wavelength
+        self.is_star = is_star(self.part.observations.source) and "altitude" in self.part.positions
         self.derotator = np.rad2deg(self.position("derotator")[0])
+
+    @property
+    def abscissa(self):
+        """What the data are drawn against, in degree, and how that is called."""
+        if self.is_star:
+            return np.rad2deg(self.position("altitude").mean(axis=0)), "altitude of the star (°)"
+        return self.derotator, "derotator angle (°)"
 
     def _grid(self, flat):
         grid = np.full(self.part.valid.shape, np.nan)
@@ -76,9 +85,15 @@ class DataGrid:
     def series(self):
         """Return the data by setting of the half-wave plate, ordered by its angle."""
         # half a turn does not matter; a value just below it belongs to zero
-        angle = np.mod(np.rad2deg(self.position("hwp")) + SAME_ANGLE, 180) - SAME_ANGLE
+        angle = np.mod(np.rad2deg(self._plate()) + SAME_ANGLE, 180) - SAME_ANGLE
         number = clusters(angle[0], SAME_ANGLE)
         return [self._one_series(angle, number == n) for n in range(number.max() + 1)]
+
+    def _plate(self):
+        """Return the angle of the plate: as commanded where it follows the sky."""
+        if self.is_star:
+            return self.part.observations.position("hwp")[self.part.frames.T]
+        return self.position("hwp")
 
     def _one_series(self, angle, member):
         middle = np.median(angle[:, member], axis=1)

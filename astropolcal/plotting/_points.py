@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Points and lines of parameters, which tell how well each is known."""
 
+from itertools import islice
+
 import astropy.units as u
 import numpy as np
 
@@ -24,6 +26,7 @@ _FINE = 201
 # how near to half a wave a panel must be to show that line (deg)
 _NEAR_HALF_WAVE = 45
 _STEP = 1e-3
+_WORDS_IN_A_ROW = 2
 
 
 def draw_entry(axes, calibration, entry, look):
@@ -97,7 +100,9 @@ def draw_law(axes, calibration, leaf, known, look):
     if std is not None:
         axes.fill_between(lam, value - std, value + std, color=look[0], alpha=0.3, linewidth=0)
     _draw_stage(axes, calibration, leaf)
-    axes.set_title("\n".join([f"{leaf.name}: law", ", ".join(_words(own))]))
+    shown = {key: entry for key, entry in own.items() if not entry["fixed"]} or own
+    words = [", ".join(row) for row in _in_rows(_words(shown))]
+    axes.set_title("\n".join([f"{leaf.name}: law", *words]))
 
 
 def _retardance(leaf, lam):
@@ -153,6 +158,12 @@ def _words(own):
         error = f" ± {float(std):.4f}" if np.ndim(std) == 0 and np.isfinite(std) else ""
         if np.ndim(entry["value"]) == 0:
             yield f"{key} = {float(entry['value']):.4f}{error} {entry['unit'] or ''}".rstrip()
+
+
+def _in_rows(words):
+    words = iter(words)
+    while row := list(islice(words, _WORDS_IN_A_ROW)):
+        yield row
 
 
 def mark_half_wave(axes):

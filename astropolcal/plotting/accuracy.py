@@ -109,7 +109,7 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
         for axes in panels:
             references = _draw_references(axes, curves)
             axes.set_ylabel("accuracy (% of polarization)")
-        _scale(panels[0], _all_values(records, standards, curves))
+        scale_axis(panels[0], _all_values(records, standards, curves))
         wavelength_label(panels[-1])
         heading(
             figure, calibration, "Accuracy of the calibration", [record.name for record in records]
@@ -220,7 +220,7 @@ def _all_values(records, standards, curves):
     return np.concatenate([*values, *(value for _, value in curves.values())])
 
 
-def _scale(axes, values):
+def scale_axis(axes, values):
     """Use a logarithmic axis where the values need it, with plain numbers on it."""
     known = values[np.isfinite(values) & (values > 0)]
     if known.size and known.max() > _LOGARITHMIC_FROM * known.min():

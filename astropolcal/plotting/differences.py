@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Observed and modelled differences against the derotator angle."""
+"""Observed and modelled differences against the derotator angle, or the altitude of a star."""
 
 import astropy.units as u
 import numpy as np
@@ -24,10 +24,11 @@ _CURVE_POINTS = 241
 
 def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=None):
     """
-    Draw observed and modelled differences against the derotator angle.
+    Draw observed and modelled differences against the derotator angle, or a star's altitude.
 
     One pair of panels a wavelength: above the observed data and the model,
-    evaluated between the data too; below their difference in percent. Where
+    evaluated between the data too; below their difference in percent. Stars are drawn
+    against their altitude, by the commanded angle of the half-wave plate. Where
     another stage than the derotator moves within a series, the model is drawn
     at the data only.
 
@@ -80,7 +81,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
         rows = -(-len(bins) // columns)
         figure = canvas(figure, 3.0 + 4.4 * columns, 1.2 + 4.1 * rows)
         pairs = _panels(figure, len(bins), rows, columns)
-        fine = _fine(grid.derotator)
+        fine = _fine(grid.abscissa[0])
         curves = [_curve(grid, one, bins, fine) for one in series]
         spread = _s_res(calibration, dataset)
         for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
@@ -124,7 +125,7 @@ def _draw_heading(pair, wavelength, s_res):
 def _draw_series(pair, grid, row, one, look):
     """Draw the data of one setting of the half-wave plate, and their residuals."""
     color, marker = look
-    angle = grid.derotator[one.data]
+    angle = grid.abscissa[0][one.data]
     value, residual, sigma = (
         array[row, one.data] for array in (grid.observed, grid.residual, grid.sigma)
     )
@@ -156,14 +157,14 @@ def _label(pairs, grid, columns):
         last = i + columns >= len(pairs)
         bottom.tick_params(labelbottom=last)
         if last:
-            bottom.set_xlabel("derotator angle (°)")
+            bottom.set_xlabel(grid.abscissa[1])
         if i % columns == 0:
             top.set_ylabel(_two_lines(grid.quantity))
             bottom.set_ylabel(f"obs. {MINUS} model\n(%)")
         else:
             top.tick_params(labelleft=False)
             bottom.tick_params(labelleft=False)
-    fine = _fine(grid.derotator)
+    fine = _fine(grid.abscissa[0])
     pairs[0][0].set_xlim(fine[0], fine[-1])
 
 
@@ -191,9 +192,10 @@ def _legend(figure, grid, series, bins, s_res):
     if np.isfinite(s_res).any():
         handles.append(Patch(color="0.92", label="± s_res"))
     frames = f"plus {MINUS} minus frame" if grid.part.frames.shape[1] == 2 else "of the frame"
+    plate = "half-wave plate\nas commanded" if grid.is_star else "half-wave plate"
     legend_outside(
         figure,
         handles,
         place="outside right upper",
-        title=f"half-wave plate,\n{frames}",
+        title=f"{plate},\n{frames}",
     )

@@ -6,6 +6,8 @@ import textwrap
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
+from astropolcal.gap._numbers import Fitted
+from astropolcal.gap._words import in_title, is_determined, shortened
 from astropolcal.gap.residuals import locate
 from astropolcal.plotting._style import (
     BLACK,
@@ -21,7 +23,13 @@ from astropolcal.plotting._style import (
     wavelength_label,
 )
 
-__all__ = ["plot_effect_scores", "plot_gap_maps", "plot_gap_spectrum", "plot_where"]
+__all__ = [
+    "plot_effect_scores",
+    "plot_effect_sizes",
+    "plot_gap_maps",
+    "plot_gap_spectrum",
+    "plot_where",
+]
 
 _CHANNELS = {
     "difference": ("normalized difference of the beams", "R\N{MINUS SIGN}L over R+L"),
@@ -29,8 +37,10 @@ _CHANNELS = {
 }
 # share of the residuals that the colour scale of the maps covers
 _COVERED = 99.5
-_WIDTH = 42
+_WIDTH = 56
 _MOST_TICKS = 10
+# characters of a dataset's name above a panel
+_LONGEST_NAME = 30
 
 
 def _gaps(model, noise):
@@ -51,13 +61,15 @@ def _rms(values, axis=None):
 
 
 def _title(diagnosis):
-    """Return the verdict as a line."""
-    names = ", ".join(cause.name for cause in diagnosis.causes)
+    """Return the verdict as a line that fits a figure."""
+    largest = sorted(diagnosis.causes, key=lambda cause: -cause.explained)
+    names = in_title([cause.name for cause in largest])
+    several = "effects are" if len(largest) > 1 else "effect is"
     return {
-        "effect": f"an effect is missing: {names}",
+        "effect": f"{len(largest)} {several} missing: {names}",
         "none": "no gap beyond the noise",
         "unexplained": "a real gap that no effect explains"
-        + (f" (in part: {names})" if names else ""),
+        + (f"\n(in part: {names})" if names else ""),
     }.get(diagnosis.verdict, diagnosis.verdict)
 
 
@@ -107,7 +119,7 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
     order = np.argsort(nm)
     n = len(before)
     with style():
-        figure = canvas(figure, 10, 1.4 + 3.0 * n)
+        figure = canvas(figure, 10, 1.6 + 3.3 * n)
         grid = figure.subplots(n, 2, sharex=True, squeeze=False)
         for i, row in enumerate(grid):
             sigma = nominal.problem.channels[i].sigma
@@ -126,7 +138,7 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
                 _spectrum_labels(axes, nominal.observations[i].name, c, i == n - 1)
         handles = grid[0, 0].get_legend_handles_labels()[0]
         legend_outside(figure, handles, columns=3)
-        figure.suptitle(f"Gap between model and data: {_title(diagnosis)}")
+        figure.suptitle(f"Gap between model and data\n{_title(diagnosis)}")
     return figure
 
 
@@ -155,7 +167,7 @@ def _plain(digits=(1,)):
 
 def _spectrum_labels(axes, name, channel, last):
     title, label = list(_CHANNELS.values())[channel]
-    axes.set_title(f"{name}: {title}", loc="left")
+    axes.set_title(f"{shortened(name, _LONGEST_NAME)}\n{title}", loc="left")
     axes.set_ylabel(f"rms of {label} (%)")
     if last:
         wavelength_label(axes)
@@ -207,19 +219,20 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     sizes = np.abs(np.concatenate([gap[c].ravel() for pair in pairs for gap in pair]))
     limit = max(np.nanpercentile(sizes, _COVERED), 1e-12)
     with style():
-        figure = canvas(figure, 12, 1.3 + 3.2 * len(pairs))
+        figure = canvas(figure, 12, 1.5 + 3.2 * len(pairs))
         grid = figure.subplots(len(pairs), 2, sharey=True, squeeze=False)
         for row, pair, observations in zip(grid, pairs, nominal.observations, strict=True):
             for axes, gap, when in zip(row, pair, ("before", "after"), strict=True):
                 drawn = _map(axes, gap[c], nominal.problem.wavelength, limit)
                 rms = _rms(gap[c])
-                axes.set_title(f"{observations.name}, {when}: rms {rms:.2g} %", loc="left")
+                name = shortened(observations.name, _LONGEST_NAME)
+                axes.set_title(f"{name}, {when}: rms {rms:.2g} %", loc="left")
                 _frame_axis(axes, observations)
             row[0].set_ylabel("wavelength (nm)")
         extend = "both" if np.nanmax(sizes) > limit else "neither"
         bar = figure.colorbar(drawn, ax=grid, extend=extend, shrink=0.85, aspect=35)
         bar.set_label(f"observed {MINUS} model (%); grey: masked")
-        figure.suptitle(f"Residuals of the {_CHANNELS[channel][0]}: {_title(diagnosis)}")
+        figure.suptitle(f"Residuals of the {_CHANNELS[channel][0]}\n{_title(diagnosis)}")
     return figure
 
 
@@ -318,7 +331,7 @@ def plot_effect_scores(diagnosis, *, limit=12, figure=None):
         axes.set_xlabel("signal-to-noise ratio in the scan; at the bars: corrected probability")
         axes.set_xlim(0, 1.18 * max(map(_strength, scores), default=1.0))
         legend_outside(figure, _keys(used), columns=4)
-        figure.suptitle(f"Scan of the effects: {_title(diagnosis)}")
+        figure.suptitle(f"Scan of the effects\n{_title(diagnosis)}")
         if not scores:
             axes.text(0.5, 0.5, "no effect to score", transform=axes.transAxes, ha="center")
     return figure
@@ -352,6 +365,93 @@ def _keys(used):
     from matplotlib.patches import Patch
 
     return [Patch(label=label, **look) for label, look in _LOOKS.items() if label in used]
+
+
+def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
+    """
+    Draw the fitted size of a cause with its errors by wavelength.
+
+    One panel a parameter. Where the data do not tell the size, the wavelength
+    is marked at the foot of the panel.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+    effect : str
+        Name of one of its causes.
+    content : dict, optional
+        What `~astropolcal.gap.report.to_dict` returned for it, if it is known already.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If the effect is no cause, or has no size that depends on wavelength.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.optics import BeamGain
+    >>> from astropolcal.plotting.gap import plot_effect_sizes
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> wavelength = [1200, 1600, 2000] * u.nm
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=wavelength)
+    >>> truth = chain | BeamGain(imbalance=0.02, name="flat")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 70, 95, 120] * u.deg)
+    >>> data = simulate(truth, wavelength, frames, seed=1)
+    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> plot_effect_sizes(diagnosis, "beam_gain").axes[0].get_ylabel()
+    'imbalance'
+    """
+    sizes = _sizes_by_wavelength(diagnosis, effect, content)
+    nm = 1000 * diagnosis.nominal.problem.wavelength
+    with style():
+        figure = canvas(figure, 4.9 * min(len(sizes), 2) + 0.6, 0.4 + 2.5 * -(-len(sizes) // 2))
+        grid = figure.subplots(-(-len(sizes) // 2), min(len(sizes), 2), squeeze=False, sharex=True)
+        for axes in grid.flat[len(sizes) :]:
+            axes.set_axis_off()
+        for axes, (name, size) in zip(grid.flat, sizes.items(), strict=False):
+            _size_panel(axes, nm, size)
+            unit = f" ({size['unit']})" if size["unit"] else ""
+            axes.set_ylabel(f"{name.partition('.')[2].replace('_', ' ')}{unit}")
+            wavelength_label(axes)
+    return figure
+
+
+def _sizes_by_wavelength(diagnosis, effect, content):
+    names = [cause.name for cause in diagnosis.causes]
+    if effect not in names:
+        raise ParameterError(f"effect = {effect!r} is no cause; these are: {', '.join(names)}")
+    if content is None:
+        sizes = Fitted(diagnosis.improved).sizes(effect)
+    else:
+        sizes = content["causes"][names.index(effect)]["parameters"]
+    found = {name: size for name, size in sizes.items() if isinstance(size["value"], list)}
+    if not found:
+        raise ParameterError(f"effect = {effect!r} has no size that depends on wavelength")
+    return found
+
+
+def _size_panel(axes, nm, size):
+    known = np.array([is_determined(std, size["limit"]) for std in size["std"]])
+    value = np.array(size["value"], dtype=float)
+    error = np.array(size["std"], dtype=float)
+    axes.axhline(0, color=BLACK, linewidth=0.8)
+    axes.errorbar(nm[known], value[known], error[known], fmt="o", color=BLUE, elinewidth=1.5)
+    if not known.all():
+        foot = axes.get_xaxis_transform()
+        axes.plot(nm[~known], np.full((~known).sum(), 0.05), "x", color=VERMILION, transform=foot)
+        axes.set_title("crosses: not determined", loc="left", fontsize=10)
+    if not known.any():
+        axes.set_yticks([])
 
 
 def plot_where(diagnosis, *, limit=12, figure=None):
@@ -393,10 +493,13 @@ def plot_where(diagnosis, *, limit=12, figure=None):
     where = diagnosis if hasattr(diagnosis, "table") else _where(diagnosis)
     told = where.told
     kinds = [told[told["kind"] == kind][:limit] for kind in ("pattern", "place")]
-    heights = [max(len(rows), 1) for rows in kinds]
-    titles = ("what the gap follows (one after the other)", "where the gap is largest")
+    heights = [max(len(rows), 1) + 0.4 for rows in kinds]
+    titles = (
+        "what the gap follows (one after the other, shares add up)",
+        "where the gap is large (overlapping, shares do not add up)",
+    )
     with style():
-        figure = canvas(figure, 10, 1.6 + 0.62 * sum(heights))
+        figure = canvas(figure, 10, 1.8 + 0.5 * sum(heights))
         panels = figure.subplots(2, 1, height_ratios=heights, sharex=True)
         for axes, rows, color, title in zip(panels, kinds, (BLUE, ORANGE), titles, strict=True):
             _shares(axes, rows, color)
@@ -404,6 +507,10 @@ def plot_where(diagnosis, *, limit=12, figure=None):
         panels[-1].set_xlabel("share of the excess over the noise (%)")
         figure.suptitle("Where the gap lies")
     return figure
+
+
+# beyond this share (percent) its number stands inside the bar
+_NEAR_THE_EDGE = 93
 
 
 def _where(diagnosis):
@@ -416,11 +523,13 @@ def _shares(axes, rows, color):
     labels = [textwrap.fill(str(row["detail"]), _WIDTH) for row in rows]
     axes.barh(range(len(rows)), shares, color=color, height=0.6)
     for i, share in enumerate(shares):
-        axes.text(share, i, f" {share:.0f}", va="center")
-    axes.set_yticks(range(len(rows)), labels=labels, fontsize=9)
-    axes.invert_yaxis()
+        inside = share > _NEAR_THE_EDGE
+        ends = {"ha": "right", "color": "white" if color == BLUE else BLACK} if inside else {}
+        axes.text(share, i, f"{share:.0f} " if inside else f" {share:.0f}", va="center", **ends)
+    axes.set_yticks(range(len(rows)), labels=labels, fontsize=10)
+    axes.set_ylim(max(len(rows), 1) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
-    axes.set_xlim(0, 110)
+    axes.set_xlim(0, 100)
     if not len(rows):
         axes.set_yticks([])
         axes.text(0.5, 0.5, "nothing beyond the noise", transform=axes.transAxes, ha="center")

@@ -2,6 +2,7 @@
 """Calibrated parameters against wavelength, with what is known of their errors."""
 
 import difflib
+import textwrap
 
 import astropy.units as u
 import numpy as np
@@ -21,6 +22,8 @@ _RETARDANCES = {
     "circular": r"circular retardance $\Delta_R$",
     "retardance": r"retardance $\Delta$",
 }
+# longer labels do not fit beside a panel
+_LABEL_WIDTH = 28
 _EFFICIENCY = r"modulation efficiency $|\eta|$"
 
 
@@ -220,7 +223,7 @@ def _check_name(name, known):
 
 
 def _describe(parameter):
-    words = parameter.__doc__ or parameter.name
+    words = textwrap.fill(parameter.__doc__ or parameter.name, _LABEL_WIDTH)
     if parameter.unit is None or parameter.unit == u.dimensionless_unscaled:
         return words
     return f"{words} ({'°' if parameter.unit == u.deg else parameter.unit})"

@@ -18,6 +18,7 @@ from astropolcal.plotting.accuracy import plot_accuracy
 from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
 from astropolcal.plotting.identifiability import plot_identifiability
+from astropolcal.plotting.mirrors import plot_mirrors
 from astropolcal.plotting.parameters import (
     other_parameters,
     plot_efficiency,
@@ -26,6 +27,8 @@ from astropolcal.plotting.parameters import (
 )
 from astropolcal.plotting.posterior import MAX_CORNER, MAX_TRACES, plot_corner, plot_traces
 from astropolcal.plotting.residuals import plot_residuals
+from astropolcal.plotting.star_check import plot_star_check
+from astropolcal.plotting.targets import plot_target_accuracy
 
 __all__ = ["save_all"]
 
@@ -56,7 +59,8 @@ def save_all(calibration, folder):
     list of `~pathlib.Path`
         The files: of ``double_differences.png`` (``double_differences_2.png``
         for the second dataset, and so on), ``residuals.png``,
-        ``accuracy.png``, ``retardances.png``, ``efficiency.png``,
+        ``accuracy.png``, ``targets.png``, ``mirrors.png``, ``star.png`` (one a star that
+        was checked), ``retardances.png``, ``efficiency.png``,
         ``correlations.png``, ``identifiability.png``,
         ``other_parameters.png``, ``traces.png`` and ``corner.png`` those that
         could be drawn.
@@ -143,6 +147,11 @@ def _figures(calibration):
     yield "identifiability", lambda: plot_identifiability(calibration)
     yield "accuracy", lambda: plot_accuracy(calibration)
     yield "retardances", lambda: plot_retardances(calibration)
+    yield "targets", lambda: plot_target_accuracy(calibration)
+    yield "mirrors", lambda: plot_mirrors(calibration)
+    for i, entry in enumerate(calibration.fit.get("stars", [])):
+        name = "star" + (f"_{i + 1}" if i else "")
+        yield name, lambda entry=entry: plot_star_check(calibration, entry)
     yield "efficiency", lambda: plot_efficiency(calibration)
     yield "correlations", lambda: plot_correlations(calibration)
     yield "other_parameters", lambda: plot_parameters(calibration, other_parameters(calibration))

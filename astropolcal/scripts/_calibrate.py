@@ -52,7 +52,7 @@ def _add_model_options(parser):
         "--derotator",
         metavar="MODEL",
         default="elliptical",
-        help="elliptical (default) or linear retarder",
+        help="elliptical (default) or linear retarder, or kmirror: three silver mirrors with films",
     )
     parser.add_argument(
         "--bounds",
@@ -65,6 +65,14 @@ def _add_model_options(parser):
         metavar="MODEL",
         help="tertiary mirror of stars: free (default, a diattenuation a wavelength), "
         "'power law' (the paper's permittivity) or metal (silver with a film)",
+    )
+    parser.add_argument(
+        "--nuisance",
+        action="append",
+        default=[],
+        metavar="KIND[:DATASET]",
+        help="add what differs from dataset to dataset, with a prior: background, beam_gain, or "
+        "lamp (q and u of an unpolarized internal source); for all datasets or for one",
     )
     _add_fit_options(parser)
     _add_parameter_options(parser)
@@ -123,6 +131,11 @@ def _add_parameter_options(parser):
         help="free a parameter, such as wollaston.theta",
     )
     parser.add_argument(
+        "--start",
+        metavar="OLD.asdf",
+        help="start from this calibration, hold it, and refit only what --free names",
+    )
+    parser.add_argument(
         "--prior",
         action="append",
         default=[],
@@ -152,7 +165,8 @@ def _add_accuracy_options(parser):
         action="append",
         default=[],
         metavar="FILE",
-        help="table that is predicted, not fitted; its errors are s_standard",
+        help="table that is predicted, not fitted; its errors are s_standard. A standard star is "
+        "compared with the catalogue, too",
     )
     parser.add_argument(
         "--groups",
@@ -172,13 +186,15 @@ def _add_accuracy_options(parser):
 def run(arguments):
     """Calibrate, print the summary and write what was asked for."""
     from astropolcal import instruments
-    from astropolcal.calibration import calibrate, summary
+    from astropolcal.calibration import summary
     from astropolcal.calibration.standards import add_standard
+    from astropolcal.calibration.star_check import add_star_check
     from astropolcal.calibration.target_accuracy import TARGETS
     from astropolcal.observations import get_observable
 
     say = _silent if arguments.quiet or arguments.json == "-" else print
     check_outputs(arguments.output, arguments.json)
+    _check_start(arguments)
     get_observable(arguments.observable)
     targets = [_target(text) for text in arguments.target] or TARGETS
     files = arguments.files or [_example(say)]
@@ -192,35 +208,77 @@ def run(arguments):
     tables = [*datasets, *standards]
     options = {"derotator": arguments.derotator, "bounds": arguments.bounds}
     options |= {"m3": arguments.m3} if arguments.m3 else {}
-    chains = instrument.chains_for(datasets, **options)
+    chains = instrument.chains_for(datasets, nuisance=arguments.nuisance, **options)
     # each on its own wavelengths
     chains += [instrument.chains_for([table], **options)[0] for table in standards]
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix", "prior")}
+    if arguments.start:
+        edits["free"] = []
     chains = edit_chains(chains, **edits)
     positions = [instrument.positions(*pair) for pair in zip(tables, chains, strict=True)]
-    calibration = calibrate(
-        chains[:n],
-        datasets,
-        strategy=arguments.strategy,
-        observable=arguments.observable,
-        weights=None if arguments.weights == "none" else arguments.weights,
-        loss=arguments.loss,
-        positions=positions[:n],
-        gauge=None if arguments.gauge == "none" else arguments.gauge,
-        fix=_held(arguments, chains[:n]),
-        instrument=instrument.name,
-        cross_validate=arguments.groups is None,
-    )
+    calibration = _fitted(arguments, chains[:n], datasets, positions[:n], instrument)
     if arguments.groups:
         calibration.cross_validate(arguments.groups)
         calibration.fit["groups"] = arguments.groups
     for item in list(zip(chains, tables, positions, strict=True))[n:]:
         add_standard(calibration, *item)
+        if _is_known(item[1]):
+            add_star_check(calibration, *item)
     # written first: whoever reads the summary may go away
     written = _write(calibration, arguments, targets)
     say(summary(calibration, targets))
     if written:
         say("\nWritten: " + "\n         ".join(written))
+
+
+def _is_known(observations):
+    """Return whether a table is of a star whose polarization the catalogue knows."""
+    from astropolcal import standards
+    from astropolcal.observations import is_star
+
+    if not is_star(observations.source):
+        return False
+    try:
+        standards.get(str(observations.meta.get("object"))).stokes(observations.wavelength)
+    except AstropolcalError:
+        return False
+    return True
+
+
+def _fitted(arguments, chains, datasets, positions, instrument):
+    """Return the fit of all that is free, or of what changed since another calibration."""
+    from astropolcal.calibration import Calibration, calibrate, restart
+
+    options = {
+        "weights": None if arguments.weights == "none" else arguments.weights,
+        "loss": arguments.loss,
+        "positions": positions,
+        "gauge": None if arguments.gauge == "none" else arguments.gauge,
+        "cross_validate": arguments.groups is None,
+    }
+    if arguments.start:
+        old = Calibration.read(arguments.start)
+        return restart(old, datasets, arguments.free, chain=chains, **options)
+    return calibrate(
+        chains,
+        datasets,
+        strategy=arguments.strategy,
+        observable=arguments.observable,
+        fix=_held(arguments, chains),
+        instrument=instrument.name,
+        **options,
+    )
+
+
+def _check_start(arguments):
+    """Refuse what a calibration to start from settles already."""
+    others = ("fix", "prior", "without")
+    given = [f"--{key}" for key in others if getattr(arguments, key)]
+    if arguments.start and (given or arguments.strategy != "joint"):
+        shown = given[0] if given else f"--strategy {arguments.strategy}"
+        raise AstropolcalError(f"{shown} cannot be combined with --start; --free can")
+    if arguments.start and not arguments.free:
+        raise AstropolcalError("--start holds everything: say with --free NAME what may change")
 
 
 def _check_standards(paths, standards, files, datasets):

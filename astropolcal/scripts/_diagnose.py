@@ -195,7 +195,10 @@ def _write(diagnosis, content, arguments, instrument):
     if arguments.report:
         from astropolcal.gap.report import write_html
 
-        write_html(diagnosis, arguments.report, figures=_figures(diagnosis), content=content)
+        figures, sizes = _figures(diagnosis), _size_figures(diagnosis, content)
+        write_html(
+            diagnosis, arguments.report, figures=figures, size_figures=sizes, content=content
+        )
         written.append(arguments.report)
     if arguments.save:
         _improved(diagnosis, instrument).write(arguments.save, overwrite=True)
@@ -215,6 +218,23 @@ def _figures(diagnosis):
     if diagnosis.scores:
         figures["Evidence for each effect that was tried"] = gap.plot_effect_scores(diagnosis)
     return figures
+
+
+def _size_figures(diagnosis, content):
+    """Return a figure for every cause whose size the data tell and that varies."""
+    from astropolcal.gap._words import has_sizes
+    from astropolcal.plotting.gap import plot_effect_sizes
+
+    return {
+        entry["effect"]: plot_effect_sizes(diagnosis, entry["effect"], content=content)
+        for entry in content["causes"]
+        if any(has_sizes(entry)) and any(map(_varies, entry["parameters"].values()))
+    }
+
+
+def _varies(size):
+    value = size["value"]
+    return isinstance(value, list) and max(value) - min(value) > 1e-6 * max(map(abs, value))
 
 
 def _improved(diagnosis, instrument):

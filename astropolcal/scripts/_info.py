@@ -10,11 +10,17 @@ def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
     parser = commands.add_parser(
         "info",
-        help="say what a calibration or an observation table holds",
-        description="Say what a calibration file or an observation table holds; without a file, "
-        "what this installation knows.",
+        help="say what a calibration, a folder of them or an observation table holds",
+        description="Say what a calibration file, a folder of calibrations or an observation "
+        "table holds, how good it is and for what it is valid; without a file, what this "
+        "installation knows.",
     )
-    parser.add_argument("file", nargs="?", metavar="FILE", help="ASDF calibration or ECSV table")
+    parser.add_argument(
+        "file",
+        nargs="?",
+        metavar="FILE|DIR",
+        help="ASDF calibration, folder of calibrations, or ECSV table",
+    )
     parser.add_argument("--instruments", action="store_true", help="list the instruments only")
     parser.add_argument("--json", metavar="FILE", help="write it for machines (- for stdout)")
     parser.set_defaults(run=run)
@@ -29,6 +35,8 @@ def run(arguments):
         return
     if arguments.file is None:
         text, content = _installation()
+    elif Path(arguments.file).is_dir():
+        text, content = _library(arguments.file)
     elif Path(arguments.file).suffix.lower() == ".asdf":
         text, content = _calibration(arguments.file)
     else:
@@ -59,17 +67,64 @@ def _installation():
 
 def _calibration(path):
     from astropolcal.calibration import Calibration
+    from astropolcal.calibration.validity import content_hash, validity_of
 
     calibration = Calibration.read(path)
-    made = calibration.provenance
+    made, held = calibration.provenance, validity_of(calibration)
+    digest = content_hash(calibration)
     lines = [
         f"{path}: calibration made {made.get('created', 'at an unknown time')} "
-        f"with astropolcal {made.get('astropolcal', '?')}"
+        f"with astropolcal {made.get('astropolcal', '?')}",
+        f"  valid for {held}",
+        f"  content sha256 {digest}",
     ]
     for record in calibration.datasets:
         optics = ", ".join(f"{k}: {v}" for k, v in record.meta.items() if k not in _DULL)
         lines.append(f"  {record.name}: {optics}, sha256 {record.content_hash[:12]}")
-    return "\n".join([*lines, "", calibration.summary()]), calibration.to_dict()
+    content = calibration.to_dict() | {"validity": held.to_dict(), "content_hash": digest}
+    return "\n".join([*lines, "", calibration.summary()]), content
+
+
+def _library(folder):
+    """Return what a folder of calibrations holds, one block of lines a file."""
+    from astropolcal.calibration.library import Library
+
+    library = Library(folder)
+    table = library.table()
+    lines = [f"{folder}: {len(library)} calibration{'s' * (len(library) != 1)}"]
+    files = []
+    for entry, row in zip(library.entries, table, strict=True):
+        good = f"s_res {_percent(row['s_res'])}, s_cv {_percent(row['s_cv'])}"
+        state = "" if row["converged"] else ", NOT CONVERGED"
+        lines += [
+            f"{entry.name}",
+            f"  valid for {entry.validity}",
+            f"  from {row['datasets']}; {good} (median){state}",
+            f"  content sha256 {entry.content_hash[:12]}",
+        ]
+        files.append(_plain(row) | {"validity": entry.validity.to_dict()})
+    problems = {path.name: reason for path, reason in library.problems.items()}
+    lines += [f"{name}\n  UNREADABLE: {reason}" for name, reason in problems.items()]
+    overlaps = library.overlaps()
+    lines += [f"OVERLAP: {words}" for words in overlaps]
+    content = {"folder": str(folder), "calibrations": files}
+    return "\n".join(lines), content | {"unreadable": problems, "overlaps": overlaps}
+
+
+def _plain(row):
+    """Return a row of the library's table as JSON knows it; what is not a number is null."""
+    import math
+
+    numbers = {f"{key}_percent": float(row[key]) for key in ("s_res", "s_cv")}
+    return {
+        **{key: str(row[key]) for key in ("name", "datasets", "content_hash")},
+        "converged": bool(row["converged"]),
+        **{key: value if math.isfinite(value) else None for key, value in numbers.items()},
+    }
+
+
+def _percent(value):
+    return f"{value:.3f} %" if value == value else "-"
 
 
 _DULL = ("description", "comments", "reference")

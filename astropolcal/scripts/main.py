@@ -42,6 +42,7 @@ def build_parser():
     from astropolcal.scripts import (
         _calibrate,
         _challenge,
+        _correct,
         _diagnose,
         _efficiency,
         _info,
@@ -59,6 +60,7 @@ def build_parser():
         _calibrate,
         _sample,
         _diagnose,
+        _correct,
         _efficiency,
         _standards,
         _simulate,

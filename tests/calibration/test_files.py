@@ -537,6 +537,10 @@ def test_file_says_for_what_it_holds(content):
         node = file["calibration"]
     assert node["validity"] == {
         "instrument": "bench",
+        "mode": None,
+        "valid_from": "2025-05-01",
+        "valid_until": None,
+        "optics_in": None,
         "dates": ["2025-05-01", "2025-10-02"],
         "optics_in_beam": [
             ["polarizer", "hwp", "derotator", "wollaston"],
@@ -753,8 +757,8 @@ def test_asdf_of_something_else(path):
 
 def test_other_versions(path, content):
     for old, new, message in (
-        (b"calibration-1.0.0>", b"calibration-2.0.0>", "calibration of version 2.0.0; this"),
-        (b"calibration-1.0.0>", b"calibration-1.0.1>", "reads version 1.0.0"),
+        (b"calibration-1.1.0>", b"calibration-2.0.0>", "calibration of version 2.0.0; this"),
+        (b"calibration-1.1.0>", b"calibration-1.0.1>", "reads version 1.0.0, 1.1.0$"),
         (b"linear_polarizer-1.0.0>", b"linear_polarizer-1.1.0>", "unknown kind or version"),
         (b"linear_polarizer-1.0.0>", b"circular_polarizer-1.0.0>", "damaged: .*not recognized"),
     ):

@@ -13,9 +13,10 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from sky_data import sky_track
 
 from astropolcal import Calibration, calibrate, instruments, optics
-from astropolcal.chain import leaves
+from astropolcal.chain import insert_optic, leaves
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import scan
 from astropolcal.gap.effects import (
@@ -39,8 +40,23 @@ from astropolcal.units import canonical_factor
 WAVELENGTH = np.geomspace(1.16, 2.3, 6) * u.um
 FRAMES = half_wave_plate_cycles(derotator=[45, 62, 77, 98] * u.deg)
 LONG = half_wave_plate_cycles(np.arange(0, 360, 33.75) * u.deg, [45, 62, 77, 98] * u.deg)
+SKY = sky_track(12, parallactic=(-50, 70), altitude=(50, 75))
 #: Photons of a beam, at first.
 FLUX = 1e8
+
+
+def _transit():
+    """Return the frames of a star near transit, which turns fastest in the middle."""
+    table, n = SKY.copy(), len(SKY)
+    commanded = table["hwp"] - 0.5 * table["parallactic"] - table["altitude"]
+    x = np.linspace(-3, 3, n)
+    table["parallactic"], table["altitude"] = 60 * np.tanh(x) * u.deg, (80 - x**2) * u.deg
+    table["derotator"] = 0.5 * (table["altitude"] - table["parallactic"]) + 63.5 * u.deg
+    table["hwp"] = commanded + 0.5 * table["parallactic"] + table["altitude"]
+    return table
+
+
+TRANSIT = _transit()
 
 
 def lamp(n_frames):
@@ -78,6 +94,20 @@ def _bounded(optic, key, low, high):
     return change
 
 
+def _steep_dichroic(chains):
+    """Put in a retarder that stands still and is steep in wavelength, held where it is."""
+    values = 40 * np.tanh(np.linspace(-3, 3, WAVELENGTH.size)) * u.deg
+    dichroic = optics.LinearRetarder(retardance=values, theta=40 * u.deg, name="dichroic")
+    dichroic.retardance.fixed = True
+    return [insert_optic(chain, dichroic.copy(), before="wollaston") for chain in chains]
+
+
+def _hold_mirror(chains):
+    for chain in chains:
+        chain["m3"].diattenuation.fixed = True
+    return chains
+
+
 @dataclass
 class Case:
     """How an effect is tested."""
@@ -87,6 +117,8 @@ class Case:
     #: What the nominal chains need before the effect has a place.
     prepare: object = _nothing
     frames: object = None
+    #: Whether the chains are those of two stars.
+    sky: bool = False
 
 
 _ONE_SIGN = (1.0,)
@@ -95,22 +127,30 @@ CASES = {
     "background": Case((2.0, -0.6, 0.4)),
     "beam_crosstalk": Case((-1.0, 0.3, 0.2)),
     "beam_gain": Case(),
+    "altitude_sign": Case(sky=True),
     "beams_swapped": Case(),
     "derotator_45_retardance": Case(),
     "derotator_angle_bound": Case(_ONE_SIGN, _bounded("derotator", "theta", -5, 0)),
+    "derotator_band_average": Case((-1.0, -2.0)),
     "derotator_circular_retardance": Case(),
     "derotator_diattenuation": Case(),
+    "derotator_elliptical_retardance": Case(),
     "derotator_encoder": Case(),
     "derotator_encoder_eccentricity": Case((5.0, 5.0)),
     "derotator_misalignment": Case(_ONE_SIGN, _hold("derotator")),
+    "derotator_motion": Case((2.0,), sky=True, frames=TRANSIT),
     "derotator_offset": Case(),
     "derotator_retardance_bound": Case(_ONE_SIGN, _bounded("derotator", "retardance", -400, 0)),
     "derotator_sign": Case(),
     "detector_nonlinearity": Case(),
+    "dichroic_band_average": Case((-1.0, -3.0), _steep_dichroic),
     "dichroic_j_band": Case((1.0, -0.6, 0.4, 0.8, -1.0)),
     "fringes": Case(),
     "fringes_12_um": Case(),
     "fringes_4_um": Case(),
+    "fringes_drift": Case(),
+    "fringes_drift_12_um": Case(),
+    "fringes_drift_4_um": Case(),
     "hwp_angle_bound": Case(_ONE_SIGN, _bounded("hwp", "theta", -5, 0)),
     "hwp_axis_dispersion": Case(),
     "hwp_beam_wander": Case(frames=LONG),
@@ -118,24 +158,34 @@ CASES = {
     "hwp_encoder_eccentricity": Case(frames=LONG),
     "hwp_encoder_two_lobe": Case(frames=LONG),
     "hwp_misalignment": Case(_ONE_SIGN, _hold("hwp")),
+    "hwp_not_tracking": Case(sky=True),
     "hwp_offset": Case(),
     "hwp_retardance": Case(),
     "hwp_retardance_free": Case((1.0, -0.6, 0.4, 0.8, -1.0)),
     "hwp_sign": Case(),
     "hwp_thickness_bound": Case(_ONE_SIGN, _bounded("hwp", "w_sio2", -0.1, 0)),
     "hwp_tilt": Case(frames=LONG),
+    "hwp_tracking_altitude_sign": Case(sky=True),
+    "hwp_tracking_parallactic_sign": Case(sky=True),
     "hwp_transmission": Case(frames=LONG),
     "hwp_transmission_once": Case(frames=LONG),
+    "m3_diattenuation": Case((0.5, -0.1, 0.05), _hold_mirror, sky=True),
+    "m3_recoating": Case((1.0, -0.3, 0.1), sky=True),
+    "m3_retardance": Case(sky=True),
     "mirror_flip": Case(),
     "mirror_flip_before_plate": Case(),
     "mirror_misalignment": Case((4.0,)),
+    "parallactic_sign": Case(sky=True),
     "persistence": Case((0.3,)),
     "polarizer_angle_bound": Case(_ONE_SIGN, _bounded("calibration_polarizer", "theta", -5, 0)),
     "polarizer_leak": Case((-1.0, 0.3, 0.2)),
     "polarizer_misalignment": Case(_ONE_SIGN, _hold("calibration_polarizer")),
     "retarder_before_plate": Case(),
+    "sky_background": Case(sky=True),
+    "sky_motion": Case((2.0,), sky=True, frames=TRANSIT),
     "source_circular": Case(),
     "source_rotation_drift": Case((5.0,)),
+    "standard_polarization": Case(sky=True),
     "static_diattenuator": Case(),
     "static_retarder": Case(),
     "wavelength_scale": Case(),
@@ -154,12 +204,34 @@ RIVALS = (
     "source_circular",
     "static_retarder",
 )
+#: The same for chains of stars.
+SKY_RIVALS = ("beam_gain", "hwp_diattenuation", "m3_diattenuation", "m3_recoating",
+              "m3_retardance", "sky_background", "standard_polarization")  # fmt: skip
 SMOOTH = [name for name in CASES if EFFECTS[name].kind != "discrete"]
 SHOWN = [name for name in SMOOTH if EFFECTS[name].absorbed_by is None]
 
 
+def star_chains(case):
+    """Return the chains of an unpolarized and a polarized star; all behind the mirror is held."""
+    charis = instruments.get("charis")
+    options = {"wavelength": WAVELENGTH, "derotator": "linear"}
+    made = [
+        charis.chain("unpolarized standard star", **options),
+        charis.chain("star", star="other", **options),
+    ]
+    made[1]["other"].q, made[1]["other"].u = np.full((2, WAVELENGTH.size), [[0.03], [-0.05]])
+    for chain in made:
+        chain["m3"].diattenuation = 0.017 - 0.001 * np.arange(WAVELENGTH.size)
+        for leaf in leaves(chain)[4:]:
+            for key in leaf.param_names:
+                getattr(leaf, key).fixed = True
+    return case.prepare(made)
+
+
 def nominal_chains(case):
     """Return a polarized and an unpolarized chain at their true values."""
+    if case.sky:
+        return star_chains(case)
     charis = instruments.get("charis")
     made = [
         charis.chain(source, wavelength=WAVELENGTH, derotator="linear")
@@ -174,7 +246,8 @@ def clean(name):
     """Return nominal chains of a case, and noiseless data."""
     case = CASES[name]
     chains = nominal_chains(case)
-    frames = FRAMES if case.frames is None else case.frames
+    usual = SKY if case.sky else FRAMES
+    frames = usual if case.frames is None else case.frames
     settings = {"flux": FLUX, "lamp": lamp(len(frames)), "noise": False}
     data = [simulate(chain, WAVELENGTH, frames, **settings) for chain in chains]
     return chains, data
@@ -219,7 +292,8 @@ def noisy(problem, q, data, seed):
         frames = np.repeat(np.arange(old.n_frames), WAVELENGTH.size)
         table = QTable({"frame": frames, "wavelength": np.tile(WAVELENGTH, old.n_frames)})
         table["bin"] = np.tile(np.arange(WAVELENGTH.size), old.n_frames)
-        for stage in ("hwp", "derotator"):
+        there = ("hwp", "derotator", "parallactic", "altitude")
+        for stage in (key for key in there if key in old.frames.colnames):
             table[stage] = old.position(stage)[frames] * u.rad
         for beam, flux, mean in zip(("right", "left"), drawn, fluxes, strict=True):
             table[f"flux_{beam}"] = flux.T.ravel() * u.adu
@@ -340,7 +414,8 @@ def test_recovery(name):
     effect, model = EFFECTS[name], fitted(chains, data)
     nominal = fixed_tangent(model)
     assert effect.applies(model.chains)
-    rivals = [EFFECTS[other] for other in RIVALS if other != name]
+    rivals = SKY_RIVALS if CASES[name].sky else RIVALS
+    rivals = [EFFECTS[other] for other in rivals if other != name]
     scores = scan(model, [effect, *rivals], nominal=nominal)
     mine = next(score for score in scores if score.effect is effect)
     assert mine.p_value < 1e-3

@@ -9,7 +9,7 @@ from gap_data import WAVELENGTH, chain, fitted, observed, with_effect
 from astropolcal import instruments
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import get_effect
-from astropolcal.gap.planning import Exposure, exposures, plan
+from astropolcal.gap.planning import Exposure, exposures, few, plan
 from astropolcal.simulation import half_wave_plate_cycles
 
 PAIR = ("source_circular", "static_retarder")
@@ -135,6 +135,39 @@ def test_unknown_effect(model):
 def test_words_of_an_exposure():
     one = Exposure(0, (0.0, 45.0), (("derotator", 60.0),), lamp=2.0, without=("polarizer",))
     assert one.words == (
-        "2 half-wave-plate angles (0 to 45 deg) at derotator 60 deg without polarizer "
-        "with the lamp 2 times as bright"
+        "2 half-wave-plate angles from 0 to 45 deg, derotator at 60 deg, polarizer taken out, "
+        "the lamp 2 times as bright"
     )
+    turn = Exposure(0, (0.0, 56.25, 112.5, 337.5), lamp=0.5)
+    assert "over a full turn (0, 56.25, 112.5, ... deg), the lamp half as bright" in turn.words
+
+
+def test_exposures_for_one_purpose_differ_in_kind(model, members):
+    found = plan(model, members=members)
+    for_the_pair = [e for e in found if set(e["separates"]) == set(PAIR)]
+    assert 1 <= len(for_the_pair) <= 2
+    turned = ["polarizer" in e["words"] or "lamp" in e["words"] for e in for_the_pair]
+    assert len(set(turned)) == len(turned)
+    assert all(f"({name})" in for_the_pair[0]["words"] for name in PAIR)
+    assert get_effect(PAIR[0]).title in for_the_pair[0]["words"]
+
+
+def entry(words, separates, gain):
+    return {"words": f"Take {words}", "separates": separates, "gain": gain}
+
+
+def test_several_plans_become_few():
+    one = [entry(f"x{i}: tells a from b", ["a", "b"], 30.0 - i) for i in range(5)]
+    two = [entry(f"y{i}: tells c from d", ["c", "d"], 9.0 - i) for i in range(5)]
+    found = few([*one, *two], limit=3)
+    assert [e["gain"] for e in found] == [30.0, 29.0, 9.0]
+    assert few([]) == []
+    # two causes may be aliases of each other
+    assert [e["gain"] for e in few([one[0], one[0], one[1]])] == [30.0, 29.0]
+
+
+def test_an_exposure_with_two_purposes_is_named_once():
+    one, two = entry("x: tells a from b", ["a", "b"], 9.0), entry("x: fixes c", ["c"], 5.0)
+    (both,) = few([two, one])
+    assert both["words"] == "Take x: tells a from b; fixes c"
+    assert (both["separates"], both["gain"]) == (["a", "b", "c"], 9.0)

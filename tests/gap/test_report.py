@@ -13,8 +13,10 @@ import pytest
 
 from astropolcal import instruments
 from astropolcal.exceptions import GapError
-from astropolcal.gap import _words, diagnose, get_effect
+from astropolcal.gap import EFFECTS, _words, diagnose, get_effect
+from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.effects import Context
+from astropolcal.gap.model import nominal_model
 from astropolcal.gap.report import causes_table, summary, to_dict, write_html
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -174,7 +176,7 @@ def test_without_cross_validation_the_report_says_so():
 
 def test_words_of_an_effect(found, content):
     large, what, left = content["sentences"]
-    assert f"{content['gap_before_percent']:.3g} % of polarization" in large
+    assert f"{content['gap_before_percent']:#.3g} % of polarization" in large
     assert "the gap is real" in large
     assert get_effect("beam_gain").title in what
     assert "what remains is noise" in left
@@ -250,19 +252,132 @@ def test_what_the_data_do_not_tell_is_not_given_as_a_size():
             "a.e": {"value": 1.23456, "std": None, **known},
         }
     )
-    assert lines[0].startswith("a.b: 1.000 to 2.000 deg, errors 0.011 to 0.100")
+    assert lines[0].startswith(
+        "a.b: median 1.500, from 1.000 to 2.000 deg; errors 0.011 to 0.10 deg"
+    )
     assert lines[0].endswith("determined at 2 of 3 wavelengths")
     assert lines[1] == "a.c: not determined by these data at any wavelength"
     assert lines[2] == "a.d: 1.235 +- 0.012 deg"
     assert lines[3] == "a.e: not determined by these data"
 
 
-def test_several_causes_are_numbered(found):
+def several(found, shares):
+    """Return the diagnosis with as many causes of other effects, which explain these shares."""
     (cause,) = found.causes
-    two = [replace(cause, explained=0.6), replace(cause, explained=0.3)]
-    content = to_dict(replace(found, causes=two))
-    assert "misses 2 effects, (1) " in content["sentences"][1]
-    assert "90 %" in content["sentences"][1]
+    names = [n for n in EFFECTS if EFFECTS[n].kind != "discrete" and n != "beam_gain"]
+    others = [replace(cause, effect=get_effect(n)) for n in names[: len(shares) - 1]]
+    causes = [replace(c, explained=s) for c, s in zip([cause, *others], shares, strict=True)]
+    return replace(found, causes=causes)
+
+
+def test_the_largest_of_several_causes_are_named(found):
+    content = to_dict(several(found, [0.3, 0.6]))
+    what = content["sentences"][1]
+    first, second = (cause["title"] for cause in content["causes"])
+    assert "lacks 2 effects, which explain 90 %" in what
+    assert what.index(second) < what.index(first)
+
+
+def test_many_causes_fit_a_sentence_a_title_and_a_table(found, tmp_path):
+    diagnosis = several(found, [0.5, 0.2, 0.1, 0.1, 0.004, 0.05])
+    content = to_dict(diagnosis)
+    what, titles = content["sentences"][1], [cause["title"] for cause in content["causes"]]
+    assert all(title in what for title in titles[:3])
+    assert "and 3 more" in what
+    assert titles[4] not in what
+    assert "less than 1 %" in content["causes"][4]["words"]
+    write_html(diagnosis, tmp_path / "gap.html", content=content)
+    page = (tmp_path / "gap.html").read_text(encoding="utf-8")
+    heading = re.search(r"<h1>(.*?)</h1>", page, re.DOTALL).group(1)
+    assert f"{titles[0]}, {titles[1]} and 4 more" in heading
+    rows = re.findall(r"^ \d \w.*%.*->.*", summary(diagnosis, content), re.MULTILINE)
+    assert len(rows) == 6
+    assert "< 1 %" in rows[4]
+
+
+def test_an_alias_that_is_a_cause_itself_is_no_alternative(found):
+    diagnosis = several(found, [0.9, 0.1])
+    first, second = diagnosis.causes
+    aliased = replace(diagnosis, causes=[replace(first, aliases=[second.name]), second])
+    content = to_dict(aliased)
+    assert "It resembles cause 2: the data ask for both" in content["causes"][0]["words"]
+    assert "cannot tell it from" not in content["causes"][0]["words"]
+    assert "may as well be" not in content["sentences"][1]
+    other = replace(first, aliases=[second.name, "background"])
+    content = to_dict(replace(diagnosis, causes=[other, second]))
+    assert get_effect("background").title in content["causes"][0]["words"]
+    assert "one of them may as well be another effect" in content["sentences"][1]
+
+
+def test_a_size_that_is_not_determined_is_explained(content):
+    (cause,) = content["causes"]
+    ((name, size),) = cause["parameters"].items()
+    vague = {name: size | {"std": [size["limit"]] * len(WAVELENGTH)}}
+    entry = cause | {"parameters": vague, "trades_with": ["hwp.w_sio2"]}
+    words = _words.cause(entry, {})
+    assert "do not tell its size" in words
+    assert "changes of hwp.w_sio2" in words
+    assert "do not tell" not in cause["words"]
+    partly = cause | {"parameters": {name: size, "other": vague[name]}, "trades_with": []}
+    assert "do not tell all of its size: a part of it hardly changes" in _words.cause(partly, {})
+
+
+def test_what_can_be_exchanged_for_a_size_is_named():
+    """The retardance of a plate without a law is open in the thicknesses of its materials."""
+    chain, observations = data()
+    model = nominal_model([chain], [observations]).with_effect(get_effect("hwp_retardance_free"))
+    fitted = Fitted(model)
+    assert set(fitted.trades("hwp_retardance_free")) & {"hwp.w_sio2", "hwp.w_mgf2"}
+    gain = Fitted(model.with_effect(get_effect("beam_gain")))
+    assert "hwp.w_sio2" not in gain.trades("beam_gain")
+
+
+def test_significance_is_counted_from_where_an_effect_is_absent(found):
+    """Also where the fit went on from another one, at which its prior then is centred."""
+    again = found.improved.with_effect(get_effect("hwp_diattenuation"))
+    values = [Fitted(model).significance("beam_gain") for model in (found.improved, again)]
+    assert values[0] > 30
+    assert values[1] == pytest.approx(values[0], rel=0.1)
+
+
+def test_a_size_that_is_the_same_everywhere_is_given_once():
+    size = {"value": [0.01, 0.01], "std": [0.001, 0.001], "unit": "", "limit": 1.0}
+    assert _words.sizes({"a.b": size}) == ["a.b: 0.0100 +- 0.0010 at every wavelength"]
+
+
+def test_effects_that_leave_the_gap_unexplained_are_no_causes(found, tmp_path):
+    diagnosis = replace(several(found, [0.1, 0.1]), verdict="unexplained")
+    content = to_dict(diagnosis)
+    text = summary(diagnosis, content)
+    assert "Cause" not in text
+    assert "\nEffects that help; " in text
+    assert "\nEffect 2: " in text
+    write_html(diagnosis, tmp_path / "gap.html", content=content)
+    page = (tmp_path / "gap.html").read_text(encoding="utf-8")
+    assert "<h2>Effects that help, but do not explain the gap</h2>" in page
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (1.9, "1.90"),
+        (0.108, "0.108"),
+        (123.4, "123"),
+        (12345.6, "12346"),
+        (None, "-"),
+        (0.0, "0.00"),
+    ],
+)
+def test_percent(value, words):
+    assert _words.percent(value) == words
+
+
+def test_names_that_are_too_long():
+    assert _words.shortened("short", 9) == "short"
+    assert _words.shortened("dataset_2025-10-05", 9) == "data\N{HORIZONTAL ELLIPSIS}0-05"
+    assert _words.in_title(["a", "b"]) == "a and b"
+    assert _words.in_title(["a", "b", "c"]) == "a, b and 1 more"
+    assert _words.in_title([]) == ""
 
 
 def test_table(found, nothing):
@@ -328,7 +443,7 @@ def test_page_is_self_contained_and_complete(found, content, tmp_path):
 
 
 def test_page_of_nothing_and_of_the_unknown(nothing, unknown, tmp_path):
-    for diagnosis, words in ((nothing, "no gap"), (unknown, "a real gap, unexplained")):
+    for diagnosis, words in ((nothing, "No gap beyond"), (unknown, "A real gap, unexplained")):
         path = tmp_path / "gap.html"
         write_html(diagnosis, path)
         page = Page(path.read_text(encoding="utf-8"))

@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Where the gap lies: noise has no place, planted gaps have the right one."""
 
+from types import SimpleNamespace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from astropolcal.chain import insert_optic
 from astropolcal.exceptions import GapError
 from astropolcal.gap.patterns import badly_separated, frame_blocks, frame_patterns
 from astropolcal.gap.remainder import _chance, outlying_frames, remainder
-from astropolcal.gap.residuals import Where, locate
+from astropolcal.gap.residuals import Where, _simplest, locate
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles
 
@@ -97,6 +99,31 @@ def test_beam_gain_is_constant_in_the_plate_angle():
     null = [r for r in where.told if "null channel" in r["detail"]]
     assert null
     assert null[0]["share"] > 0.5
+
+
+def test_what_the_angles_cannot_separate_gets_the_simplest_name():
+    """A constant and a little of harmonic 2: another harmonic fits both better than either."""
+    angle = np.deg2rad(np.tile(np.arange(8) * 11.25, 4))
+    shape = 1 + 0.01 * (1 + 0.5 * np.sin(2 * angle))
+    model = fitted(with_flux(observed(), shape))
+    row = first(locate(model))
+    assert row["detail"].startswith("what is constant in the half-wave-plate angle")
+
+
+def test_a_harmonic_that_explains_nothing_gives_way_to_none():
+    terms = [SimpleNamespace(axis="hwp", channel=0, doubtful=i > 0) for i in range(3)]
+    tested = {0: SimpleNamespace(evidence=-30.0), 2: SimpleNamespace(evidence=-9.0)}
+    assert _simplest(terms, tested, 2) == 2
+    tested = {0: SimpleNamespace(evidence=40.0), 2: SimpleNamespace(evidence=60.0)}
+    assert _simplest(terms, tested, 2) == 0
+    tested = {0: SimpleNamespace(evidence=20.0), 2: SimpleNamespace(evidence=60.0)}
+    assert _simplest(terms, tested, 2) == 2
+
+
+def test_null_channel_is_a_place_since_it_holds_several_patterns():
+    where = locate(fitted(observed(with_effect("beam_gain", imbalance=0.01))))
+    (kind,) = {r["kind"] for r in where.table if "null channel" in r["detail"]}
+    assert kind == "place"
 
 
 def test_sharp_gap_is_found_at_its_wavelengths():
@@ -199,8 +226,17 @@ def test_harmonics_that_look_alike_are_named_once():
 
 def test_a_full_turn_separates_the_harmonics():
     full = half_wave_plate_cycles(np.arange(32) * 11.25 * u.deg, [45, 90] * u.deg)
-    assert badly_separated([observed(table=full)]) == {}
+    notes = badly_separated([observed(table=full)])
+    assert not [words for words in notes if words.startswith("harmonic")]
     assert "harmonic 1 of the half-wave-plate angle" in badly_separated([observed()])
+
+
+def test_order_in_a_block_is_doubtful_where_it_tells_the_angle():
+    order = "the order of frames within a block at one derotator angle"
+    assert order in badly_separated([observed()])
+    table = half_wave_plate_cycles(np.arange(8) * 11.25 * u.deg, [45, 90] * u.deg)
+    table["hwp"][8:] = table["hwp"][8:][::-1]
+    assert order not in badly_separated([observed(), observed(table=table)])
 
 
 def test_altitude_and_parallactic_angle_are_axes():

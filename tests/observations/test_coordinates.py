@@ -116,10 +116,26 @@ def test_sequence_is_monotonic_in_time(times):
 
 def test_observations_are_not_changed():
     obs = make(MINUTES * u.min)
-    for name in COORDINATES:
+    for name in set(COORDINATES) - {"parallactic_rate"}:
         first = obs.position(name)
         first[...] = 99.0
         assert not np.any(obs.position(name) == 99.0)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3], [2, 0, 3, 1]])
+def test_rate_of_an_angle_is_its_change_from_frame_to_frame(order):
+    table = example_table()
+    when = np.array(order)[table["frame"]]
+    table["time"] = when * u.min
+    # a whole turn between two frames is no motion
+    table["parallactic"] = (170.0 + 20.0 * when - 360.0 * (when > 0)) * u.deg
+    found = np.rad2deg(Observations.from_table(table).position("parallactic_rate"))
+    np.testing.assert_allclose(found, 20.0, atol=1e-12)
+
+
+def test_rate_wants_the_angle():
+    with pytest.raises(ObservationError, match="no column 'parallactic'"):
+        Observations.from_table(example_table()).position("parallactic_rate")
 
 
 # --- fluxes ------------------------------------------------------------------------------------

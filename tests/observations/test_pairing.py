@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Pairs by half-wave-plate angle: preference, left-over frames, laws."""
 
+import time
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -183,3 +185,38 @@ def test_pairs_follow_the_times_whatever_the_order(order):
     found = pair_frames(hwp[order] * u.deg, time=time[order])
     back = {tuple(order[p] for p in pair) for pair in found.tolist()}
     assert back == {(i, i + 1) for i in range(0, 12, 2)}
+
+
+# --- long tables ------------------------------------------------------------------------------
+
+
+def cycles(n_frames, rng):
+    hwp = np.resize([0, 45, 22.5, 67.5, 90, 135, 112.5, 157.5], n_frames)
+    return hwp + rng.uniform(-0.05, 0.05, n_frames), 45 + 2.5 * (np.arange(n_frames) // 16 % 30)
+
+
+def test_long_tables_are_paired_as_short_ones(monkeypatch):
+    """Neighbours in time first: where cycles are complete nothing changes."""
+    hwp, derotator = cycles(2400, np.random.default_rng(1))
+    long = pair_frames(hwp * u.deg, derotator * u.deg)
+    monkeypatch.setattr("astropolcal.observations.pairing._SMALL", 10_000)
+    whole = pair_frames(hwp * u.deg, derotator * u.deg)
+    assert len(long) == 1200
+    np.testing.assert_array_equal(long, whole)
+
+
+def test_partners_far_away_are_found():
+    """First all frames at 0 deg, then all at 45 deg."""
+    hwp = np.repeat([0.0, 45.0], 1500)
+    pairs = pair_frames(hwp * u.deg)
+    assert len(pairs) == 1500
+    assert sorted(pairs.ravel().tolist()) == list(range(3000))
+
+
+def test_time_of_pairing_is_linear():
+    hwp, derotator = cycles(20_000, np.random.default_rng(2))
+    start = time.process_time()
+    pairs = pair_frames(hwp * u.deg, derotator * u.deg)
+    assert len(pairs) == 10_000
+    # quadratic work took 30 s
+    assert time.process_time() - start < 5

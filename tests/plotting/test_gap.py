@@ -1,19 +1,24 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Figures of a diagnosis show the numbers of the diagnosis."""
 
+from dataclasses import replace
+
 import astropy.units as u
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic
 from astropolcal.exceptions import ParameterError
-from astropolcal.gap import diagnose
+from astropolcal.gap import diagnose, get_effect
+from astropolcal.gap.report import to_dict
 from astropolcal.gap.residuals import locate
 from astropolcal.plotting.gap import (
     plot_effect_scores,
+    plot_effect_sizes,
     plot_gap_maps,
     plot_gap_spectrum,
     plot_where,
@@ -103,3 +108,67 @@ def test_shares_are_those_of_the_table(gap, none):
     assert plot_where(gap).axes[0].patches[0].get_width() == pytest.approx(widths[0])
     texts = [t.get_text() for t in plot_where(none).axes[0].texts]
     assert "nothing beyond the noise" in texts
+
+
+def test_shares_end_at_a_hundred(gap):
+    for axes in plot_where(gap).axes:
+        assert axes.get_xlim() == (0, 100)
+
+
+def test_sizes_are_those_of_the_fit(gap):
+    figure = plot_effect_sizes(gap, "beam_gain")
+    (axes,) = figure.axes
+    line, _, bars = axes.containers[0].lines
+    np.testing.assert_allclose(line.get_ydata(), 0.02, rtol=0.1)
+    ends = np.array([np.ptp(s[:, 1]) / 2 for s in bars[0].get_segments()])
+    content = to_dict(gap)
+    (size,) = content["causes"][0]["parameters"].values()
+    np.testing.assert_allclose(ends, size["std"], rtol=1e-6)
+    same = plot_effect_sizes(gap, "beam_gain", content=content)
+    assert same.axes[0].get_ylim() == axes.get_ylim()
+
+
+def test_sizes_that_are_not_determined_are_marked(gap):
+    content = to_dict(gap)
+    (size,) = content["causes"][0]["parameters"].values()
+    size["std"][1], size["std"][3] = None, 9.0
+    (axes,) = plot_effect_sizes(gap, "beam_gain", content=content).axes
+    assert len(axes.containers[0].lines[0].get_xdata()) == 3
+    assert axes.get_title(loc="left") == "crosses: not determined"
+
+
+def test_sizes_of_what_is_no_cause(gap):
+    with pytest.raises(ParameterError, match="these are: beam_gain"):
+        plot_effect_sizes(gap, "hwp_diattenuation")
+    content = to_dict(gap)
+    for size in content["causes"][0]["parameters"].values():
+        size["value"] = 0.1
+    with pytest.raises(ParameterError, match="depends on wavelength"):
+        plot_effect_sizes(gap, "beam_gain", content=content)
+
+
+def test_titles_of_many_causes_fit(gap, monkeypatch):
+    """Names of effects and of a dataset that are too long stay within the figure."""
+    (cause,) = gap.causes
+    names = ("hwp_encoder_eccentricity", "derotator_diattenuation", "static_diattenuator")
+    many = [replace(cause, effect=get_effect(n)) for n in (*names, "background", "hwp_tilt")]
+    diagnosis = replace(gap, causes=[*many, cause])
+    monkeypatch.setattr(gap.nominal.observations[0], "name", "a_very_long_name_of_a_dataset_" * 3)
+    figures = [plot(diagnosis) for plot in (plot_effect_scores, plot_gap_maps, plot_gap_spectrum)]
+    for figure in figures:
+        assert "and 4 more" in figure.get_suptitle()
+        check_titles(figure)
+
+
+def check_titles(figure):
+    """Every title is within the figure, and within the width of its panel or nearly so."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    box = figure._suptitle.get_window_extent(renderer)
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.x1
+    for axes in figure.axes:
+        title = axes.title if axes.get_title() else axes._left_title
+        extent = title.get_window_extent(renderer)
+        assert extent.x1 <= axes.get_window_extent(renderer).x1 + 5

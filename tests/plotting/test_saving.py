@@ -47,6 +47,7 @@ def test_writes_every_figure_as_png(elliptical, tmp_path):
         "identifiability.png",
         "accuracy.png",
         "retardances.png",
+        "targets.png",
         "efficiency.png",
         "correlations.png",
     ]
@@ -70,6 +71,7 @@ def test_calibration_without_data_gets_the_other_figures(elliptical, tmp_path):
         "identifiability.png",
         "accuracy.png",
         "retardances.png",
+        "targets.png",
         "efficiency.png",
         "correlations.png",
     ]
@@ -88,7 +90,7 @@ def test_dataset_without_a_datum_is_left_out(several, tmp_path):
 
 @pytest.mark.parametrize("name", ["masked", "undetermined", "single_angle"])
 def test_every_kind_of_calibration_is_drawn(name, request, tmp_path):
-    assert len(save_all(request.getfixturevalue(name), tmp_path)) == 7
+    assert len(save_all(request.getfixturevalue(name), tmp_path)) == 8
 
 
 def with_posterior(calibration, names=None, seed=1):

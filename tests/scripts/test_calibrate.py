@@ -305,3 +305,35 @@ def test_model_of_the_tertiary_mirror(tables, star_table, tmp_path):
 )
 def test_unknown_models_get_one_line(tables, capsys, options, words):
     assert words in complaint(capsys, tables["first"], *options)
+
+
+# ---- refit of what changed ------------------------------------------------------------------
+
+
+def test_start_holds_all_but_what_is_free(tables, tmp_path):
+    old, new = tmp_path / "old.asdf", tmp_path / "new.asdf"
+    assert main(["calibrate", str(tables["first"]), "-q", "-o", str(old), *HELD]) == 0
+    refit = ["--start", str(old), "--free", "Wollaston"]
+    assert main(["calibrate", str(tables["second"]), "-q", "-o", str(new), *refit]) == 0
+    before, after = Calibration.read(old), Calibration.read(new)
+    assert {name.partition("[")[0] for name in after.covariance.names} == {"wollaston.efficiency"}
+    assert after.chain["hwp"].w_sio2.value == before.chain["hwp"].w_sio2.value
+    assert after.settings["restarted"]["free"] == ["Wollaston"]
+
+
+@pytest.mark.parametrize(
+    ("more", "complaint"),
+    [
+        ([], "say with --free NAME what may change"),
+        (["--free", "hwp", "--fix", "hwp.theta"], "--fix cannot be combined with --start"),
+        (["--free", "hwp", "--strategy", "two-step"], "--strategy two-step cannot be combined"),
+        (["--free", "m9"], "free: no 'm9' in the chains; optics are calibration_polarizer"),
+        (["--free", "hwp"], r"old.asdf: no such file"),
+    ],
+)
+def test_start_on_bad_input(tables, tmp_path, capsys, more, complaint):
+    path = tmp_path / "old.asdf"
+    if "m9" in more:
+        assert main(["calibrate", str(tables["first"]), "-q", "-o", str(path)]) == 0
+    assert main(["calibrate", str(tables["second"]), "--start", str(path), *more]) == 2
+    assert complaint in capsys.readouterr().err

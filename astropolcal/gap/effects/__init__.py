@@ -8,7 +8,16 @@ One class each, registered in `EFFECTS`; `register_effect` adds your own.
 import difflib
 
 from astropolcal.exceptions import GapError
-from astropolcal.gap.effects import derotator, detector, discrete, held, plate, relay, source
+from astropolcal.gap.effects import (
+    derotator,
+    detector,
+    discrete,
+    held,
+    plate,
+    relay,
+    source,
+    telescope,
+)
 from astropolcal.gap.effects.base import (
     KINDS,
     Context,
@@ -157,8 +166,9 @@ def get_effect(name):
     raise GapError(f"no effect {name!r}; there are {', '.join(EFFECTS)}{hint}")
 
 
-for _module in (plate, derotator, relay, source, detector, held, discrete):
+for _module in (plate, derotator, relay, source, telescope, detector, held, discrete):
     for _name in _module.__all__:
         register_effect(getattr(_module, _name))
 for _thickness in (4.0, 12.0):
     register_effect(relay.Fringes(_thickness))
+    register_effect(relay.FringesDrift(_thickness))

@@ -150,6 +150,8 @@ class Roles:
         self.plate = self._first(lambda o: o.stage == "hwp" and _retards(o))
         self.derotator = self._first(lambda o: o.stage == "derotator" and _retards(o))
         self.splitter = self._first(lambda o: isinstance(o, optics.WollastonPrism))
+        #: The plate, where the model has nothing in front of it.
+        self.entrance = self.plate if self._first(lambda o: True) is self.plate else None
 
     def _mirror(self):
         """Return what stands in the place of the polarizer for unpolarized light."""

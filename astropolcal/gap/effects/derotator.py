@@ -8,12 +8,16 @@ from astropolcal import optics
 from astropolcal.chain import replace_optic
 from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion, Roles
 from astropolcal.gap.effects.plate import _Around
+from astropolcal.gap.effects.relay import _BandAverage
 
 __all__ = [
+    "DerotatorBandAverage",
     "DerotatorCircular",
     "DerotatorDiagonal",
     "DerotatorDiattenuation",
     "DerotatorEccentricity",
+    "DerotatorElliptical",
+    "DerotatorMotion",
     "DerotatorTwoLobes",
 ]
 
@@ -36,13 +40,18 @@ class DerotatorDiagonal(Effect):
     component = "diagonal"
     scale, limit = 2 * u.deg, 60 * u.deg
 
+    @property
+    def components(self):
+        """Components that the effect frees."""
+        return (self.component,)
+
     def applies_to(self, roles):
         """Return whether the derotator lacks this component."""
         if isinstance(roles.derotator, optics.LinearRetarder):
             return True
         if not isinstance(roles.derotator, optics.EllipticalRetarder):
             return False
-        return bool(getattr(roles.derotator, self.component).fixed)
+        return all(getattr(roles.derotator, key).fixed for key in self.components)
 
     def edit(self, chains, context):
         """Return the chains with an elliptical derotator; see `Effect.edit`."""
@@ -54,29 +63,38 @@ class DerotatorDiagonal(Effect):
             edited.append(chain)
         name = next(r.derotator.name for r in map(Roles, edited) if r.derotator is not None)
         basis = None if len(context.wavelength) == 1 else context.basis(self.degree)
-        parameter = EffectParameter(f"{name}.{self.component}", self.scale, self.limit, basis)
-        return Edit(edited, [parameter])
+        return Edit(
+            edited,
+            [
+                EffectParameter(f"{name}.{key}", self.scale, self.limit, basis)
+                for key in self.components
+            ],
+        )
 
     def _elliptical(self, old, context):
         size = len(context.wavelength)
         zero = np.zeros(size) * u.deg
         if isinstance(old, optics.EllipticalRetarder):
-            value = np.broadcast_to(getattr(old, self.component).value, size) * u.deg
-            new = old.with_parameters(**{self.component: value})
+            values = {
+                key: np.broadcast_to(getattr(old, key).value, size) * u.deg
+                for key in self.components
+            }
+            new = old.with_parameters(**values)
         else:
             new = optics.EllipticalRetarder(
                 horizontal=old.retardance.value * u.deg,
                 theta=old.theta.value * u.deg,
                 mount=old.mount,
                 name=old.name,
-                **{self.component: zero},
+                **dict.fromkeys(self.components, zero),
             )
             for ours, theirs in (("theta", "theta"), ("horizontal", "retardance")):
                 source, target = getattr(old, theirs), getattr(new, ours)
                 target.fixed, target.bounds = source.fixed, source.bounds
-            for key in {"diagonal", "circular"} - {self.component}:
+            for key in {"diagonal", "circular"} - set(self.components):
                 getattr(new, key).fixed = True
-        getattr(new, self.component).fixed = False
+        for key in self.components:
+            getattr(new, key).fixed = False
         return new
 
 
@@ -95,6 +113,45 @@ class DerotatorCircular(DerotatorDiagonal):
     title = "circular retardance of the derotator"
     shows = "rotation of Q and U that depends on wavelength"
     component = "circular"
+
+
+class DerotatorElliptical(DerotatorDiagonal):
+    """
+    Retardance of the derotator at 45 deg and circular, both at once.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("derotator_elliptical_retardance").components
+    ('diagonal', 'circular')
+    """
+
+    name = "derotator_elliptical_retardance"
+    title = "retardance of the derotator at 45 deg and circular (an elliptical retarder)"
+    shows = "rotation of Q and U that depends on wavelength, in part on the derotator angle"
+    components = ("diagonal", "circular")
+
+
+class DerotatorBandAverage(_BandAverage):
+    """
+    Retardance of the derotator that changes within a wavelength bin.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import get_effect
+    >>> effect = get_effect("derotator_band_average")
+    >>> effect.applies([instruments.get("charis").published()])
+    True
+    """
+
+    name, kind, place = "derotator_band_average", "optic", "derotator"
+    title = "retardance of the derotator that changes within a wavelength bin"
+    shows = "less modulation where the retardance is steep, most between the axes of the derotator"
+
+    def retarder(self, roles):
+        """Return the derotator."""
+        return roles.derotator
 
 
 class DerotatorDiattenuation(Insertion):
@@ -159,3 +216,44 @@ class DerotatorTwoLobes(DerotatorEccentricity):
     name = "derotator_encoder"
     title = "angle of the derotator wrong twice a turn (encoder not round)"
     harmonic = 2
+
+
+class DerotatorMotion(_Around):
+    """
+    Derotator angle of another moment than that of the exposure.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import get_effect
+    >>> effect = get_effect("derotator_motion")
+    >>> effect.applies([instruments.get("charis").chain()])
+    False
+    """
+
+    name, kind, place = "derotator_motion", "parameter", "stage of the derotator"
+    title = "angle of the derotator of another moment than the middle of the exposure"
+    shows = "rotation of Q and U by the rate of the derotator, most near transit"
+    reference = "van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
+    anchor, side, degree = "derotator", "before", None
+    free = {"rate": (0.25 * u.rad, 2 * u.rad)}
+
+    def applies_to(self, roles):
+        """Return whether there is a derotator, in the chain of a star: elsewhere it stops."""
+        moving = any(leaf.stage == "parallactic" for leaf in roles.leaves)
+        return moving and roles.derotator is not None
+
+    def edit(self, chains, context):
+        """Return the chains with the pair at zero, in those of stars; see `Effect.edit`."""
+        moves = [self.applies_to(Roles(chain)) for chain in chains]
+        edit = super().edit([c for c, moving in zip(chains, moves, strict=True) if moving], context)
+        ready = iter(edit.chains)
+        edited = [next(ready) if moving else c for c, moving in zip(chains, moves, strict=True)]
+        return Edit(edited, edit.parameters, edit.ties)
+
+    def build(self, size, anchor, context):
+        """Return a rotator by the lag times the rate."""
+        sign = "-" if anchor.stage_sign < 0 else ""
+        turn = optics.DriftRotator(mount=f"{sign}{anchor.stage}_rate", name=self.label)
+        turn.rate.bounds = (-360, 360)
+        return turn

@@ -1,0 +1,214 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What the headers of frames tell: instrument, mode, date, and the angles of the stages."""
+
+import astropy.units as u
+import numpy as np
+from astropy.io.fits.card import Undefined
+from astropy.table import QTable
+from astropy.time import Time
+
+from astropolcal import instruments
+from astropolcal.exceptions import CalibrationFileError, InstrumentError, ObservationError
+from astropolcal.observations.reading import numeric_column
+
+_MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
+# columns that are no angles of a stage, though their values may be numbers
+_OTHERS = ("exposure_time", "mjd", "date", "time", "object", "instrument", "filter", "pickoff")
+# beyond these, in degree, an angle cannot be right
+_RANGE, _RANGES = (-720.0, 720.0), {"altitude": (0.0, 90.0)}
+
+
+def describe(header, instrument=None, stated=()):
+    """
+    Return what a header tells of a frame.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header` or mapping
+        Primary header.
+    instrument : str, optional
+        Name of the instrument, by default that whose identity stands in the header.
+    stated : set of str
+        What is not to be looked for.
+
+    Returns
+    -------
+    dict
+        ``instrument`` (name), ``stated`` (what the header calls it), ``mode`` and ``date`` (ISO,
+        UTC); what is not told is None.
+    """
+    if instrument is None:
+        found = _recognized(header)
+    else:
+        found = instruments.get(instrument)
+    layout = found.files
+    if layout is None:
+        return {"instrument": found.name}
+    own = _look_up(header, "instrument", layout)
+    if "instrument" in stated or own in layout.identities:
+        own = None
+    time = None if "date" in stated else _time(header, layout)
+    return {
+        "instrument": found.name,
+        "stated": own,
+        "mode": None if "mode" in stated else _text(_look_up(header, "filter", layout)),
+        "date": None if time is None else time.utc.isot,
+    }
+
+
+def _text(value):
+    return None if value is None else str(value).strip()
+
+
+def _recognized(header):
+    """Return the instrument whose identity a header bears."""
+    seen = []
+    for name in instruments.names():
+        instrument = instruments.get(name)
+        layout = instrument.files
+        told = None if layout is None else _text(_look_up(header, "instrument", layout))
+        if told is None:
+            continue
+        if told in layout.identities or instrument.answers_to(told):
+            return instrument
+        seen.append(told)
+    words = f"says {seen[0]!r}, which is not known" if seen else "does not say it"
+    raise InstrumentError(
+        f"which instrument? the header {words}; give instrument=, one of "
+        f"{', '.join(instruments.names())}"
+    )
+
+
+def _look_up(header, column, layout):
+    """Return the value of the first keyword of a column that has one, or None."""
+    if column not in layout.keywords:
+        return None
+    for keyword in (layout.keywords[column], *layout.alternatives.get(column, ())):
+        value = header.get(keyword)
+        if value is None or isinstance(value, Undefined):
+            continue
+        if str(value).strip().lower() not in _MISSING:
+            return value
+    return None
+
+
+def _time(header, layout):
+    """Return when a frame was taken, or None."""
+    mjd, date, clock = (_look_up(header, key, layout) for key in ("mjd", "date", "time"))
+    try:
+        if mjd is not None:
+            return Time(float(mjd), format="mjd", scale="utc")
+        if date is None:
+            return None
+        day = str(date).strip()
+        if "T" not in day and clock is not None:
+            day = f"{day}T{str(clock).strip()}"
+        return Time(day, scale="utc")
+    except (TypeError, ValueError):
+        shown = mjd if mjd is not None else f"{date} {clock or ''}".strip()
+        raise CalibrationFileError(f"the header's date {shown!r} cannot be understood") from None
+
+
+class FrameAngles:
+    """
+    The angles of frames from their headers, as `~astropolcal.instruments.Instrument` reads them.
+
+    Parameters
+    ----------
+    headers : list of mappings
+        One a frame.
+    instrument : Instrument
+        With a layout of its files.
+
+    Raises
+    ------
+    InstrumentError
+        If the instrument has no map of keywords.
+    ObservationError
+        If an angle is no number, cannot be right, or is missing in some of the frames.
+    """
+
+    def __init__(self, headers, instrument):
+        if instrument.files is None:
+            raise InstrumentError(f"{instrument.name}: no map of header keywords; give positions")
+        if not headers:
+            raise ObservationError("no header: at least one frame is needed")
+        self.name, self.path, self.meta = "header", None, {"instrument": instrument.name}
+        self.instrument, self.source, self.mask = instrument.name, "star", np.zeros((1, 1), bool)
+        self._layout = layout = instrument.files
+        self.n_frames = len(headers)
+        table = QTable({"frame": np.arange(self.n_frames)})
+        for column in (c for c in layout.keywords if c not in _OTHERS):
+            values = [_look_up(header, column, layout) for header in headers]
+            if self._complete(column, values):
+                table[column] = self._column(column, values)
+        times = [_time(header, layout) for header in headers]
+        if all(time is not None for time in times):
+            table["time"] = Time(times)
+        self._table = table
+
+    @property
+    def frames(self):
+        """One row a frame."""
+        return self._table.copy()
+
+    def _complete(self, column, values):
+        missing = [i for i, value in enumerate(values) if value is None]
+        if not missing:
+            return True
+        if len(missing) < len(values):
+            keyword = self._layout.keywords[column]
+            raise ObservationError(
+                f"frame {missing[0]}: no {keyword} in the header, others have it"
+            )
+        return False
+
+    def _column(self, column, values):
+        """Return angles as a Quantity, anything else as text."""
+        if column in ("right_ascension", "declination"):
+            return _sky(column, values)
+        keyword, layout = self._layout.keywords[column], self._layout
+        unit = u.Unit(layout.units.get(column, "deg"))
+        if not unit.is_equivalent(u.deg):
+            return np.array([str(value).strip() for value in values])
+        factor, offset = layout.transforms.get(column, (1.0, 0.0))
+        low, high = _RANGES.get(column, _RANGE)
+        angles = []
+        for i, value in enumerate(values):
+            try:
+                angle = (factor * float(value) + offset) * unit.to(u.deg)
+            except (TypeError, ValueError):
+                if column not in ("hwp", "hwp_true", "derotator", "parallactic", "altitude"):
+                    return np.array([str(value).strip() for value in values])
+                raise ObservationError(
+                    f"frame {i}: {keyword} = {value!r}, a number is needed"
+                ) from None
+            if not low <= angle <= high:
+                raise ObservationError(
+                    f"frame {i}: {keyword} = {value}, allowed are {low:g} to {high:g} deg"
+                )
+            angles.append(angle)
+        return angles * u.deg
+
+    def position(self, column):
+        """Return an angle of every frame in radian."""
+        if column not in self._table.colnames:
+            keyword = self._layout.keywords.get(column)
+            lacking = f"no {keyword}" if keyword else "no keyword is known for it"
+            raise ObservationError(f"position of {column!r}: {lacking} in the header")
+        return numeric_column(self._table, column, self.name, u.rad)
+
+
+def _sky(column, values):
+    from astropy.coordinates import Angle
+
+    try:
+        numbers = [float(value) for value in values]
+        return numbers * u.deg
+    except (TypeError, ValueError):
+        pass
+    unit = u.hourangle if column == "right_ascension" else u.deg
+    try:
+        return u.Quantity([Angle(str(value), unit=unit).to(u.deg) for value in values])
+    except ValueError as error:
+        raise ObservationError(f"{column}: {' '.join(str(error).split())}") from None

@@ -1,0 +1,405 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What a pipeline loads: the system Mueller matrix of a frame, from its header.
+
+Loading needs numpy, astropy and asdf, nothing that fits, measures or draws.
+"""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import instruments
+from astropolcal.calibration._header import FrameAngles, describe
+from astropolcal.calibration._system import at_bins, errors, match_wavelengths, split_chain
+from astropolcal.calibration.covariance import full_covariance
+from astropolcal.calibration.library import Entry, Library
+from astropolcal.calibration.result import Calibration
+from astropolcal.calibration.validity import content_hash, optics_words, validity_of
+from astropolcal.chain import (
+    join,
+    leaves,
+    system_mueller,
+    system_mueller_derivatives,
+    with_beam,
+)
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    CalibrationFileError,
+    ChainError,
+    InstrumentError,
+    ParameterError,
+)
+
+__all__ = ["LoadedCalibration", "SystemMueller", "load"]
+
+
+@dataclass
+class SystemMueller:
+    """
+    System Mueller matrices of frames and wavelengths, with what is known of their errors.
+
+    Parameters
+    ----------
+    value : `~numpy.ndarray`
+        Shape (n_frames, n_wavelengths, 4, 4); no first axis for a single frame. The first row
+        gives the flux of the beam for incident I, Q, U and V.
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_wavelengths,).
+    beam : str
+        ``"right"`` or ``"left"``.
+    positions : dict of str to `~astropy.units.Quantity`
+        Of every stage, in degree.
+    factor : `~numpy.ndarray`
+        Changes of ``value`` for one standard error along each direction that the data of the
+        calibration determine, shape (..., 4, 4, rank). The covariance of any two elements,
+        also of different frames, wavelengths or beams, is the sum of the products of theirs.
+    is_open, is_blind : `~numpy.ndarray`
+        Elements that move along an open direction, or depend on parameters at a bound alone.
+    assumed : tuple of str
+        Optics that are not calibrated: they have published values and add nothing to the errors.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal.calibration import SystemMueller
+    >>> one = SystemMueller(np.eye(4)[None], [1.6] * u.um, "right", {}, np.full((1, 4, 4, 1), 0.1))
+    >>> one.covariance.shape, float(one.std[0, 0, 0])
+    ((1, 16, 16), 0.1)
+    """
+
+    value: np.ndarray
+    wavelength: u.Quantity
+    beam: str
+    positions: dict
+    factor: np.ndarray
+    is_open: np.ndarray | None = None
+    is_blind: np.ndarray | None = None
+    assumed: tuple = ()
+
+    @property
+    def covariance(self):
+        """
+        Covariance of the 16 elements of each matrix, row by row, shape (..., 16, 16).
+
+        Infinite for what the data leave open and NaN for what they tell nothing of, as
+        `~astropolcal.calibration.Covariance.propagate` has it.
+        """
+        matrix = self.covariance_in_gauge
+        is_open, is_blind = (self._flat(flags) for flags in (self.is_open, self.is_blind))
+        unknown = is_open | is_blind
+        matrix[unknown[..., :, None] | unknown[..., None, :]] = np.nan
+        matrix[is_open[..., :, None] & np.eye(16, dtype=bool)] = np.inf
+        return matrix
+
+    @property
+    def covariance_in_gauge(self):
+        """
+        The covariance with open directions held where the calibration has put them.
+
+        Finite everywhere. It is too small for what moves along them, such as the angle of
+        polarization where the data know misalignments up to a common turn; a prior on one
+        of the angles in the calibration gives an error that is right.
+        """
+        moved = self.factor.reshape(*self.value.shape[:-2], 16, -1)
+        return moved @ np.swapaxes(moved, -1, -2)
+
+    @property
+    def std(self):
+        """Standard error of each element, of the shape of ``value``."""
+        std = np.sqrt(np.sum(self.factor**2, axis=-1))
+        is_open, is_blind = (
+            self._flat(flags).reshape(std.shape) for flags in (self.is_open, self.is_blind)
+        )
+        return np.where(is_open, np.inf, np.where(is_blind, np.nan, std))
+
+    def _flat(self, flags):
+        shape = (*self.value.shape[:-2], 16)
+        return np.zeros(shape, dtype=bool) if flags is None else flags.reshape(shape)
+
+
+def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=None):
+    """
+    Load the calibration that holds for a frame.
+
+    Parameters
+    ----------
+    path : path-like, Library or Calibration
+        A folder of calibrations, a file, or a calibration that is in memory.
+    header : `~astropy.io.fits.Header` or mapping, optional
+        Primary header of the frame (or of one of several), which tells instrument, mode and
+        date; what is given below comes before it.
+    instrument, mode, date, optics_in
+        As for `~astropolcal.calibration.Library.find`.
+
+    Returns
+    -------
+    LoadedCalibration
+
+    Raises
+    ------
+    CalibrationFileError
+        If no calibration holds, several do, or a file is damaged.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import load
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> table = simulate(chain, charis.wavelength, frames, seed=2, meta={"date": "2025-10-05"})
+    >>> calibrate(chain, table, instrument="charis").write("to_load.asdf")
+    >>> header = {"MJD": 60960.5, "RET-ANG1": 22.5, "D_IMRANG": 60.0, "INSTRUME": "CHARIS"}
+
+    The three lines of a pipeline, here for a frame of the internal source:
+
+    >>> calibration = load("to_load.asdf", header)
+    >>> mueller = calibration.system_mueller(header, light="internal")
+    >>> mueller.value.shape, mueller.covariance.shape
+    ((22, 4, 4), (22, 16, 16))
+    """
+    library = _library(path)
+    told = {} if header is None else describe(header, instrument)
+    chosen = {"instrument": instrument, "mode": mode, "date": date}
+    wanted = {key: told.get(key) if value is None else value for key, value in chosen.items()}
+    entry = library.find(**wanted, optics_in=optics_in)
+    stated = {key for key, value in chosen.items() if value is not None}
+    return LoadedCalibration(entry, optics_in=optics_in, stated=stated)
+
+
+def _library(source):
+    if isinstance(source, Library):
+        return source
+    if not isinstance(source, Calibration):
+        return Library(source)
+    library = Library([])
+    held, digest = validity_of(source), content_hash(source)
+    library.entries.append(Entry(Path("calibration in memory"), source, held, digest))
+    return library
+
+
+class LoadedCalibration:
+    """
+    A calibration that gives the system Mueller matrix of frames; `load` makes it.
+
+    Parameters
+    ----------
+    entry : Entry
+        File and validity.
+    optics_in : sequence of str, optional
+        Optional optics in the beam; needed if the calibration has several sets of them.
+    stated : set of str
+        Which of ``instrument``, ``mode``, ``date`` the user vouches for, whatever headers say.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        All that the file holds.
+    path : `~pathlib.Path`
+    validity : Validity
+    content_hash : str
+        Of the file's content, for the provenance of products.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import load
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2)).write("lab.asdf")
+    >>> load("lab.asdf")
+    <LoadedCalibration lab.asdf: an instrument, any mode, from any date on, optics in the beam not known>
+    """  # noqa: E501
+
+    def __init__(self, entry, optics_in=None, stated=()):
+        self.calibration = entry.calibration
+        self.path, self.validity = entry.path, entry.validity
+        self.content_hash = entry.content_hash
+        self.optics_in = optics_in
+        self._stated = frozenset(stated)
+        self._covariance = full_covariance(self.calibration)._axes()
+
+    def __repr__(self):
+        return f"<LoadedCalibration {self.path.name}: {self.validity}>"
+
+    @property
+    def instrument(self):
+        """The `~astropolcal.instruments.Instrument`, or None if it is not a known one."""
+        try:
+            return instruments.get(self.calibration.instrument)
+        except InstrumentError:
+            return None
+
+    @property
+    def wavelength(self):
+        """Wavelengths of the calibration, a `~astropy.units.Quantity`."""
+        return self.calibration.wavelength
+
+    def system_mueller(
+        self, header=None, *, positions=None, wavelength=None, beam="right", light="sky"
+    ):
+        """
+        Return the system Mueller matrix of frames, with its covariance.
+
+        The covariance is that of the calibrated parameters to first order.
+
+        Parameters
+        ----------
+        header : `~astropy.io.fits.Header`, mapping, or sequence of those
+            Primary header of a frame, or those of several.
+        positions : dict of str to `~astropy.units.Quantity`
+            In its place the positions of all stages (on sky with the true angle of the
+            half-wave plate), scalar or shape (n_frames,).
+        wavelength : `~astropy.units.Quantity`, optional
+            By default the calibration's grid. Others than those of the grid are possible where
+            no parameter is given per wavelength, and within the range of the grid.
+        beam : {"right", "left"}
+            The beam.
+        light : {"sky", "internal"}
+            Where the light enters: above the telescope, in the frame of the sky; or in front of
+            the half-wave plate, as from the internal source.
+
+        Returns
+        -------
+        SystemMueller
+
+        Raises
+        ------
+        CalibrationFileError
+            If the calibration does not hold for the header.
+        ObservationError
+            If the header lacks an angle.
+        ChainError, ParameterError
+            If a position is missing, the optics in the beam are ambiguous or lacking.
+        WavelengthRangeError
+            If the wavelengths do not match.
+
+        Warns
+        -----
+        AstropolcalWarning
+            If an optic is not calibrated and has published values.
+        """
+        if (header is None) == (positions is None):
+            raise ParameterError("give either header or positions")
+        chain, assumed = self._chain(light)
+        single = isinstance(header, Mapping) or hasattr(header, "cards")
+        if header is not None:
+            found = self._positions([header] if single else list(header), chain)
+            positions = {name: angle * u.rad for name, angle in found.items()}
+        lam, bins = match_wavelengths(self.wavelength, chain, wavelength)
+        chain = with_beam(at_bins(chain, bins, len(self.wavelength)), beam)
+        value = system_mueller(chain, lam, positions)
+        slopes = system_mueller_derivatives(chain, lam, positions)
+        parts = errors(self.calibration, self._covariance, value, slopes, bins)
+        shown = {name: _degrees(position) for name, position in positions.items()}
+        if single:
+            value, *parts = (part[0] for part in (value, *parts))
+            shown = {name: angle[0] for name, angle in shown.items()}
+        return SystemMueller(value, lam, beam, shown, *parts, assumed)
+
+    def _positions(self, headers, chain):
+        """Return the positions that headers tell, after a look whether they may be reduced."""
+        instrument = self.instrument
+        if instrument is None:
+            raise InstrumentError(
+                f"{self.path.name}: instrument {self.calibration.instrument!r} has no map of "
+                "header keywords; give positions"
+            )
+        for i, header in enumerate(headers):
+            self._check(header, instrument, f"frame {i}")
+        return instrument.positions(FrameAngles(headers, instrument), chain)
+
+    def _check(self, header, instrument, label):
+        told = describe(header, instrument.name, self._stated)
+        held, name = self.validity, self.path.name
+        stated = told.get("stated")
+        if stated is not None and not instrument.answers_to(stated):
+            raise CalibrationFileError(f"{label} is of {stated}, but {name} holds for {held}")
+        date = told.get("date")
+        if date is not None and not held.holds(date):
+            raise CalibrationFileError(f"{label} was taken {date}, but {name} holds for {held}")
+        mode = told.get("mode")
+        if mode and held.mode and mode.casefold().split() != held.mode.casefold().split():
+            raise CalibrationFileError(
+                f"{label} is in mode {mode!r}, but {name} holds for {held}; load(..., mode=) if "
+                "it is the same by another name"
+            )
+
+    # ---- the chain ---------------------------------------------------------------------
+
+    def _chain(self, light):
+        """Return the chain from where the light enters, and the optics that are assumed."""
+        if light not in ("sky", "internal"):
+            raise ParameterError(f"light = {light!r}; allowed are 'sky', 'internal'")
+        inner = self._inner()
+        if light == "internal":
+            return join(inner), ()
+        for chain in self.calibration.chains:
+            outer, _ = split_chain(chain)
+            start = next((i for i, o in enumerate(outer) if o.stage == "parallactic"), None)
+            if start is not None:
+                return join([*outer[start:], *inner]), ()
+        return self._published(inner)
+
+    def _published(self, inner):
+        """Return a chain with the telescope as the instrument publishes it."""
+        try:
+            chain = self.instrument.on_sky(join(inner)) if self.instrument else None
+        except InstrumentError:
+            chain = None
+        if chain is None:
+            raise ChainError(
+                f"{self.path.name} calibrates no telescope, and no published one is known; "
+                "light='internal' leaves it out"
+            )
+        known = {leaf.name for leaf in inner}
+        assumed = tuple(o.name for o in leaves(chain) if o.name not in known and not o.stage)
+        if assumed:
+            warnings.warn(
+                f"{self.path.name}: {', '.join(assumed)} not calibrated, published values are "
+                "taken without errors",
+                AstropolcalWarning,
+                stacklevel=4,
+            )
+        return chain, assumed
+
+    def _inner(self):
+        """Return the optics from the first on a stage of the instrument, for the optics in."""
+        kinds = {}
+        for record, chain in zip(self.calibration.datasets, self.calibration.chains, strict=True):
+            inner = split_chain(chain)[1]
+            if self.optics_in is None or self._has(record, inner):
+                kinds.setdefault(tuple(leaf.name for leaf in inner), inner)
+        if not kinds:
+            raise ChainError(
+                f"{self.path.name}: no chain {optics_words([self.optics_in])}; it holds for "
+                f"{self.validity}"
+            )
+        if len(kinds) > 1:
+            shown = " or ".join("+".join(names) for names in kinds)
+            raise ChainError(f"{self.path.name}: which optics are in the beam? optics_in={shown}")
+        return next(iter(kinds.values()))
+
+    def _has(self, record, inner):
+        try:
+            return set(self.instrument.setup(record)[1]) == set(self.optics_in)
+        except (AttributeError, AstropolcalError):
+            # no instrument that knows: each optic named must be in the chain
+            return set(self.optics_in) <= {leaf.name for leaf in inner}
+
+
+def _degrees(position):
+    angle = u.Quantity(position)
+    return angle.to(u.deg) if angle.unit.is_equivalent(u.deg) else angle

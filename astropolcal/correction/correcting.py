@@ -1,0 +1,224 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""From science frames to corrected Stokes parameters."""
+
+import warnings
+from datetime import UTC, datetime
+from functools import partial
+
+import numpy as np
+
+from astropolcal.correction.engine import correct_block, covariance_index, run_blocks
+from astropolcal.correction.ideal import ideal_chain
+from astropolcal.correction.result import Corrected
+from astropolcal.correction.rows import RowModel
+from astropolcal.correction.solve import estimator
+from astropolcal.correction.systematic import linear_systematic, sampled_systematic
+from astropolcal.exceptions import AstropolcalWarning, ParameterError
+
+__all__ = ["MODES", "correct"]
+
+#: The whole Mueller matrix, or instrumental polarization only.
+MODES = ("stokes", "ip")
+
+
+def correct(
+    calibration,
+    frames,
+    *,
+    mode="stokes",
+    observable="intensity",
+    components="IQU",
+    weights=None,
+    max_condition=30.0,
+    chain=None,
+    interpolate=False,
+    open_directions="infinite",
+    n_samples=0,
+    seed=None,
+    workers=None,
+    cluster=None,
+    chunk=1,
+    progress=False,
+    provenance=None,
+):
+    r"""
+    Correct science frames for the polarization of telescope and instrument.
+
+    Parameters
+    ----------
+    calibration : Calibration or `~astropy.modeling.CompoundModel`
+        The calibration; or a chain with known values, which gives no systematic errors.
+    frames : ScienceFrames
+        The fluxes of both beams, images or spectra.
+    mode : {"stokes", "ip"}
+        ``"stokes"`` inverts the Mueller matrices of the frames. ``"ip"`` removes only the
+        instrumental polarization that the calibration predicts, and takes the instrument for
+        ideal in everything else (see `ideal_chain`); for comparison.
+    observable : {"intensity", "single", "double"}
+        What is fitted: the beams, or their single or double differences and sums. The
+        last are blind to what is the same in both frames of a pair, such as a gain that differs
+        between the beams.
+    components : {"IQU", "IQUV"}
+        Without V it is taken as zero. With V it is solved for where the frames determine it.
+    weights : array_like or "variance", optional
+        As for `estimator`; or by the variances of each pixel.
+    max_condition : float
+        See `estimator`.
+    chain : `~astropy.modeling.CompoundModel`, optional
+        From the sky to the detector, see `RowModel`.
+    interpolate : bool
+        See `RowModel`.
+    open_directions : {"infinite", "ignore"} or float
+        See `linear_systematic`.
+    n_samples : int
+        If above zero, systematic errors are sampled, see `sampled_systematic`; else they are
+        linearized.
+    seed : int, optional
+        Of the samples.
+    workers, cluster, chunk, progress
+        See `run_blocks`.
+    provenance : dict, optional
+        What goes into the header of the product besides versions and names of the frames.
+
+    Returns
+    -------
+    Corrected
+
+    Raises
+    ------
+    ObservationError
+        If the frames do not determine Q and U.
+    ParameterError, ChainError, WavelengthRangeError
+        If a choice is unknown, a position is missing, or a wavelength is not calibrated.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If combinations of Stokes parameters are poorly determined at some wavelengths, or the
+        calibration leaves open how they change.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal import instruments
+    >>> from astropolcal.correction import ScienceFrames, correct, measurement_rows
+    >>> charis = instruments.get("charis")
+    >>> sky = charis.on_sky(charis.published())
+    >>> positions = {"hwp": [80, 125, 102.5, 147.5] * u.deg, "derotator": [60] * 4 * u.deg,
+    ...              "parallactic": [20] * 4 * u.deg, "altitude": [70] * 4 * u.deg}
+    >>> rows = measurement_rows(sky, positions, charis.wavelength)
+    >>> right, left = np.moveaxis(rows @ [1000, 20, -10, 0], 1, 2)
+    >>> star = correct(sky, ScienceFrames.from_arrays(right, left, charis.wavelength, positions))
+    >>> float(star.q[0].round(9)), float(star.u[0].round(9))
+    (0.02, -0.01)
+    """
+    if mode not in MODES:
+        raise ParameterError(f"mode = {mode!r}; allowed are {', '.join(MODES)}")
+    by_variance = isinstance(weights, str)
+    if by_variance and weights != "variance":
+        raise ParameterError(f'weights = {weights!r}; allowed are arrays and "variance"')
+    model = RowModel(
+        calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
+    )
+    solution = estimator(
+        _rows(model, frames, mode),
+        components=components,
+        observable=observable,
+        pairs=frames.pairs,
+        weights=None if by_variance else weights,
+        scale=frames.scale,
+        max_condition=max_condition,
+        labels=frames.names,
+    )
+    _warn_of_weak(solution, frames.wavelength)
+    systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
+    n = len(components)
+    source = frames.source
+    planes = n + (len(covariance_index(n)) if source.has_variances else 0)
+    out = run_blocks(
+        partial(correct_block, source, solution, by_variance=by_variance),
+        (planes, source.n_wavelengths, *source.image_shape),
+        chunk=chunk,
+        workers=workers,
+        cluster=cluster,
+        progress=progress,
+    )
+    return Corrected(
+        components,
+        frames.wavelength,
+        out[:n],
+        out[n:] if planes > n else None,
+        systematic,
+        solution.condition,
+        solution.determined,
+        solution.leakage,
+        solution.weak,
+        mode,
+        observable,
+        frames.unit,
+        frames.north_up,
+        frames.centre,
+        frames.pixel_scale,
+        _provenance(calibration, frames, systematic, provenance),
+    )
+
+
+def _rows(model, frames, mode):
+    rows = model.rows()
+    if mode == "stokes":
+        return rows
+    ideal = RowModel(
+        ideal_chain(model.chain, frames.wavelength),
+        frames.positions,
+        frames.wavelength,
+        chain=ideal_chain(model.chain, frames.wavelength),
+    )
+    return np.concatenate([rows[..., :1], ideal.rows()[..., 1:]], axis=-1)
+
+
+def _warn_of_weak(solution, wavelength):
+    flags = solution.flags()
+    if flags:
+        first = next(iter(flags))
+        warnings.warn(
+            f"poorly determined at {len(flags)} of {len(wavelength)} wavelengths, left out there: "
+            f"at {wavelength[first]:.6g} {flags[first]} (condition "
+            f"{solution.condition[first]:.3g}, allowed is {solution.max_condition:g})",
+            AstropolcalWarning,
+            stacklevel=3,
+        )
+
+
+def _systematic(model, solution, mode, open_directions, n_samples, seed):
+    if model.calibration is None:
+        return None
+    if n_samples:
+        return sampled_systematic(model, solution, n_samples=n_samples, seed=seed, mode=mode)
+    found = linear_systematic(model, solution, mode=mode, open_directions=open_directions)
+    if found.is_open:
+        warnings.warn(
+            "the calibration leaves open how Q and U turn: their systematic errors are infinite "
+            "unless priors close its open directions, or these are ignored",
+            AstropolcalWarning,
+            stacklevel=3,
+        )
+    return found
+
+
+def _provenance(calibration, frames, systematic, given):
+    import astropy
+
+    from astropolcal.version import version
+
+    known = {
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "astropolcal": version,
+        "astropy": astropy.__version__,
+        "numpy": np.__version__,
+        "instrument": getattr(calibration, "instrument", None) or "",
+        "systematic": "none" if systematic is None else systematic.method,
+        "held": [] if systematic is None else list(systematic.held),
+        "frames": [str(name) for name in frames.names],
+    }
+    return known | dict(frames.meta) | dict(given or {})

@@ -1,0 +1,370 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Science frames: the fluxes of both beams, where the stages stood, how the field was turned."""
+
+from dataclasses import dataclass, field, replace
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.chain import stages
+from astropolcal.correction.brightness import frame_brightness
+from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
+from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.observations import Observations, pair_frames
+from astropolcal.optics import COORDINATES
+
+__all__ = ["ScienceFrames", "frame_positions"]
+
+
+@dataclass
+class ScienceFrames:
+    """
+    What is to be corrected.
+
+    Attributes
+    ----------
+    source : ArraySource, TurnedSource or CubeFiles
+        The fluxes.
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_wavelengths,).
+    positions : dict
+        Position of every stage of the chain, (n_frames,), see `RowModel`.
+    pairs : `~numpy.ndarray` or None
+        Frames of the pairs of double differences.
+    scale : `~numpy.ndarray` or None
+        Relative brightness of the frames.
+    unit : `~astropy.units.UnitBase`
+        Of the fluxes.
+    north_up : bool
+        Whether images have north up and east left.
+    centre : tuple or None
+        Of the star in the images, 0-based x and y.
+    pixel_scale : float or None
+        Milliarcsecond.
+    meta : dict
+        More that goes into a product's header.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal.correction import ScienceFrames
+    >>> hwp = [0, 45, 22.5, 67.5] * u.deg
+    >>> frames = ScienceFrames.from_arrays(np.ones((4, 22)), np.ones((4, 22)),
+    ...                                    np.linspace(1.2, 2.4, 22) * u.um, {"hwp": hwp}, hwp=hwp)
+    >>> frames.pairs.tolist()
+    [[0, 1], [2, 3]]
+    """
+
+    source: object
+    wavelength: u.Quantity
+    positions: dict
+    pairs: np.ndarray | None = None
+    scale: np.ndarray | None = None
+    unit: u.UnitBase = u.adu
+    north_up: bool = False
+    centre: tuple | None = None
+    pixel_scale: float | None = None
+    meta: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        self.wavelength = np.atleast_1d(u.Quantity(self.wavelength))
+        if self.wavelength.shape != (self.source.n_wavelengths,):
+            raise ObservationError(
+                f"wavelength has shape {self.wavelength.shape}; the frames have "
+                f"{self.source.n_wavelengths} wavelengths"
+            )
+        for name, position in self.positions.items():
+            if np.shape(position)[-1:] not in ((), (self.source.n_frames,), (1,)):
+                raise ObservationError(
+                    f"{name} has {np.shape(position)[-1]} positions; there are "
+                    f"{self.source.n_frames} frames"
+                )
+
+    @property
+    def names(self):
+        """What the frames are called."""
+        return self.source.names
+
+    def with_brightness(self, rows, **settings):
+        """
+        Return the frames with the relative brightness that their own light shows.
+
+        Parameters
+        ----------
+        rows : `~numpy.ndarray`
+            As `measurement_rows` gives them.
+        **settings
+            As for `frame_brightness`.
+
+        Returns
+        -------
+        ScienceFrames
+        """
+        fluxes = np.empty((2, self.source.n_frames, self.source.n_wavelengths))
+        for w in range(self.source.n_wavelengths):
+            for frames in self.source.batches():
+                for beam in (0, 1):
+                    found = self.source.fluxes(beam, frames, slice(w, w + 1))
+                    fluxes[beam, frames, w] = np.nansum(found.reshape(len(found), -1), axis=1)
+        return replace(self, scale=frame_brightness(rows, fluxes, **settings))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        right,
+        left,
+        wavelength,
+        positions,
+        *,
+        variance_right=None,
+        variance_left=None,
+        names=None,
+        batch=None,
+        hwp=None,
+        position_angle=None,
+        centre=None,
+        mirrored=False,
+        order=3,
+        **settings,
+    ):
+        """
+        Make it from arrays of both beams.
+
+        Parameters
+        ----------
+        right, left, variance_right, variance_left, names, batch
+            As for `ArraySource`; images or spectra.
+        wavelength, positions
+            As the attributes.
+        hwp : `~astropy.units.Quantity`, optional
+            Commanded angles of the half-wave plate, by which frames are paired.
+        position_angle : `~astropy.units.Quantity`, optional
+            Of the +y axis of every frame; the images are then turned north up.
+        centre, mirrored, order
+            As for `derotate`.
+        **settings
+            More attributes: ``pairs``, ``scale``, ``unit``, ``pixel_scale``, ``meta``.
+
+        Returns
+        -------
+        ScienceFrames
+        """
+        source = ArraySource(right, left, variance_right, variance_left, names, batch)
+        if position_angle is not None:
+            options = {"centre": centre, "mirrored": mirrored, "order": order}
+            source = TurnedSource(source, position_angle, **options)
+            settings["north_up"] = True
+        if hwp is not None and settings.get("pairs") is None:
+            settings["pairs"] = _pairs(hwp, positions, source.names)
+        return cls(source, wavelength, positions, centre=centre, **settings)
+
+    @classmethod
+    def from_differences(cls, difference, total, *arguments, variance=None, **settings):
+        """
+        Make it from single differences and sums, right minus and plus left.
+
+        Parameters
+        ----------
+        difference, total : array_like
+            Shape (n_frames, n_wavelengths, ...).
+        *arguments
+            ``wavelength`` and ``positions``, as for `from_arrays`.
+        variance : array_like, optional
+            Of the difference, which is taken as that of the sum.
+        **settings
+            As for `from_arrays`.
+
+        Returns
+        -------
+        ScienceFrames
+        """
+        difference, total = np.asarray(difference), np.asarray(total)
+        half = None if variance is None else np.asarray(variance) / 2
+        return cls.from_arrays(
+            (total + difference) / 2,
+            (total - difference) / 2,
+            *arguments,
+            variance_right=half,
+            variance_left=half,
+            **settings,
+        )
+
+    @classmethod
+    def from_files(
+        cls,
+        files,
+        instrument,
+        table,
+        chain,
+        *,
+        wavelength=None,
+        centres=None,
+        size=51,
+        position_angle=None,
+        mirrored=False,
+        order=3,
+        **settings,
+    ):
+        """
+        Make it from extracted cubes with both beams side by side.
+
+        Parameters
+        ----------
+        files : sequence of path-like
+            The cubes.
+        instrument : Instrument
+            With a file layout.
+        table : `~astropy.table.QTable`
+            One row a file, the angles that its headers give: ``hwp`` and ``derotator``, for a
+            star ``parallactic`` and ``altitude``, and ``hwp_true`` if it is known.
+        chain : `~astropy.modeling.CompoundModel`
+            From the sky to the detector, see `sky_chain`.
+        wavelength : `~astropy.units.Quantity`, optional
+            Of the slices; by default the instrument's.
+        centres : array_like, optional
+            As for `CubeFiles`, shape (2, 2) or (n_frames, 2, 2); or of the left beam only, shape
+            (2,) or (n_frames, 2), with the right beam where the layout says; by default in the
+            middle of the field.
+        size, position_angle, mirrored, order
+            As for `CubeFiles`.
+        **settings
+            More attributes.
+
+        Returns
+        -------
+        ScienceFrames
+
+        Raises
+        ------
+        ObservationError
+            If a file cannot be read, or the table lacks an angle.
+        """
+        layout = instrument.files
+        positions = frame_positions(instrument, table, chain, names=files)
+        source = CubeFiles(
+            files,
+            _centres(centres, layout),
+            size,
+            position_angle=position_angle,
+            extension=layout.cube_extension,
+            mirrored=mirrored,
+            order=order,
+        )
+        if settings.get("pairs") is None and "hwp" in table.colnames:
+            settings["pairs"] = _pairs(table["hwp"], positions, source.names)
+        settings.setdefault("pixel_scale", layout.pixel_scale)
+        middle = ((size - 1) / 2, (size - 1) / 2)
+        return cls(
+            source,
+            instrument.wavelength if wavelength is None else wavelength,
+            positions,
+            north_up=position_angle is not None,
+            centre=middle,
+            **settings,
+        )
+
+
+def _pairs(hwp, positions, names):
+    """Return the pairs of frames, or None where there are none; only some corrections need them."""
+    import warnings
+
+    derotator = positions.get("derotator")
+    if derotator is not None and not isinstance(derotator, u.Quantity):
+        derotator = np.asarray(derotator) * u.rad
+    try:
+        with warnings.catch_warnings():
+            # that frames are left over matters only where pairs are used
+            warnings.simplefilter("ignore")
+            found = pair_frames(
+                hwp,
+                None if derotator is None else np.broadcast_to(derotator, hwp.shape, subok=True),
+                derotator_tolerance=2 * u.deg,
+                labels=names,
+            )
+    except ObservationError:
+        return None
+    return found if len(found) else None
+
+
+def _centres(centres, layout):
+    """Return the place of the same point in the right and the left beam."""
+    if centres is None:
+        left, right = layout.internal_apertures[:2]
+        middle = (np.add(left, right) - layout.star_offset) / 2
+        centres = middle
+    centres = np.asarray(centres, dtype=float)
+    if centres.shape[-1:] != (2,) or not np.all(np.isfinite(centres)):
+        raise ParameterError(f"centres of shape {centres.shape}; x and y of each are needed")
+    if centres.shape == (2,) or (centres.ndim == 2 and centres.shape != (2, 2)):
+        centres = np.stack([centres + layout.star_offset, centres], axis=-2)
+    return centres
+
+
+def frame_positions(instrument, table, chain, names=None):
+    """
+    Return the position of every stage in each frame, from what the headers give.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        That knows how stages follow the sky.
+    table : `~astropy.table.QTable`
+        One row a frame with the angles of the headers.
+    chain : `~astropy.modeling.CompoundModel`
+        From the sky to the detector.
+    names : sequence of str, optional
+        What to call the frames.
+
+    Returns
+    -------
+    dict of str to `~numpy.ndarray`
+        Radian, shape (n_frames,).
+
+    Raises
+    ------
+    ObservationError
+        If an angle is missing; the message names the frame.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+    >>> from astropolcal import instruments
+    >>> from astropolcal.correction import frame_positions
+    >>> charis = instruments.get("charis")
+    >>> table = QTable({"hwp": [45] * u.deg, "derotator": [60] * u.deg,
+    ...                 "parallactic": [20] * u.deg, "altitude": [67] * u.deg})
+    >>> positions = frame_positions(charis, table, charis.on_sky(charis.published()))
+    >>> np.rad2deg(positions["hwp"])
+    array([122.])
+    """
+    table = QTable(table, copy=True)
+    names = [f"frame {i}" for i in range(len(table))] if names is None else list(map(str, names))
+    for stage in (stage for stage in stages(chain) if stage not in COORDINATES):
+        if stage in ("parallactic", "altitude") and {"time", "right_ascension"} & set(
+            table.colnames
+        ):
+            continue
+        _check_angles(table, stage, names)
+    table["frame"], table["bin"] = np.arange(len(table)), np.zeros(len(table), dtype=int)
+    table["wavelength"] = 1 * u.um
+    # positions are read as those of observations are; the fluxes do not matter
+    table["flux_right"] = table["flux_left"] = np.ones(len(table)) * u.adu
+    table.meta = {}
+    observations = Observations.from_table(table, name=names[0])
+    return dict(instrument.positions(observations, chain))
+
+
+def _check_angles(table, stage, names):
+    if stage not in table.colnames:
+        raise ObservationError(
+            f"{names[0]}: no angle {stage!r}, which the calibrated chain needs; there is "
+            f"{', '.join(table.colnames) or 'nothing'}"
+        )
+    values = np.ma.filled(np.ma.masked_invalid(np.asarray(table[stage].value, float)), np.nan)
+    unknown = ~np.isfinite(values)
+    if unknown.any():
+        raise ObservationError(f"{names[int(np.argmax(unknown))]}: no angle {stage!r}")

@@ -1,0 +1,348 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Corrected Stokes parameters with what is known of their errors."""
+
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import StokesCoord
+from astropy.table import QTable
+
+from astropolcal.correction.engine import covariance_index
+from astropolcal.correction.geometry import azimuthal, azimuthal_variances
+from astropolcal.correction.polarization import fractions, polarization
+from astropolcal.exceptions import AstropolcalError, ParameterError
+
+__all__ = ["Corrected"]
+
+_KINDS = ("statistical", "systematic")
+
+
+@dataclass
+class Corrected:
+    """
+    Stokes parameters of the light that entered, `correct` makes it.
+
+    Attributes
+    ----------
+    components : str
+        ``"IQU"`` or ``"IQUV"``.
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_wavelengths,).
+    stokes : `~numpy.ndarray`
+        Shape (n_components, n_wavelengths, ...); NaN where not determined.
+    covariance : `~numpy.ndarray` or None
+        Statistical, of the pairs of `covariance_index`, (n_pairs, n_wavelengths, ...).
+    systematic : Systematic or None
+        What the errors of the calibration do; None without a calibration.
+    condition, determined, leakage, weak
+        As in `Estimator`.
+    mode, observable : str
+        How it was corrected.
+    unit : `~astropy.units.UnitBase`
+        Of ``stokes``.
+    north_up, centre, pixel_scale
+        As in `ScienceFrames`.
+    provenance : dict
+        Calibration, versions, input files.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal import optics
+    >>> from astropolcal.correction import ScienceFrames, correct
+    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    >>> chain = chain | optics.WollastonPrism(name="wollaston")
+    >>> hwp = [0, 45, 22.5, 67.5] * u.deg
+    >>> right, left = np.array([[1.02, 0.98, 1.0, 1.0], [0.98, 1.02, 1.0, 1.0]])[..., None]
+    >>> star = correct(chain, ScienceFrames.from_arrays(right, left, [1.6] * u.um, {"hwp": hwp}))
+    >>> star.q.round(6), star.stokes_axis
+    (array([0.02]), StokesCoord(['I', 'Q', 'U']))
+    """
+
+    components: str
+    wavelength: u.Quantity
+    stokes: np.ndarray
+    covariance: np.ndarray | None
+    systematic: object
+    condition: np.ndarray
+    determined: np.ndarray
+    leakage: np.ndarray
+    weak: list
+    mode: str = "stokes"
+    observable: str = "intensity"
+    unit: u.UnitBase = u.adu
+    north_up: bool = False
+    centre: tuple | None = None
+    pixel_scale: float | None = None
+    provenance: dict = field(default_factory=dict)
+
+    # ---- Stokes parameters -------------------------------------------------------
+
+    @property
+    def stokes_axis(self):
+        """The first axis of ``stokes``, a `~astropy.coordinates.StokesCoord`."""
+        return StokesCoord(list(self.components))
+
+    def __getitem__(self, component):
+        """Return one Stokes parameter, shape (n_wavelengths, ...)."""
+        return self.stokes[self._index(component)]
+
+    def _index(self, component):
+        if len(component) != 1 or component not in self.components:
+            raise ParameterError(
+                f"no component {component!r}; there is {', '.join(self.components)}"
+            )
+        return self.components.index(component)
+
+    @property
+    def q(self):
+        """Q / I, NaN where there is no light."""
+        return self._normalized("Q")
+
+    @property
+    def u(self):
+        """U / I, NaN where there is no light."""
+        return self._normalized("U")
+
+    @property
+    def v(self):
+        """V / I, NaN where there is no light or V is not determined."""
+        return self._normalized("V")
+
+    def _normalized(self, component):
+        bright = self["I"] > 0
+        return np.where(bright, self[component], np.nan) / np.where(bright, self["I"], 1.0)
+
+    # ---- errors ------------------------------------------------------------------
+
+    def covariances(self, kind="statistical"):
+        """
+        Return the covariances of the Stokes parameters.
+
+        Parameters
+        ----------
+        kind : {"statistical", "systematic"}
+            Noise, or what the errors of the calibration do.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (n_components, n_components, n_wavelengths, ...); NaN where not known.
+        """
+        if kind not in _KINDS:
+            raise ParameterError(f"kind = {kind!r}; allowed are {', '.join(_KINDS)}")
+        n = len(self.components)
+        result = np.full((n, n, *self.stokes.shape[1:]), np.nan)
+        if kind == "statistical" and self.covariance is not None:
+            for plane, (i, j) in zip(self.covariance, covariance_index(n), strict=True):
+                result[i, j] = result[j, i] = plane
+        if kind == "systematic" and self.systematic is not None:
+            for w in range(self.stokes.shape[1]):
+                result[:, :, w] = self.systematic.covariance(self.stokes[:, w], w)
+            result[:, :, ~np.isfinite(self.stokes).any(axis=0)] = np.nan
+        return result
+
+    def error(self, component, kind="statistical"):
+        """Return the standard deviation of a Stokes parameter, shape (n_wavelengths, ...)."""
+        i = self._index(component)
+        return np.sqrt(self.covariances(kind)[i, i])
+
+    def fractional_errors(self, kind="statistical"):
+        """
+        Return errors of the normalized Stokes parameters.
+
+        Returns
+        -------
+        dict of str to `~numpy.ndarray`
+            ``q``, ``u`` and, if solved for, ``v``: standard deviations; ``covariance_qu``.
+        """
+        return fractions(self.stokes, self.covariances(kind), self.components)
+
+    def polarization(self, method="mas"):
+        """
+        Return degree and angle of linear polarization with their errors.
+
+        Parameters
+        ----------
+        method : str
+            Of `~astropolcal.stokes.debias_dolp`, for the statistical error.
+
+        Returns
+        -------
+        dict of str to `~numpy.ndarray`
+            ``dolp``, ``dolp_debiased`` (where statistical errors are known), ``aolp`` in degree
+            from north through east, and for each kind of error ``s_p_...`` and ``s_chi_...`` (in
+            degree).
+        """
+        kinds = {kind: self.fractional_errors(kind) for kind in _KINDS}
+        return polarization(self.q, self.u, kinds, method)
+
+    def azimuthal(self):
+        """
+        Return Q_phi and U_phi of images, with their errors.
+
+        Returns
+        -------
+        dict of str to `~numpy.ndarray`
+            ``q_phi``, ``u_phi``, and ``..._statistical`` and ``..._systematic``.
+        """
+        if self.stokes.ndim != 4:
+            raise ParameterError("Q_phi and U_phi are of images; these are not")
+        i, j = self._index("Q"), self._index("U")
+        pair = azimuthal(self.stokes[i], self.stokes[j], self.centre)
+        result = dict(zip(("q_phi", "u_phi"), pair, strict=True))
+        for kind in _KINDS:
+            known = self.covariances(kind)
+            variances = azimuthal_variances(known[i, i], known[j, j], known[i, j], self.centre)
+            for name, variance in zip(("q_phi", "u_phi"), variances, strict=True):
+                result[f"{name}_{kind}"] = np.sqrt(np.maximum(variance, 0))
+        return result
+
+    # ---- spectra -----------------------------------------------------------------
+
+    def aperture(self, radius, centre=None):
+        """
+        Return the sum within a circle, as the spectrum of a point source.
+
+        Parameters
+        ----------
+        radius : float
+            Pixels; a pixel counts if its middle is inside.
+        centre : (float, float), optional
+            0-based x and y; by default that of the images.
+
+        Returns
+        -------
+        Corrected
+            Of shape (n_components, n_wavelengths). The statistical errors take the pixels as
+            independent.
+        """
+        if self.stokes.ndim != 4:
+            raise ParameterError("an aperture needs images; these are spectra")
+        rows, columns = np.indices(self.stokes.shape[2:])
+        x, y = self._middle() if centre is None else centre
+        inside = np.hypot(columns - x, rows - y) <= radius
+        if not radius > 0 or not inside.any():
+            raise ParameterError(f"radius = {radius}: no pixel is inside")
+        covariance = None if self.covariance is None else self.covariance[..., inside].sum(axis=-1)
+        changed = {"stokes": self.stokes[..., inside].sum(axis=-1), "covariance": covariance}
+        return type(self)(**{**self.__dict__, **changed})
+
+    def _middle(self):
+        height, width = self.stokes.shape[2:]
+        return ((width - 1) / 2, (height - 1) / 2) if self.centre is None else self.centre
+
+    def table(self):
+        """
+        Return the spectrum of a point source.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            One row a wavelength: I, q, u (and v) with both errors, degree and angle of linear
+            polarization with both errors, ``condition``, ``leakage_q`` and ``leakage_u`` (what
+            they take from v), ``determined``.
+        """
+        if self.stokes.ndim != 2:
+            raise ParameterError("a table is of a point source; take an aperture of the images")
+        table = QTable({"wavelength": self.wavelength, "I": self["I"] * self.unit})
+        for kind in _KINDS:
+            table[f"I_{kind}"] = self.error("I", kind) * self.unit
+        errors = {kind: self.fractional_errors(kind) for kind in _KINDS}
+        for name in self.components[1:].lower():
+            table[name] = getattr(self, name)
+            for kind in _KINDS:
+                table[f"{name}_{kind}"] = errors[kind][name]
+        for kind in _KINDS:
+            table[f"covariance_qu_{kind}"] = errors[kind]["covariance_qu"]
+        for name, values in self.polarization().items():
+            table[name] = values * u.deg if "chi" in name or "aolp" in name else values
+        table["condition"] = self.condition
+        table["leakage_q"], table["leakage_u"] = self.leakage[:, 1:3].T
+        table["determined"] = self.determined.all(axis=1)
+        table.meta |= {"mode": self.mode, "observable": self.observable} | self.provenance
+        return table
+
+    def spectra(self):
+        """
+        Return the spectra of a point source.
+
+        Returns
+        -------
+        dict of str to `~specutils.Spectrum`
+            ``"I"``, ``"q"``, ``"u"`` (and ``"v"``). The uncertainty is the statistical one; the
+            systematic one, one value a wavelength, stands in ``meta["systematic"]``.
+        """
+        try:
+            from specutils import Spectrum
+        except ImportError:
+            raise AstropolcalError("spectra need specutils 2, which is not installed") from None
+        from astropy.nddata import StdDevUncertainty
+
+        table = self.table()
+        found = {}
+        for name in ("I", *self.components[1:].lower()):
+            flux = u.Quantity(table[name])
+            found[name] = Spectrum(
+                flux=flux,
+                spectral_axis=self.wavelength,
+                uncertainty=StdDevUncertainty(u.Quantity(table[f"{name}_statistical"])),
+                mask=~np.isfinite(flux.value),
+                meta=dict(table.meta)
+                | {"systematic": np.asarray(u.Quantity(table[f"{name}_systematic"]).value)},
+            )
+        return found
+
+    # ---- files -------------------------------------------------------------------
+
+    def write(self, path, overwrite=False, maps=True):
+        """
+        Write a FITS product, atomically.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool
+            Whether an existing file may be replaced.
+        maps : bool
+            Whether maps that follow from the others are written too: the systematic
+            covariances, degree and angle of polarization, Q_phi and U_phi.
+
+        Raises
+        ------
+        ObservationError
+            If the file exists or cannot be written.
+        """
+        from astropolcal.correction.product import write_product
+
+        write_product(self, path, overwrite=overwrite, maps=maps)
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read a FITS product.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        Corrected
+
+        Raises
+        ------
+        ObservationError
+            If the file is missing, damaged or not ours.
+        """
+        from astropolcal.correction.product import read_product
+
+        return read_product(path)
+
+    def __repr__(self):
+        shape = " x ".join(map(str, self.stokes.shape[1:]))
+        return f"<Corrected {self.components} of {shape}, mode {self.mode}>"

@@ -1,0 +1,403 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+r"""
+What each frame measures of the light that enters: the rows of the measurement matrix.
+
+The flux of a beam is :math:`d = \mathbf a \cdot \mathbf S`, where :math:`\mathbf a` is the
+first row of the system Mueller matrix of that beam, frame and wavelength.
+"""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.chain import join, leaves, stages
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    ChainError,
+    ParameterError,
+    WavelengthRangeError,
+)
+from astropolcal.measurement import FreeParameters
+from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.optics import COORDINATES
+from astropolcal.optics.core import finite_position
+from astropolcal.propagation import Propagator
+from astropolcal.units import length_to_um
+
+__all__ = ["RowModel", "check_optics", "measurement_rows", "sky_chain"]
+
+
+def sky_chain(calibration, dataset=None):
+    """
+    Return the optics from the sky to the detector, with calibrated values.
+
+    The chain of a star that was calibrated, without the star itself; if there is none, the
+    instrument's chain from the sky, with the calibrated values of the optics inside. A chain
+    of an instrument without a telescope begins with the first optic on a stage.
+
+    Parameters
+    ----------
+    calibration : Calibration or `~astropy.modeling.CompoundModel`
+        The calibration, or a chain.
+    dataset : int, optional
+        Which of the calibration's chains; by default the first of a star, or the first.
+
+    Returns
+    -------
+    `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    ChainError
+        If no optic stands on a stage.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.correction.rows import sky_chain
+    >>> charis = instruments.get("charis")
+    >>> [optic.name for optic in sky_chain(charis.on_sky(charis.published()))][:4]
+    ['parallactic', 'm3', 'altitude', 'hwp']
+    """
+    chains = getattr(calibration, "chains", [calibration])
+    if dataset is not None:
+        chains = [chains[dataset]]
+    seen = [chain for chain in chains if "parallactic" in stages(chain)]
+    if seen:
+        return _from_stage(seen[0], ("parallactic",))
+    name = getattr(calibration, "instrument", None)
+    if name:
+        from astropolcal import instruments
+        from astropolcal.exceptions import InstrumentError
+
+        try:
+            return instruments.get(name).on_sky(chains[0])
+        except InstrumentError:
+            # an instrument without a telescope's chain
+            pass
+    return _from_stage(chains[0], [s for s in stages(chains[0]) if s not in COORDINATES])
+
+
+def _from_stage(chain, wanted):
+    found = leaves(chain)
+    first = next((i for i, leaf in enumerate(found) if leaf.stage in wanted), None)
+    if first is None:
+        raise ChainError("the chain has no optic on a stage; give the chain from the sky")
+    return join(found[first:])
+
+
+def check_optics(chain, optics_in):
+    """
+    Raise if an optic that is in the beam is absent from the chain.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        The chain.
+    optics_in : sequence of str
+        Names of optics that were in the beam.
+
+    Raises
+    ------
+    ChainError
+        Naming the optic.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.correction.rows import check_optics
+    >>> check_optics(instruments.get("charis").published(), ["dichroic", "nbs"])
+    """
+    known = [leaf.name for leaf in leaves(chain)]
+    absent = [name for name in optics_in if name not in known]
+    if absent:
+        raise ChainError(
+            f"{', '.join(absent)} was in the beam, but is not in the calibrated chain "
+            f"({', '.join(filter(None, known))})"
+        )
+
+
+class RowModel:
+    """
+    Measurement rows of a calibration at given positions and wavelengths, and how they move.
+
+    Parameters
+    ----------
+    calibration : Calibration or `~astropy.modeling.CompoundModel`
+        The calibration, or a chain with known values, which has no errors.
+    positions : dict of str to `~astropy.units.Quantity` or `~numpy.ndarray`
+        Position of every stage in each frame, shape (n_frames,), or (nodes, n_frames) at the
+        Gauss-Legendre nodes of the exposures. Angles without a unit are in radian.
+    wavelength : `~astropy.units.Quantity`
+        Of the science data.
+    chain : `~astropy.modeling.CompoundModel`, optional
+        From the sky to the detector, with optics named as the calibrated ones; by default
+        that of `sky_chain`.
+    interpolate : bool
+        Whether parameters known at the calibrated wavelengths only are interpolated linearly
+        between them. Else each wavelength must be one of the calibrated.
+
+    Raises
+    ------
+    WavelengthRangeError
+        If a wavelength is not one at which the calibration is known.
+    ChainError
+        If the position of a stage is missing, or the frames of the stages differ in number.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If parameters are interpolated; it names them.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.correction import RowModel
+    >>> charis = instruments.get("charis")
+    >>> positions = {"hwp": [0, 22.5, 45, 67.5] * u.deg, "derotator": [60] * 4 * u.deg,
+    ...              "parallactic": [10] * 4 * u.deg, "altitude": [70] * 4 * u.deg}
+    >>> RowModel(charis.on_sky(charis.published()), positions, charis.wavelength).rows().shape
+    (2, 22, 4, 4)
+    """
+
+    def __init__(self, calibration, positions, wavelength, *, chain=None, interpolate=False):
+        self.chain = sky_chain(calibration) if chain is None else chain
+        self.wavelength = np.atleast_1d(u.Quantity(wavelength))
+        self.calibration = calibration if hasattr(calibration, "covariance") else None
+        lam = length_to_um(self.wavelength)
+        self._leaves = leaves(self.chain)
+        self._own = [leaf.canonical_values() for leaf in self._leaves]
+        self._mix = self._mixing(lam, interpolate)
+        self._free = None
+        if self.calibration is not None:
+            grid = len(calibration.wavelength)
+            self._free = FreeParameters(calibration.chains, grid, calibration.ties)
+        placed, self._nodes = _placed(positions, stages(self.chain))
+        self._light = [Propagator(self.chain, lam, placed, source) for source in np.eye(4)]
+        columns = self._light[0].shape[1]
+        self.n_frames = columns // len(self._nodes)
+
+    def _mixing(self, lam, interpolate):
+        """Return weights of the calibrated wavelengths, (n_wavelengths, n_grid), or None."""
+        names = [
+            f"{leaf.name}.{key}"
+            for leaf, own in zip(self._leaves, self._own, strict=True)
+            for key, value in zip(leaf.param_names, own, strict=True)
+            if value.size > 1
+        ]
+        if not names:
+            return None
+        if self.calibration is None:
+            return np.eye(len(lam))
+        grid = np.atleast_1d(self.calibration.wavelength.to_value(u.um))
+        nearest = np.abs(lam[:, None] - grid).argmin(axis=1)
+        off = np.abs(lam / grid[nearest] - 1) > SAME_WAVELENGTH
+        if not off.any():
+            return np.eye(len(grid))[nearest]
+        if not interpolate:
+            raise WavelengthRangeError(_not_calibrated(self.wavelength, off, grid, names))
+        return _between(lam, self.wavelength, grid, names)
+
+    def rows(self, vector=None):
+        """
+        Return the rows of both beams.
+
+        Parameters
+        ----------
+        vector : `~numpy.ndarray`, optional
+            Free parameters of the calibration in canonical units; by default its own values.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (2, n_wavelengths, n_frames, 4), the right beam first; the last axis is
+            I, Q, U, V.
+        """
+        values = self._values(vector)
+        fluxes = [np.stack(light.fluxes(values)) for light in self._light]
+        return np.stack([self._over_nodes(flux) for flux in fluxes], axis=-1)
+
+    def derivatives(self):
+        """
+        Return how the rows change with each free parameter of the chain.
+
+        Returns
+        -------
+        dict of str to `~numpy.ndarray`
+            ``"optic.parameter"`` to derivative per canonical unit (radian, micrometre or 1), of
+            the shape of `rows`; for a parameter given per wavelength, to the value at that
+            wavelength.
+        """
+        wanted = self._wanted()
+        if not wanted:
+            return {}
+        values, shape = self._values(None), self._light[0].shape
+        result = {name: np.empty((2, *self._shape(), 4)) for name in wanted.values()}
+        ones, zeros = np.ones(shape), np.zeros(shape)
+        for k, light in enumerate(self._light):
+            sweep = light.forward(values)
+            for beam, weights in enumerate([(ones, zeros), (zeros, ones)]):
+                found = sweep.derivatives(list(wanted), weights)
+                for place, name in wanted.items():
+                    # what lies behind the splitter of the other beam leaves no trace
+                    slope = found.get(place, np.zeros(shape))
+                    result[name][beam, ..., k] = self._over_nodes(slope)
+        return result
+
+    def spread(self, slopes):
+        """
+        Lay derivatives by name out over the calibration's free parameters.
+
+        Parameters
+        ----------
+        slopes : dict of str to `~numpy.ndarray`
+            Derivatives per canonical unit, the first axis that of the wavelengths.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Derivatives per declared unit, with a last axis for the free parameters.
+        """
+        shape = next(iter(slopes.values())).shape if slopes else self._shape()
+        result = np.zeros((*shape, self._free.size))
+        for name, slope in slopes.items():
+            slot, factor, _ = self._free.lookup(name)
+            part = slope * factor * slot.factor
+            if slot.per_wavelength:
+                result[..., slot.slice] += np.einsum("w...,wi->w...i", part, self._mix)
+            else:
+                result[..., slot.start] += part
+        return result
+
+    @property
+    def start(self):
+        """Values of the calibration's free parameters, canonical; shape (n_free,)."""
+        return self._free.start()
+
+    @property
+    def held(self):
+        """Names of parameters of optics in the chain that have no error: they were not free."""
+        return [name for name in self._names() if self._slot(name) is None]
+
+    def _shape(self):
+        return len(self.wavelength), self.n_frames
+
+    def _names(self):
+        return [f"{leaf.name}.{key}" for leaf in self._leaves for key in leaf.param_names]
+
+    def _slot(self, name):
+        return None if self._free is None else self._free.lookup(name)[0]
+
+    def _wanted(self):
+        places = (
+            (i, j) for i, leaf in enumerate(self._leaves) for j in range(len(leaf.param_names))
+        )
+        named = zip(places, self._names(), strict=True)
+        return {place: name for place, name in named if self._slot(name) is not None}
+
+    def _values(self, vector):
+        """Return the values of every optic at the wavelengths of the data."""
+        names = iter(self._names())
+        values = []
+        for own in self._own:
+            values.append([self._at(next(names), value, vector) for value in own])
+        return values
+
+    def _at(self, name, value, vector):
+        slot = None if vector is None else self._slot(name)
+        if slot is not None:
+            _, factor, offset = self._free.lookup(name)
+            value = np.reshape(factor * vector[slot.slice] + offset, value.shape)
+        if value.size == 1:
+            return value.reshape(())
+        if value.size != self._mix.shape[1]:
+            raise ParameterError(
+                f"{name} has {value.size} values; allowed are 1 or {self._mix.shape[1]}, "
+                "one a wavelength"
+            )
+        return self._mix @ value
+
+    def _over_nodes(self, array):
+        """Average over the nodes of the exposures, the last axis but one of columns."""
+        array = array.reshape(*array.shape[:-1], len(self._nodes), self.n_frames)
+        return np.einsum("...nf,n->...f", array, self._nodes)
+
+
+def measurement_rows(calibration, positions, wavelength, *, chain=None, interpolate=False):
+    """
+    Return what each beam, wavelength and frame measures of the light that enters.
+
+    Parameters
+    ----------
+    calibration, positions, wavelength, chain, interpolate
+        As for `RowModel`, which also has the derivatives.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (2, n_wavelengths, n_frames, 4), the right beam first.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import optics
+    >>> from astropolcal.correction import measurement_rows
+    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    >>> chain = chain | optics.WollastonPrism(name="wollaston")
+    >>> rows = measurement_rows(chain, {"hwp": [0, 22.5] * u.deg}, [1.6] * u.um)
+    >>> (rows[0, 0] - rows[1, 0]).round(12).tolist()
+    [[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+    """
+    model = RowModel(calibration, positions, wavelength, chain=chain, interpolate=interpolate)
+    return model.rows()
+
+
+def _not_calibrated(wavelength, off, grid, names):
+    return (
+        f"wavelength = {wavelength[off][0]:.7g} is none of the {len(grid)} calibrated from "
+        f"{grid.min():.6g} to {grid.max():.6g} um, and {names[0]} is known at these only; "
+        "interpolate=True interpolates it linearly"
+    )
+
+
+def _between(lam, wavelength, grid, names):
+    """Return the weights of linear interpolation, and say that there is one."""
+    order = np.argsort(grid)
+    beyond = (lam < grid.min() * (1 - SAME_WAVELENGTH)) | (lam > grid.max() * (1 + SAME_WAVELENGTH))
+    if beyond.any():
+        raise WavelengthRangeError(
+            f"wavelength = {wavelength[beyond][0]:.7g} is outside the calibrated range of "
+            f"{names[0]}, {grid.min():.6g} to {grid.max():.6g} um"
+        )
+    warnings.warn(
+        f"interpolated linearly between the {len(grid)} calibrated wavelengths: {', '.join(names)}",
+        AstropolcalWarning,
+        stacklevel=4,
+    )
+    units = np.eye(len(grid))[order]
+    return np.stack([np.interp(lam, grid[order], column) for column in units.T], axis=1)
+
+
+def _placed(positions, wanted):
+    """Return the positions of all columns in canonical floats, and the weights of the nodes."""
+    placed = {}
+    for name in wanted:
+        if name not in positions:
+            raise ChainError(
+                f"no position of {name!r}, which the chain needs; there is "
+                f"{', '.join(sorted(positions)) or 'none'}"
+            )
+        value = positions[name]
+        if not isinstance(value, u.Quantity) and name not in COORDINATES:
+            value = np.asarray(value, dtype=float) * u.rad
+        placed[name] = np.atleast_1d(finite_position(value, name))
+    nodes = {name: len(v) for name, v in placed.items() if v.ndim == 2}
+    if not nodes:
+        return placed, np.ones(1)
+    if len(set(nodes.values())) > 1:
+        raise ChainError(f"the stages have different numbers of nodes: {nodes}")
+    _, weights = np.polynomial.legendre.leggauss(next(iter(nodes.values())))
+    spread = {n: v.ravel() if v.ndim == 2 else np.tile(v, len(weights)) for n, v in placed.items()}
+    return spread, weights / 2

@@ -1,0 +1,311 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Where the fluxes of both beams come from: arrays in memory or on disk, or cubes in files."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import astropy.units as u
+import numpy as np
+from astropy.io import fits
+
+from astropolcal.correction.geometry import derotate, derotate_variance
+from astropolcal.exceptions import ObservationError, ParameterError
+
+__all__ = ["ArraySource", "CubeFiles", "TurnedSource"]
+
+
+class ArraySource:
+    """
+    Beams as arrays, in memory, mapped from disk, or of dask.
+
+    Parameters
+    ----------
+    right, left : array_like
+        Fluxes, shape (n_frames, n_wavelengths, ...); NaN where there is none.
+    variance_right, variance_left : array_like, optional
+        Their variances, of the same shape.
+    names : sequence of str, optional
+        What to call the frames.
+    batch : int, optional
+        Frames that are read at a time; by default all of arrays in memory, those of a chunk of
+        dask arrays, and one of arrays on disk.
+
+    Raises
+    ------
+    ObservationError
+        If the shapes differ, or only one beam has variances.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.correction.sources import ArraySource
+    >>> ArraySource(np.ones((4, 22)), np.ones((4, 22))).image_shape
+    ()
+    """
+
+    def __init__(
+        self, right, left, variance_right=None, variance_left=None, names=None, batch=None
+    ):
+        self._batch = batch
+        self._beams = [_array(right), _array(left)]
+        given = [v is not None for v in (variance_right, variance_left)]
+        if any(given) != all(given):
+            raise ObservationError("variances of one beam only; both or none are needed")
+        self._variances = None
+        if all(given):
+            self._variances = [_array(variance_right), _array(variance_left)]
+        shapes = {array.shape for array in [*self._beams, *(self._variances or [])]}
+        if len(shapes) > 1 or len(next(iter(shapes))) < 2:
+            raise ObservationError(
+                f"the beams and their variances have shapes {sorted(shapes)}; one shape "
+                "(n_frames, n_wavelengths, ...) is needed"
+            )
+        self.n_frames, self.n_wavelengths, *image = self._beams[0].shape
+        self.image_shape = tuple(image)
+        self.names = [f"frame {i}" for i in range(self.n_frames)] if names is None else list(names)
+
+    @property
+    def has_variances(self):
+        """Whether the fluxes have variances."""
+        return self._variances is not None
+
+    def batches(self):
+        """Return the frames that are read at a time, a list of slices."""
+        array = self._beams[0]
+        batch = self._batch or (1 if isinstance(array, np.memmap) else self.n_frames)
+        ends = [*range(0, self.n_frames, batch), self.n_frames]
+        if self._batch is None and hasattr(array, "chunks"):
+            ends = np.cumsum([0, *array.chunks[0]]).tolist()
+        return [slice(start, end) for start, end in pairwise(ends)]
+
+    def fluxes(self, beam, frames, wavelengths):
+        """Return the fluxes of a beam in some frames and wavelengths, (n, m, ...)."""
+        return np.asarray(self._beams[beam][frames, wavelengths])
+
+    def variances(self, beam, frames, wavelengths):
+        """Return their variances."""
+        return np.asarray(self._variances[beam][frames, wavelengths])
+
+
+def _array(values):
+    return values if hasattr(values, "dtype") and hasattr(values, "shape") else np.asarray(values)
+
+
+class TurnedSource:
+    """
+    Beams turned north up, frame by frame, when they are read.
+
+    Parameters
+    ----------
+    source : ArraySource or CubeFiles
+        Images of both beams.
+    position_angle : `~astropy.units.Quantity`
+        Of the +y axis of every frame, from north through east, shape (n_frames,).
+    **options
+        Of `derotate`: ``centre``, ``size``, ``mirrored``, ``order``.
+
+    Raises
+    ------
+    ParameterError
+        If the source has no images, or the angles are not one a frame.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal.correction.sources import ArraySource, TurnedSource
+    >>> image = np.zeros((1, 1, 3, 3))
+    >>> image[0, 0, 2, 1] = 1
+    >>> turned = TurnedSource(ArraySource(image, image), [90] * u.deg)
+    >>> turned.fluxes(0, slice(0, 1), slice(0, 1))[0, 0].tolist()
+    [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    """
+
+    def __init__(self, source, position_angle, **options):
+        self._source, self._angles, self._options = source, position_angle, options
+        if len(source.image_shape) != 2:
+            raise ParameterError(f"images of shape {source.image_shape} cannot be turned")
+        if np.shape(position_angle) != (source.n_frames,):
+            raise ParameterError(
+                f"position_angle has shape {np.shape(position_angle)}; one for each of the "
+                f"{source.n_frames} frames is needed"
+            )
+        self.n_frames, self.n_wavelengths = source.n_frames, source.n_wavelengths
+        size = options.get("size")
+        self.image_shape = source.image_shape if size is None else tuple(np.broadcast_to(size, 2))
+        self.names = source.names
+
+    @property
+    def has_variances(self):
+        """Whether the fluxes have variances."""
+        return self._source.has_variances
+
+    def batches(self):
+        """Return the frames that are read at a time, one by one."""
+        return [slice(i, i + 1) for i in range(self.n_frames)]
+
+    def fluxes(self, beam, frames, wavelengths):
+        """Return the fluxes of a beam in some frames and wavelengths, (n, m, Y, X)."""
+        return self._turned(derotate, self._source.fluxes(beam, frames, wavelengths), frames)
+
+    def variances(self, beam, frames, wavelengths):
+        """Return their variances."""
+        found = self._source.variances(beam, frames, wavelengths)
+        return self._turned(derotate_variance, found, frames)
+
+    def _turned(self, turn, cubes, frames):
+        angles = self._angles[frames]
+        return np.stack(
+            [turn(cube, angle, **self._options) for cube, angle in zip(cubes, angles, strict=True)]
+        )
+
+
+class CubeFiles:
+    """
+    Both beams of extracted cubes, cut out of files when they are needed.
+
+    Parameters
+    ----------
+    files : sequence of path-like
+        FITS cubes of shape (n_wavelengths, Y, X) with both beams side by side.
+    centres : array_like
+        Place of the same point of the sky in the right and in the left beam, 0-based x and y,
+        shape (2, 2), or (n_frames, 2, 2) for one in each frame.
+    size : int
+        Rows and columns that are cut out, with the point in the middle.
+    position_angle : `~astropy.units.Quantity`, optional
+        Of the +y axis of every frame; the images are then turned north up.
+    extension : int
+        That holds the cube; inverse variances may follow in ``extension + 1``.
+    mirrored, order
+        As for `derotate`.
+
+    Raises
+    ------
+    ObservationError
+        If a file is missing, no FITS file, or of another shape than the first.
+
+    Examples
+    --------
+    >>> from astropolcal.correction.sources import CubeFiles
+    >>> CubeFiles(["nowhere.fits"], [(100, 100), (36, 67)], 51)
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: nowhere.fits: no such file
+    """
+
+    def __init__(
+        self, files, centres, size, *, position_angle=None, extension=1, mirrored=False, order=3
+    ):
+        self.files = [str(path) for path in files]
+        if not self.files:
+            raise ObservationError("no files")
+        self._extension, self._order, self._mirrored = extension, order, mirrored
+        self.n_frames = len(self.files)
+        self.names = self.files
+        self._centres = np.broadcast_to(np.asarray(centres, dtype=float), (self.n_frames, 2, 2))
+        self._angles = position_angle
+        self.image_shape = (int(size), int(size))
+        self._places = [_places(path, extension) for path in self.files]
+        self._shape = self._places[0][0].shape
+        for path, (cube, *_) in zip(self.files, self._places, strict=True):
+            if cube.shape != self._shape or len(cube.shape) != 3:
+                raise ObservationError(
+                    f"{path}: a cube of shape {cube.shape}; {self.files[0]} has {self._shape}, and "
+                    "three axes are needed"
+                )
+        self.n_wavelengths = self._shape[0]
+        self.has_variances = all(len(places) > 1 for places in self._places)
+        self._check_window(self._shape[1:])
+
+    def _check_window(self, shape):
+        x, y = self._centres[..., 0], self._centres[..., 1]
+        inside = (x > -0.5) & (x < shape[1] - 0.5) & (y > -0.5) & (y < shape[0] - 0.5)
+        if not inside.all():
+            frame, beam = np.argwhere(~inside)[0]
+            raise ObservationError(
+                f"{self.files[frame]}: the {('right', 'left')[beam]} beam's centre "
+                f"{self._centres[frame, beam].tolist()} is outside the image of {shape[1]} x "
+                f"{shape[0]} pixels"
+            )
+
+    def batches(self):
+        """Return the frames that are read at a time, one by one."""
+        return [slice(i, i + 1) for i in range(self.n_frames)]
+
+    def fluxes(self, beam, frames, wavelengths):
+        """Return the fluxes of a beam in some frames and wavelengths, (n, m, size, size)."""
+        numbers = range(self.n_frames)[frames]
+        return np.stack([self._cut(derotate, i, beam, self._read(i, wavelengths)) for i in numbers])
+
+    def variances(self, beam, frames, wavelengths):
+        """Return their variances, NaN where the inverse variance is zero."""
+        found = []
+        for i in range(self.n_frames)[frames]:
+            weight = self._read(i, wavelengths, 1)
+            with np.errstate(divide="ignore"):
+                variance = np.where(weight > 0, 1 / weight, np.nan)
+            found.append(self._cut(derotate_variance, i, beam, variance))
+        return np.stack(found)
+
+    def _cut(self, resample, i, beam, cube):
+        angle = 0 * u.deg if self._angles is None else self._angles[i]
+        return resample(
+            cube,
+            angle,
+            centre=self._centres[i, beam],
+            size=self.image_shape,
+            mirrored=self._mirrored,
+            order=self._order,
+        )
+
+    def _read(self, i, wavelengths, offset=0):
+        place, path = self._places[i][offset], self.files[i]
+        try:
+            if place.start is not None:
+                # a thousand files would take long to open, wavelength by wavelength
+                cube = np.memmap(path, place.dtype, "r", place.start, place.shape)
+                return np.array(cube[wavelengths], dtype=float)
+            with fits.open(path) as hdus:
+                return np.array(hdus[self._extension + offset].section[wavelengths], dtype=float)
+        except (OSError, IndexError, TypeError, ValueError) as error:
+            raise ObservationError(
+                f"{path}: cannot be read: {' '.join(str(error).split())[:200]}"
+            ) from error
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where an array stands in a file; no start if its numbers are packed or scaled."""
+
+    shape: tuple
+    dtype: str
+    start: int | None
+
+
+def _places(path, extension):
+    """Return where the cube stands in a file, and the inverse variances if they follow."""
+    try:
+        with fits.open(path, memmap=True) as hdus:
+            if len(hdus) <= extension:
+                raise ObservationError(f"{path}: no extension {extension} in it")
+            found = [_place(hdu) for hdu in hdus[extension : extension + 2]]
+    except FileNotFoundError:
+        raise ObservationError(f"{path}: no such file") from None
+    except ObservationError:
+        raise
+    except Exception as error:  # astropy raises errors of many kinds for damaged files
+        reason = " ".join(str(error).split())[:200]
+        raise ObservationError(f"{path}: not a readable FITS file: {reason}") from error
+    return found if found[-1].shape == found[0].shape else found[:1]
+
+
+def _place(hdu):
+    header, info = hdu.header, hdu.fileinfo()
+    # a compressed image is of a subclass
+    plain = type(hdu) in (fits.ImageHDU, fits.PrimaryHDU)
+    plain &= header.get("BZERO", 0) == 0 and header.get("BSCALE", 1) == 1
+    plain &= info is not None and info["file"].compression is None and "BLANK" not in header
+    bits = header.get("BITPIX", 8)
+    dtype = f">{'f' if bits < 0 else 'i' if bits > 8 else 'u'}{abs(bits) // 8}"
+    return _Place(tuple(getattr(hdu, "shape", ())), dtype, info["datLoc"] if plain else None)

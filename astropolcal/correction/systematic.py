@@ -1,0 +1,271 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+r"""
+What the errors of a calibration do to corrected Stokes parameters.
+
+A change of the parameters changes the solution by :math:`\delta\hat{\mathbf S} = -G\,\delta A\,
+\mathbf S`, a 4 x 4 matrix times the Stokes vector, the same for all pixels. So the errors
+of all pixels and wavelengths, and their correlations, are a few small matrices.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from astropolcal.calibration import full_covariance
+from astropolcal.correction.solve import estimator
+from astropolcal.exceptions import ParameterError
+
+__all__ = ["Systematic", "linear_systematic", "sampled_systematic"]
+
+
+@dataclass
+class Systematic:
+    """
+    Change of the Stokes parameters for one sigma along each independent direction.
+
+    Attributes
+    ----------
+    factor : `~numpy.ndarray`
+        Shape (n_directions, n_wavelengths, n_components, n_components): the last axis is the
+        true Stokes vector, the one before what is found.
+    open : `~numpy.ndarray` of bool
+        Where the calibration leaves it open how they change, (n_wavelengths, n_components,
+        n_components).
+    method : str
+        ``"linear"`` or ``"sampled"``.
+    held : list of str
+        Parameters that were not free in the calibration, so that no error of them counts.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.correction import Systematic
+    >>> one = Systematic(np.diag([0, 1e-3, 1e-3])[None, None], np.zeros((1, 3, 3), bool), "linear")
+    >>> np.sqrt(np.diag(one.covariance([1, 0.1, 0.02], 0))).tolist()
+    [0.0, 0.0001, 2e-05]
+    """
+
+    factor: np.ndarray
+    open: np.ndarray
+    method: str
+    held: list = field(default_factory=list)
+
+    def covariance(self, stokes, wavelength):
+        """
+        Return the covariance of Stokes parameters at one wavelength.
+
+        Parameters
+        ----------
+        stokes : array_like
+            Shape (n_components, ...).
+        wavelength : int
+            Index.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (n_components, n_components, ...); infinite on the diagonal for what is open,
+            NaN beside it.
+        """
+        stokes = np.nan_to_num(np.asarray(stokes, dtype=float))
+        flat = stokes.reshape(len(stokes), -1)
+        factor = self.factor[:, wavelength]
+        tensor = np.einsum("rac,rbd->abcd", factor, factor)
+        products = flat[:, None] * flat[None, :]
+        covariance = np.einsum("abcd,cdp->abp", tensor, products, optimize=True)
+        is_open = np.einsum("ac,cp->ap", self.open[wavelength].astype(float), np.abs(flat)) > 0
+        if is_open.any():
+            covariance[is_open[:, None] | is_open[None, :]] = np.nan
+            diagonal = np.arange(len(flat))
+            covariance[diagonal, diagonal] = np.where(
+                is_open, np.inf, covariance[diagonal, diagonal]
+            )
+        return covariance.reshape(len(flat), len(flat), *stokes.shape[1:])
+
+    def between(self, stokes):
+        """
+        Return the covariance of a spectrum between its wavelengths.
+
+        Parameters
+        ----------
+        stokes : array_like
+            Shape (n_components, n_wavelengths).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (n_components, n_wavelengths, n_components, n_wavelengths), of what is not open.
+        """
+        moved = np.einsum("rwac,cw->raw", self.factor, np.nan_to_num(stokes))
+        return np.einsum("raw,rbv->awbv", moved, moved)
+
+    @property
+    def is_open(self):
+        """Whether something is left open at some wavelength."""
+        return bool(self.open.any())
+
+
+def linear_systematic(model, solution, *, mode="stokes", open_directions="infinite"):
+    """
+    Return the systematic errors by the exact derivatives of the rows.
+
+    Parameters
+    ----------
+    model : RowModel
+        With a calibration.
+    solution : Estimator
+        What was solved.
+    mode : {"stokes", "ip"}
+        As for `correct`.
+    open_directions : {"infinite", "ignore"} or float
+        Errors along directions that the calibration leaves open: infinite; zero, as if the
+        choice that it made were true; or a standard deviation along each direction, whose
+        length is counted in degrees, micrometres and percent.
+
+    Returns
+    -------
+    Systematic
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.correction import RowModel, estimator, linear_systematic
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> positions = {"hwp": [0, 22.5, 45, 67.5] * u.deg, "derotator": [60] * 4 * u.deg}
+    >>> model = RowModel(cal, positions, cal.wavelength)
+    >>> systematic = linear_systematic(model, estimator(model.rows()))
+    >>> bool(systematic.covariance([1, 0.01, 0], 5)[1, 1] ** 0.5 < 1e-4)
+    True
+    """
+    _choice(open_directions)
+    n = len(solution.components)
+    gain = np.nan_to_num(solution.gain)
+    slopes = {}
+    for name, change in model.derivatives().items():
+        if mode == "ip":
+            change = change * np.array([1.0, 0.0, 0.0, 0.0])
+        scaled = change * _brightness(solution)
+        slopes[name] = -np.einsum("wkbf,bwfs->wks", gain, scaled[..., :n])
+    shape = (len(gain), n, n)
+    flat = model.spread(slopes).reshape(-1, model._free.size)
+    covariance = full_covariance(model.calibration)
+    spread = covariance._spread(flat)
+    is_open = (spread.is_open | spread.is_blind).reshape(shape)
+    moved = np.where(is_open.ravel()[:, None], 0.0, spread.moved)
+    if open_directions != "infinite":
+        is_open, moved = np.zeros_like(is_open), spread.moved
+        if open_directions != "ignore":
+            axes = covariance._axes()
+            along = float(open_directions) * (flat * axes.steps) @ axes.open.T
+            moved = np.concatenate([moved, along], axis=1)
+    factor = moved.T.reshape(-1, *shape)
+    return Systematic(factor, is_open, "linear", model.held)
+
+
+def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stokes"):
+    """
+    Return the systematic errors by solving anew for samples of the parameters.
+
+    The samples are those of the calibration's posterior, if it holds all free parameters, else
+    drawn from its covariance; directions that the calibration leaves open stay where they are.
+
+    Parameters
+    ----------
+    model : RowModel
+        With a calibration.
+    solution : Estimator
+        What was solved.
+    n_samples : int
+        How many.
+    seed : int, optional
+        Of the samples.
+    mode : {"stokes", "ip"}
+        As for `correct`.
+
+    Returns
+    -------
+    Systematic
+        Nothing is open.
+
+    Raises
+    ------
+    ParameterError
+        If there are fewer than two samples.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.correction import RowModel, estimator, sampled_systematic
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> positions = {"hwp": [0, 22.5, 45, 67.5] * u.deg, "derotator": [60] * 4 * u.deg}
+    >>> model = RowModel(cal, positions, cal.wavelength)
+    >>> sampled_systematic(model, estimator(model.rows()), n_samples=10, seed=1).factor.shape
+    (10, 22, 3, 3)
+    """
+    if n_samples < 2:
+        raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")
+    n = len(solution.components)
+    settings = {
+        "components": solution.components,
+        "observable": solution.channels.observable,
+        "pairs": solution.channels.pairs,
+        "max_condition": solution.max_condition,
+    }
+    bright = _brightness(solution)
+    found = np.empty((n_samples, len(solution.gain), n, n))
+    for i, vector in enumerate(_draws(model, n_samples, np.random.default_rng(seed))):
+        rows = model.rows(vector) * bright
+        if mode == "ip":
+            rows = np.concatenate([rows[..., :1], solution.rows[..., 1:]], axis=-1)
+        gain = estimator(rows, weights=solution.beam_weights, **settings).gain
+        found[i] = np.einsum("wkbf,bwfs->wks", np.nan_to_num(gain), solution.rows[..., :n])
+    factor = (found - found.mean(axis=0)) / np.sqrt(n_samples - 1)
+    return Systematic(factor, np.zeros(found.shape[1:], dtype=bool), "sampled", model.held)
+
+
+def _brightness(solution):
+    """Return what the rows of the solution were scaled with, (1, n_wavelengths, n_frames, 1)."""
+    return 1.0 if solution.scale is None else solution.scale[None, :, :, None]
+
+
+def _draws(model, count, rng):
+    """Yield values of all free parameters in canonical units."""
+    start, factors = model.start, model._free.factors()
+    posterior = model.calibration.posterior
+    if posterior is not None and set(model._free.names) <= set(posterior.names):
+        yield from _of_posterior(model, posterior, count, rng)
+        return
+    covariance = full_covariance(model.calibration)
+    axes = covariance._axes()
+    known = axes.known * axes.sigmas[:, None] * axes.steps
+    for _ in range(count):
+        yield start + rng.standard_normal(len(known)) @ known * factors
+
+
+def _of_posterior(model, posterior, count, rng):
+    samples = posterior.samples()
+    columns = [posterior.index(name) for name in model._free.names]
+    for row in samples[rng.integers(len(samples), size=count)]:
+        yield row[columns] * model._free.factors()
+
+
+def _choice(open_directions):
+    if isinstance(open_directions, str):
+        good = open_directions in ("infinite", "ignore")
+    else:
+        good = np.isfinite(open_directions) and open_directions >= 0
+    if not good:
+        raise ParameterError(
+            f"open_directions = {open_directions!r}; allowed are infinite, ignore, and numbers "
+            "from zero"
+        )

@@ -1,0 +1,415 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Effects on sky: the telescope's tertiary mirror, the background, the signs of what follows the sky.
+
+They have their place in the chains of stars, where rotations by the parallactic
+angle and by the altitude stand in front of the half-wave plate.
+"""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import optics
+from astropolcal.chain import insert_optic
+from astropolcal.gap.effects.base import Edit, EffectParameter, Insertion, Roles
+from astropolcal.gap.effects.discrete import _Discrete
+from astropolcal.observations.pointing import TRACKING
+
+__all__ = [
+    "AltitudeSign",
+    "ParallacticSign",
+    "PlateNotTracking",
+    "PlateTrackingAltitudeSign",
+    "PlateTrackingParallacticSign",
+    "SkyBackground",
+    "SkyMotion",
+    "TertiaryDiattenuation",
+    "TertiaryRecoating",
+    "TertiaryRetardance",
+]
+
+# lag of an angle in frames, written as an angle over that of one frame: 0.25, at most 2
+_LAG = (0.25 * u.rad, 2 * u.rad)
+_VAN_HARTEN = "van Harten et al. 2009, arXiv:0903.2740"
+_SIGNS = "McIntosh et al. 2026, Sec. 6.1; van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
+
+
+class _Telescope:
+    """The optics of a star's chain from the star to the altitude axis; None where one lacks."""
+
+    def __init__(self, roles):
+        before, last = [], next((o for o in roles.leaves if _turns(o, "altitude")), None)
+        if last is not None:
+            before = roles.leaves[: roles.leaves.index(last)]
+        self.altitude = last
+        self.parallactic = next((o for o in before if _turns(o, "parallactic")), None)
+        self.star = next((o for o in before if isinstance(o, optics.PolarizedSource)), None)
+        self.mirror = None
+        if self.parallactic is not None:
+            between = before[before.index(self.parallactic) + 1 :]
+            own = (o for o in between if not (o.name or "").startswith("gap_"))
+            self.mirror = next(own, None)
+
+    @property
+    def complete(self):
+        """Whether both axes are there."""
+        return self.altitude is not None and self.parallactic is not None
+
+    def mirror_leaves(self, *keys):
+        """Return whether no parameter of the mirror is free, its angle and ``keys`` aside."""
+        if self.mirror is None:
+            return True
+        others = (getattr(self.mirror, k) for k in self.mirror.param_names if k not in keys)
+        return all(parameter.fixed for parameter in others)
+
+    @property
+    def unpolarized(self):
+        """Whether the star is held at zero polarization."""
+        if self.star is None:
+            return False
+        return all(p.fixed and not np.any(p.value) for p in (self.star.q, self.star.u))
+
+
+def _turns(optic, stage):
+    return isinstance(optic, optics.Rotator) and optic.stage == stage
+
+
+class _OnSky(Insertion):
+    """One more optic in front of the altitude axis of the telescope."""
+
+    def applies_to(self, roles):
+        """Return whether one chain has the telescope."""
+        return _Telescope(roles).complete
+
+    def edit(self, chains, context):
+        """Return the chains with the optic at zero; see `Effect.edit`."""
+        edited = []
+        for chain in chains:
+            roles = Roles(chain)
+            if self.applies_to(roles):
+                chain = self._with(chain, _Telescope(roles), self.label, context)
+            edited.append(chain)
+        return Edit(edited, self.parameters(context))
+
+    def _with(self, chain, telescope, name, context):
+        optic = self._freed(self.build(len(context.wavelength), telescope, context))
+        optic.name = name
+        return insert_optic(chain, optic, before=self.neighbour(telescope).name)
+
+    def neighbour(self, telescope):
+        """Return the optic behind the new one."""
+        return telescope.altitude
+
+
+def _along(mirror):
+    """Return the orientation of what acts as a mirror does."""
+    return {} if mirror is None else {"theta": mirror.theta.value * u.deg, "mount": mirror.mount}
+
+
+class TertiaryDiattenuation(_OnSky):
+    """
+    Diattenuation of the tertiary mirror that the model lacks or holds fixed.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import get_effect
+    >>> charis = instruments.get("charis")
+    >>> get_effect("m3_diattenuation").applies([charis.on_sky(charis.published())])
+    False
+    >>> get_effect("m3_diattenuation").applies([charis.chain()])
+    False
+    """
+
+    name, kind, place = "m3_diattenuation", "optic", "tertiary mirror"
+    title = "diattenuation of the telescope's tertiary mirror"
+    shows = "harmonic 4 of the plate angle, with a phase that follows altitude and derotator"
+    reference = _VAN_HARTEN
+    free = {"diattenuation": (0.01, 0.1)}
+
+    def applies_to(self, roles):
+        """Return whether there is a telescope whose mirror has no free diattenuation."""
+        telescope = _Telescope(roles)
+        return telescope.complete and telescope.mirror_leaves("theta", "retardance")
+
+    def build(self, size, telescope, context):
+        """Return a diattenuator in the plane of the mirror."""
+        return optics.Diattenuator(diattenuation=np.zeros(size), **_along(telescope.mirror))
+
+
+class TertiaryRetardance(_OnSky):
+    """
+    Retardance of the tertiary mirror that the model lacks or holds fixed.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import get_effect
+    >>> charis, effect = instruments.get("charis"), get_effect("m3_retardance")
+    >>> effect.applies([charis.chain("star")])
+    True
+    >>> effect.applies([charis.chain("unpolarized standard star")])
+    False
+    """
+
+    name, kind, place = "m3_retardance", "optic", "tertiary mirror"
+    title = "retardance of the telescope's tertiary mirror"
+    shows = "circular from linear polarization of stars, with altitude; none of unpolarized ones"
+    reference = _VAN_HARTEN
+    free = {"retardance": (5 * u.deg, 180 * u.deg)}
+
+    def applies_to(self, roles):
+        """Return whether a star that may be polarized is behind a mirror of fixed retardance."""
+        telescope = _Telescope(roles)
+        open_ = telescope.complete and not telescope.unpolarized
+        return open_ and telescope.mirror_leaves("theta", "diattenuation")
+
+    def build(self, size, telescope, context):
+        """Return a retarder in the plane of the mirror."""
+        zero = np.zeros(size) * u.deg
+        return optics.LinearRetarder(retardance=zero, **_along(telescope.mirror))
+
+
+class TertiaryRecoating(_OnSky):
+    """
+    Diattenuation of the tertiary mirror that changes from one dataset to the next.
+
+    A mirror that is coated anew, or washed, changes in steps. The datasets of stars
+    are taken in the order in which they are given; the first one is the
+    reference, and each of the others has a change of its own.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import get_effect
+    >>> night = instruments.get("charis").chain("unpolarized standard star")
+    >>> effect = get_effect("m3_recoating")
+    >>> effect.applies([night]), effect.applies([night, night])
+    (False, True)
+    """
+
+    name, kind, place = "m3_recoating", "optic", "tertiary mirror"
+    title = "tertiary mirror that is coated anew between two datasets of stars"
+    shows = "as the diattenuation of the tertiary mirror, in some datasets and not in others"
+    reference = _VAN_HARTEN
+    free = {"diattenuation": (0.003, 0.1)}
+
+    def applies(self, chains):
+        """Return whether there are two datasets of stars; see `Effect.applies`."""
+        return sum(self.applies_to(Roles(chain)) for chain in chains) > 1
+
+    def build(self, size, telescope, context):
+        """Return a diattenuator in the plane of the mirror."""
+        return optics.Diattenuator(diattenuation=np.zeros(size), **_along(telescope.mirror))
+
+    def edit(self, chains, context):
+        """Return the chains with a diattenuator in all but the first; see `Effect.edit`."""
+        edited, added, seen = [], [], 0
+        for chain in chains:
+            roles = Roles(chain)
+            if self.applies_to(roles):
+                if seen:
+                    name = f"{self.label}_{seen}"
+                    chain = self._with(chain, _Telescope(roles), name, context)
+                    added += self._named(name, context)
+                seen += 1
+            edited.append(chain)
+        return Edit(edited, added)
+
+    def _named(self, name, context):
+        return [
+            EffectParameter(f"{name}.{key}", *sizes, self.law(key, context))
+            for key, sizes in self.free.items()
+        ]
+
+
+class SkyBackground(_OnSky):
+    """
+    Polarized light of the sky that was not subtracted: moonlight, twilight.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> sorted(get_effect("sky_background").free)
+    ['q', 'u']
+    """
+
+    name, kind, place = "sky_background", "source", "sky"
+    title = "polarized background of the sky in the apertures"
+    shows = "harmonic 4 of the plate angle with a phase of its own, as one over the flux"
+    reference = "Patat & Romaniello 2006, doi:10.1086/497581"
+    degree = 1
+    free = {"q": (0.002, 0.1), "u": (0.002, 0.1)}
+
+    def build(self, size, telescope, context):
+        """Return polarized light that is added at a constant flux."""
+        return optics.PolarizedBackground(
+            q=np.zeros(size), u=np.zeros(size), reference=2 * context.flux, mount="total_flux"
+        )
+
+    def neighbour(self, telescope):
+        """Return the optic behind the new one."""
+        return telescope.parallactic
+
+
+class SkyMotion(_OnSky):
+    """
+    Parallactic angle of another moment than that of the exposure.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("sky_motion").degree is None
+    True
+    """
+
+    name, kind, place = "sky_motion", "parameter", "telescope"
+    title = "parallactic angle of another moment than the middle of the exposure"
+    shows = "polarization of stars turned by the rate of the parallactic angle, most near transit"
+    reference = "van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
+    degree = None
+    free = {"rate": _LAG}
+
+    def applies_to(self, roles):
+        """Return whether a star that may be polarized is behind a telescope."""
+        telescope = _Telescope(roles)
+        return telescope.complete and not telescope.unpolarized
+
+    def build(self, size, telescope, context):
+        """Return a rotator by the lag times the rate."""
+        return _lagging("parallactic", self.label)
+
+    def neighbour(self, telescope):
+        """Return the optic behind the new one."""
+        return telescope.parallactic
+
+
+def _lagging(stage, name):
+    """Return a rotator by the change of an angle, times a lag in frames (1 rad is one frame)."""
+    turn = optics.DriftRotator(mount=f"{stage}_rate", name=name)
+    turn.rate.bounds = (-360, 360)
+    return turn
+
+
+# ---- signs -----------------------------------------------------------------------------------
+
+
+class ParallacticSign(_Discrete):
+    """
+    Parallactic angle that counts the other way, as the star sees it.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("parallactic_sign").axis
+    'parallactic'
+    """
+
+    name, place, axis = "parallactic_sign", "sky", "parallactic"
+    title = "parallactic angle with the wrong sign"
+    shows = "polarization of stars that turns with the parallactic angle"
+    reference = _SIGNS
+
+    def applies_to(self, roles):
+        """Return whether one chain has the telescope."""
+        return _Telescope(roles).complete
+
+    def change(self, chain, roles):
+        """Return the chain with the axis turned the other way."""
+        axis = getattr(_Telescope(Roles(chain)), self.axis)
+        axis.mount = axis.stage if axis.stage_sign < 0 else f"-{axis.stage}"
+        return chain
+
+
+class AltitudeSign(ParallacticSign):
+    """
+    Altitude that counts the other way.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("altitude_sign").axis
+    'altitude'
+    """
+
+    name, place, axis = "altitude_sign", "telescope", "altitude"
+    title = "altitude with the wrong sign"
+    shows = "everywhere on sky: the polarization turns with twice the altitude"
+
+
+class PlateTrackingParallacticSign(_Discrete):
+    """
+    Half-wave plate that follows the parallactic angle the other way.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("hwp_tracking_parallactic_sign").law
+    (-0.5, 1.0)
+    """
+
+    name, place = "hwp_tracking_parallactic_sign", "stage of the half-wave plate"
+    title = "half-wave plate that follows the parallactic angle with the wrong sign"
+    shows = "everywhere on sky: the polarization turns with the parallactic angle"
+    reference = _SIGNS
+    #: Factors of parallactic angle and altitude in the plate's true angle.
+    law = (-TRACKING[0], TRACKING[1])
+
+    def applies_to(self, roles):
+        """Return whether there are a telescope and a plate."""
+        return roles.plate is not None and _Telescope(roles).complete
+
+    def change(self, chain, roles):
+        """Return the chain with the plate turned by the difference of the laws."""
+        plate = roles.plate.name
+        for stage, new, old in zip(("parallactic", "altitude"), self.law, TRACKING, strict=True):
+            if new != old:
+                sides = {"before": 1, "after": -1}
+                for side, sign in sides.items():
+                    name = f"gap_{self.name}_{stage}_{side}"
+                    turn = _follower(sign * (new - old), stage, name)
+                    chain = insert_optic(chain, turn, **{side: plate})
+        return chain
+
+
+class PlateTrackingAltitudeSign(PlateTrackingParallacticSign):
+    """
+    Half-wave plate that follows the altitude the other way.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("hwp_tracking_altitude_sign").law
+    (0.5, -1.0)
+    """
+
+    name = "hwp_tracking_altitude_sign"
+    title = "half-wave plate that follows the altitude with the wrong sign"
+    shows = "everywhere on sky: the polarization turns with four times the altitude"
+    law = (TRACKING[0], -TRACKING[1])
+
+
+class PlateNotTracking(PlateTrackingParallacticSign):
+    """
+    Half-wave plate that does not follow the sky.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import get_effect
+    >>> get_effect("hwp_not_tracking").law
+    (0.0, 0.0)
+    """
+
+    name = "hwp_not_tracking"
+    title = "half-wave plate that stands still between the commands"
+    shows = "everywhere on sky: the polarization turns with parallactic angle and altitude"
+    law = (0.0, 0.0)
+
+
+def _follower(factor, stage, name):
+    """Return a rotator by a multiple of the angle of a stage, a whole number of turns included."""
+    turn = optics.DriftRotator(mount=stage, name=name)
+    turn.rate.bounds = (None, None)
+    turn.rate = factor * u.rad
+    turn.rate.fixed = True
+    return turn

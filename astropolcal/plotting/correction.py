@@ -1,0 +1,371 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Corrected science: images of the Stokes parameters, spectra, how well they are determined."""
+
+from pathlib import Path
+
+import numpy as np
+
+from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.files import atomic_path
+from astropolcal.plotting._style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    PURPLE,
+    VERMILION,
+    canvas,
+    legend_outside,
+    nanometres,
+    style,
+    wavelength_label,
+)
+
+__all__ = ["plot_corrected", "plot_images", "plot_spectrum", "save_figure"]
+
+_DPI = 150
+# of the brightest pixels, those beyond this quantile may saturate the colours
+_QUANTILE = 0.995
+_COLORS = {"q": BLUE, "u": VERMILION, "v": GREEN}
+_MARKERS = {"q": "o", "u": "s", "v": "^"}
+
+
+def plot_corrected(corrected, **options):
+    """
+    Draw corrected images or spectra.
+
+    Parameters
+    ----------
+    corrected : Corrected
+        What to draw.
+    **options
+        Of `plot_images` or `plot_spectrum`.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal import optics
+    >>> from astropolcal.correction import ScienceFrames, correct
+    >>> from astropolcal.plotting.correction import plot_corrected
+    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    >>> chain = chain | optics.WollastonPrism(name="wollaston")
+    >>> hwp = [0, 45, 22.5, 67.5] * u.deg
+    >>> right, left = np.array([[1.02, 0.98, 1.0, 1.0], [0.98, 1.02, 1.0, 1.0]])[..., None]
+    >>> star = correct(chain, ScienceFrames.from_arrays(right, left, [1.6] * u.um, {"hwp": hwp}))
+    >>> len(plot_corrected(star).axes)
+    3
+    """
+    draw = plot_images if corrected.stokes.ndim == 4 else plot_spectrum
+    return draw(corrected, **options)
+
+
+def plot_images(corrected, *, wavelength=None, figure=None):
+    """
+    Draw I, Q, U, Q_phi, U_phi and the error of Q of images.
+
+    Parameters
+    ----------
+    corrected : Corrected
+        Images.
+    wavelength : int, optional
+        Index of the wavelength; by default the mean over all that are determined.
+    figure : `~matplotlib.figure.Figure`, optional
+        Where to draw.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If these are no images, or there is no such wavelength.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal import optics
+    >>> from astropolcal.correction import ScienceFrames, correct
+    >>> from astropolcal.plotting.correction import plot_images
+    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    >>> chain = chain | optics.WollastonPrism(name="wollaston")
+    >>> hwp = [0, 45, 22.5, 67.5] * u.deg
+    >>> image = np.ones((4, 1, 9, 9))
+    >>> found = correct(chain, ScienceFrames.from_arrays(image, image, [1.6] * u.um, {"hwp": hwp}))
+    >>> [axes.get_title() for axes in plot_images(found).axes][:2]
+    ['I', 'Q']
+    """
+    if corrected.stokes.ndim != 4:
+        raise ParameterError("these are spectra; plot_spectrum draws them")
+    panels = _panels(corrected, _chosen(corrected, wavelength))
+    with style():
+        figure = canvas(figure, 12.5, 8.2)
+        grid = figure.subplots(2, 3, sharex=True, sharey=True)
+        polarized = [np.abs(panels[name]) for name in ("Q", "U", "Q$_\\phi$", "U$_\\phi$")]
+        limit = _top(np.stack(polarized))
+        for axes, (name, image) in zip(grid.flat, panels.items(), strict=True):
+            _panel(figure, axes, name, image, corrected, limit)
+        for axes in grid[:, 0]:
+            axes.set_ylabel(_axis_label(corrected, "north" if corrected.north_up else "y"))
+        for axes in grid[1]:
+            axes.set_xlabel(_axis_label(corrected, "east" if corrected.north_up else "x"))
+        figure.suptitle(_heading(corrected, wavelength))
+        figure.supxlabel("+ star; grey: no value", fontsize=10.5)
+    return figure
+
+
+def _chosen(corrected, wavelength):
+    count = corrected.stokes.shape[1]
+    if wavelength is None:
+        return np.flatnonzero(corrected.determined[:, :3].all(axis=1))
+    if not -count <= wavelength < count:
+        raise ParameterError(f"wavelength = {wavelength}; there are 0 to {count - 1}")
+    return np.array([wavelength % count])
+
+
+def _panels(corrected, chosen):
+    """Return the images by name, in the order of the panels."""
+    found = corrected.azimuthal()
+    images = {name: corrected[name][chosen] for name in "IQU"}
+    images |= {"Q$_\\phi$": found["q_phi"][chosen], "U$_\\phi$": found["u_phi"][chosen]}
+    panels = {name: _mean(values) for name, values in images.items()}
+    error = corrected.error("Q")[chosen]
+    kind = "statistical error of Q"
+    if not np.isfinite(error).any():
+        error, kind = corrected.error("Q", "systematic")[chosen], "systematic error of Q"
+    # errors of wavelengths are independent if they are statistical, and hardly if not
+    power = 2 if kind.startswith("stat") else 1
+    panels[kind] = _mean(error**power) ** (1 / power) / (len(chosen) ** 0.5 if power == 2 else 1)
+    return panels
+
+
+def _mean(images):
+    """Return the mean of the known values."""
+    known = np.isfinite(images)
+    count = known.sum(axis=0)
+    total = np.where(known, images, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _panel(figure, axes, name, image, corrected, limit):
+    """Draw one image with its own scale of brightness, or the common one of polarization."""
+    if name in ("Q", "U", "Q$_\\phi$", "U$_\\phi$"):
+        look = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    elif name == "I":
+        from matplotlib.colors import LogNorm
+
+        bright = image[image > 0]
+        low = max(bright.min(), 1e-4 * bright.max()) if bright.size else 0.1
+        top = max(bright.max() if bright.size else 1.0, 1.001 * low)
+        look = {"cmap": "viridis", "norm": LogNorm(low, top)}
+        # what is darker, or negative, gets the darkest colour, not that of missing pixels
+        image = np.where(image < low, low, image)
+    else:
+        look = {"cmap": "viridis", "vmin": 0.0, "vmax": _top(image)}
+    drawn = axes.imshow(image, origin="lower", extent=_extent(corrected), **look)
+    axes.grid(False)
+    axes.set_facecolor("0.75")
+    axes.set_title(name)
+    axes.plot(0, 0, "+", color=BLACK if "cmap" in look and look["cmap"] == "RdBu_r" else "white")
+    low, high = drawn.get_clim()
+    with np.errstate(invalid="ignore"):
+        beyond = (image > high).any() + 2 * (image < low).any()
+    bar = figure.colorbar(
+        drawn, ax=axes, shrink=0.85, extend=("neither", "max", "min", "both")[beyond]
+    )
+    bar.set_label(f"flux ({corrected.unit.to_string()} per pixel)")
+
+
+def _top(values):
+    known = values[np.isfinite(values)]
+    top = np.quantile(known, _QUANTILE) if known.size else 1.0
+    return top if top > 0 else 1.0
+
+
+def _extent(corrected):
+    """Return the edges of the image about the star; east is positive and to the left."""
+    height, width = corrected.stokes.shape[2:]
+    x, y = corrected._middle()
+    step = _step(corrected)
+    edges = np.array([-0.5 - x, width - 0.5 - x, -0.5 - y, height - 0.5 - y]) * step
+    if corrected.north_up:
+        edges[:2] *= -1
+    return edges
+
+
+def _step(corrected):
+    return 1.0 if corrected.pixel_scale is None else corrected.pixel_scale / 1000
+
+
+def _axis_label(corrected, direction):
+    unit = "pixels" if corrected.pixel_scale is None else "arcsec"
+    return f"offset to the {direction} ({unit})" if corrected.north_up else f"{direction} ({unit})"
+
+
+def _heading(corrected, wavelength):
+    nm = nanometres(corrected.wavelength)
+    of = (
+        f"mean of {corrected.determined[:, :3].all(axis=1).sum()} wavelengths, "
+        f"{nm.min():.0f} to {nm.max():.0f} nm"
+        if wavelength is None
+        else f"{nm[wavelength]:.0f} nm"
+    )
+    return f"Corrected Stokes parameters ({_MODES[corrected.mode]})\n{of}"
+
+
+_MODES = {"stokes": "full Mueller matrices", "ip": "instrumental polarization only"}
+
+
+def plot_spectrum(corrected, *, figure=None):
+    """
+    Draw q and u of a point source, their errors, and how well they are determined.
+
+    Parameters
+    ----------
+    corrected : Corrected
+        A spectrum.
+    figure : `~matplotlib.figure.Figure`, optional
+        Where to draw.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If these are images.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal import optics
+    >>> from astropolcal.correction import ScienceFrames, correct
+    >>> from astropolcal.plotting.correction import plot_spectrum
+    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    >>> chain = chain | optics.WollastonPrism(name="wollaston")
+    >>> hwp = [0, 45, 22.5, 67.5] * u.deg
+    >>> flux = np.ones((4, 1))
+    >>> found = correct(chain, ScienceFrames.from_arrays(flux, flux, [1.6] * u.um, {"hwp": hwp}))
+    >>> plot_spectrum(found).axes[-1].get_ylabel()
+    'condition'
+    """
+    if corrected.stokes.ndim != 2:
+        raise ParameterError("these are images; take an aperture, or draw them with plot_images")
+    nm = nanometres(corrected.wavelength)
+    with style():
+        figure = canvas(figure, 9.0, 9.5)
+        top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1.3))
+        for name in corrected.components[1:].lower():
+            _values(top, nm, corrected, name)
+        top.axhline(0, color=GREY, linewidth=0.8)
+        top.set_ylabel("fraction of I (%)")
+        _error_lines(middle, nm, corrected)
+        bottom.plot(nm, corrected.condition, "o-", color=PURPLE)
+        bottom.set_ylabel("condition")
+        bottom.set_ylim(bottom=1 if np.nanmax(corrected.condition) < 1e3 else None)
+        if np.nanmax(corrected.condition) >= 1e3:
+            bottom.set_yscale("log")
+        wavelength_label(bottom)
+        figure.suptitle(f"Corrected polarization ({_MODES[corrected.mode]})")
+        legend_outside(figure, _handles(top, middle), columns=len(corrected.components))
+        figure.align_ylabels()
+    return figure
+
+
+def _handles(*all_axes):
+    """Return what a legend shows: the errors of each quantity below each other."""
+    found = []
+    for axes in all_axes:
+        handles, labels = axes.get_legend_handles_labels()
+        # the statistical error comes first, in the order of q, u, v
+        found += [handle for _, handle in sorted(zip(labels, handles, strict=True), key=_first)]
+    return found
+
+
+def _first(labelled):
+    return labelled[0].split(",")[0], "systematic" in labelled[0]
+
+
+def _values(axes, nm, corrected, name):
+    value = 100 * getattr(corrected, name)
+    statistical = 100 * corrected.fractional_errors()[name]
+    systematic = 100 * corrected.fractional_errors("systematic")[name]
+    color = _COLORS[name]
+    known = np.isfinite(statistical)
+    label = f"{name}, statistical error" if known.any() else name
+    bars = np.where(known, statistical, 0.0)
+    axes.errorbar(nm, value, bars, fmt=_MARKERS[name], color=color, label=label)
+    if np.isfinite(systematic).any():
+        band = np.where(np.isfinite(systematic), systematic, np.nan)
+        axes.fill_between(
+            nm,
+            value - band,
+            value + band,
+            color=color,
+            alpha=0.25,
+            linewidth=0,
+            label=f"{name}, systematic error",
+        )
+
+
+def _error_lines(axes, nm, corrected):
+    known = corrected.polarization()
+    looks = {"statistical": (BLACK, "o-"), "systematic": (GREEN, "s--")}
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    drawn = False
+    for kind, (color, line) in looks.items():
+        values = 100 * known[f"s_p_{kind}"]
+        if np.isfinite(values).any():
+            axes.plot(nm, values, line, color=color, label=f"$s_p$, {kind}")
+            drawn = True
+    axes.set_ylabel("error of the degree (%)")
+    if drawn:
+        axes.set_yscale("log")
+        axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        for set_formatter in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+            set_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    else:
+        axes.text(
+            0.5, 0.5, "no errors are known", transform=axes.transAxes, ha="center", va="center"
+        )
+
+
+def save_figure(figure, path):
+    """
+    Write a figure, atomically; the suffix tells the format.
+
+    Parameters
+    ----------
+    figure : `~matplotlib.figure.Figure`
+        The figure.
+    path : path-like
+        The file.
+
+    Raises
+    ------
+    ObservationError
+        If the file cannot be written, or its format is not known.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from astropolcal.plotting.correction import save_figure
+    >>> save_figure(Figure(), "figure.xyz")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: figure.xyz: no format of this suffix is known
+    """
+    path = Path(path)
+    if path.suffix.removeprefix(".").lower() not in figure.canvas.get_supported_filetypes():
+        raise ObservationError(f"{path}: no format of this suffix is known")
+    with atomic_path(path, ObservationError) as temporary:
+        figure.savefig(temporary, dpi=_DPI)

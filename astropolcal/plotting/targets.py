@@ -1,0 +1,127 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Accuracy for targets against wavelength."""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.calibration import target_accuracies
+from astropolcal.calibration.target_accuracy import TARGETS
+from astropolcal.exceptions import ObservationError
+from astropolcal.plotting._style import (
+    canvas,
+    heading,
+    legend_outside,
+    looks,
+    nanometres,
+    style,
+    wavelength_label,
+)
+from astropolcal.plotting.accuracy import scale_axis
+
+__all__ = ["plot_target_accuracy"]
+
+_PARTS = {
+    "s_rel": "s_rel, of the polarized source: scales with the polarization",
+    "s_unpol": "s_unpol, of the unpolarized source",
+    "s_sky": "s_sky, of unpolarized stars",
+    "s_abs": "s_abs = √(s_unpol² + s_sky²): scales with the intensity",
+}
+
+
+def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
+    """
+    Draw the accuracy for targets against wavelength, and what it is made of.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    targets : sequence of (dolp, aolp)
+        See `~astropolcal.calibration.target_accuracies`.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+        Panels of s_rel, s_unpol, s_sky and s_abs; of s_p, and of s_chi.
+
+    Raises
+    ------
+    ParameterError
+        If a target is impossible.
+    ObservationError
+        If no dataset is of a known kind of source.
+
+    Notes
+    -----
+    The figures of the accuracies of McIntosh et al. (2026, Sec. 2.3). All are
+    accuracies of means (s_mean); a prediction of one datum is worse, see the held-out error.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.plotting import plot_target_accuracy
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> len(plot_target_accuracy(cal).axes)
+    3
+    """
+    tables = target_accuracies(calibration, targets)
+    if not tables:
+        raise ObservationError("no dataset is of a known kind of source: no accuracy for targets")
+    with style():
+        figure = canvas(figure, 8.5, 11)
+        panels = figure.subplots(3, 1, sharex=True)
+        handles = _draw_parts(panels[0], tables[0])
+        lines = _draw_targets(panels[1], tables, "s_p")
+        _draw_targets(panels[2], tables, "s_chi")
+        for axes, label in zip(panels, ("accuracy (%)", "s_p (%)", "s_chi (°)"), strict=True):
+            axes.set_ylabel(label)
+        panels[1].set_title("Degree of polarization of a target")
+        panels[2].set_title("Angle of polarization of a target")
+        wavelength_label(panels[2])
+        names = [record.name for record in calibration.datasets]
+        heading(figure, calibration, "Accuracy for targets", names)
+        legend_outside(figure, [*handles, *lines])
+    return figure
+
+
+def _draw_parts(axes, table):
+    axes.set_title("What it is made of")
+    lam = nanometres(table["wavelength"])
+    handles, values = [], []
+    for (key, label), (color, marker) in zip(_PARTS.items(), looks(len(_PARTS)), strict=True):
+        value = table[key].to_value(u.percent)
+        if not np.isfinite(value).any():
+            label = f"{key}: not known, no such dataset"
+        # what is exactly zero stands for a calibration that is missing
+        order = np.argsort(lam)
+        handles += axes.plot(lam[order], value[order], color=color, marker=marker, label=label)
+        values.append(value)
+    scale_axis(axes, np.concatenate(values))
+    return handles
+
+
+def _draw_targets(axes, tables, key):
+    lines, values = [], []
+    # apart from the looks of the parts, which share the legend
+    for table, (color, marker) in zip(tables, looks(len(tables) + 4)[4:], strict=True):
+        lam, value = nanometres(table["wavelength"]), table[key].value
+        order = np.argsort(lam)
+        label = f"target of {_words(table)}"
+        lines += axes.plot(lam[order], value[order], color=color, marker=marker, label=label)
+        values.append(value)
+    scale_axis(axes, np.concatenate(values))
+    return lines
+
+
+def _words(table):
+    angle = table.meta["aolp"]
+    dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
+    where = "at its worst angle" if angle is None else f"at {angle.to_value(u.deg):g}°"
+    return f"{dolp:g} % {where}"

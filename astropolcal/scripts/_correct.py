@@ -1,0 +1,425 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""``astropolcal correct``: from science cubes to Stokes parameters."""
+
+import argparse
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.scripts._common import check_outputs, write_json
+
+_ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
+
+
+def add_parser(commands):
+    """Add the subcommand to what ``add_subparsers`` returned."""
+    parser = commands.add_parser(
+        "correct",
+        help="correct science cubes with a calibration and write Stokes parameters",
+        description="Solve for the Stokes parameters of the light that entered the telescope, by "
+        "least squares over all frames, and write them with their errors.",
+    )
+    parser.add_argument(
+        "cubes", metavar="CUBES", nargs="+", help="cubes, or folders of them (*.fits)"
+    )
+    parser.add_argument(
+        "--calibration",
+        metavar="LIB_OR_FILE",
+        required=True,
+        help="a calibration file, or a library, from which the one of the date is taken",
+    )
+    parser.add_argument("-o", "--output", metavar="OUT.fits", required=True, help="the product")
+    parser.add_argument(
+        "--mode",
+        choices=("stokes", "ip"),
+        default="stokes",
+        help="stokes (default): invert the Mueller matrices; ip: instrumental polarization only",
+    )
+    parser.add_argument(
+        "--observable",
+        choices=("intensity", "single", "double"),
+        default="intensity",
+        help="what is fitted: the beams (default), or their single or double differences and sums",
+    )
+    parser.add_argument(
+        "--components", choices=("IQU", "IQUV"), default="IQU", help="default: IQU, V is zero"
+    )
+    _add_instrument(parser)
+    _add_images(parser)
+    parser.add_argument(
+        "--weights", choices=("equal", "variance"), default="equal", help="of the fluxes"
+    )
+    parser.add_argument(
+        "--brightness",
+        choices=("exposure", "measured"),
+        default="exposure",
+        help="relative brightness of the frames: by their exposure times (default), or by the "
+        "light in the images, for clouds",
+    )
+    parser.add_argument(
+        "--max-condition", metavar="X", type=float, default=30.0, help="default: 30"
+    )
+    parser.add_argument(
+        "--open-directions",
+        metavar="SIGMA",
+        type=_sigma,
+        default="infinite",
+        help="systematic errors along what the calibration leaves open: infinite (default), "
+        "ignore, or a standard deviation in degrees, micrometres and percent",
+    )
+    parser.add_argument(
+        "--samples", metavar="N", type=int, default=0, help="sample the systematic errors"
+    )
+    parser.add_argument("--seed", metavar="N", type=int, help="of the samples")
+    parser.add_argument("--spectrum", metavar="OUT.ecsv", help="table of the star in an aperture")
+    parser.add_argument(
+        "--radius", metavar="PIXELS", type=float, default=10.0, help="of the aperture, default: 10"
+    )
+    parser.add_argument("--plot", metavar="FILE", help="figure of the result")
+    parser.add_argument("--workers", metavar="N", type=int, help="threads of dask")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of dask.distributed")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(run=run)
+
+
+def _add_instrument(parser):
+    parser.add_argument("--instrument", metavar="NAME", help="default: that of the calibration")
+    parser.add_argument(
+        "--raw", metavar="DIR", help="folder of raw frames, for keywords that the cubes lack"
+    )
+    parser.add_argument(
+        "--optics-in",
+        metavar="NAME,NAME,...",
+        type=lambda text: [name.strip() for name in text.split(",") if name.strip()],
+        help="optional optics that were in the beam; an error if the calibration lacks one",
+    )
+    parser.add_argument(
+        "--interpolate",
+        action="store_true",
+        help="interpolate parameters that are known at the calibrated wavelengths only",
+    )
+
+
+def _add_images(parser):
+    parser.add_argument(
+        "--centre",
+        metavar="X,Y",
+        type=_point,
+        help="place of the star in the left beam, 0-based; by default it is found",
+    )
+    parser.add_argument("--size", metavar="PIXELS", type=int, default=51, help="default: 51")
+    parser.add_argument(
+        "--rotation",
+        choices=("none", "fixed", "pupil"),
+        default="none",
+        help="how the field turned: not known, images stay as they are (default); the +y axis at a "
+        "fixed position angle; at a fixed angle from the zenith",
+    )
+    parser.add_argument(
+        "--camera-angle",
+        metavar="DEG",
+        type=float,
+        default=0.0,
+        help="position angle of the +y axis, or with --rotation pupil that from the zenith",
+    )
+    parser.add_argument("--mirrored", action="store_true", help="east is to the right of north")
+
+
+def _point(text):
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y") from None
+    return x, y
+
+
+def _sigma(text):
+    if text in ("infinite", "ignore"):
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not infinite, ignore or a number") from None
+
+
+def run(arguments):
+    """Correct the cubes and write the product."""
+    from astropolcal import instruments
+    from astropolcal.correction import (
+        ScienceFrames,
+        check_optics,
+        correct,
+        measurement_rows,
+        sky_chain,
+    )
+
+    check_outputs(arguments.output, arguments.json, arguments.spectrum, arguments.plot)
+    files = _files(arguments.cubes)
+    calibration, provenance = _calibration(arguments, files)
+    instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
+    chain = sky_chain(calibration)
+    check_optics(chain, arguments.optics_in or ())
+    table, centres, scale = _headers(files, instrument, arguments)
+    frames = ScienceFrames.from_files(
+        files,
+        instrument,
+        table,
+        chain,
+        centres=centres,
+        size=arguments.size,
+        position_angle=_position_angles(table, arguments),
+        mirrored=arguments.mirrored,
+        scale=scale,
+    )
+    if arguments.brightness == "measured":
+        rows = measurement_rows(
+            calibration,
+            frames.positions,
+            frames.wavelength,
+            chain=chain,
+            interpolate=arguments.interpolate,
+        )
+        frames = frames.with_brightness(rows)
+    result = correct(
+        calibration,
+        frames,
+        mode=arguments.mode,
+        observable=arguments.observable,
+        components=arguments.components,
+        weights="variance" if arguments.weights == "variance" else None,
+        max_condition=arguments.max_condition,
+        chain=chain,
+        interpolate=arguments.interpolate,
+        open_directions=arguments.open_directions,
+        n_samples=arguments.samples,
+        seed=arguments.seed,
+        workers=arguments.workers,
+        cluster=arguments.cluster,
+        progress=not arguments.quiet,
+        provenance=provenance,
+    )
+    result.write(arguments.output, overwrite=True)
+    star = result.aperture(arguments.radius)
+    _write_others(result, star, arguments)
+    summary = _summary(result, star, arguments, len(files))
+    if arguments.json:
+        write_json(summary, arguments.json)
+    if arguments.json != "-":
+        _report(summary)
+
+
+def _files(cubes):
+    """Return the files, and those in the folders, that are named."""
+    found = []
+    for path in map(Path, cubes):
+        inside = sorted(path.glob("*.fits*")) if path.is_dir() else [path]
+        if not inside:
+            raise AstropolcalError(f"{path}: no FITS file in this folder")
+        found += inside
+    return found
+
+
+def _calibration(arguments, files):
+    """Return the calibration of the frames, and what is to be said of where it comes from."""
+    from astropolcal.calibration.validity import content_hash
+
+    path = Path(arguments.calibration)
+    if path.is_dir():
+        entry = _of_library(path, arguments, files)
+        calibration, path = entry.calibration, entry.path
+    else:
+        from astropolcal import Calibration
+
+        calibration = Calibration.read(path)
+        _warn_if_not_valid(calibration, path, arguments, files)
+    return calibration, {
+        "calibration": str(path),
+        "calibration_hash": content_hash(calibration),
+    }
+
+
+def _warn_if_not_valid(calibration, path, arguments, files):
+    """Warn of a calibration that says itself that it does not hold for the date."""
+    import warnings
+
+    from astropolcal.calibration.validity import validity_of
+    from astropolcal.exceptions import AstropolcalWarning
+
+    validity = validity_of(calibration)
+    for date in _dates(files, arguments.instrument or calibration.instrument):
+        if not validity.holds(date):
+            warnings.warn(
+                f"{path} does not hold for {date}: {validity}", AstropolcalWarning, stacklevel=2
+            )
+            return
+
+
+def _dates(files, name):
+    """Return the dates of the first and the last frame, as far as headers give them."""
+    from astropolcal import instruments
+
+    layout = instruments.get(name or "charis").files
+    dates = sorted(filter(None, (_date(file, layout) for file in files)))
+    return list(dict.fromkeys((dates[0], dates[-1]))) if dates else []
+
+
+def _of_library(path, arguments, files):
+    """Return the calibration that holds for the first and the last frame."""
+    from astropolcal.calibration.library import Library
+
+    dates = _dates(files, arguments.instrument)
+    if not dates:
+        raise ObservationError(f"{files[0]}: no date in its header to choose a calibration by")
+    library = Library(path)
+    found = [
+        library.find(arguments.instrument, date=date, optics_in=arguments.optics_in)
+        for date in dates
+    ]
+    if len({str(entry.path) for entry in found}) > 1:
+        raise AstropolcalError(
+            f"{path}: the frames from {dates[0]} to {dates[-1]} need two calibrations, "
+            f"{found[0].path} and {found[1].path}: correct them apart"
+        )
+    return found[0]
+
+
+def _date(file, layout):
+    from astropolcal.reduction.headers import observation_time, read_header
+
+    try:
+        return observation_time(read_header(file, layout).values).isot
+    except ObservationError:
+        return None
+
+
+def _headers(files, instrument, arguments):
+    """Return the angles of all frames, the places of the star, and the relative exposures."""
+    from astropy.table import QTable
+
+    from astropolcal.reduction.headers import raw_frames
+
+    layout = instrument.files
+    if layout is None:
+        raise AstropolcalError(f"{instrument.name}: it is not known how its files look")
+    raw = None if arguments.raw is None else raw_frames(arguments.raw, layout)
+    found = [_frame(file, layout, raw, arguments.centre) for file in files]
+    table = QTable()
+    for name in _ANGLES:
+        values = [frame.values.get(name, np.nan) for frame in found]
+        if np.isfinite(values).any():
+            table[name] = values * u.deg
+    if "hwp_true" in table.colnames and not np.isfinite(table["hwp_true"]).all():
+        # an angle that some headers lack follows from the tracking law in all
+        table.remove_column("hwp_true")
+    centres = arguments.centre
+    if centres is None:
+        centres = [np.median([f.photometry.x, f.photometry.y], axis=2).T for f in found]
+        first = np.asarray(centres)
+        if not np.isfinite(first).all():
+            bad = files[int(np.argmin(np.isfinite(first).all(axis=(1, 2))))]
+            raise ObservationError(f"{bad}: the star was not found; give its place with --centre")
+    exposure = np.array([frame.values.get("exposure_time", np.nan) for frame in found])
+    differ = np.isfinite(exposure).all() and np.ptp(exposure) > 1e-6 * exposure.max()
+    return table, centres, exposure / np.median(exposure) if differ else None
+
+
+def _frame(file, layout, raw, centre):
+    """Return what is known of a file; refuse one that cannot be used."""
+    from astropolcal.reduction.frames import reduce_frame
+    from astropolcal.reduction.headers import pointing, read_header
+
+    if centre is None:
+        frame = reduce_frame(file, layout, source="star", raw=raw)
+    else:
+        frame = read_header(file, layout, raw=raw)
+        if not {"parallactic", "altitude"} <= set(frame.values):
+            try:
+                found = pointing(frame.values, layout.site)
+                frame.values.update(zip(("altitude", "parallactic"), found, strict=True))
+            except ObservationError:
+                # whether they are needed depends on the calibration
+                pass
+    own = frame.values.get("instrument")
+    if own is not None and layout.identities and own not in layout.identities:
+        raise ObservationError(
+            f"{file}: {layout.keywords['instrument']} = {own!r}, allowed are "
+            f"{', '.join(layout.identities)}"
+        )
+    if frame.errors:
+        raise ObservationError(f"{file}: {'; '.join(frame.errors)}")
+    return frame
+
+
+def _position_angles(table, arguments):
+    if arguments.rotation == "none":
+        return None
+    angle = np.full(len(table), arguments.camera_angle) * u.deg
+    if arguments.rotation == "pupil":
+        if "parallactic" not in table.colnames:
+            raise ObservationError("--rotation pupil needs the parallactic angle of every frame")
+        angle = angle + table["parallactic"]
+    return angle
+
+
+def _write_others(result, star, arguments):
+    if arguments.spectrum:
+        from astropolcal.files import atomic_path
+
+        table = star.table()
+        with atomic_path(arguments.spectrum, ObservationError) as temporary:
+            table.write(temporary, format="ascii.ecsv", overwrite=True)
+    if arguments.plot:
+        from astropolcal.plotting.correction import plot_corrected, save_figure
+
+        save_figure(plot_corrected(result), arguments.plot)
+
+
+def _summary(result, star, arguments, n_frames):
+    known = star.polarization()
+    errors = {kind: star.fractional_errors(kind) for kind in ("statistical", "systematic")}
+    spectrum = {"q": star.q, "u": star.u} | known
+    for kind, error in errors.items():
+        spectrum |= {f"q_{kind}": error["q"], f"u_{kind}": error["u"]}
+    return {
+        "output": str(arguments.output),
+        "calibration": result.provenance["calibration"],
+        "calibration_hash": result.provenance["calibration_hash"],
+        "mode": result.mode,
+        "observable": result.observable,
+        "components": result.components,
+        "n_frames": n_frames,
+        "north_up": result.north_up,
+        "wavelength_nm": result.wavelength.to_value(u.nm).tolist(),
+        "condition": _plain(result.condition),
+        "poorly_determined": dict((str(i), words) for i, words in enumerate(result.weak) if words),
+        "leakage_q": _plain(result.leakage[:, 1]),
+        "leakage_u": _plain(result.leakage[:, 2]),
+        "held": [] if result.systematic is None else result.systematic.held,
+        "aperture": {"radius": arguments.radius}
+        | {name: _plain(values) for name, values in spectrum.items()},
+    }
+
+
+def _plain(values):
+    """Return numbers for JSON, None where there is none."""
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def _report(summary):
+    condition = [value for value in summary["condition"] if value is not None]
+    print(f"Written: {summary['output']} ({summary['n_frames']} frames, mode {summary['mode']})")
+    print(f"  calibration: {summary['calibration']}")
+    if condition:
+        print(f"  condition: {min(condition):.3g} to {max(condition):.3g}")
+    for i, words in summary["poorly_determined"].items():
+        print(f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}")
+    for name, words in (("s_p", "degree"), ("s_chi", "angle, deg")):
+        for kind in ("statistical", "systematic"):
+            values = [v for v in summary["aperture"][f"{name}_{kind}"] if v is not None]
+            text = f"{np.median(values):.2g}" if values else "not known"
+            print(f"  {kind} error of the star's {words}: {text}")

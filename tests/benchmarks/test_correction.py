@@ -1,0 +1,101 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Speed and memory of the correction of cubes, against copying and summing them with numpy.
+
+Not part of the normal run: ``pytest tests/benchmarks``.
+"""
+
+import time
+import tracemalloc
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import instruments
+from astropolcal.correction import ScienceFrames, correct
+
+N_FRAMES = 100
+#: Cubes of CHARIS; the two beams of a frame are two such arrays.
+SHAPE = (22, 201, 201)
+#: Least share of the speed of a copy and a sum.
+GOAL = 0.5
+
+
+def positions(n):
+    parallactic, altitude = np.linspace(-20, 20, n) * u.deg, np.linspace(65, 70, n) * u.deg
+    hwp = np.resize([0, 45, 22.5, 67.5], n) * u.deg
+    return {
+        "hwp": hwp + 0.5 * parallactic + altitude,
+        "derotator": np.linspace(55, 80, n) * u.deg,
+        "parallactic": parallactic,
+        "altitude": altitude,
+    }
+
+
+@pytest.fixture(scope="module")
+def chain():
+    charis = instruments.get("charis")
+    return charis.on_sky(charis.published())
+
+
+@pytest.fixture(scope="module")
+def beams():
+    rng = np.random.default_rng(1)
+    # half of the pixels each, so that both together are the array that is copied
+    shape = (N_FRAMES // 2, *SHAPE)
+    return [rng.uniform(1, 2, size=shape) for _ in "rl"]
+
+
+def seconds(function, repeat=3):
+    best = np.inf
+    for _ in range(repeat):
+        started = time.perf_counter()
+        function()
+        best = min(best, time.perf_counter() - started)
+    return best
+
+
+def copy_and_sum(arrays):
+    for array in arrays:
+        array.copy().sum(axis=0)
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+def test_speed(beams, chain, capsys, workers):
+    frames = ScienceFrames.from_arrays(
+        *beams, instruments.get("charis").wavelength, positions(N_FRAMES // 2)
+    )
+    ours = seconds(lambda: correct(chain, frames, workers=workers))
+    theirs = seconds(lambda: copy_and_sum(beams))
+    with capsys.disabled():
+        print(
+            f"\n  {N_FRAMES} images x {' x '.join(map(str, SHAPE))}, workers {workers}: "
+            f"{ours:.2f} s, copy and sum {theirs:.2f} s, ratio {theirs / ours:.2f}"
+        )
+    assert theirs / ours > GOAL
+
+
+@pytest.mark.parametrize("n_frames", [50, 200])
+def test_memory(tmp_path, chain, capsys, n_frames):
+    """Frames on disk; beyond the result, less than twice the share of one frame is held."""
+    shape = (n_frames, 22, 101, 101)
+    beams = []
+    for name in "rl":
+        array = np.lib.format.open_memmap(tmp_path / name, "w+", "f4", shape)
+        for i in range(n_frames):
+            array[i] = 1.0 + i
+        array.flush()
+        beams.append(np.load(tmp_path / name, mmap_mode="r"))
+    frames = ScienceFrames.from_arrays(
+        *beams, instruments.get("charis").wavelength, positions(n_frames), batch=1
+    )
+    correct(chain, frames, workers=1)
+    tracemalloc.start()
+    result = correct(chain, frames, workers=1)
+    peak = tracemalloc.get_traced_memory()[1] - result.stokes.nbytes
+    tracemalloc.stop()
+    share = 2 * 8 * np.prod(shape[1:])
+    with capsys.disabled():
+        print(f"\n  {n_frames} frames: {peak / share:.2f} of a frame's share beyond the result")
+    assert peak < 2 * share

@@ -1,0 +1,270 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Calibrations over the years: what changed, how surely, and refits of that alone."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+import pytest
+from scipy import stats
+
+from astropolcal import calibrate, instruments
+from astropolcal.calibration.history import (
+    Change,
+    _log_p,
+    changes,
+    parameter_history,
+    significance,
+)
+from astropolcal.calibration.library import Library
+from astropolcal.calibration.restarting import restart
+from astropolcal.calibration.validity import content_hash
+from astropolcal.chain import leaves
+from astropolcal.exceptions import AstropolcalError, FitError, ParameterError
+from astropolcal.measurement import Tie
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+CHARIS = instruments.get("charis")
+WAVELENGTH = CHARIS.wavelength[[9, 12, 16]]
+DATES = ("2025-02-01", "2025-10-05", "2025-12-10")
+FRAMES = half_wave_plate_cycles(derotator=[50, 62.5, 80, 100] * u.deg)
+
+
+def make_chain(derotator="linear", shift=0.0):
+    chain = CHARIS.chain("polarized", ["nbs"], derotator=derotator, wavelength=WAVELENGTH)
+    chain["hwp"].theta.fixed = chain["derotator"].theta.fixed = derotator == "linear"
+    if shift:
+        chain["derotator"].retardance = chain["derotator"].retardance.quantity + shift * u.deg
+    return chain
+
+
+def observe(seed, date, shift=0.0, derotator="linear"):
+    meta = CHARIS.published_meta() | {"date": date, "yjh50_dichroic": "out"}
+    truth = make_chain(derotator, shift)
+    return simulate(truth, WAVELENGTH, FRAMES, seed=seed, meta=meta, name=f"run{seed}")
+
+
+def fit(table, derotator="linear", **options):
+    options = {"instrument": "charis", "search": False, "cross_validate": False} | options
+    return calibrate(make_chain(derotator), table, **options)
+
+
+@pytest.fixture(scope="module")
+def years():
+    """Three runs; before the last the derotator was recoated."""
+    return [fit(observe(i, date, 0.3 * (i == 2))) for i, date in enumerate(DATES)]
+
+
+# ---- the table ---------------------------------------------------------------------------
+
+
+def test_table_has_a_row_a_value(years):
+    table = parameter_history(years[::-1])
+    assert len(table) == 3 * (3 + 2 * 3)
+    assert [t.iso[:10] for t in table["date"][::9]] == list(DATES)
+    own = table[(table["parameter"] == "derotator.retardance") & (table["calibration"] == "run1")]
+    known = years[1].parameter_values()["derotator.retardance"]
+    np.testing.assert_array_equal(own["value"], known["value"])
+    np.testing.assert_array_equal(own["std"], known["std"])
+    assert own["wavelength"].to_value(u.nm) == pytest.approx(WAVELENGTH.value)
+    assert set(own["unit"]) == {"deg"}
+
+
+def test_optic_stands_for_its_parameters_also_fixed_ones(years):
+    table = parameter_history(years, ["hwp"])
+    assert set(table["parameter"]) == {"hwp.theta", "hwp.w_sio2", "hwp.w_mgf2"}
+    assert set(table["fixed"][table["parameter"] == "hwp.theta"]) == {True}
+    with pytest.raises(ParameterError, match="no calibration has a parameter 'hwp"):
+        parameter_history(years, ["hwp.thickness"])
+
+
+def test_library_and_unknown_dates(years, tmp_path):
+    library = Library(tmp_path)
+    for calibration in years:
+        library.add(calibration)
+    table = parameter_history(library, ["hwp.w_sio2"])
+    assert [name.split("_")[2] for name in table["calibration"]] == list(DATES)
+    record = dataclasses.replace(years[0].datasets[0], meta={})
+    undated = dataclasses.replace(years[0], datasets=[record])
+    table = parameter_history([undated, years[1]], ["hwp.w_sio2"])
+    assert table["date"].mask.tolist() == [True, False]
+    (tmp_path / "bad.asdf").write_bytes(b"#ASDF")
+    with pytest.raises(ParameterError, match=r"bad.asdf: truncated"):
+        parameter_history(Library(tmp_path))
+
+
+# ---- significance ------------------------------------------------------------------------
+
+
+def test_change_is_found_where_it_is(years):
+    table = changes(years)
+    assert len(table) == 2 * 4
+    for row in table:
+        changed = row["what"] == "derotator" and row["before"] == "run1"
+        assert (row["sigma"] > 20) == changed, row
+        if not changed:
+            assert row["sigma"] < 3.5
+    words = str(significance(years[1:], ["derotator"]))
+    assert words.startswith("derotator.retardance: changed from run1 to run2 at ")
+    assert "no change seen" in str(significance(years[:2]))
+
+
+def test_chi_square_is_that_of_the_difference(years):
+    """Two calibrations, by hand from their covariance matrices."""
+    found = significance(years[:2], ["hwp", "derotator"])
+    names = found.parameters
+    places = [c.covariance.names.index(n) for c in years[:1] for n in names]
+    values = [np.array([_value(c, n) for n in names]) for c in years[:2]]
+    total = sum(c.covariance.matrix[np.ix_(places, places)] for c in years[:2])
+    difference = values[1] - values[0]
+    assert found.chi2 == pytest.approx(difference @ np.linalg.solve(total, difference), rel=1e-6)
+    assert found.dof == len(names) == 5
+    assert found.p_value == pytest.approx(stats.chi2.sf(found.chi2, 5), rel=1e-9)
+
+
+def _value(calibration, name):
+    row = calibration.parameters[calibration.parameters["name"] == name]
+    return row["value"][0]
+
+
+def test_three_together_are_tested_for_one_value(years):
+    found = significance(years, ["wollaston"])
+    assert found.dof == 3 * 2
+    assert found.sigma < 3.5
+    assert significance(years, ["derotator"]).sigma > 20
+
+
+def test_chi_square_is_right_over_many_runs():
+    chi2 = []
+    for seed in range(60):
+        pair = [fit(observe(1000 * (i + 1) + seed, date)) for i, date in enumerate(DATES[:2])]
+        found = significance(pair)
+        chi2.append(found.chi2)
+    assert found.dof == 9
+    # 60 times 9 degrees of freedom
+    assert stats.chi2.sf(sum(chi2), 540) > 1e-3
+    assert stats.chi2.cdf(sum(chi2), 540) > 1e-3
+    assert stats.kstest(chi2, stats.chi2(9).cdf).pvalue > 1e-3
+
+
+def test_open_directions_do_not_count():
+    """Misalignments are known up to a common turn, in which two gauges may differ."""
+    free = "elliptical"
+    first = fit(observe(1, DATES[0], derotator=free), free)
+    turned = make_chain(free)
+    turned["hwp"].theta = 1.0 * u.deg
+    second = calibrate(
+        turned, observe(2, DATES[1], derotator=free), instrument="charis", search=False, gauge=None
+    )
+    thetas = [c.chain["hwp"].theta.value for c in (first, second)]
+    assert abs(thetas[1] - thetas[0]) > 0.1
+    found = significance([first, second])
+    assert found.n_open >= 1
+    assert found.sigma < 4
+    alone = significance([first, second], ["hwp.theta"])
+    assert (alone.dof, alone.p_value, alone.sigma) == (0, 1.0, 0.0)
+    assert "nothing that is determined" in str(alone)
+
+
+def test_probability_far_in_the_tail():
+    for dof in (1, 4, 24):
+        for chi2 in (dof, 80.0, 900.0):
+            assert _log_p(chi2, dof) == pytest.approx(stats.chi2.logsf(chi2, dof), rel=1e-6)
+        # beyond what a float holds, and without a step
+        near, far = _log_p(1300.0, dof), _log_p(1400.0, dof)
+        assert far == pytest.approx(near - 50 + (dof / 2 - 1) * np.log(1400 / 1300), rel=2e-3)
+    one = Change(["a", "b"], ["m3.diattenuation"], 36.0, 1, 2e-9)
+    assert one.sigma == pytest.approx(6.0, rel=1e-6)
+
+
+def test_what_cannot_be_compared(years):
+    with pytest.raises(FitError, match="1 calibration: at least two"):
+        significance(years[:1])
+    with pytest.raises(FitError, match="at least two"):
+        changes(years[:1])
+    again = dataclasses.replace(years[0], settings=dict(years[0].settings))
+    with pytest.raises(FitError, match="run0 and run0 were both made from run0"):
+        significance([years[0], again])
+    with pytest.raises(ParameterError, match="run0: no free parameter 'hwp"):
+        significance(years, ["hwp.theta"])
+    other = dataclasses.replace(years[0], wavelength=years[0].wavelength * 1.01)
+    with pytest.raises(ParameterError, match="different wavelengths"):
+        significance([other, years[1]])
+    assert significance([other, years[1]], ["hwp"]).dof == 2
+
+
+def test_values_at_a_bound_are_left_out(years):
+    stuck = dataclasses.replace(years[0], at_bound=["wollaston.efficiency[1]"])
+    found = significance([stuck, years[1]], ["wollaston"])
+    assert found.left_out == ["wollaston.efficiency[1]"]
+    assert found.dof == 2
+
+
+# ---- refit what changed ------------------------------------------------------------------
+
+
+def test_restart_frees_what_is_named_and_holds_the_rest(years):
+    new = restart(years[0], observe(7, "2026-03-01", 0.3), ["derotator"], cross_validate=False)
+    assert new.covariance.names == [f"derotator.retardance[{i}]" for i in range(3)]
+    for old, now in zip(leaves(years[0].chain), leaves(new.chain), strict=True):
+        for key in old.param_names:
+            same = np.array_equal(getattr(old, key).value, getattr(now, key).value)
+            assert same == (f"{old.name}.{key}" != "derotator.retardance")
+    moved = new.chain["derotator"].retardance.value - years[0].chain["derotator"].retardance.value
+    assert np.abs(moved - 0.3).max() < 0.1
+    assert new.settings["restarted"] == {"from": content_hash(years[0]), "free": ["derotator"]}
+    assert not years[0].chain["hwp"].w_sio2.fixed
+    assert new.converged
+
+
+def test_restart_of_a_parameter_and_from_a_file(years, tmp_path):
+    from astropolcal.calibration.loading import load
+
+    years[0].write(tmp_path / "old.asdf")
+    new = restart(load(tmp_path / "old.asdf"), observe(7, "2026-03-01"), "HWP.theta")
+    assert new.covariance.names == ["hwp.theta"]
+    new.write(tmp_path / "new.asdf")
+    assert load(tmp_path / "new.asdf").calibration.settings["restarted"]["free"] == ["HWP.theta"]
+
+
+def test_new_star_brings_its_own_parameters(years):
+    meta = CHARIS.published_meta() | {"yjh50_dichroic": "out", "source": "star", "object": "HD 1"}
+    frames = FRAMES.copy()
+    frames["altitude"] = np.linspace(40, 70, len(frames)) * u.deg
+    frames["parallactic"] = np.linspace(-60, 40, len(frames)) * u.deg
+    truth = CHARIS.chain(
+        "star", ["nbs"], derotator="linear", wavelength=WAVELENGTH, star="star_HD1"
+    )
+    table = simulate(truth, WAVELENGTH, frames, seed=3, meta=meta | {"date": "2026-03-01"})
+    new = restart(years[0], table, ["m3"], cross_validate=False)
+    assert {name.partition("[")[0] for name in new.covariance.names} == {
+        "star_HD1.q", "star_HD1.u", "m3.diattenuation",
+    }  # fmt: skip
+
+
+def test_restart_keeps_ties_of_what_is_free(years):
+    tie = {"derotator.theta": Tie("hwp.theta", 0.5)}
+    chain = make_chain()
+    chain["hwp"].theta.fixed = False
+    old = calibrate(chain, observe(1, DATES[0]), ties=tie, instrument="charis", search=False)
+    held = restart(old, observe(7, "2026-03-01"), ["wollaston"])
+    assert held.ties == {}
+    assert held.chain["derotator"].theta.value == old.chain["derotator"].theta.value
+    free = restart(old, observe(7, "2026-03-01"), ["hwp.theta"])
+    assert list(free.ties) == ["derotator.theta"]
+
+
+def test_restart_on_bad_input(years):
+    table = observe(7, "2026-03-01")
+    with pytest.raises(ParameterError, match="free: no 'm3' in the chains; optics are "):
+        restart(years[0], table, ["m3"])
+    with pytest.raises(FitError, match="nothing to fit"):
+        restart(years[0], table, [])
+    with pytest.raises(ParameterError, match="1 chains for 2 datasets"):
+        restart(years[0], [table, table], ["hwp"], chain=make_chain())
+    other = CHARIS.wavelength[[8, 12, 16]]
+    chain = CHARIS.chain("polarized", ["nbs"], derotator="linear", wavelength=other)
+    meta = table.meta
+    shifted = simulate(chain, other, FRAMES, seed=3, meta=meta)
+    with pytest.raises(AstropolcalError, match="wavelength"):
+        restart(years[0], shifted, ["hwp"])

@@ -1,0 +1,396 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What a pipeline loads: system Mueller matrices from headers, with their errors."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from astropolcal import calibrate, instruments
+from astropolcal.calibration import propagate
+from astropolcal.calibration.library import Library
+from astropolcal.calibration.loading import load
+from astropolcal.chain import join, leaves, system_mueller, with_beam
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    CalibrationFileError,
+    ChainError,
+    InstrumentError,
+    ObservationError,
+    ParameterError,
+    WavelengthRangeError,
+)
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+OLD = Path(__file__).parent / "data" / "calibration-1.0.0.asdf"
+CHARIS = instruments.get("charis")
+WAVELENGTH = CHARIS.wavelength[[9, 12, 16]]
+HEADER = {
+    "INSTRUME": "CHARIS",
+    "MJD": 60988.5,
+    "RET-ANG1": 22.5,
+    "D_IMRANG": 60.0,
+    "ALTITUDE": 55.0,
+    "PARANG": -30.0,
+}
+
+
+def meta(source, **more):
+    known = CHARIS.published_meta() | {"date": "2025-10-05", "yjh50_dichroic": "out"}
+    return known | {"source": source} | more
+
+
+def observe(source, seed, optics_in=("nbs",), name=None, derotator="linear"):
+    chain = CHARIS.chain(source, optics_in, derotator=derotator, wavelength=WAVELENGTH)
+    frames = half_wave_plate_cycles(derotator=[50, 62.5, 80, 100] * u.deg)
+    if "star" in source:
+        n = len(frames)
+        frames["altitude"] = np.linspace(40, 70, n) * u.deg
+        frames["parallactic"] = np.linspace(-60, 40, n) * u.deg
+    table = simulate(chain, WAVELENGTH, frames, seed=seed, meta=meta(source), name=name or source)
+    return chain, table
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    """Internal source and an unpolarized star together: the telescope is calibrated."""
+    pairs = [observe("polarized", 1), observe("unpolarized standard star", 2)]
+    chains, tables = zip(*pairs, strict=True)
+    chains = [chain.copy() for chain in chains]
+    for chain in chains:
+        for name in ("hwp", "derotator"):
+            chain[name].theta.fixed = True
+    positions = [CHARIS.positions(t, c) for t, c in zip(tables, chains, strict=True)]
+    return calibrate(chains, tables, positions=positions, instrument="charis", cross_validate=False)
+
+
+@pytest.fixture(scope="module")
+def path(calibration, tmp_path_factory):
+    path = tmp_path_factory.mktemp("loading") / "charis.asdf"
+    calibration.write(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def loaded(path):
+    return load(path)
+
+
+def expected(calibration, light="sky", beam="right"):
+    """The matrix by hand, for a frame of HEADER."""
+    chain = leaves(calibration.chains[1])
+    start = 1 if light == "sky" else 4
+    chain = with_beam(join(chain[start:]), beam)
+    # tracking law of the half-wave plate
+    hwp = 22.5 + 0.5 * -30.0 + 55.0 if light == "sky" else 22.5
+    angles = {"hwp": hwp, "derotator": 60.0, "parallactic": -30.0, "altitude": 55.0}
+    return system_mueller(chain, WAVELENGTH, {k: v * u.deg for k, v in angles.items()})
+
+
+# ---- values ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("light", ["sky", "internal"])
+@pytest.mark.parametrize("beam", ["right", "left"])
+def test_matrix_of_a_frame(calibration, path, light, beam):
+    loaded = load(path, HEADER)
+    found = loaded.system_mueller(fits.Header(HEADER), light=light, beam=beam)
+    assert found.value.shape == (3, 4, 4)
+    np.testing.assert_allclose(found.value, expected(calibration, light, beam), atol=1e-14)
+    assert found.beam == beam
+    assert found.assumed == ()
+
+
+def test_frames_have_an_axis_of_their_own(loaded):
+    other = HEADER | {"RET-ANG1": 67.5}
+    both = loaded.system_mueller([HEADER, other])
+    assert both.value.shape == (2, 3, 4, 4)
+    assert both.covariance.shape == (2, 3, 16, 16)
+    assert both.positions["hwp"].to_value(u.deg) == pytest.approx([62.5, 107.5])
+    np.testing.assert_allclose(both.value[1], loaded.system_mueller(other).value, atol=1e-15)
+
+
+def test_positions_in_place_of_headers(loaded):
+    angles = {"hwp": 62.5, "derotator": 60.0, "parallactic": -30.0, "altitude": 55.0}
+    positions = {key: value * u.deg for key, value in angles.items()}
+    one = loaded.system_mueller(positions=positions)
+    np.testing.assert_allclose(one.value, loaded.system_mueller(HEADER).value, atol=1e-14)
+
+
+def test_true_angle_of_the_half_wave_plate_comes_first(loaded):
+    found = loaded.system_mueller(HEADER | {"RET-POS1": 242.5})
+    np.testing.assert_allclose(found.value, loaded.system_mueller(HEADER).value, atol=1e-12)
+    assert found.positions["hwp"].to_value(u.deg) == pytest.approx(242.5)
+
+
+def test_pointing_is_computed_where_the_header_lacks_it(loaded):
+    header = {k: v for k, v in HEADER.items() if k not in ("ALTITUDE", "PARANG")}
+    header |= {"MJD": 60982.55, "RA": "05:18:00", "DEC": "-01:00:00"}
+    angles = loaded.system_mueller(header).positions
+    assert angles["altitude"].to_value(u.deg) == pytest.approx(69, abs=1.5)
+
+
+# ---- errors ------------------------------------------------------------------------------
+
+
+def test_covariance_is_that_of_the_parameters(calibration, loaded):
+    """Against central differences along the directions of the covariance."""
+    angles = {"hwp": 62.5, "derotator": 60.0, "parallactic": -30.0, "altitude": 55.0}
+    positions = {key: value * u.deg for key, value in angles.items()}
+
+    def matrix(*chains):
+        return system_mueller(join(leaves(chains[1])[1:]), WAVELENGTH, positions)
+
+    found = loaded.system_mueller(HEADER)
+    known = propagate(calibration, matrix)
+    np.testing.assert_allclose(found.std, known.std, rtol=1e-5, atol=1e-12)
+    assert found.std.max() > 1e-6
+    whole = found.factor.reshape(48, -1)
+    np.testing.assert_allclose(whole @ whole.T, known.covariance(), rtol=1e-4, atol=1e-14)
+    for i in range(3):
+        block = known.covariance()[16 * i : 16 * i + 16, 16 * i : 16 * i + 16]
+        np.testing.assert_allclose(found.covariance[i], block, rtol=1e-4, atol=1e-14)
+
+
+def test_covariance_agrees_with_samples(calibration, loaded):
+    rng = np.random.default_rng(3)
+    found = loaded.system_mueller(HEADER)
+    from astropolcal.measurement import FreeParameters
+
+    chains = [chain.copy() for chain in calibration.chains]
+    free = FreeParameters(chains, 3, calibration.ties)
+    start, factor = free.start(), calibration.covariance.factor * free.factors()
+    draws = []
+    for _ in range(800):
+        free.put_back(start + rng.normal(size=len(factor)) @ factor)
+        changed = dataclasses.replace(calibration, chains=chains)
+        draws.append(expected(changed))
+    std = np.std(draws, axis=0)
+    certain = found.std > 1e-6
+    assert certain.sum() > 20
+    assert np.abs(std[certain] / found.std[certain] - 1).max() < 0.12
+
+
+def test_what_is_open_has_an_infinite_error(tmp_path):
+    chain, table = observe("polarized", 1, derotator="elliptical")
+    calibrate(chain, table, instrument="charis", cross_validate=False).write(tmp_path / "a.asdf")
+    loaded = load(tmp_path / "a.asdf")
+    # the misalignments of plate and derotator are known up to a common turn
+    found = loaded.system_mueller(HEADER, light="internal")
+    assert np.isinf(found.std).any()
+    diagonal = np.diagonal(found.covariance, axis1=-2, axis2=-1).reshape(3, 4, 4)
+    np.testing.assert_allclose(np.sqrt(diagonal), found.std, rtol=1e-14)
+    assert np.isnan(found.covariance).any()
+    # as far as the data determine it, and in the gauge of the calibration
+    known = found.covariance_in_gauge
+    assert np.isfinite(known).all()
+    certain = np.isfinite(found.covariance)
+    np.testing.assert_array_equal(known[certain], found.covariance[certain])
+
+
+def test_published_mirror_is_said(tmp_path):
+    chain, table = observe("polarized", 1)
+    calibrate(chain, table, instrument="charis", cross_validate=False).write(tmp_path / "a.asdf")
+    with pytest.warns(AstropolcalWarning, match=r"a.asdf: m3 not calibrated, published"):
+        found = load(tmp_path / "a.asdf").system_mueller(HEADER)
+    assert found.assumed == ("m3",)
+
+
+# ---- what it holds for -------------------------------------------------------------------
+
+
+def test_calibration_in_memory(calibration, loaded):
+    here = load(calibration, HEADER)
+    assert here.content_hash == loaded.content_hash
+    np.testing.assert_array_equal(
+        here.system_mueller(HEADER).value, loaded.system_mueller(HEADER).value
+    )
+    with pytest.raises(CalibrationFileError, match="calibration in memory"):
+        load(calibration, HEADER | {"MJD": 60400.0})
+
+
+def test_library_is_looked_up_by_the_header(calibration, tmp_path):
+    library = Library(tmp_path)
+    early = library.add(calibration, valid_from="2025-01-01", valid_until="2025-10-05")
+    late = library.add(calibration)
+    assert load(tmp_path, HEADER).path == late.resolve()
+    assert load(tmp_path, HEADER | {"MJD": 60800.0}).path == early.resolve()
+    assert load(library, HEADER, date="2025-02-01").path == early.resolve()
+    iso = {k: v for k, v in HEADER.items() if k != "MJD"}
+    iso |= {"UTC-DATE": "2025-11-01", "UTC-TIME": "10:11:12"}
+    assert load(tmp_path, iso).path == late.resolve()
+    with pytest.raises(CalibrationFileError, match="no calibration of charis for date 2024-"):
+        load(tmp_path, HEADER | {"MJD": 60400.0})
+    with pytest.raises(CalibrationFileError, match="date 'x' cannot"):
+        load(tmp_path, HEADER | {"MJD": "x"})
+
+
+def test_frame_for_which_it_does_not_hold_is_refused(loaded):
+    for change, message in (
+        ({"MJD": 60400.0}, "frame 1 was taken 2024-.*charis.asdf holds for charis"),
+        ({"INSTRUME": "HICIAO"}, "frame 1 is of HICIAO"),
+        ({"FILTNAME": "K"}, "frame 1 is in mode 'K'.*broadband JHK"),
+    ):
+        with pytest.raises(CalibrationFileError, match=message):
+            loaded.system_mueller([HEADER, HEADER | change])
+
+
+def test_what_the_user_states_comes_before_the_header(path):
+    header = HEADER | {"FILTNAME": "Broadband"}
+    with pytest.raises(CalibrationFileError, match="for mode Broadband"):
+        load(path, header)
+    assert load(path, header, mode="broadband JHK").system_mueller(header).value.shape == (3, 4, 4)
+
+
+def test_instrument_must_be_told(path):
+    header = {k: v for k, v in HEADER.items() if k != "INSTRUME"}
+    with pytest.raises(InstrumentError, match="the header does not say it; give instrument="):
+        load(path, header)
+    assert load(path, header, instrument="charis").path == path.resolve()
+
+
+def test_optics_in_the_beam(tmp_path):
+    pairs = [observe("polarized", 1), observe("polarized", 2, (), name="before")]
+    chains, tables = zip(*pairs, strict=True)
+    tables[1].meta["nasmyth_beam_switcher"] = "not installed"
+    cal = calibrate(list(chains), list(tables), instrument="charis", cross_validate=False)
+    cal.write(tmp_path / "a.asdf")
+    with pytest.raises(ChainError, match="which optics are in the beam"):
+        load(tmp_path / "a.asdf").system_mueller(HEADER, light="internal")
+    values = {}
+    for optics in ((), ("nbs",)):
+        loaded = load(tmp_path / "a.asdf", optics_in=optics)
+        values[optics] = loaded.system_mueller(HEADER, light="internal").value
+    assert np.abs(values[()] - values[("nbs",)]).max() > 0.5
+    with pytest.raises(CalibrationFileError, match=r"optics_in dichroic\+nbs"):
+        load(tmp_path / "a.asdf", optics_in=("dichroic", "nbs"))
+
+
+# ---- bad input ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"RET-ANG1": None}, "position of 'hwp': no RET-ANG1 in the header"),
+        ({"D_IMRANG": "unavailable"}, "position of 'derotator': no D_IMRANG"),
+        ({"RET-ANG1": "closed"}, "frame 0: RET-ANG1 = 'closed', a number is needed"),
+        ({"RET-ANG1": float("inf")}, "frame 0: RET-ANG1 = inf, allowed are -720 to 720"),
+        ({"ALTITUDE": 95.0}, "frame 0: ALTITUDE = 95.0, allowed are 0 to 90 deg"),
+        ({"PARANG": None}, "a star needs its pointing"),
+        ({"RA": "five", "DEC": "x"}, "right_ascension: "),
+    ],
+)
+def test_header_without_a_usable_angle(loaded, change, message):
+    header = {k: v for k, v in (HEADER | change).items() if v is not None}
+    with pytest.raises(ObservationError, match=message):
+        loaded.system_mueller(header)
+
+
+def test_angle_that_some_frames_lack(loaded):
+    lacking = {k: v for k, v in HEADER.items() if k != "D_IMRANG"}
+    with pytest.raises(ObservationError, match="frame 1: no D_IMRANG in the header, others have"):
+        loaded.system_mueller([HEADER, lacking])
+    with pytest.raises(ObservationError, match="at least one frame"):
+        loaded.system_mueller([])
+
+
+def test_wavelengths(loaded):
+    two = loaded.system_mueller(HEADER, wavelength=WAVELENGTH[[2, 0]].to(u.um))
+    whole = loaded.system_mueller(HEADER)
+    np.testing.assert_allclose(two.value, whole.value[[2, 0]], atol=1e-14)
+    np.testing.assert_allclose(two.covariance, whole.covariance[[2, 0]], atol=1e-16)
+    with pytest.raises(WavelengthRangeError, match=r"1500.00 nm is none of the 3 .*m3\.diatt"):
+        loaded.system_mueller(HEADER, wavelength=1500 * u.nm)
+    with pytest.raises(ParameterError, match="needs a unit"):
+        loaded.system_mueller(HEADER, wavelength=1500)
+
+
+def test_laws_in_wavelength_allow_others_within_the_range(tmp_path):
+    from astropolcal import optics
+
+    chain = (
+        optics.LinearPolarizer(theta=90 * u.deg, name="polarizer")
+        | optics.TwoLayerWaveplate(mount="hwp", name="hwp")
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    frames = half_wave_plate_cycles(derotator=[50] * u.deg)
+    cal = calibrate(chain, simulate(chain, WAVELENGTH, frames, seed=1), cross_validate=False)
+    cal.write(tmp_path / "a.asdf")
+    loaded = load(tmp_path / "a.asdf")
+    options = {"positions": {"hwp": 10 * u.deg}, "light": "internal"}
+    found = loaded.system_mueller(wavelength=1700 * u.nm, **options)
+    hand = system_mueller(join(leaves(cal.chain)[1:]), 1700 * u.nm, {"hwp": 10 * u.deg})
+    np.testing.assert_allclose(found.value[0], hand, atol=1e-14)
+    assert found.std.max() > 0
+    with pytest.raises(WavelengthRangeError, match=r"3000.* outside the calibrated"):
+        loaded.system_mueller(wavelength=3000 * u.nm, **options)
+    with pytest.raises(InstrumentError, match="has no map of header keywords"):
+        loaded.system_mueller(HEADER, light="internal")
+    with pytest.raises(ChainError, match="calibrates no telescope"):
+        loaded.system_mueller(positions={"hwp": 10 * u.deg})
+
+
+def test_either_header_or_positions(loaded):
+    for arguments in ({}, {"header": HEADER, "positions": {}}):
+        with pytest.raises(ParameterError, match="either header or positions"):
+            loaded.system_mueller(**arguments)
+    with pytest.raises(ParameterError, match="light = 'lamp'"):
+        loaded.system_mueller(HEADER, light="lamp")
+    with pytest.raises(ChainError, match="altitude"):
+        loaded.system_mueller(positions={"hwp": 1 * u.deg, "parallactic": 1 * u.deg})
+
+
+# ---- what it needs -----------------------------------------------------------------------
+
+_BLOCKED = """
+import re, sys, warnings
+from importlib.metadata import packages_distributions, requires
+
+def needed(names):
+    found, waiting = set(), list(names)
+    while waiting:
+        name = waiting.pop().lower().replace("_", "-")
+        if name in found:
+            continue
+        found.add(name)
+        try:
+            lines = requires(name) or []
+        except ImportError:
+            continue
+        waiting += [re.match(r"[A-Za-z0-9_.-]+", r)[0] for r in lines if "extra ==" not in r]
+    return found
+
+allowed = needed(["numpy", "astropy", "asdf"])
+blocked = []
+for module, owners in packages_distributions().items():
+    ours = module == "astropolcal" or module in sys.stdlib_module_names
+    if not ours and not {o.lower().replace("_", "-") for o in owners} & allowed:
+        sys.modules[module] = None
+        blocked.append(module)
+assert {"matplotlib", "photutils", "specutils", "tqdm", "jinja2", "scipy"} <= set(blocked), blocked
+
+from astropolcal.calibration.loading import load
+header = {"INSTRUME": "CHARIS", "MJD": 60988.5, "RET-ANG1": 22.5, "D_IMRANG": 60.0}
+calibration = load(sys.argv[1], header)
+mueller = calibration.system_mueller([header] * 2, light="internal")
+assert mueller.covariance.shape == (2, 3, 16, 16)
+
+from astropolcal.calibration.export import mueller_table, write_mueller
+write_mueller(mueller_table(calibration, header, light="internal"), sys.argv[2])
+print(repr(float(mueller.value[0, 0, 0, 1])))
+"""
+
+
+def test_nothing_else_is_needed(tmp_path):
+    command = [sys.executable, "-c", _BLOCKED, str(OLD), str(tmp_path / "m.fits")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    value = load(OLD).system_mueller(HEADER, light="internal").value[0, 0, 1]
+    assert done.stdout.strip() == repr(float(value))
+    assert (tmp_path / "m.fits").exists()

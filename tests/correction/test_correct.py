@@ -1,0 +1,479 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""A disk and a star through the real chain: exact without noise, pulls of one with it."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from astropolcal.correction import ScienceFrames, correct, derotate
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    ObservationError,
+    ParameterError,
+    WavelengthRangeError,
+)
+
+
+@pytest.fixture(scope="module")
+def disk_frames(sky, charis, track, scene, seen):
+    hwp, positions = track()
+    stokes = scene(22)
+    right, left = seen(sky, positions, charis.wavelength, stokes)
+    return stokes, right, left, positions, hwp
+
+
+def frames_of(disk_frames, charis, **settings):
+    _, right, left, positions, hwp = disk_frames
+    return ScienceFrames.from_arrays(right, left, charis.wavelength, positions, hwp=hwp, **settings)
+
+
+@pytest.mark.parametrize("observable", ["intensity", "single", "double"])
+def test_disk_comes_back_exactly(disk_frames, sky, charis, observable):
+    found = correct(sky, frames_of(disk_frames, charis), observable=observable)
+    stokes = disk_frames[0]
+    np.testing.assert_allclose(found.q, stokes[1] / stokes[0], atol=1e-10)
+    np.testing.assert_allclose(found.u, stokes[2] / stokes[0], atol=1e-10)
+    parts = found.azimuthal()
+    np.testing.assert_allclose(parts["u_phi"], 0, atol=1e-10)
+    assert found.covariance is None
+    assert np.isnan(found.fractional_errors()["q"]).all()
+
+
+def test_star_comes_back_exactly(star, sky, charis):
+    frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
+    found = correct(sky, frames)
+    np.testing.assert_allclose(found.q, star.stokes[1] / star.stokes[0], atol=1e-10)
+    np.testing.assert_allclose(found.u, star.stokes[2] / star.stokes[0], atol=1e-10)
+
+
+def test_quarter_turns_of_the_field_are_exact(sky, charis, track, scene, seen):
+    """A camera that turns between frames; the rows refer to the sky, the images do not."""
+    hwp, positions = track(1)
+    stokes = scene(22)
+    right, left = seen(sky, positions, charis.wavelength, stokes)
+    camera = [0, 90, 180, 270] * u.deg
+    for beam in (right, left):
+        for i, angle in enumerate(camera):
+            beam[i] = derotate(beam[i], -angle)
+    turned = ScienceFrames.from_arrays(
+        right, left, charis.wavelength, positions, hwp=hwp, position_angle=camera
+    )
+    found = correct(sky, turned)
+    np.testing.assert_allclose(found.q, stokes[1] / stokes[0], atol=1e-10)
+    assert found.north_up
+    wrong = ScienceFrames.from_arrays(
+        right, left, charis.wavelength, positions, position_angle=-camera
+    )
+    assert np.abs(correct(sky, wrong).q - stokes[1] / stokes[0]).max() > 0.01
+
+
+def test_what_some_frames_do_not_show_is_found_from_the_others(sky, charis, track, seen):
+    """Corners that turn out of the image must not count as dark."""
+    hwp, positions = track(2)
+    stokes = np.ones((3, 22, 11, 11)) * np.array([100.0, 2.0, -1.0])[:, None, None, None]
+    right, left = seen(sky, positions, charis.wavelength, stokes)
+    camera = np.repeat([0, 45], 4) * u.deg
+    frames = ScienceFrames.from_arrays(
+        right, left, charis.wavelength, positions, hwp=hwp, position_angle=camera
+    )
+    found = correct(sky, frames)
+    np.testing.assert_allclose(found.stokes, stokes, rtol=1e-9)
+
+
+def test_any_turn_of_the_field(sky, charis, track, scene, seen):
+    hwp, positions = track(2)
+    stokes = scene(22, size=31)
+    camera = np.linspace(0, 50, 8) * u.deg
+    right, left = seen(sky, positions, charis.wavelength, stokes)
+    for beam in (right, left):
+        for i, angle in enumerate(camera):
+            beam[i] = derotate(beam[i], -angle, order=5)
+    found = correct(
+        sky,
+        ScienceFrames.from_arrays(
+            right, left, charis.wavelength, positions, hwp=hwp, position_angle=camera, order=5
+        ),
+    )
+    rows, columns = np.indices((31, 31)) - 15
+    inner = np.hypot(rows, columns) < 13
+    q = (stokes[1] / stokes[0])[:, inner]
+    assert np.abs(found.q[:, inner] - q).max() < 0.02 * np.abs(q).max()
+
+
+def test_pulls_of_noise(disk_frames, sky, charis):
+    """Statistical errors alone: the chain is the true one."""
+    stokes, right, left, positions, hwp = disk_frames
+    rng = np.random.default_rng(7)
+    variances = [beam / 4 + 3 for beam in (right, left)]
+    noisy = [
+        beam + rng.normal(size=beam.shape) * np.sqrt(variance)
+        for beam, variance in zip((right, left), variances, strict=True)
+    ]
+    frames = ScienceFrames.from_arrays(
+        *noisy,
+        charis.wavelength,
+        positions,
+        hwp=hwp,
+        variance_right=variances[0],
+        variance_left=variances[1],
+    )
+    truth = stokes[1:] / stokes[0]
+    for settings in ({}, {"observable": "double"}, {"weights": "variance"}):
+        found = correct(sky, frames, **settings)
+        errors = found.fractional_errors()
+        for name, true in zip("qu", truth, strict=True):
+            pull = (getattr(found, name) - true) / errors[name]
+            assert abs(pull.mean()) < 0.1
+            assert abs(pull.std() - 1) < 0.1
+        pull = (found["I"] - stokes[0]) / found.error("I")
+        assert abs(pull.std() - 1) < 0.1
+    # weights by variance do not make it worse
+    assert np.median(errors["q"]) <= np.median(correct(sky, frames).fractional_errors()["q"]) * 1.01
+
+
+def test_pulls_of_the_calibration(calibration, star, charis, seen, track):
+    """Systematic errors alone, noise off: each true instrument differs from the calibrated."""
+    from astropolcal.correction import RowModel
+    from astropolcal.correction.systematic import _draws
+
+    _, positions = track()
+    model = RowModel(calibration, positions, charis.wavelength)
+    pulls = {"q": [], "u": [], "p": []}
+    truth = star.stokes[1:] / star.stokes[0]
+    for vector in _draws(model, 250, np.random.default_rng(5)):
+        rows = model.rows(vector)[..., :3]
+        right, left = np.einsum("bwfs,sw->bfw", rows, star.stokes)
+        found = correct(
+            calibration, ScienceFrames.from_arrays(right, left, charis.wavelength, positions)
+        )
+        errors = found.fractional_errors("systematic")
+        pulls["q"].append((found.q - truth[0]) / errors["q"])
+        pulls["u"].append((found.u - truth[1]) / errors["u"])
+        known = found.polarization()
+        pulls["p"].append((known["dolp"] - np.hypot(*truth)) / known["s_p_systematic"])
+    for values in pulls.values():
+        assert abs(np.mean(values)) < 0.1
+        assert abs(np.std(values) - 1) < 0.1
+
+
+def test_errors_stay_apart(calibration, star, charis, track):
+    _, positions = track()
+    variance = np.full(star.right.shape, 100.0)
+    frames = ScienceFrames.from_arrays(
+        star.right,
+        star.left,
+        charis.wavelength,
+        positions,
+        variance_right=variance,
+        variance_left=variance,
+    )
+    found = correct(calibration, frames)
+    sampled = correct(calibration, frames, n_samples=300, seed=1)
+    np.testing.assert_array_equal(found.covariance, sampled.covariance)
+    one, two = (f.fractional_errors("systematic")["q"] for f in (found, sampled))
+    np.testing.assert_allclose(two, one, rtol=0.2)
+    # ideal: 32 fluxes that each measure half of the light
+    assert found.error("I") == pytest.approx(10 * 2 / np.sqrt(32), rel=0.2)
+    table = found.table()
+    for name in ("s_p_statistical", "s_p_systematic", "s_chi_statistical", "s_chi_systematic"):
+        assert (table[name] > 0).all()
+    assert (table["dolp_debiased"] < table["dolp"]).all()
+    assert table["s_chi_systematic"].unit == u.deg
+
+
+def test_offsets_only_leaves_the_crosstalk(disk_frames, sky, charis):
+    stokes = disk_frames[0]
+    whole = correct(sky, frames_of(disk_frames, charis))
+    offsets = correct(sky, frames_of(disk_frames, charis), mode="ip")
+    truth = stokes[1] / stokes[0]
+    assert np.abs(whole.q - truth).max() < 1e-10
+    assert 0.01 < np.abs(offsets.q - truth).max() < 0.3
+
+
+def test_offsets_only_is_right_for_unpolarized_light(sky, charis, track, seen):
+    _, positions = track()
+    stokes = np.array([1e4, 0, 0])[:, None] * np.ones(22)
+    right, left = seen(sky, positions, charis.wavelength, stokes)
+    frames = ScienceFrames.from_arrays(right, left, charis.wavelength, positions)
+    np.testing.assert_allclose(correct(sky, frames, mode="ip").q, 0, atol=1e-12)
+
+
+def test_bad_pixels_count_in_the_other_frames(disk_frames, sky, charis):
+    stokes, right, left, positions, hwp = disk_frames
+    right, left = right.copy(), left.copy()
+    right[2, 5, 8, 8] = left[7, 5, 8, 8] = np.nan
+    right[:, 6, 3, 4] = np.nan
+    left[:, 9, 1, 1] = right[:, 9, 1, 1] = np.nan
+    frames = ScienceFrames.from_arrays(right, left, charis.wavelength, positions, hwp=hwp)
+    for observable in ("intensity", "double"):
+        found = correct(sky, frames, observable=observable)
+        assert found.q[5, 8, 8] == pytest.approx((stokes[1] / stokes[0])[5, 8, 8], abs=1e-10)
+        assert np.isnan(found.q[9, 1, 1])
+        assert np.isfinite(found.q).sum() >= found.q.size - 2
+    # one beam alone says something too, if all the intensities count
+    assert np.isfinite(correct(sky, frames).q[6, 3, 4])
+
+
+def test_dask_changes_no_number(disk_frames, sky, charis):
+    da = pytest.importorskip("dask.array", reason="dask is not installed")
+    _, right, left, positions, _ = disk_frames
+    right = right.copy()
+    right[3, :, 4, 4] = np.nan
+    frames = ScienceFrames.from_arrays(
+        right, left, charis.wavelength, positions, variance_right=left, variance_left=left
+    )
+    plain = correct(sky, frames)
+    for settings in ({"workers": 2}, {"workers": 1, "chunk": 5}, {"chunk": 22}):
+        other = correct(sky, frames, **settings)
+        np.testing.assert_array_equal(other.stokes, plain.stokes)
+        np.testing.assert_array_equal(other.covariance, plain.covariance)
+    lazy = ScienceFrames.from_arrays(
+        da.from_array(right, chunks=(16, 2, 21, 21)),
+        da.from_array(left, chunks=(16, 2, 21, 21)),
+        charis.wavelength,
+        positions,
+    )
+    np.testing.assert_array_equal(correct(sky, lazy, workers=2).stokes, plain.stokes)
+
+
+@pytest.mark.parametrize("spectrum", [True, False])
+def test_clouds_are_seen_in_the_light_itself(sky, charis, track, scene, seen, spectrum):
+    from astropolcal.correction import measurement_rows
+
+    _, positions = track()
+    stokes = scene(22, size=9)
+    if spectrum:
+        stokes = stokes.sum(axis=(2, 3))
+    beams = seen(sky, positions, charis.wavelength, stokes)
+    clouds = np.random.default_rng(3).uniform(0.3, 1, size=(16, 22))
+    clouds /= clouds.mean(axis=0)
+    beams *= clouds.reshape(16, 22, *[1] * (stokes.ndim - 2))
+    frames = ScienceFrames.from_arrays(*beams, charis.wavelength, positions)
+    assert np.abs(correct(sky, frames).q - stokes[1] / stokes[0]).max() > 1e-3
+    clear = frames.with_brightness(measurement_rows(sky, positions, charis.wavelength))
+    np.testing.assert_allclose(clear.scale, clouds.T, rtol=1e-10)
+    np.testing.assert_allclose(correct(sky, clear).q, stokes[1] / stokes[0], atol=1e-10)
+
+
+def test_a_dark_frame_has_no_brightness(star, sky, charis):
+    from astropolcal.correction import frame_brightness, measurement_rows
+
+    rows = measurement_rows(sky, star.positions, charis.wavelength)
+    fluxes = np.stack([star.right, star.left])
+    fluxes[:, 5, 3] = 0
+    with pytest.raises(ObservationError, match="frame 5 has no light at wavelength 3"):
+        frame_brightness(rows, fluxes)
+    rng = np.random.default_rng(1)
+    with pytest.raises(ObservationError, match=r"does not settle|not determined"):
+        frame_brightness(rows, rng.normal(size=fluxes.shape) ** 8)
+
+
+def test_single_differences_as_input(star, sky, charis):
+    frames = ScienceFrames.from_differences(
+        star.right - star.left,
+        star.right + star.left,
+        charis.wavelength,
+        star.positions,
+        variance=np.ones(star.right.shape),
+    )
+    found = correct(sky, frames, observable="single")
+    np.testing.assert_allclose(found.q, star.stokes[1] / star.stokes[0], atol=1e-10)
+    assert found.covariance.shape == (6, 22)
+
+
+def test_spectra(calibration, star, charis, track):
+    pytest.importorskip("specutils", reason="specutils is not installed")
+    ones = np.ones(star.right.shape)
+    frames = ScienceFrames.from_arrays(
+        star.right,
+        star.left,
+        charis.wavelength,
+        track()[1],
+        variance_right=ones,
+        variance_left=ones,
+    )
+    found = correct(calibration, frames)
+    spectra = found.spectra()
+    assert set(spectra) == {"I", "q", "u"}
+    np.testing.assert_array_equal(spectra["q"].flux.value, found.q)
+    assert spectra["q"].spectral_axis.unit == charis.wavelength.unit
+    errors = found.fractional_errors("systematic")["q"]
+    np.testing.assert_array_equal(spectra["q"].meta["systematic"], errors)
+
+
+def test_an_aperture_sums(disk_frames, sky, charis):
+    found = correct(sky, frames_of(disk_frames, charis)).aperture(6)
+    rows, columns = np.indices((21, 21)) - 10
+    true = disk_frames[0][..., np.hypot(rows, columns) <= 6].sum(axis=-1)
+    np.testing.assert_allclose(found.stokes, true, atol=1e-9)
+    with pytest.raises(ParameterError, match="no pixel"):
+        correct(sky, frames_of(disk_frames, charis)).aperture(0)
+
+
+def test_v_and_its_fraction(sky, charis, track, seen):
+    _, positions = track()
+    stokes = np.array([1e4, 100, 50, 30])[:, None] * np.ones(22)
+    right, left = seen(sky, positions, charis.wavelength, stokes)
+    frames = ScienceFrames.from_arrays(right, left, charis.wavelength, positions)
+    found = correct(sky, frames, components="IQUV")
+    np.testing.assert_allclose(found.v, 0.003, atol=1e-12)
+    assert list(found.stokes_axis.symbol) == ["I", "Q", "U", "V"]
+
+
+def test_too_few_angles(star, sky, charis):
+    keep = [0, 1]
+    positions = {k: v[keep] for k, v in star.positions.items()}
+    positions["hwp"] = positions["hwp"][[0, 0]]
+    positions = {k: v[[0, 0]] for k, v in positions.items()}
+    frames = ScienceFrames.from_arrays(
+        star.right[keep], star.left[keep], charis.wavelength, positions, names=["a", "b"]
+    )
+    with pytest.raises(ObservationError, match=r"Q and U are not determined .* 2 frames \(a, b\)"):
+        correct(sky, frames)
+
+
+def test_a_poor_wavelength_is_flagged(calibration, star, charis, track):
+    from astropolcal import optics
+    from astropolcal.chain import join, leaves
+
+    chain = calibration.chain.copy()
+    found = leaves(chain)
+    efficiency = np.array(chain["wollaston"].efficiency.value)
+    efficiency[4] = 1e-6
+    blind = join(
+        optics.WollastonPrism(efficiency=efficiency, name="wollaston")
+        if leaf.name == "wollaston"
+        else leaf
+        for leaf in found
+    )
+    frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, track()[1])
+    with pytest.warns(AstropolcalWarning, match=r"poorly determined at 1 of 22 .* 1328\.63 nm"):
+        result = correct(charis.on_sky(blind), frames)
+    assert np.isnan(result.q[4])
+    assert np.isfinite(np.delete(result.q, 4)).all()
+    assert np.isfinite(np.delete(result["I"], 4)).all()
+
+
+def test_open_calibrations_warn(open_calibration, star, charis):
+    frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
+    with pytest.warns(AstropolcalWarning, match="open directions"):
+        found = correct(open_calibration, frames)
+    assert np.isinf(found.fractional_errors("systematic")["q"]).all()
+    assert np.isinf(found.polarization()["s_chi_systematic"]).all()
+    known = correct(open_calibration, frames, open_directions="ignore")
+    assert (known.polarization()["s_p_systematic"] < 1e-3).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"mode": "mueller"}, "mode = 'mueller'"),
+        ({"weights": "photon"}, "weights = 'photon'"),
+        ({"weights": "variance"}, "need variances"),
+        ({"chunk": 0}, "chunk = 0"),
+        ({"workers": -1}, "workers = -1"),
+    ],
+)
+def test_bad_choices(star, sky, charis, settings, words):
+    frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
+    with pytest.raises(ParameterError, match=words):
+        correct(sky, frames, **settings)
+
+
+def test_frames_that_do_not_fit(star, charis, calibration):
+    with pytest.raises(ObservationError, match="22 wavelengths"):
+        ScienceFrames.from_arrays(star.right, star.left, charis.wavelength[:5], star.positions)
+    with pytest.raises(ObservationError, match="one shape"):
+        ScienceFrames.from_arrays(star.right, star.left[:3], charis.wavelength, star.positions)
+    with pytest.raises(ObservationError, match="altitude has 3 positions"):
+        ScienceFrames.from_arrays(
+            star.right, star.left, charis.wavelength, {"altitude": [1, 2, 3] * u.deg}
+        )
+    with pytest.raises(ObservationError, match="one beam only"):
+        ScienceFrames.from_arrays(
+            star.right, star.left, charis.wavelength, star.positions, variance_right=star.left
+        )
+    frames = ScienceFrames.from_arrays(
+        star.right[:, :2], star.left[:, :2], [1.3, 1.4] * u.um, star.positions
+    )
+    with pytest.raises(WavelengthRangeError, match="none of the 22"):
+        correct(calibration, frames)
+
+
+# ---- laws and other implementations -----------------------------------------------------------
+
+
+@given(turn=st.floats(-90, 90))
+def test_turning_the_sky_turns_q_and_u(star, sky, charis, turn):
+    positions = star.positions | {"parallactic": star.positions["parallactic"] + turn * u.deg}
+    frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, positions)
+    found = correct(sky, frames)
+    q, stokes_u = star.stokes[1:] / star.stokes[0]
+    c, s = np.cos(2 * np.deg2rad(turn)), np.sin(2 * np.deg2rad(turn))
+    np.testing.assert_allclose(found.q, c * q - s * stokes_u, atol=1e-10)
+    np.testing.assert_allclose(found.u, s * q + c * stokes_u, atol=1e-10)
+
+
+def test_scaling_the_fluxes_scales_all(star, sky, charis):
+    def solved(factor):
+        return correct(
+            sky,
+            ScienceFrames.from_arrays(
+                factor * star.right,
+                factor * star.left,
+                charis.wavelength,
+                star.positions,
+                variance_right=factor**2 * star.right,
+                variance_left=factor**2 * star.left,
+            ),
+        )
+
+    one, seven = solved(1.0), solved(7.0)
+    np.testing.assert_allclose(seven.stokes, 7 * one.stokes)
+    for name, values in one.polarization().items():
+        np.testing.assert_allclose(seven.polarization()[name], values, rtol=1e-9)
+
+
+def test_against_numpy_least_squares(star, sky, charis):
+    from astropolcal.correction import measurement_rows
+
+    rng = np.random.default_rng(9)
+    fluxes = np.stack([star.right, star.left])
+    variances = rng.uniform(50, 500, size=fluxes.shape)
+    fluxes = fluxes + rng.normal(size=fluxes.shape) * np.sqrt(variances)
+    frames = ScienceFrames.from_arrays(
+        *fluxes,
+        charis.wavelength,
+        star.positions,
+        variance_right=variances[0],
+        variance_left=variances[1],
+    )
+    found = correct(sky, frames, weights="variance")
+    rows = measurement_rows(sky, star.positions, charis.wavelength)[..., :3]
+    for w in range(22):
+        sigma = np.sqrt(variances[:, :, w]).ravel()
+        design = rows[:, w].reshape(-1, 3) / sigma[:, None]
+        solution = np.linalg.lstsq(design, fluxes[:, :, w].ravel() / sigma, rcond=None)[0]
+        np.testing.assert_allclose(found.stokes[:, w], solution, rtol=1e-9)
+        covariance = np.linalg.inv(design.T @ design)
+        np.testing.assert_allclose(found.covariances()[:, :, w], covariance, rtol=1e-8, atol=1e-9)
+
+
+def test_systematic_errors_against_those_of_double_differences(calibration, charis, track, seen):
+    from astropolcal.calibration import derived_sky
+
+    _, positions = track(1)
+    hwp = positions["hwp"][0] + [0, 45, 22.5, 67.5] * u.deg
+    positions = {k: np.full(4, v[0].value) * v.unit for k, v in positions.items()} | {"hwp": hwp}
+    stokes = np.array([1.0, 0.1, -0.04])[:, None] * np.ones(22)
+    right, left = seen(calibration, positions, charis.wavelength, stokes)
+    frames = ScienceFrames.from_arrays(
+        right, left, charis.wavelength, positions, pairs=[(0, 1), (2, 3)]
+    )
+    ours = correct(calibration, frames, observable="double").fractional_errors("systematic")
+    plus = {name: angle[[0, 2]] for name, angle in positions.items()}
+    theirs = derived_sky(calibration, 0.1, -0.04, plus, chain=charis.on_sky(calibration.chain)).std
+    np.testing.assert_allclose(ours["q"], theirs[:, 0], rtol=0.02)
+    np.testing.assert_allclose(ours["u"], theirs[:, 1], rtol=0.02)

@@ -1,0 +1,163 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""FITS products: what the header states, what comes back, what is refused."""
+
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from astropolcal.correction import Corrected, ScienceFrames, correct
+from astropolcal.exceptions import ObservationError
+
+
+@pytest.fixture(scope="module")
+def corrected(calibration, charis, track, scene, seen):
+    hwp, positions = track()
+    stokes = scene(22, size=9)
+    right, left = seen(calibration, positions, charis.wavelength, stokes)
+    names = [f"CRSA{i:08d}_cube.fits" for i in range(16)]
+    frames = ScienceFrames.from_arrays(
+        right,
+        left,
+        charis.wavelength,
+        positions,
+        hwp=hwp,
+        names=names,
+        centre=(4.0, 4.0),
+        variance_right=right,
+        variance_left=left,
+        pixel_scale=16.2,
+    )
+    given = {"calibration": "charis.asdf", "calibration_hash": "ab" * 32}
+    return correct(calibration, frames, provenance=given)
+
+
+@pytest.fixture
+def path(corrected, tmp_path):
+    corrected.write(tmp_path / "out.fits")
+    return tmp_path / "out.fits"
+
+
+def test_the_header_states_its_conventions(path):
+    header = fits.getheader(path)
+    assert header["POLCONV"] == "IAU"
+    assert header["CTYPE4"] == "STOKES"
+    assert (header["CRVAL4"], header["CDELT4"], header["CRPIX4"]) == (1, 1, 1)
+    assert header["STOKES"] == "IQU"
+    assert header["CALFILE"] == "charis.asdf"
+    assert header["CALHASH"] == "ab" * 32
+    assert header["CRPIX1"] == 5
+    for keyword in ("APCVERS", "APYVERS", "NPYVERS", "DATE", "INSTRUME"):
+        assert header[keyword]
+    assert any("m3." in line for line in header["HISTORY"])
+    with fits.open(path, checksum=True) as hdus:
+        hdus.verify("exception")
+        names = [hdu.name for hdu in hdus]
+        assert hdus["FRAMES"].data["frame"][3] == "CRSA00000003_cube.fits"
+        assert hdus["COVSYST"].header["PLANE2"] == "IQ"
+        assert hdus["AOLP"].header["BUNIT"] == "deg"
+    assert names[1:] == [
+        "WAVELENGTH", "COVSTAT", "SYSFACT", "SYSOPEN", "COVSYST", "DOLP", "AOLP", "QPHI", "FRAMES",
+    ]  # fmt: skip
+
+
+def test_astropy_reads_the_stokes_axis(path):
+    from astropy.wcs import WCS
+
+    wcs = WCS(fits.getheader(path))
+    coordinates = wcs.sub([4]).pixel_to_world([0, 1, 2])
+    assert list(coordinates.symbol) == ["I", "Q", "U"]
+
+
+def test_everything_comes_back(corrected, path):
+    again = Corrected.read(path)
+    for name in ("stokes", "covariance", "condition", "determined", "leakage"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(corrected, name))
+    np.testing.assert_allclose(again.wavelength, corrected.wavelength, rtol=1e-15)
+    for name in ("components", "weak", "mode", "observable", "unit", "centre", "pixel_scale"):
+        assert getattr(again, name) == getattr(corrected, name)
+    assert again.systematic.held == corrected.systematic.held
+    one, two = corrected.polarization(), again.polarization()
+    for name in one:
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-10)
+    assert again.provenance["frames"] == corrected.provenance["frames"]
+
+
+def test_maps_are_what_the_object_says(corrected, path):
+    found = corrected.polarization()
+    with fits.open(path) as hdus:
+        np.testing.assert_array_equal(hdus["DOLP"].data[2], found["s_p_statistical"])
+        np.testing.assert_array_equal(hdus["AOLP"].data[2], found["s_chi_systematic"])
+        np.testing.assert_array_equal(hdus["QPHI"].data[0], corrected.azimuthal()["q_phi"])
+
+
+def test_a_spectrum_without_errors(sky, charis, star, tmp_path):
+    frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
+    found = correct(sky, frames)
+    found.write(tmp_path / "star.fits")
+    again = Corrected.read(tmp_path / "star.fits")
+    assert again.covariance is None
+    assert again.systematic is None
+    np.testing.assert_array_equal(again.q, found.q)
+    assert fits.getheader(tmp_path / "star.fits")["CTYPE2"] == "STOKES"
+
+
+def test_a_file_is_not_replaced_unasked(corrected, path):
+    before = path.read_bytes()
+    with pytest.raises(ObservationError, match="exists already"):
+        corrected.write(path)
+    assert path.read_bytes() == before
+    corrected.write(path, overwrite=True, maps=False)
+    with fits.open(path) as hdus:
+        assert [hdu.name for hdu in hdus][-2:] == ["SYSOPEN", "FRAMES"]
+
+
+def test_no_folder(corrected, tmp_path):
+    with pytest.raises(ObservationError, match="there is no folder"):
+        corrected.write(tmp_path / "nowhere" / "out.fits")
+
+
+def test_a_failure_leaves_nothing(corrected, tmp_path, monkeypatch):
+    def fail(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(fits.HDUList, "writeto", fail)
+    with pytest.raises(ObservationError, match="No space left"):
+        corrected.write(tmp_path / "out.fits")
+    assert not list(tmp_path.iterdir())
+
+
+def test_damaged_files_are_refused(path, tmp_path):
+    content = path.read_bytes()
+    rng = np.random.default_rng(3)
+    refused = 0
+    for i in range(60):
+        broken = bytearray(content)
+        for place in rng.integers(0, len(content), size=5):
+            broken[place] ^= int(rng.integers(1, 256))
+        target = tmp_path / f"broken{i}.fits"
+        target.write_bytes(bytes(broken))
+        # nothing but our own error may come out
+        with suppress(ObservationError):
+            Corrected.read(target)
+            continue
+        refused += 1
+    assert refused > 50
+    (tmp_path / "short.fits").write_bytes(content[: len(content) // 2])
+    with pytest.raises(ObservationError, match=r"short\.fits"):
+        Corrected.read(tmp_path / "short.fits")
+
+
+def test_other_files_are_refused(tmp_path):
+    fits.PrimaryHDU(np.ones((2, 2))).writeto(tmp_path / "other.fits")
+    with pytest.raises(ObservationError, match="CONTENT = None"):
+        Corrected.read(tmp_path / "other.fits")
+    with pytest.raises(ObservationError, match="no such file"):
+        Corrected.read(tmp_path / "nowhere.fits")
+
+
+def test_another_convention_is_refused(path):
+    fits.setval(path, "POLCONV", value="COSMO")
+    with pytest.raises(ObservationError, match=r"POLCONV = 'COSMO'|checksum"):
+        Corrected.read(path)

@@ -1,0 +1,138 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Rows of the measurement matrix: against system matrices, and their derivatives."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import optics
+from astropolcal.chain import find_optic, insert_optic, system_mueller, with_beam
+from astropolcal.correction import RowModel, check_optics, measurement_rows, sky_chain
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    ChainError,
+    ParameterError,
+    WavelengthRangeError,
+)
+
+
+def test_rows_are_the_first_rows_of_the_system_matrices(sky, charis, track):
+    _, positions = track()
+    rows = measurement_rows(sky, positions, charis.wavelength)
+    for beam, name in enumerate(("right", "left")):
+        matrix = system_mueller(with_beam(sky, name), charis.wavelength, positions)
+        np.testing.assert_allclose(rows[beam], np.moveaxis(matrix[..., 0, :], 0, 1), atol=1e-14)
+
+
+def test_rows_of_a_calibration_are_those_of_its_chain_on_sky(calibration, charis, track):
+    _, positions = track()
+    rows = measurement_rows(calibration, positions, charis.wavelength)
+    on_sky = charis.on_sky(calibration.chain)
+    np.testing.assert_array_equal(rows, measurement_rows(on_sky, positions, charis.wavelength))
+    assert next(leaf.name for leaf in sky_chain(calibration)) == "parallactic"
+
+
+def test_some_of_the_calibrated_wavelengths_in_any_order(calibration, charis, track):
+    _, positions = track()
+    every = measurement_rows(calibration, positions, charis.wavelength)
+    some = measurement_rows(calibration, positions, charis.wavelength[[7, 3]].to(u.um))
+    np.testing.assert_allclose(some, every[:, [7, 3]], atol=1e-12)
+
+
+def test_derivatives_are_central_differences(calibration, track):
+    _, positions = track(1)
+    wavelength = calibration.wavelength[[4, 11]]
+    model = RowModel(calibration, positions, wavelength)
+    found = model.spread({k: np.moveaxis(v, 1, 0) for k, v in model.derivatives().items()})
+    start, factors = model.start, model._free.factors()
+    names = model._free.names
+    for name in ("hwp.w_sio2", "hwp.theta", "derotator.theta", "derotator.retardance[11]"):
+        i = names.index(name)
+        step = np.zeros(start.size)
+        step[i] = h = 1e-6 * max(1.0, abs(start[i]) / 10)
+        numeric = (model.rows(start + step) - model.rows(start - step)) / (2 * h) * factors[i]
+        np.testing.assert_allclose(np.moveaxis(found[..., i], 0, 1), numeric, rtol=1e-6, atol=1e-7)
+    other = names.index("derotator.retardance[3]")
+    assert not found[..., other].any()
+
+
+def test_what_is_not_on_sky_has_no_influence(calibration, track):
+    _, positions = track(1)
+    model = RowModel(calibration, positions, calibration.wavelength)
+    assert not any(name.startswith("calibration_polarizer") for name in model.derivatives())
+    assert any(name.startswith("m3.") for name in model.held)
+
+
+def test_a_wavelength_that_is_not_calibrated_is_refused(calibration, track):
+    _, positions = track(1)
+    with pytest.raises(WavelengthRangeError, match=r"wavelength = 1\.5 um is none of the 22"):
+        measurement_rows(calibration, positions, [1.5] * u.um)
+    with pytest.raises(WavelengthRangeError, match="outside the calibrated range"):
+        measurement_rows(calibration, positions, [2.5] * u.um, interpolate=True)
+
+
+def test_interpolation_names_the_parameters(calibration, track):
+    _, positions = track(1)
+    grid = calibration.wavelength
+    between = 0.5 * (grid[7] + grid[8])
+    with pytest.warns(AstropolcalWarning, match=r"derotator\.retardance, wollaston\.efficiency"):
+        rows = measurement_rows(
+            calibration, positions, [between.value] * grid.unit, interpolate=True
+        )
+    chain = charis_at(calibration, 7, 8)
+    expected = measurement_rows(chain, positions, [between.value] * grid.unit)
+    np.testing.assert_allclose(rows, expected, atol=1e-9)
+
+
+def charis_at(calibration, i, j):
+    """The chain with the means of two wavelengths in place of values per wavelength."""
+    chain = sky_chain(calibration)
+    from astropolcal.chain import join, leaves
+
+    found = []
+    for leaf in leaves(chain):
+        values = {
+            key: np.mean(getattr(leaf, key).quantity[[i, j]])
+            if getattr(leaf, key).unit
+            else np.mean(getattr(leaf, key).value[[i, j]])
+            for key in leaf.param_names
+            if np.size(getattr(leaf, key).value) > 1
+        }
+        found.append(leaf.with_parameters(**values) if values else leaf)
+    return join(found)
+
+
+def test_nodes_of_an_exposure_are_averaged(sky, charis):
+    points, weights = np.polynomial.legendre.leggauss(3)
+    hwp = np.deg2rad(10 + 4 * points)[:, None] * np.ones(2)
+    still = {"derotator": [1.0, 1.0], "parallactic": [0.2, 0.2], "altitude": [1.1, 1.1]}
+    rows = measurement_rows(sky, {"hwp": hwp, **still}, charis.wavelength)
+    each = [measurement_rows(sky, {"hwp": row, **still}, charis.wavelength) for row in hwp]
+    mean = sum(w / 2 * one for w, one in zip(weights, each, strict=True))
+    np.testing.assert_allclose(rows, mean, atol=1e-14)
+
+
+def test_a_missing_position_is_named(sky, charis):
+    with pytest.raises(ChainError, match=r"no position of 'parallactic'.* there is hwp"):
+        measurement_rows(sky, {"hwp": [0] * u.deg}, charis.wavelength)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_position_that_is_not_finite_is_refused(sky, charis, track, bad):
+    _, positions = track(1)
+    positions["altitude"] = [70, bad, 70, 70] * u.deg
+    with pytest.raises(ParameterError, match="altitude"):
+        measurement_rows(sky, positions, charis.wavelength)
+
+
+def test_an_optic_that_the_model_lacks_is_named(sky):
+    with pytest.raises(ChainError, match="vampires_beamsplitter was in the beam"):
+        check_optics(sky, ["nbs", "vampires_beamsplitter"])
+    more = insert_optic(sky, optics.ParityFlip(name="extra"), before="wollaston")
+    check_optics(more, ["extra"])
+    assert find_optic(more, "extra").name == "extra"
+
+
+def test_a_chain_without_stages_has_no_sky():
+    with pytest.raises(ChainError, match="no optic on a stage"):
+        sky_chain(optics.LinearPolarizer() | optics.WollastonPrism())
