@@ -24,7 +24,7 @@ __all__ = ["Cause", "Diagnosis", "diagnose"]
 
 # effects that explain less of the gap than this share, and leave no noise, are stand-ins for
 # what the library does not hold
-_EXPLAINED = 0.9
+_EXPLAINED = 0.8
 
 
 @dataclass

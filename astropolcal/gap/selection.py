@@ -28,7 +28,7 @@ _LEAST_SHARE = 0.05
 _STRUCTURED = 1.5
 # so many are fitted in full where an effect might be exchanged
 _RIVALS = 4
-_EXCHANGED_AT = (2, 3)
+_EXCHANGED_AT = (2,)
 # an effect that explains this share gives way to one other alone, and only if what is left
 # falls to this share
 _MAIN, _CLEARLY = 0.5, 2 / 3
@@ -162,6 +162,12 @@ def _exchanged(base, selected, history, library, alpha, groups, say):
             chosen[i], now = rival, rival.model
     if _outline(chosen) == _outline(selected):
         return selected, history
+    # a law that was freed may do what needed another effect before
+    for i in reversed(range(len(chosen))):
+        others = chosen[:i] + chosen[i + 1 :]
+        model = base.with_effects([c.recipe for c in others], like=now)
+        if others and _advantage(model, now) > 0 and not _is_main(base, selected, chosen[i]):
+            chosen, now = others, model
     return _retraced(base, chosen, now, groups, history[0])
 
 
