@@ -10,12 +10,21 @@ costs next to nothing.
 
 from astropolcal.version import version as __version__
 
-__all__ = ["Calibration", "Observations", "__version__", "calibrate", "instruments", "optics"]
+__all__ = [
+    "Calibration",
+    "Observations",
+    "__version__",
+    "calibrate",
+    "correct",
+    "instruments",
+    "optics",
+]
 
 _WHERE = {
     "Calibration": "astropolcal.calibration",
     "Observations": "astropolcal.observations",
     "calibrate": "astropolcal.calibration",
+    "correct": "astropolcal.correction",
     "instruments": None,
     "optics": None,
 }

@@ -51,7 +51,7 @@ def get_extensions():
     --------
     >>> from astropolcal.extension import get_extensions
     >>> len(get_extensions()[0].tags)
-    27
+    28
     """
     from asdf.extension import ManifestExtension
 

@@ -3,19 +3,17 @@
 
 import astropy.units as u
 import numpy as np
-from astropy.io.fits.card import Undefined
 from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal import instruments
 from astropolcal.exceptions import CalibrationFileError, InstrumentError, ObservationError
+from astropolcal.instruments._keywords import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
 from astropolcal.observations.reading import numeric_column
 
-_MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
+_SKY = ("right_ascension", "declination")
 # columns that are no angles of a stage, though their values may be numbers
-_OTHERS = ("exposure_time", "mjd", "date", "time", "object", "instrument", "filter", "pickoff")
-# beyond these, in degree, an angle cannot be right
-_RANGE, _RANGES = (-720.0, 720.0), {"altitude": (0.0, 90.0)}
+_OTHERS = {"exposure_time", "mjd", *TEXTS} - set(_SKY)
 
 
 def describe(header, instrument=None, stated=()):
@@ -80,32 +78,17 @@ def _recognized(header):
 
 
 def _look_up(header, column, layout):
-    """Return the value of the first keyword of a column that has one, or None."""
-    if column not in layout.keywords:
-        return None
-    for keyword in (layout.keywords[column], *layout.alternatives.get(column, ())):
-        value = header.get(keyword)
-        if value is None or isinstance(value, Undefined):
-            continue
-        if str(value).strip().lower() not in _MISSING:
-            return value
-    return None
+    return look_up([header], column, layout)[1]
 
 
 def _time(header, layout):
     """Return when a frame was taken, or None."""
-    mjd, date, clock = (_look_up(header, key, layout) for key in ("mjd", "date", "time"))
     try:
-        if mjd is not None:
-            return Time(float(mjd), format="mjd", scale="utc")
-        if date is None:
-            return None
-        day = str(date).strip()
-        if "T" not in day and clock is not None:
-            day = f"{day}T{str(clock).strip()}"
-        return Time(day, scale="utc")
+        return frame_time(header, layout)
     except (TypeError, ValueError):
-        shown = mjd if mjd is not None else f"{date} {clock or ''}".strip()
+        told = (_look_up(header, key, layout) for key in ("mjd", "date", "time"))
+        mjd, date, clock = (_text(value) for value in told)
+        shown = mjd or f"{date} {clock or ''}".strip()
         raise CalibrationFileError(f"the header's date {shown!r} cannot be understood") from None
 
 
@@ -165,20 +148,18 @@ class FrameAngles:
 
     def _column(self, column, values):
         """Return angles as a Quantity, anything else as text."""
-        if column in ("right_ascension", "declination"):
+        if column in _SKY:
             return _sky(column, values)
         keyword, layout = self._layout.keywords[column], self._layout
-        unit = u.Unit(layout.units.get(column, "deg"))
-        if not unit.is_equivalent(u.deg):
+        if not u.Unit(layout.units.get(column, "deg")).is_equivalent(u.deg):
             return np.array([str(value).strip() for value in values])
-        factor, offset = layout.transforms.get(column, (1.0, 0.0))
-        low, high = _RANGES.get(column, _RANGE)
+        low, high = RANGES.get(column, (-720.0, 720.0))
         angles = []
         for i, value in enumerate(values):
             try:
-                angle = (factor * float(value) + offset) * unit.to(u.deg)
+                angle = convert(column, value, layout, u.deg)
             except (TypeError, ValueError):
-                if column not in ("hwp", "hwp_true", "derotator", "parallactic", "altitude"):
+                if column not in ANGLES:
                     return np.array([str(value).strip() for value in values])
                 raise ObservationError(
                     f"frame {i}: {keyword} = {value!r}, a number is needed"

@@ -433,12 +433,17 @@ def _lack_of_fit(calibration):
         found.append(
             {
                 "noise": noise.method,
-                "times_noise": float(np.sqrt(test.chi2 / test.expected)),
+                "times_noise": _ratio(test),
                 "p_value": float(test.p_value),
                 "words": test.words,
             }
         )
     return found
+
+
+def _ratio(test):
+    """Return residuals over noise; unknown where no degree of freedom is left."""
+    return float(np.sqrt(test.chi2 / test.expected)) if test.expected > 0 else np.nan
 
 
 def _outliers(calibration):

@@ -21,6 +21,7 @@ from astropolcal import instruments
 from astropolcal.calibration.files import read_calibration, write_calibration
 from astropolcal.calibration.validity import (
     Validity,
+    beam_words,
     content_hash,
     optics_sets,
     optics_words,
@@ -141,7 +142,7 @@ class Library:
     def _label(self):
         return "of files" if self.source is None else str(self.source)
 
-    def find(self, instrument=None, *, mode=None, date=None, optics_in=None):
+    def find(self, instrument=None, *, mode=None, date=None, optics_in=None, beam=None):
         """
         Return the newest calibration that holds.
 
@@ -154,7 +155,9 @@ class Library:
         date : str, `~astropy.time.Time` or date, optional
             When, UTC.
         optics_in : sequence of str, optional
-            Optional optics in the beam.
+            All optional optics in the beam.
+        beam : dict of str to bool, optional
+            Single optics that are known to be in the beam or not, such as ``{"nbs": True}``.
 
         Returns
         -------
@@ -172,7 +175,7 @@ class Library:
             raise CalibrationFileError(
                 f"{path}: {reason}; as it might be the one that is needed, remove or repair it"
             )
-        wanted = {"mode": mode, "optics_in": optics_in, "date": date}
+        wanted = {"mode": mode, "optics_in": optics_in, "beam": beam or None, "date": date}
         found = [e for e in self.entries if instrument is None or _same(e, instrument)]
         words = f"no calibration of {instrument}" if instrument else "no calibration"
         for key, value in wanted.items():
@@ -180,6 +183,8 @@ class Library:
                 continue
             kept = [e for e in found if _fits(e.validity, key, value)]
             if not kept:
+                if date is not None and not any(e.validity.holds(date) for e in found):
+                    key, value = "date", date
                 raise CalibrationFileError(self._lacking(words, key, value, found))
             before, found = found, kept
         if not found:
@@ -190,9 +195,11 @@ class Library:
         return newest
 
     def _lacking(self, words, key, value, found):
-        shown = "+".join(value) or "none" if key == "optics_in" else value
-        words = f"{self._label}: {words} for {key} {shown}"
-        return words + self._known(found)
+        if key == "beam":
+            told = f"a beam {beam_words(value)}"
+        else:
+            told = f"{key} {'+'.join(value) or 'none' if key == 'optics_in' else value}"
+        return f"{self._label}: {words} for {told}{self._known(found)}"
 
     def _known(self, entries):
         if not entries:
@@ -315,7 +322,14 @@ def _fits(validity, key, value):
         return validity.holds(value)
     if key == "mode":
         return validity.mode is None or _folded(validity.mode) == _folded(value)
+    if key == "beam":
+        sets = validity.optics_in
+        return sets is None or any(_in_beam(names, value) for names in sets)
     return validity.optics_in is not None and optics_sets(value)[0] in validity.optics_in
+
+
+def _in_beam(names, beam):
+    return all((name in names) == is_in for name, is_in in beam.items())
 
 
 def _folded(text):

@@ -14,12 +14,13 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments
+from astropolcal.calibration._beam import inner_optics, instrument_of, telescope_optics, told_beam
 from astropolcal.calibration._header import FrameAngles, describe
-from astropolcal.calibration._system import at_bins, errors, match_wavelengths, split_chain
+from astropolcal.calibration._system import at_bins, errors, match_wavelengths
 from astropolcal.calibration.covariance import full_covariance
 from astropolcal.calibration.library import Entry, Library
 from astropolcal.calibration.result import Calibration
-from astropolcal.calibration.validity import content_hash, optics_words, validity_of
+from astropolcal.calibration.validity import content_hash, validity_of
 from astropolcal.chain import (
     join,
     leaves,
@@ -28,7 +29,6 @@ from astropolcal.chain import (
     with_beam,
 )
 from astropolcal.exceptions import (
-    AstropolcalError,
     AstropolcalWarning,
     CalibrationFileError,
     ChainError,
@@ -133,8 +133,9 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     path : path-like, Library or Calibration
         A folder of calibrations, a file, or a calibration that is in memory.
     header : `~astropy.io.fits.Header` or mapping, optional
-        Primary header of the frame (or of one of several), which tells instrument, mode and
-        date; what is given below comes before it.
+        Primary header of the frame (or of one of several), which tells instrument, mode,
+        date and, as far as the instrument knows, optics in the beam; what is given below comes
+        before it.
     instrument, mode, date, optics_in
         As for `~astropolcal.calibration.Library.find`.
 
@@ -154,7 +155,7 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     >>> from astropolcal.calibration import load
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
+    >>> chain = charis.chain(derotator="linear", optics_in=["nbs"])
     >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
     >>> table = simulate(chain, charis.wavelength, frames, seed=2, meta={"date": "2025-10-05"})
     >>> calibrate(chain, table, instrument="charis").write("to_load.asdf")
@@ -171,7 +172,10 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     told = {} if header is None else describe(header, instrument)
     chosen = {"instrument": instrument, "mode": mode, "date": date}
     wanted = {key: told.get(key) if value is None else value for key, value in chosen.items()}
-    entry = library.find(**wanted, optics_in=optics_in)
+    beam = None
+    if header is not None and optics_in is None:
+        beam = instruments.get(wanted["instrument"]).optics_of(header)
+    entry = library.find(**wanted, optics_in=optics_in, beam=beam)
     stated = {key for key, value in chosen.items() if value is not None}
     return LoadedCalibration(entry, optics_in=optics_in, stated=stated)
 
@@ -196,7 +200,8 @@ class LoadedCalibration:
     entry : Entry
         File and validity.
     optics_in : sequence of str, optional
-        Optional optics in the beam; needed if the calibration has several sets of them.
+        Optional optics in the beam; needed if the calibration has several sets of them, and
+        the headers do not tell which.
     stated : set of str
         Which of ``instrument``, ``mode``, ``date`` the user vouches for, whatever headers say.
 
@@ -237,10 +242,7 @@ class LoadedCalibration:
     @property
     def instrument(self):
         """The `~astropolcal.instruments.Instrument`, or None if it is not a known one."""
-        try:
-            return instruments.get(self.calibration.instrument)
-        except InstrumentError:
-            return None
+        return instrument_of(self.calibration)
 
     @property
     def wavelength(self):
@@ -293,10 +295,13 @@ class LoadedCalibration:
         """
         if (header is None) == (positions is None):
             raise ParameterError("give either header or positions")
-        chain, assumed = self._chain(light)
         single = isinstance(header, Mapping) or hasattr(header, "cards")
+        headers = [header] if single else list(() if header is None else header)
         if header is not None:
-            found = self._positions([header] if single else list(header), chain)
+            self._check(headers)
+        chain, assumed = self._chain(light, headers)
+        if header is not None:
+            found = self.instrument.positions(FrameAngles(headers, self.instrument), chain)
             positions = {name: angle * u.rad for name, angle in found.items()}
         lam, bins = match_wavelengths(self.wavelength, chain, wavelength)
         chain = with_beam(at_bins(chain, bins, len(self.wavelength)), beam)
@@ -309,8 +314,8 @@ class LoadedCalibration:
             shown = {name: angle[0] for name, angle in shown.items()}
         return SystemMueller(value, lam, beam, shown, *parts, assumed)
 
-    def _positions(self, headers, chain):
-        """Return the positions that headers tell, after a look whether they may be reduced."""
+    def _check(self, headers):
+        """Refuse frames for which the calibration does not hold."""
         instrument = self.instrument
         if instrument is None:
             raise InstrumentError(
@@ -318,10 +323,9 @@ class LoadedCalibration:
                 "header keywords; give positions"
             )
         for i, header in enumerate(headers):
-            self._check(header, instrument, f"frame {i}")
-        return instrument.positions(FrameAngles(headers, instrument), chain)
+            self._check_frame(header, instrument, f"frame {i}")
 
-    def _check(self, header, instrument, label):
+    def _check_frame(self, header, instrument, label):
         told = describe(header, instrument.name, self._stated)
         held, name = self.validity, self.path.name
         stated = told.get("stated")
@@ -339,19 +343,18 @@ class LoadedCalibration:
 
     # ---- the chain ---------------------------------------------------------------------
 
-    def _chain(self, light):
+    def _chain(self, light, headers):
         """Return the chain from where the light enters, and the optics that are assumed."""
         if light not in ("sky", "internal"):
             raise ParameterError(f"light = {light!r}; allowed are 'sky', 'internal'")
-        inner = self._inner()
+        beam = None
+        if self.optics_in is None and self.instrument is not None:
+            beam = told_beam(headers, self.instrument)
+        inner = inner_optics(self.calibration, self.optics_in, beam, self.path.name)
         if light == "internal":
             return join(inner), ()
-        for chain in self.calibration.chains:
-            outer, _ = split_chain(chain)
-            start = next((i for i, o in enumerate(outer) if o.stage == "parallactic"), None)
-            if start is not None:
-                return join([*outer[start:], *inner]), ()
-        return self._published(inner)
+        outer = telescope_optics(self.calibration)
+        return self._published(inner) if outer is None else (join([*outer, *inner]), ())
 
     def _published(self, inner):
         """Return a chain with the telescope as the instrument publishes it."""
@@ -374,30 +377,6 @@ class LoadedCalibration:
                 stacklevel=4,
             )
         return chain, assumed
-
-    def _inner(self):
-        """Return the optics from the first on a stage of the instrument, for the optics in."""
-        kinds = {}
-        for record, chain in zip(self.calibration.datasets, self.calibration.chains, strict=True):
-            inner = split_chain(chain)[1]
-            if self.optics_in is None or self._has(record, inner):
-                kinds.setdefault(tuple(leaf.name for leaf in inner), inner)
-        if not kinds:
-            raise ChainError(
-                f"{self.path.name}: no chain {optics_words([self.optics_in])}; it holds for "
-                f"{self.validity}"
-            )
-        if len(kinds) > 1:
-            shown = " or ".join("+".join(names) for names in kinds)
-            raise ChainError(f"{self.path.name}: which optics are in the beam? optics_in={shown}")
-        return next(iter(kinds.values()))
-
-    def _has(self, record, inner):
-        try:
-            return set(self.instrument.setup(record)[1]) == set(self.optics_in)
-        except (AttributeError, AstropolcalError):
-            # no instrument that knows: each optic named must be in the chain
-            return set(self.optics_in) <= {leaf.name for leaf in inner}
 
 
 def _degrees(position):

@@ -136,5 +136,11 @@ def _with_error(calibration, name, key):
         value = getattr(_leaf(chains, name), key)(calibration.wavelength)
         return value.to_value(u.deg) if isinstance(value, u.Quantity) else value
 
-    derived = propagate(calibration, law)
+    def slopes(*chains):
+        leaf = _leaf(chains, name)
+        found = leaf.law_slopes(calibration.wavelength)[key]
+        # the thickness of a film cannot be stepped below zero, so no differences are taken
+        return {f"{name}.{own}": found[own] for own in found if not getattr(leaf, own).fixed}
+
+    derived = propagate(calibration, law, slopes)
     return np.asarray(derived.value), np.asarray(derived.std)

@@ -93,6 +93,16 @@ def optics_words(sets):
     return " or ".join(f"with {' + '.join(s)}" if s else "no optional optics" for s in sets)
 
 
+def beam_words(beam):
+    """Return in words which optics are known to be in the beam or not."""
+    told = {True: [], False: []}
+    for name, is_in in sorted(beam.items()):
+        told[is_in].append(name)
+    parts = [f"with {' + '.join(told[True])}"] if told[True] else []
+    parts += [f"without {' + '.join(told[False])}"] if told[False] else []
+    return ", ".join(parts)
+
+
 def _moment(value, key):
     """Return a moment as ISO text in UTC, a date alone where it is midnight."""
     if value is None:

@@ -27,6 +27,7 @@ OPTIC_MODULES = {
     "DriftRetarder": "modulated",
     "DriftRotator": "modulated",
     "EllipticalRetarder": "retarders",
+    "FerroelectricLiquidCrystal": "modulators",
     "FluxGain": "modulated",
     "HarmonicGain": "modulated",
     "HarmonicRetarder": "modulated",

@@ -301,8 +301,10 @@ def _double(shape, centre):
 def azimuthal_variances(variance_q, variance_u, covariance, centre=None):
     """Return the variances of `azimuthal` from those of Q and U and their covariance."""
     cosine, sine = _double(np.shape(variance_q)[-2:], centre)
-    cross = 2 * cosine * sine * covariance
-    return (
-        cosine**2 * variance_q + sine**2 * variance_u + cross,
-        sine**2 * variance_q + cosine**2 * variance_u - cross,
-    )
+    with np.errstate(invalid="ignore"):
+        cross = 2 * cosine * sine * covariance
+        # an infinite variance of Q says nothing of a combination without Q
+        return (
+            cosine**2 * variance_q + sine**2 * variance_u + cross,
+            sine**2 * variance_q + cosine**2 * variance_u - cross,
+        )

@@ -11,6 +11,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration._beam import inner_optics, telescope_optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import (
     AstropolcalWarning,
@@ -28,7 +29,7 @@ from astropolcal.units import length_to_um
 __all__ = ["RowModel", "check_optics", "measurement_rows", "sky_chain"]
 
 
-def sky_chain(calibration, dataset=None):
+def sky_chain(calibration, dataset=None, *, optics_in=None, beam=None, label="the calibration"):
     """
     Return the optics from the sky to the detector, with calibrated values.
 
@@ -41,7 +42,14 @@ def sky_chain(calibration, dataset=None):
     calibration : Calibration or `~astropy.modeling.CompoundModel`
         The calibration, or a chain.
     dataset : int, optional
-        Which of the calibration's chains; by default the first of a star, or the first.
+        Which of the calibration's chains; by default the one of the optics in the beam.
+    optics_in : sequence of str, optional
+        All optional optics in the beam; needed if the calibration has several sets of them.
+    beam : dict of str to bool, optional
+        Single ones that are known to be in the beam or not, as
+        `~astropolcal.instruments.Instrument.optics_of` tells them.
+    label : str
+        What messages call the calibration.
 
     Returns
     -------
@@ -50,7 +58,8 @@ def sky_chain(calibration, dataset=None):
     Raises
     ------
     ChainError
-        If no optic stands on a stage.
+        If no optic stands on a stage, or the calibration has no chain of the optics in the
+        beam, or several.
 
     Examples
     --------
@@ -63,6 +72,9 @@ def sky_chain(calibration, dataset=None):
     chains = getattr(calibration, "chains", [calibration])
     if dataset is not None:
         chains = [chains[dataset]]
+    elif hasattr(calibration, "datasets"):
+        inner = inner_optics(calibration, optics_in, beam, label)
+        chains = [join([*(telescope_optics(calibration) or ()), *inner])]
     seen = [chain for chain in chains if "parallactic" in stages(chain)]
     if seen:
         return _from_stage(seen[0], ("parallactic",))

@@ -17,12 +17,12 @@ from scipy import stats
 
 from astropolcal.gap.model import effect_tangent
 
-__all__ = ["Candidate", "Score", "choose", "false_discovery", "freed", "scan"]
+__all__ = ["Candidate", "Score", "choose", "contenders", "false_discovery", "freed", "scan"]
 
 #: False discovery rate of the scan.
 ALPHA = 0.01
-# the best candidates that are fitted in full
-_MOST_REFITTED = 8
+#: The best candidates that are fitted in full.
+MOST_REFITTED = 8
 #: An effect fits nearly as well as another if it is this close in evidence.
 SAME_EVIDENCE = 10.0
 _WORTH_A_REFIT = 0.4
@@ -204,7 +204,7 @@ class Candidate:
         return self.score.effect, self.context
 
 
-def choose(model, scores, *, alpha=ALPHA, most=_MOST_REFITTED):
+def choose(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
     """
     Fit the best effects in full, and return the best with its alias group.
 
@@ -230,9 +230,45 @@ def choose(model, scores, *, alpha=ALPHA, most=_MOST_REFITTED):
     >>> choose(None, []) is None
     True
     """
+    fitted = contenders(model, scores, alpha=alpha, most=most)
+    if not fitted:
+        return None
+    top = fitted[0]
+    top.aliases = [
+        c for c in fitted[1:] if c.physical and top.evidence - c.evidence < SAME_EVIDENCE
+    ]
+    return top
+
+
+def contenders(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
+    """
+    Fit the best effects in full.
+
+    Parameters
+    ----------
+    model : Model
+        The model so far.
+    scores : list of Score
+        As `scan` gives them.
+    alpha : float
+        False discovery rate.
+    most : int
+        So many are fitted in full.
+
+    Returns
+    -------
+    list of Candidate
+        Best first; those of physical size before the others.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.attribution import contenders
+    >>> contenders(None, [])
+    []
+    """
     significant = [s for s in scores if s.p_value < alpha]
     if not significant:
-        return None
+        return []
     freedom = model.problem.n_data - model.problem.size
     best = max(s.evidence(freedom) for s in significant)
     worth = [s for s in significant if s.evidence(freedom) > min(_WORTH_A_REFIT * best, best - 20)][
@@ -253,11 +289,7 @@ def choose(model, scores, *, alpha=ALPHA, most=_MOST_REFITTED):
         one.gain = (model.fit.chi2 - one.model.fit.chi2) / scale
         one.evidence = one.gain - one.score.rank * np.log(freedom)
     fitted.sort(key=lambda c: (not c.physical, -c.evidence))
-    top = fitted[0]
-    top.aliases = [
-        c for c in fitted[1:] if c.physical and top.evidence - c.evidence < SAME_EVIDENCE
-    ]
-    return top
+    return fitted
 
 
 def _fitted(model, score, freedom):

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from astropolcal.gap.attribution import SAME_EVIDENCE, choose, freed, scan
+from astropolcal.gap.attribution import SAME_EVIDENCE, choose, contenders, freed, scan
 from astropolcal.gap.shrinkage import held_out
 
 __all__ = ["REMAINDER", "select"]
@@ -28,6 +28,8 @@ _LEAST_SHARE = 0.05
 _STRUCTURED = 1.5
 # so many are fitted in full where an effect might be exchanged
 _RIVALS = 4
+# so many first effects are tried with a second one
+_LOOKED_AHEAD = 4
 _EXCHANGED_AT = (2,)
 # an effect that explains this share gives way to one other alone, and only if what is left
 # falls to this share
@@ -87,7 +89,8 @@ def _forward(base, scores, library, alpha, groups, say):
     model, selected, refused = base, [], 0
     history = [_errors(base, groups)]
     while len(selected) < _MOST_CAUSES and refused < _MOST_REFUSED:
-        candidate = choose(model, scores, alpha=alpha)
+        pick = choose if selected else _looking_ahead
+        candidate = pick(model, scores, alpha=alpha)
         if candidate is None or not _worthy(model, candidate):
             break
         candidate = freed(model, candidate)
@@ -106,6 +109,32 @@ def _forward(base, scores, library, alpha, groups, say):
         model = selected[-1].model
         scores = scan(model, _without_aliases(library, selected))
     return selected, history
+
+
+def _looking_ahead(model, scores, *, alpha):
+    """
+    Return the first effect: where much is left, the one that does best with a second one.
+
+    What a single effect explains best while another large one is missing is often a
+    makeshift for both.
+    """
+    fitted = contenders(model, scores, alpha=alpha)
+    if not fitted or fitted[0].model.mean_square < _STRUCTURED:
+        return choose(model, scores, alpha=alpha)
+    library = [score.effect for score in scores]
+    ends = {}
+    for one in [c for c in fitted if c.physical][:_LOOKED_AHEAD]:
+        second = choose(one.model, scan(one.model, library), alpha=alpha, most=_RIVALS)
+        ends[one.name] = one, one.model if second is None else second.model
+    if not ends:
+        return fitted[0]
+    best, end = max(ends.values(), key=lambda pair: _advantage(pair[1], model))
+    best.aliases = [
+        one
+        for one, other in ends.values()
+        if one is not best and _advantage(end, other) < SAME_EVIDENCE
+    ]
+    return best
 
 
 def _without_aliases(library, chosen):

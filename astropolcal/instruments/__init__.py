@@ -12,10 +12,14 @@ from importlib.metadata import entry_points
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.charis import CHARIS
+from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
+from astropolcal.instruments.vampires import VAMPIRES
 
 __all__ = [
     "CHARIS",
+    "IRDIS",
+    "VAMPIRES",
     "Instrument",
     "add_nuisance",
     "get",
@@ -112,3 +116,5 @@ def get(name):
 
 
 register(CHARIS)
+register(IRDIS)
+register(VAMPIRES)

@@ -100,6 +100,23 @@ class Instrument(ABC):
             If the table does not say.
         """
 
+    def optics_of(self, header):
+        """
+        Return what a frame's header tells of the optional optics.
+
+        Parameters
+        ----------
+        header : `~astropy.io.fits.Header` or mapping
+            Primary header.
+
+        Returns
+        -------
+        dict of str to bool
+            Name of an optic to whether it was in the beam; what the header does not tell is
+            absent.
+        """
+        return {}
+
     def published(self):
         """
         Return the chain with published values, for simulations and examples.

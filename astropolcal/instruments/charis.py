@@ -20,6 +20,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import InstrumentError
+from astropolcal.instruments._keywords import frame_time
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.instruments.nuisance import without_nuisance
@@ -342,6 +343,15 @@ class CHARIS(Instrument):
             present.append("nbs")
         return source, tuple(present)
 
+    def optics_of(self, header):
+        """Return whether the beam switcher was in the beam, where the date tells."""
+        try:
+            time = frame_time(header, self.files)
+        except (TypeError, ValueError):
+            return {}
+        present = None if time is None else _switcher_by(time.utc.isot[:10])
+        return {} if present is None else {"nbs": present}
+
 
 def _choice(what, value, allowed):
     if value not in allowed:
@@ -366,16 +376,21 @@ def _beam_switcher(meta, name):
     if stated is not None:
         return stated
     day = str(meta.get("date", ""))[:10]
-    # ISO dates compare as strings
-    if re.fullmatch(r"\d{4}-\d\d-\d\d", day):
-        if day <= _NBS_ABSENT_UNTIL:
-            return False
-        if day >= _NBS_PRESENT_FROM:
-            return True
+    by_date = _switcher_by(day) if re.fullmatch(r"\d{4}-\d\d-\d\d", day) else None
+    if by_date is not None:
+        return by_date
     raise InstrumentError(
         f"{name}: neither nasmyth_beam_switcher nor a conclusive date in the table's meta; "
         "is the beam switcher 'installed' or 'not installed'?"
     )
+
+
+def _switcher_by(day):
+    """Return whether the beam switcher was installed at a date, None in between."""
+    # ISO dates compare as strings
+    if day <= _NBS_ABSENT_UNTIL:
+        return False
+    return True if day >= _NBS_PRESENT_FROM else None
 
 
 def _misaligned(about):

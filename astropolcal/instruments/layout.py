@@ -69,6 +69,10 @@ class FileLayout:
         The commanded angles are multiples of it, degree.
     site : tuple of float
         Longitude and latitude in degree, height in metre.
+    optics : dict of str to (str, dict of str to str)
+        What headers say of optics in the beam: key of the table's meta to (column,
+        {regular expression: word}). The first expression found in the column's text
+        gives the word.
 
     Raises
     ------
@@ -106,6 +110,7 @@ class FileLayout:
     tracking_tolerance: float = 1.0
     hwp_step: float = 11.25
     site: tuple = ()
+    optics: dict = field(default_factory=dict)
 
     def __post_init__(self):
         for name in ("gain", "saturation", "pixel_scale", "fwhm", "hwp_step"):

@@ -19,7 +19,7 @@ from astropolcal.observations import common_wavelengths
 __all__ = ["NUISANCES", "add_nuisance", "without_nuisance"]
 
 #: What may be added, and the standard deviation of its prior, a normal around zero.
-NUISANCES = {"background": 0.01, "beam_gain": 0.05, "lamp": 0.002}
+NUISANCES = {"background": 0.01, "beam_gain": 0.02, "lamp": 0.002}
 
 
 def add_nuisance(chains, datasets, nuisance):
@@ -102,7 +102,9 @@ def without_nuisance(chain):
     'wollaston'
     """
     prefixes = tuple(f"{kind}_" for kind in NUISANCES)
-    return join([leaf for leaf in leaves(chain) if not str(leaf.name).startswith(prefixes)])
+    found = leaves(chain)
+    kept = [leaf for leaf in found if not str(leaf.name).startswith(prefixes)]
+    return chain if len(kept) == len(found) else join(kept)
 
 
 def _check(kind, wanted, names):

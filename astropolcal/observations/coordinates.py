@@ -9,6 +9,8 @@ from astropolcal.optics import COORDINATES
 
 __all__ = ["angle_change", "clock", "frame_coordinate"]
 
+_STATES = {"A": 0.0, "B": 1.0, "0": 0.0, "1": 1.0, "0.0": 0.0, "1.0": 1.0}
+
 
 def frame_coordinate(observations, name):
     r"""
@@ -25,6 +27,9 @@ def frame_coordinate(observations, name):
         column ``time`` if it gives the time of every frame (see `clock`), else
         by the order of the frames; it is 0 where all are at one time.
 
+        ``"flc_state"`` is the state of a modulator, from the column of that name: 0 where it
+        holds A (or 0), 1 where it holds B (or 1).
+
         ``"parallactic_rate"`` and ``"derotator_rate"`` are the changes of that angle from
         one frame to the next, in radian, in the order in which the frames were taken.
 
@@ -40,12 +45,13 @@ def frame_coordinate(observations, name):
     Returns
     -------
     `~numpy.ndarray`
-        Shape (F,) for the sequence and the rates, (2, B, F) for the fluxes, the right beam first.
+        Shape (F,) for the sequence, the state and the rates, (2, B, F) for the fluxes, the right beam first.
 
     Raises
     ------
     ObservationError
-        If the name is another, or there is no such angle.
+        If the name is another, there is no such angle, or the state of the modulator is
+        missing or neither of the two.
 
     Notes
     -----
@@ -64,6 +70,8 @@ def frame_coordinate(observations, name):
         raise ObservationError(
             f"{observations.name}: no coordinate {name!r}; allowed are {', '.join(COORDINATES)}"
         )
+    if name == "flc_state":
+        return _modulator_state(observations)
     time = _time_or_order(observations)
     if name == "sequence":
         passed = time - time.min()
@@ -147,6 +155,22 @@ def clock(frames):
     plain = getattr(column, "unmasked", column)
     times = np.asarray(getattr(plain, "value", plain), dtype=float)
     return times if np.all(known & np.isfinite(times)) else None
+
+
+def _modulator_state(observations):
+    frames = observations.frames
+    if "flc_state" not in frames.colnames:
+        raise ObservationError(
+            f"{observations.name}: no column flc_state; it is needed, with A or B in each frame"
+        )
+    found = [_STATES.get(str(value).strip().upper()) for value in frames["flc_state"]]
+    if None in found:
+        i = found.index(None)
+        raise ObservationError(
+            f"{observations.name}: flc_state = {str(frames['flc_state'][i])!r} in frame "
+            f"{frames['frame'][i]}; allowed are A and B, or 0 and 1"
+        )
+    return np.array(found)
 
 
 def _time_or_order(observations):

@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Pairs of frames whose half-wave plates stand 45 degrees apart.
+Pairs of frames whose half-wave plates stand 45 degrees apart, or whose modulators differ.
 
 Pairs are found from the angles, never from the order of the rows: the angles
 must differ by 45 degrees modulo 180, the derotator must stand still and the
@@ -15,7 +15,10 @@ import numpy as np
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.units import angle_to_rad
 
-__all__ = ["pair_frames"]
+__all__ = ["PAIRINGS", "pair_frames", "pair_states"]
+
+#: By what frames may be paired: the half-wave plate, or the state of a modulator.
+PAIRINGS = ("hwp", "flc_state")
 
 _QUARTER, _HALF, _TURN = np.deg2rad([45.0, 90.0, 180.0])
 _MAX_NAMED = 10
@@ -94,6 +97,95 @@ def pair_frames(
     if left:
         _warn_left_over(left, hwp, labels, name)
     return pairs
+
+
+def pair_states(
+    state,
+    hwp,
+    derotator,
+    time=None,
+    *,
+    tolerance=0.3 * u.deg,
+    derotator_tolerance=0.5 * u.deg,
+    share=False,
+    rows=None,
+    name="table",
+):
+    """
+    Pair the frames of two states of a modulator at the same angles.
+
+    Parameters
+    ----------
+    state : array_like of float
+        State of every frame, 0 or 1, shape (F,).
+    hwp, derotator : `~astropy.units.Quantity`
+        Angles of every frame; the frames of a pair agree in them, modulo 180 deg.
+    time : array_like of float, optional
+        Time of every frame in any unit; by default the index of the frame.
+    tolerance, derotator_tolerance : `~astropy.units.Quantity`
+        Largest difference that still counts as the same angle.
+    share : bool
+        Whether a frame left over may be paired with one that is already used.
+    rows : sequence of int, optional
+        The row of the file each frame starts in, for messages.
+    name : str
+        What to call the table in messages.
+
+    Returns
+    -------
+    `~numpy.ndarray` of int
+        Frame indices, shape (P, 2), ordered by the first: state 0, then state 1. Among
+        several partners the nearest in time is taken.
+
+    Raises
+    ------
+    ObservationError
+        If a frame has no partner in the other state at its angles.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If frames are left over because their partners are used.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.observations.pairing import pair_states
+    >>> pair_states([0, 1, 1, 0], [0, 0, 22.5, 22.5] * u.deg, [90, 90, 90, 90] * u.deg).tolist()
+    [[0, 1], [3, 2]]
+    """
+    state = np.asarray(state)
+    angles = [np.atleast_1d(angle_to_rad(x, "angle")) for x in (hwp, derotator)]
+    limits = [float(angle_to_rad(x, "tolerance")) for x in (tolerance, derotator_tolerance)]
+    steps = np.arange(len(state)) if time is None else np.asarray(time, dtype=float)
+    first, second = np.flatnonzero(state == 0), np.flatnonzero(state == 1)
+    alike = np.ones((first.size, second.size), dtype=bool)
+    for angle, limit in zip(angles, limits, strict=True):
+        alike &= _apart(angle[first][:, None], angle[second]) <= limit
+    lonely = [*first[~alike.any(axis=1)], *second[~alike.any(axis=0)]]
+    if lonely:
+        _refuse_lonely(min(lonely), state, angles, rows, name)
+    i, j = (frames[k] for frames, k in zip((first, second), np.nonzero(alike), strict=True))
+    order = np.lexsort((np.minimum(i, j), np.abs(i - j), np.abs(steps[i] - steps[j])))
+    chosen, used = _choose(i[order], j[order], len(state), share)
+    if not used.all():
+        warnings.warn(
+            f"{name}: {np.sum(~used)} of {len(state)} frames left out, their partner in the other "
+            "state of the modulator is used",
+            AstropolcalWarning,
+            stacklevel=2,
+        )
+    return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2)
+
+
+def _refuse_lonely(frame, state, angles, rows, name):
+    where = f"frame index {frame}" if rows is None else f"row {rows[frame]}"
+    own, other = ("A", "B") if state[frame] == 0 else ("B", "A")
+    hwp, derotator = (np.rad2deg(angle[frame]) for angle in angles)
+    raise ObservationError(
+        f"{name}, {where}: flc_state {own} at hwp = {hwp:g} deg and derotator = {derotator:g} deg "
+        f"has no partner; a frame in state {other} at these angles is needed"
+    )
 
 
 def _apart(first, second):

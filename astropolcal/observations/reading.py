@@ -18,12 +18,14 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from astropolcal.exceptions import ObservationError
+from astropolcal.observations.wavelengths import stated_wavelength
 
-__all__ = ["check_table", "first_bad_row", "numeric_column", "read_ecsv"]
+__all__ = ["check_table", "complete_table", "first_bad_row", "numeric_column", "read_ecsv"]
 
 # real headers have 1 to 3 kB; the YAML loader needs seconds for a quarter of a megabyte
 _MAX_HEADER = 2**18
 # merge keys let a header of one kilobyte grow exponentially while it is loaded
+_SINGLE = ("single_difference", "single_sum")
 _MERGE_KEY = re.compile(r"<<|!!merge|2002:merge")
 
 
@@ -152,6 +154,77 @@ def _check_plain(column, name, label):
         raise ObservationError(
             f"{label}: column {name} has shape {column.shape}, one value a row is allowed"
         )
+
+
+def complete_table(table, label):
+    """
+    Return a table of single differences and sums as one of beam fluxes.
+
+    Where neither beam has a column, right and left are half the sum and difference of
+    ``single_sum`` and ``single_difference``. Where neither ``frame`` nor ``bin`` is there, each
+    row is a frame, of one wavelength. Where ``wavelength`` is not there, it is that of the
+    meta: ``wavelength``, such as "625 nm", or ``filter``, see
+    `~astropolcal.observations.wavelengths.filter_wavelength`. Frames of single differences
+    with a column ``flc_state`` are paired by it, unless the meta say ``pairing: hwp``.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The table; it is not changed.
+    label : str
+        What to call it in messages.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        The same, or a completed copy.
+
+    Raises
+    ------
+    ObservationError
+        If a difference or sum is no number, the units do not fit, or the filter is unknown.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from astropolcal.observations.reading import complete_table
+    >>> table = QTable({"single_difference": [1.0] * u.adu, "single_sum": [3.0] * u.adu},
+    ...                meta={"wavelength": "625 nm"})
+    >>> complete_table(table, "night").colnames
+    ['frame', 'bin', 'wavelength', 'flux_right', 'flux_left']
+    """
+    if not isinstance(table, Table) or not len(table):
+        return table
+    there, n = set(table.colnames), len(table)
+    new = {}
+    if not there & {"frame", "bin"}:
+        new |= {"frame": np.arange(n), "bin": np.zeros(n, dtype=int)}
+    if "wavelength" not in there:
+        wavelength = stated_wavelength(table.meta, label)
+        new |= {} if wavelength is None else {"wavelength": np.full(n, 1.0) * wavelength}
+    if not there & {"flux_right", "flux_left"} and there >= set(_SINGLE):
+        new |= _beams(table, label)
+    if not new:
+        return table
+    kept = [name for name in table.colnames if name not in _SINGLE or "flux_right" not in new]
+    modulated = "flux_right" in new and "flc_state" in there
+    # the states alternate within an exposure, so that their difference is the better one
+    meta = {"pairing": "flc_state"} if modulated else {}
+    completed = QTable(new, meta=meta | dict(table.meta))
+    for name in kept:
+        completed[name] = table[name]
+    return completed
+
+
+def _beams(table, label):
+    check_table(table, label, _SINGLE)
+    unit = getattr(table[_SINGLE[0]], "unit", None) or u.dimensionless_unscaled
+    difference, total = (numeric_column(table, name, label, unit) for name in _SINGLE)
+    return {
+        "flux_right": 0.5 * (total + difference) * unit,
+        "flux_left": 0.5 * (total - difference) * unit,
+    }
 
 
 def numeric_column(table, name, label, unit=None):

@@ -15,8 +15,8 @@ from astropolcal.files import atomic_path
 from astropolcal.observations.coordinates import clock, frame_coordinate
 from astropolcal.observations.grid import build_grid
 from astropolcal.observations.hashing import hash_columns
-from astropolcal.observations.pairing import pair_frames
-from astropolcal.observations.reading import numeric_column, read_ecsv
+from astropolcal.observations.pairing import PAIRINGS, pair_frames, pair_states
+from astropolcal.observations.reading import complete_table, numeric_column, read_ecsv
 from astropolcal.observations.variances import beam_variances
 from astropolcal.optics import COORDINATES
 from astropolcal.units import angle_to_rad
@@ -155,7 +155,8 @@ class Observations:
         astropolcal.exceptions.ObservationError: x: missing columns wavelength, derotator, flux_right, flux_left; it has frame, bin, hwp
         """  # noqa: E501
         label = str(name if path is None else path)
-        return cls(build_grid(table, label), table.meta, name, path)
+        table = complete_table(table, label)
+        return cls(build_grid(table, label), getattr(table, "meta", {}), name, path)
 
     @property
     def instrument(self):
@@ -313,6 +314,7 @@ class Observations:
             `~astropolcal.optics.COORDINATES`: ``"sequence"``, how far the run has
             come, from 0 in the first frame to 1 in the last (by the column ``time``
             if it gives the time of every frame, else by the order);
+            ``"flc_state"``, 0 or 1 for the states A and B of a modulator;
             ``"parallactic_rate"`` and ``"derotator_rate"``, by how much that angle
             changes from one frame to the next, in radian; ``"flux"``, the
             fluxes of the beams in the unit of the table, 0 where masked;
@@ -323,7 +325,7 @@ class Observations:
         Returns
         -------
         `~numpy.ndarray`
-            Radian, shape (F,); a number for the sequence; for the fluxes shape
+            Radian, shape (F,); a number for the sequence and the state; for the fluxes shape
             (2, B, F), the right beam first.
 
         Raises
@@ -356,9 +358,54 @@ class Observations:
     def _label(self):
         return self.name if self.path is None else str(self.path)
 
+    @property
+    def pairing(self):
+        """
+        What differs between the frames of a pair, from the meta (str).
+
+        ``"hwp"``, the default: the half-wave plate, by 45 deg. ``"flc_state"``, the default
+        in a table of single differences with that column: the state of a modulator.
+        """
+        value = self.meta.get("pairing", PAIRINGS[0])
+        if value not in PAIRINGS:
+            raise ObservationError(
+                f"{self._label}: pairing = {value!r} in the meta; allowed are {', '.join(PAIRINGS)}"
+            )
+        return value
+
+    def paired_by(self, pairing):
+        """
+        Return the same observations with other pairs.
+
+        Parameters
+        ----------
+        pairing : {"hwp", "flc_state"}
+            What differs between the frames of a pair, see `pairing`.
+
+        Returns
+        -------
+        Observations
+
+        Raises
+        ------
+        ObservationError
+            If it is something else.
+
+        Examples
+        --------
+        >>> from astropolcal.observations import Observations, example_table
+        >>> table = example_table(hwp=(0, 0, 45, 45), wavelength=(0.625,))
+        >>> table["flc_state"] = ["A", "B", "A", "B"]
+        >>> Observations.from_table(table).paired_by("flc_state").pairs().tolist()
+        [[0, 1], [2, 3]]
+        """
+        new = Observations(self._grid, self.meta | {"pairing": pairing}, self.name, self.path)
+        _ = new.pairing  # refuses what is not allowed
+        return new
+
     def pairs(self, tolerance=0.3 * u.deg, *, derotator_tolerance=0.5 * u.deg, share=False):
         """
-        Pair the frames 45 degrees of (commanded) half-wave-plate angle apart.
+        Pair the frames 45 degrees of (commanded) half-wave-plate angle apart, or see `pairing`.
 
         Parameters
         ----------
@@ -400,6 +447,18 @@ class Observations:
 
     def _find_pairs(self, tolerance, derotator_tolerance, share):
         frames = self._grid.frames
+        if self.pairing == "flc_state":
+            return pair_states(
+                self.position("flc_state"),
+                self.position("hwp") * u.rad,
+                self.position("derotator") * u.rad,
+                clock(frames),
+                tolerance=tolerance,
+                derotator_tolerance=derotator_tolerance,
+                share=share,
+                rows=self._grid.rows.tolist(),
+                name=self._label,
+            )
         pairs = pair_frames(
             self.position("hwp") * u.rad,
             self.position("derotator") * u.rad,

@@ -24,6 +24,7 @@ from astropolcal.optics.modulated import (
     PolarizedBackground,
     StrayLight,
 )
+from astropolcal.optics.modulators import FerroelectricLiquidCrystal
 from astropolcal.optics.polarizers import (
     Diattenuator,
     DiattenuatorRetarder,
@@ -44,6 +45,7 @@ __all__ = [
     "DriftRetarder",
     "DriftRotator",
     "EllipticalRetarder",
+    "FerroelectricLiquidCrystal",
     "FluxGain",
     "FrameOptic",
     "HarmonicGain",
@@ -78,6 +80,7 @@ OPTICS = {
         DriftRetarder,
         DriftRotator,
         EllipticalRetarder,
+        FerroelectricLiquidCrystal,
         FluxGain,
         HarmonicGain,
         HarmonicRetarder,

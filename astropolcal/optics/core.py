@@ -35,9 +35,9 @@ _SHARED = (str, bool, int, float, type(None), u.UnitBase)
 #: By how much an angle changes from one frame to the next.
 RATES = ("parallactic_rate", "derotator_rate")
 
-#: Positions that are numbers, not angles: how far the run has come (0 to 1), the change of an
-#: angle from frame to frame, and the fluxes.
-COORDINATES = ("sequence", *RATES, *FLUXES)
+#: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
+#: modulator (0 or 1), the change of an angle from frame to frame, and the fluxes.
+COORDINATES = ("sequence", "flc_state", *RATES, *FLUXES)
 
 
 def rotation_generator(matrix):

@@ -26,6 +26,7 @@ from astropolcal.optics.polarizers import (
     _transverse,
 )
 from astropolcal.thinfilm import _Stack, _wrapped
+from astropolcal.units import canonical_factor
 
 __all__ = ["MetalMirror", "ParityFlip", "PowerLawMirror"]
 
@@ -141,6 +142,31 @@ class _Mirror(Optic):
             0 to 360 deg; 180 deg for an ideal mirror.
         """
         return np.rad2deg(_wrapped(self._ratio_at(wavelength).imag)) * u.deg
+
+    def law_slopes(self, wavelength):
+        """
+        Return the derivatives of diattenuation and retardance to the parameters.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Shape (n_wavelengths,).
+
+        Returns
+        -------
+        dict of str to dict
+            ``"diattenuation"`` and ``"retardance"`` (degree) to the name of each parameter but
+            ``theta`` to the derivative per unit of that parameter, shape (n_wavelengths,).
+        """
+        dispersion, _, values = self._resolve(wavelength, None)
+        ratio, slopes = self._log_slopes(dispersion, *values)
+        steepness = 1 - np.tanh(ratio.real) ** 2
+        found = {"diattenuation": {}, "retardance": {}}
+        for key, slope in zip(self.own_names, slopes, strict=True):
+            per_unit = slope * canonical_factor(getattr(self, key).unit)
+            found["diattenuation"][key] = -steepness * per_unit.real
+            found["retardance"][key] = np.rad2deg(per_unit.imag)
+        return found
 
     def loosened(self, wavelength):
         """

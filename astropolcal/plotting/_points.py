@@ -1,8 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Points and lines of parameters, which tell how well each is known."""
 
-from itertools import islice
-
 import astropy.units as u
 import numpy as np
 
@@ -26,7 +24,7 @@ _FINE = 201
 # how near to half a wave a panel must be to show that line (deg)
 _NEAR_HALF_WAVE = 45
 _STEP = 1e-3
-_WORDS_IN_A_ROW = 2
+_TITLE_WIDTH = 58
 
 
 def draw_entry(axes, calibration, entry, look):
@@ -161,9 +159,14 @@ def _words(own):
 
 
 def _in_rows(words):
-    words = iter(words)
-    while row := list(islice(words, _WORDS_IN_A_ROW)):
-        yield row
+    """Yield lists of words that are not too long for a title."""
+    row = []
+    for word in words:
+        if row and len(", ".join([*row, word])) > _TITLE_WIDTH:
+            yield row
+            row = []
+        row.append(word)
+    yield row
 
 
 def mark_half_wave(axes):

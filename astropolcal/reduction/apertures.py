@@ -16,11 +16,13 @@ from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.reduction.errors import flux_variance, shared_background
 from astropolcal.reduction.photometry import BEAMS, Photometry
 
-__all__ = ["measure_internal", "rectangles"]
+__all__ = ["evenly_lit", "measure_internal", "rectangles"]
 
 _BACKGROUNDS = ("none", "outside")
 # a background pixel is this far, in pixels, from both rectangles
 _CLEAR = 12.0
+# a rectangle whose median pixel has less than this part of the mean one holds a star
+_EVEN = 0.5
 
 
 @lru_cache(maxsize=8)
@@ -155,6 +157,52 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
         result.covariance[:] = shared_background(*areas, spread, number)
     result.flag((result.flux <= 0).any(axis=0), "no light")
     return result
+
+
+def evenly_lit(cube, good, layout):
+    """
+    Return whether the rectangles hold the light of a lamp rather than that of a star.
+
+    Parameters
+    ----------
+    cube : `~numpy.ndarray`
+        Shape (W, Y, X).
+    good : `~numpy.ndarray` of bool or None
+        Pixels that have a value; None if all have.
+    layout : FileLayout
+        With ``internal_apertures``.
+
+    Returns
+    -------
+    bool
+        Whether the median pixel of the brighter beam, in the mean of the slices, has
+        at least half of the light of the mean pixel.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.apertures import evenly_lit
+    >>> layout = instruments.get("charis").files
+    >>> cube = np.zeros(layout.shape)
+    >>> cube[:, 85:90, 70:75] = cube[:, 117:122, 132:137] = 1.0
+    >>> evenly_lit(cube, None, layout), evenly_lit(cube + 1.0, None, layout)
+    (False, True)
+    """
+    beams = []
+    for rows, columns, weights in rectangles(layout.internal_apertures, cube.shape[1:]):
+        inside = (slice(None), rows, columns)
+        values, whole = cube[inside], weights >= 1.0
+        if good is not None:
+            known = good[inside]
+            values = np.where(known, values, 0.0)
+            whole = whole & known.any(axis=0)
+            pixels = values.sum(axis=0)[whole] / known.sum(axis=0)[whole]
+        else:
+            pixels = values.mean(axis=0)[whole]
+        beams.append((pixels.mean(), np.median(pixels)) if pixels.size else (0.0, 0.0))
+    mean, median = max(beams)
+    return bool(median >= _EVEN * mean)
 
 
 def _weighted(cut, known, weights):

@@ -11,7 +11,7 @@ import numpy as np
 from astropy.io import fits
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
-from astropolcal.reduction.apertures import measure_internal
+from astropolcal.reduction.apertures import evenly_lit, measure_internal
 from astropolcal.reduction.errors import detector_of
 from astropolcal.reduction.headers import observation_time, pointing, read_header, tracking_error
 from astropolcal.reduction.photometry import Photometry
@@ -19,7 +19,10 @@ from astropolcal.reduction.stars import measure_stars
 
 __all__ = ["Frame", "open_cube", "reduce_frame"]
 
-_ARRAYS = ("flux", "variance", "covariance", "x", "y", "fwhm", "radius", "background")
+_ARRAYS = (
+    *("flux", "variance", "covariance", "scale", "scale_err"),
+    *("x", "y", "fwhm", "radius", "background"),
+)
 _NEEDED = {"internal": ("hwp", "derotator"), "star": ("hwp", "derotator")}
 
 
@@ -137,6 +140,8 @@ def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
             frame.unit = detector.unit.to_string()
             measure = measure_stars if source == "star" else measure_internal
             frame.photometry = measure(cube, good, detector, layout, **(options or {}))
+            if source == "internal":
+                frame.values["light"] = "even" if evenly_lit(cube, good, layout) else "uneven"
     except ObservationError as error:
         frame.errors.append(str(error).removeprefix(f"{path}: "))
         return frame

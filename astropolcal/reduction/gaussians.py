@@ -142,9 +142,12 @@ def _minimize(p, data, weight, grid, max_iterations, tolerance):
     for _ in range(max_iterations):
         if not todo.size:
             break
-        trial = p[todo] + _step(data[todo] - model, jacobian, weight[todo], damping[todo])
-        trial_model, trial_jacobian = _model(trial, grid)
-        trial_cost = np.where(_sane(trial), _cost(data[todo], trial_model, weight[todo]), np.inf)
+        # what overflows is no better, and its step is refused
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            trial = p[todo] + _step(data[todo] - model, jacobian, weight[todo], damping[todo])
+            trial_model, trial_jacobian = _model(trial, grid)
+            trial_cost = _cost(data[todo], trial_model, weight[todo])
+        trial_cost = np.where(_sane(trial), trial_cost, np.inf)
         better = trial_cost <= cost[todo]
         small = better & (cost[todo] - trial_cost <= tolerance * cost[todo])
         p[todo[better]], cost[todo[better]] = trial[better], trial_cost[better]

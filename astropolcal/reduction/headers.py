@@ -18,6 +18,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError
+from astropolcal.instruments._keywords import ANGLES, RANGES, TEXTS, convert, look_up
 
 __all__ = [
     "FrameHeader",
@@ -29,22 +30,6 @@ __all__ = [
     "tracking_error",
 ]
 
-_TEXTS = (
-    "date",
-    "time",
-    "right_ascension",
-    "declination",
-    "object",
-    "instrument",
-    "filter",
-    "pickoff",
-)
-_ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
-# beyond these, in degree, an angle in a header cannot be right
-_RANGES = {"altitude": (0.0, 90.0)} | dict.fromkeys(
-    ("hwp", "hwp_true", "derotator", "parallactic"), (-720.0, 720.0)
-)
-_MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
 _SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
 
 
@@ -199,11 +184,11 @@ def read_header(path, layout, *, header=None, raw=None):
     header = _primary(path) if header is None else header
     frame = FrameHeader(str(path), frame_number(path, layout, header))
     headers = [header]
-    missing = [c for c in layout.raw_columns if _look_up(headers, c, layout)[1] is None]
+    missing = [c for c in layout.raw_columns if look_up(headers, c, layout)[1] is None]
     if raw is not None and missing:
         headers += _raw_header(frame, raw)
     for column in layout.keywords:
-        keyword, value = _look_up(headers, column, layout)
+        keyword, value = look_up(headers, column, layout)
         if value is not None:
             _convert(frame, column, keyword, value, layout)
     return frame
@@ -235,33 +220,19 @@ def _raw_header(frame, raw):
     return []
 
 
-def _look_up(headers, column, layout):
-    """Return the first keyword that holds a value for a column, and the value."""
-    for header in headers:
-        for keyword in (layout.keywords[column], *layout.alternatives.get(column, ())):
-            value = header.get(keyword)
-            if isinstance(value, fits.card.Undefined):
-                continue
-            if value is not None and str(value).strip().lower() not in _MISSING:
-                return keyword, value
-    return layout.keywords[column], None
-
-
 def _convert(frame, column, keyword, value, layout):
     """Store a value in the unit of its column, or say why it cannot be right."""
-    if column in _TEXTS:
+    if column in TEXTS:
         frame.values[column] = str(value).strip()
         return
+    unit = u.Unit(layout.units.get(column, "deg"))
+    target = u.deg if column in ANGLES else u.Unit({"exposure_time": "s"}.get(column, unit))
     try:
-        number = float(value)
+        number = convert(column, value, layout, target)
     except (TypeError, ValueError):
         frame.errors.append(f"{keyword} = {value!r}, a number is needed")
         return
-    factor, offset = layout.transforms.get(column, (1.0, 0.0))
-    unit = u.Unit(layout.units.get(column, "deg"))
-    target = u.deg if column in _ANGLES else u.Unit({"exposure_time": "s"}.get(column, unit))
-    number = (factor * number + offset) * unit.to(target)
-    low, high = _RANGES.get(column, (-np.inf, np.inf))
+    low, high = RANGES.get(column, (-np.inf, np.inf))
     if column == "exposure_time":
         low = np.nextafter(0, 1)
     if not (np.isfinite(number) and low <= number <= high):

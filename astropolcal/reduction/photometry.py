@@ -16,8 +16,8 @@ class Photometry:
     """
     Fluxes of both beams in the slices of one cube.
 
-    All arrays have shape (2, W), the right beam first, but for the covariance
-    and the reasons.
+    All arrays have shape (2, W), the right beam first, but for the covariance,
+    the scale and the reasons.
 
     Attributes
     ----------
@@ -25,6 +25,9 @@ class Photometry:
         In the unit of the cube.
     covariance : `~numpy.ndarray`
         Of the two beams, shape (W,).
+    scale, scale_err : `~numpy.ndarray`
+        Factor of the aperture correction and its standard deviation, the same in both
+        beams, shape (W,); it is smooth over wavelength, so its error is too.
     x, y, fwhm, radius : `~numpy.ndarray`
         Of stars, pixels; zero for an internal source and where unknown.
     background : `~numpy.ndarray`
@@ -45,6 +48,8 @@ class Photometry:
     flux: np.ndarray
     variance: np.ndarray
     covariance: np.ndarray
+    scale: np.ndarray
+    scale_err: np.ndarray
     x: np.ndarray
     y: np.ndarray
     fwhm: np.ndarray
@@ -56,7 +61,9 @@ class Photometry:
     def empty(cls, n_wavelengths):
         """Return zeros of shape (2, ``n_wavelengths``) without a reason."""
         flux, variance, *others = (np.zeros((2, n_wavelengths)) for _ in range(7))
-        return cls(flux, variance, np.zeros(n_wavelengths), *others, [""] * n_wavelengths)
+        covariance, scale_err = np.zeros((2, n_wavelengths))
+        scale = np.ones(n_wavelengths)
+        return cls(flux, variance, covariance, scale, scale_err, *others, [""] * n_wavelengths)
 
     def flag(self, bad, reason):
         """

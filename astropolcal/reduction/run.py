@@ -2,18 +2,25 @@
 """From the cubes of a run to one table of observations."""
 
 import os
+import re
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from multiprocessing import get_all_start_methods, get_context
 
 import numpy as np
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
-from astropolcal.observations import Observations
+from astropolcal.observations import Observations, is_star
+from astropolcal.reduction._sorting import (
+    consistent,
+    replace_angles,
+    set_aside,
+    without_repeats,
+)
 from astropolcal.reduction.frames import Frame, reduce_frame
-from astropolcal.reduction.headers import check_sequence, raw_frames
+from astropolcal.reduction.headers import raw_frames
 from astropolcal.reduction.journal import Journal
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
 
@@ -214,7 +221,7 @@ def reduce_run(
     InstrumentError
         If the instrument does not say how its files look.
     ParameterError
-        If an option is wrong.
+        If an option is wrong, or the source is none that the instrument has.
 
     Examples
     --------
@@ -225,7 +232,7 @@ def reduce_run(
     astropolcal.exceptions.ObservationError: no files to reduce
     """
     instrument = _instrument(instrument)
-    photometry = "star" if "star" in source else "internal"
+    photometry = _photometry(source, instrument)
     files = [str(path) for path in files]
     if not files:
         raise ObservationError("no files to reduce")
@@ -237,14 +244,15 @@ def reduce_run(
     }
     frames = _measure_all(files, task, workers, resume, progress)
     reduction = Reduction(instrument, photometry, options=options)
-    frames = _set_aside(frames, reduction)
-    _replace_angles(frames, hwp_sequence)
-    frames = _consistent(frames, reduction, instrument.files, hwp_sequence is None)
+    frames = set_aside(frames, reduction)
+    replace_angles(frames, hwp_sequence)
+    frames = consistent(frames, reduction, instrument.files, hwp_sequence is None)
     if photometry == "internal" and not keep_repeats:
-        frames = _without_repeats(frames, reduction)
+        frames = without_repeats(frames, reduction)
     if not frames:
         raise ObservationError(_nothing(len(files), reduction.problems))
     reduction.frames = frames
+    _doubt_light(frames)
     reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
     reduction.meta = _meta(frames, instrument, source, meta or {})
     return reduction
@@ -264,6 +272,15 @@ def _instrument(instrument):
             f"{instrument.files.shape[0]} slices"
         )
     return instrument
+
+
+def _photometry(source, instrument):
+    known = getattr(instrument, "sources", ())
+    allowed = dict.fromkeys(("internal", "star", *known))
+    # an instrument of somebody else need not list its sources
+    if known and source not in allowed:
+        raise ParameterError(f"source = {source!r}; allowed are {', '.join(map(repr, allowed))}")
+    return "star" if is_star(source) else "internal"
 
 
 def _nothing(count, problems):
@@ -326,104 +343,22 @@ def _results(files, task, workers):
 
 
 def _pool(workers):
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    if "forkserver" in get_all_start_methods():
+        context = get_context("forkserver")
+        # imported once, not by each process
+        context.set_forkserver_preload(["astropolcal.reduction.frames", "photutils.aperture"])
+    else:
+        context = get_context("spawn")
+    return ProcessPoolExecutor(workers, mp_context=context)
 
 
-# --- what belongs together ---------------------------------------------------------
+# --- what is said of the run -------------------------------------------------------
 
 
-def _set_aside(frames, reduction):
-    """Leave out what cannot be used, copies, and frames of another kind than most."""
-    kept = []
-    seen = {}
+def _doubt_light(frames):
     for frame in frames:
-        if not frame.usable:
-            reduction.problems[frame.path] = frame.errors
-            continue
-        keys = [f"data {frame.digest}"]
-        keys += [f"number {frame.number}"] if frame.number is not None else []
-        first = next((seen[key] for key in keys if key in seen), None)
-        if first is not None:
-            same = "the same data as" if f"data {frame.digest}" in seen else "the same frame as"
-            reduction.problems[frame.path] = [f"{same} {first}"]
-            continue
-        seen.update(dict.fromkeys(keys, frame.name))
-        kept.append(frame)
-    for what, value in (("filter", _filter), ("unit", lambda frame: frame.unit)):
-        kept = _of_one_kind(kept, what, value, reduction)
-    return sorted(kept, key=_order)
-
-
-def _filter(frame):
-    return frame.values.get("filter")
-
-
-def _of_one_kind(frames, what, value, reduction):
-    counts = Counter(value(frame) for frame in frames if value(frame) is not None)
-    if len(counts) < 2:
-        return frames
-    usual = counts.most_common(1)[0][0]
-    for frame in frames:
-        if value(frame) not in (usual, None):
-            reduction.problems[frame.path] = [
-                f"{what} {value(frame)!r}, the others of the run have {usual!r}"
-            ]
-    return [frame for frame in frames if value(frame) in (usual, None)]
-
-
-def _order(frame):
-    """Order by frame number; what has none comes last, by time and name."""
-    if frame.number is not None:
-        return (0, frame.number, frame.name)
-    return (1, frame.values.get("mjd", np.inf), frame.name)
-
-
-def _replace_angles(frames, sequence):
-    if sequence is None:
-        return
-    sequence = [float(angle) for angle in sequence]
-    if not sequence or len(frames) % len(sequence):
-        raise ObservationError(
-            f"{len(frames)} frames cannot be cut into sequences of {len(sequence)} angles; "
-            "frames are missing, and it is unclear which"
-        )
-    for i, frame in enumerate(frames):
-        stated, frame.values["hwp"] = frame.values["hwp"], sequence[i % len(sequence)]
-        if abs(stated - frame.values["hwp"]) > 1e-3:
-            frame.doubts.append(
-                f"half-wave plate at {stated:g} deg in the header, replaced by "
-                f"{frame.values['hwp']:g} deg"
-            )
-
-
-def _consistent(frames, reduction, layout, check):
-    """Leave out frames whose commanded angle does not fit the sequence of the run."""
-    if not check or not frames:
-        return frames
-    angles = ([frame.values[name] for frame in frames] for name in ("hwp", "derotator"))
-    wrong = check_sequence(*angles, layout)
-    for i, why in wrong.items():
-        reduction.problems[frames[i].path] = [why]
-    return [frame for i, frame in enumerate(frames) if i not in wrong]
-
-
-def _without_repeats(frames, reduction):
-    """Leave out frames at 90 deg from another one, which measure the same again."""
-    kept = []
-    for frame in frames:
-        twin = next((other for other in kept if _repeats(frame, other)), None)
-        if twin is None:
-            kept.append(frame)
-        else:
-            reduction.problems[frame.path] = [
-                f"half-wave plate at {frame.values['hwp']:g} deg repeats that of {twin.name}"
-            ]
-    return kept
-
-
-def _repeats(frame, other):
-    hwp, derotator = (frame.values[k] - other.values[k] for k in ("hwp", "derotator"))
-    return abs(abs(hwp) - 90.0) < 0.3 and abs(derotator) < 0.5
+        if frame.values.get("light") == "uneven":
+            frame.doubts.append("the light in the rectangles is uneven, as that of a star")
 
 
 def _meta(frames, instrument, source, given):
@@ -436,12 +371,24 @@ def _meta(frames, instrument, source, given):
             meta[key] = Counter(texts).most_common(1)[0][0]
     if "date" in meta:
         meta["date"] = meta["date"][:10]
+    meta |= _optics(values, instrument.files)
     if source != "internal":
         meta["source"] = source
     elif "source" not in given and (seen := _seen_source(frames)):
         meta["source"] = seen
         meta["source_from"] = "the modulation of the fluxes"
     return meta | dict(given)
+
+
+def _optics(values, layout):
+    """Return what the headers say of optics in the beam."""
+    found = {}
+    for key, (column, words) in layout.optics.items():
+        stated = next((v[column] for v in values if v.get(column)), "")
+        for pattern, word in words.items():
+            if re.search(pattern, stated):
+                found.setdefault(key, word)
+    return found
 
 
 def _seen_source(frames):

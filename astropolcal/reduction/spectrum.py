@@ -4,8 +4,9 @@ A reduced target as `specutils.Spectrum` objects, and back.
 
 The table of a target has one row a wavelength: ``wavelength``, ``intensity``,
 ``q``, ``u`` and, if measured, ``v``, each with its standard deviation in a column
-that ends in ``_err``. ``covariance_qu`` and ``mask`` (true where a row must not be
-used) are optional.
+that ends in ``_err``. ``covariance_qu``, systematic errors (``q_systematic``, ...)
+and ``mask`` (true where a row must not be used) are optional. The table that a
+correction writes, with ``I`` and ``q_statistical``, is understood as well.
 """
 
 from pathlib import Path
@@ -23,7 +24,7 @@ __all__ = ["read_spectra", "spectra_from_table", "table_from_spectra", "write_sp
 
 _NAMES = {"I": "intensity", "q": "q", "u": "u", "v": "v"}
 _REQUIRED = ("I", "q", "u")
-_COVARIANCE = "covariance_qu"
+_COVARIANCE, _SYSTEMATIC = "covariance_qu", "systematic"
 
 
 def spectra_from_table(table):
@@ -35,14 +36,17 @@ def spectra_from_table(table):
     table : `~astropy.table.QTable`
         Columns ``wavelength``, ``intensity``, ``q``, ``u``, optionally ``v``, and
         their standard deviations (``intensity_err``, ...); optionally
-        ``covariance_qu`` and ``mask``.
+        ``covariance_qu``, ``intensity_systematic``, ... and ``mask``. Or the table of
+        a correction (`astropolcal.correction`), with ``I``, ``q_statistical``, ...;
+        rows that are not ``determined`` are masked.
 
     Returns
     -------
     dict of str to `~specutils.Spectrum`
         ``"I"``, ``"q"``, ``"u"`` and, if it is there, ``"v"``, on one spectral axis in
         the order of the wavelengths. ``meta`` is that of the table; ``covariance_qu``,
-        one value a wavelength, stands in that of ``q`` and ``u``.
+        one value a wavelength, stands in that of ``q`` and ``u``, a systematic error
+        as ``systematic`` in that of its spectrum.
 
     Raises
     ------
@@ -73,6 +77,8 @@ def spectra_from_table(table):
         if key in ("q", "u") and _COVARIANCE in table.colnames:
             meta[_COVARIANCE] = _plain(table[_COVARIANCE])
         name = _NAMES[key]
+        if f"{name}_{_SYSTEMATIC}" in table.colnames:
+            meta[_SYSTEMATIC] = np.asarray(u.Quantity(table[f"{name}_{_SYSTEMATIC}"]).value)
         spectra[key] = spectrum(
             flux=u.Quantity(table[name]),
             spectral_axis=axis,
@@ -128,11 +134,13 @@ def table_from_spectra(spectra):
         spectrum, name = spectra[key], _NAMES[key]
         table[name] = u.Quantity(spectrum.flux)
         table[f"{name}_err"] = _standard_deviation(key, spectrum)
+        _take(table, f"{name}_{_SYSTEMATIC}", spectrum, key, _SYSTEMATIC, table[name].unit)
         if spectrum.mask is not None:
             mask |= np.asarray(spectrum.mask, dtype=bool)
-    _take_covariance(table, spectra)
+    _take(table, _COVARIANCE, spectra["q"], "q", _COVARIANCE, u.one)
     table["mask"] = mask
-    table.meta = {k: v for k, v in spectra["I"].meta.items() if k not in ("header", _COVARIANCE)}
+    own = ("header", _COVARIANCE, _SYSTEMATIC)
+    table.meta = {k: v for k, v in spectra["I"].meta.items() if k not in own}
     return _checked(table)[0]
 
 
@@ -223,7 +231,7 @@ def _plain(column):
 
 def _checked(table):
     """Return the table in the order of the wavelengths, and its mask, or refuse it."""
-    table = QTable(table, copy=True)
+    table = _in_our_names(QTable(table, copy=True))
     names = [_NAMES[key] for key in (*_REQUIRED, "v") if key in _REQUIRED or "v" in table.colnames]
     needed = ["wavelength", *names, *(f"{name}_err" for name in names)]
     missing = [name for name in needed if name not in table.colnames]
@@ -239,13 +247,30 @@ def _checked(table):
         mask = np.array(table["mask"], dtype=bool)
     for name in names:
         unit = u.Quantity(table[name]).unit if name == "intensity" else u.one
-        for column in (name, f"{name}_err"):
+        columns = [name, f"{name}_err", f"{name}_{_SYSTEMATIC}"]
+        for column in (column for column in columns if column in table.colnames):
             table[column] = _with_unit(table, column, unit)
             _check_values(table, column, mask)
     if _COVARIANCE in table.colnames:
         table[_COVARIANCE] = _with_unit(table, _COVARIANCE, u.one)
         _check_values(table, _COVARIANCE, mask)
     return table, mask
+
+
+def _in_our_names(table):
+    """Return the table of a correction with our names of its columns."""
+    if "I" not in table.colnames or "intensity" in table.colnames:
+        return table
+    names = {"I": "intensity", f"{_COVARIANCE}_statistical": _COVARIANCE}
+    for key, name in _NAMES.items():
+        names |= {f"{key}_statistical": f"{name}_err"}
+        names |= {f"{key}_{_SYSTEMATIC}": f"{name}_{_SYSTEMATIC}"}
+    for old, new in names.items():
+        if old in table.colnames and old != new:
+            table.rename_column(old, new)
+    if "determined" in table.colnames and "mask" not in table.colnames:
+        table["mask"] = ~np.asarray(table["determined"], dtype=bool)
+    return table
 
 
 def _with_unit(table, column, unit):
@@ -275,15 +300,15 @@ def _check_wavelength(wavelength):
 
 def _check_values(table, column, mask):
     values = table[column].value
-    bad = ~np.isfinite(values)
-    if column.endswith("_err"):
-        bad |= values < 0
-    bad &= ~mask
+    error = column.endswith(("_err", f"_{_SYSTEMATIC}"))
+    # what a calibration leaves open has an infinite systematic error
+    known = ~np.isnan(values) if column.endswith(_SYSTEMATIC) else np.isfinite(values)
+    bad = (~known | (values < 0 if error else False)) & ~mask
     if bad.any():
         row = np.flatnonzero(bad)[0]
         raise ObservationError(
             f"target: {column} = {values[row]} at {table['wavelength'][row]}; "
-            f"{'a number not negative' if column.endswith('_err') else 'a finite number'} "
+            f"{'a number not negative' if error else 'a finite number'} "
             "is needed where the row is not masked"
         )
 
@@ -312,14 +337,14 @@ def _standard_deviation(key, spectrum):
     return u.Quantity(deviation.array, deviation.unit or spectrum.flux.unit)
 
 
-def _take_covariance(table, spectra):
-    """Put the covariance of q and u into the table, if the spectra know it."""
-    covariance = spectra["q"].meta.get(_COVARIANCE)
-    if covariance is None:
+def _take(table, column, spectrum, key, name, unit):
+    """Put what stands in the meta of a spectrum into the table, if it is there."""
+    values = spectrum.meta.get(name)
+    if values is None:
         return
-    if np.shape(covariance) != (len(table),):
+    if np.shape(values) != (len(table),):
         raise ObservationError(
-            f"spectrum q: {_COVARIANCE} has shape {np.shape(covariance)} for {len(table)} "
+            f"spectrum {key}: {name} has shape {np.shape(values)} for {len(table)} "
             "wavelengths; meta are not cut with a spectrum"
         )
-    table[_COVARIANCE] = covariance
+    table[column] = np.asarray(values) * unit

@@ -12,7 +12,7 @@ of a ring of 5 pixels around it is the background.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import Polynomial
+from numpy.polynomial.legendre import legvander
 from scipy import ndimage
 
 from astropolcal.exceptions import ParameterError
@@ -29,6 +29,8 @@ _OFF_TRACK = (1.5, 0.5)
 _WIDTHS = 2.5
 _SIGNIFICANT = 5.0
 _FEWEST = 20
+# of the polynomial over wavelength that smoothes an aperture correction
+_CORRECTION_DEGREE = 2
 
 
 def measure_stars(
@@ -73,7 +75,7 @@ def measure_stars(
         Width of the ring in pixels.
     aperture_correction : bool
         Whether fluxes are scaled to those within ``max_radius``, by the same factor
-        in both beams, smooth over wavelength.
+        in both beams, smooth over wavelength; its error is in variance and covariance.
     companion : float
         A second star brighter than this fraction of the first spoils a frame.
     max_masked : float
@@ -85,7 +87,7 @@ def measure_stars(
         With a reason in every slice that cannot be used: ``no star``, ``two
         stars``, ``one beam missing``, ``empty slice``, ``lost star``, ``bad
         centroid``, ``edge``, ``aperture masked``, ``no background``,
-        ``saturated``.
+        ``saturated``, ``no aperture correction``.
 
     Raises
     ------
@@ -123,14 +125,14 @@ def measure_stars(
     fits = fit_gaussians(images, there, x=starts[:, 0], y=starts[:, 1], fwhm=pair.fwhm)
     _judge(result, fits, origin, pair)
     result.radius[:] = _radii(result.fwhm, radius, factor, max_radius, mean, known, pair)
-    settings = _Settings(detector, layout.edge, annulus, max_masked)
-    _measure(result, fits, origin, cube, good, settings)
-    if aperture_correction:
-        _correct(result, fits, origin, cube, good, settings, max_radius)
-    distance = np.hypot(*(np.diff(axis, axis=0)[0] for axis in (result.x, result.y)))
-    pixel = detector.variance(result.background.mean(axis=0))
+    run = _Cube(cube, good, fits, origin, detector, layout.edge, annulus, max_masked)
+    _measure(result, run)
     usable = ~result.failed
-    result.covariance[usable] = shared_pixels(distance, result.radius[0], pixel)[usable]
+    distance = np.hypot(*(np.diff(axis[:, usable], axis=0)[0] for axis in (result.x, result.y)))
+    pixel = detector.variance(result.background[:, usable].mean(axis=0))
+    result.covariance[usable] = shared_pixels(distance, result.radius[0, usable], pixel)
+    if aperture_correction:
+        _correct(result, run, max_radius)
     return result
 
 
@@ -138,8 +140,8 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked):
     if isinstance(radius, str):
         if radius not in ("fwhm", "growth"):
             raise ParameterError(f"radius = {radius!r}; allowed are 'fwhm', 'growth' and pixels")
-    elif not 0 < radius < np.inf:
-        raise ParameterError(f"radius = {radius:g}; it must be above zero")
+    elif not 1 <= radius < np.inf:
+        raise ParameterError(f"radius = {radius:g}; it must be at least 1 pixel")
     for name, value in (("factor", factor), ("max_radius", max_radius), ("annulus", annulus)):
         if not 0 < value < np.inf:
             raise ParameterError(f"{name} = {value:g}; it must be above zero")
@@ -240,49 +242,69 @@ def _radii(fwhm, radius, factor, max_radius, mean, known, pair):
 
 
 @dataclass(frozen=True)
-class _Settings:
-    """What all apertures of a cube have in common."""
+class _Cube:
+    """A cube, its fits, and what all its apertures have in common."""
 
+    cube: np.ndarray
+    good: np.ndarray
+    fits: object
+    origin: np.ndarray
     detector: object
     edge: float
     annulus: float
     max_masked: float
 
 
-def _measure(result, fits, origin, cube, good, settings):
+def _measure(result, cube):
     """Sum the apertures of all slices that have not failed."""
     for k in np.flatnonzero(~result.failed):
-        for beam in range(2):
-            gauss = (fits, beam * len(cube) + k, origin[beam])
-            place = (result.x[beam, k], result.y[beam, k])
-            found = _aperture(cube[k], good[k], place, result.radius[beam, k], gauss, settings)
-            if isinstance(found, str):
-                result.flag(np.arange(len(cube)) == k, found)
-                break
-            result.flux[beam, k], result.variance[beam, k], result.background[beam, k] = found
+        found = _both(result, cube, k, result.radius[0, k])
+        if isinstance(found, str):
+            result.flag(np.arange(len(result.reasons)) == k, found)
+        else:
+            result.flux[:, k], result.variance[:, k], result.background[:, k] = found
 
 
-def _aperture(image, good, place, radius, gauss, settings):
+def _both(result, cube, k, radius):
+    """Return flux, variance and background of both beams in a slice, or why there are none."""
+    places = np.stack([result.x[:, k], result.y[:, k]], axis=1)
+    found = []
+    for beam in range(2):
+        values = _aperture(cube, k, beam, places, radius)
+        if isinstance(values, str):
+            return values
+        found.append(values)
+    return np.transpose(found)
+
+
+def _aperture(cube, k, beam, places, radius):
     """Return flux, variance and background of one aperture, or why it cannot be used."""
     from photutils.aperture import CircularAperture
 
-    if _beyond_edge(place, radius, image.shape, settings.edge):
+    place, image, detector = places[beam], cube.cube[k], cube.detector
+    if _beyond_edge(place, radius, image.shape, cube.edge):
         return "edge"
     mask = CircularAperture(place, radius).to_mask(method="exact")
-    image, known, corner, inner = _cut(image, good, mask.bbox, settings.annulus)
-    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
-    distance = np.hypot(columns + corner[0] - place[0], rows + corner[1] - place[1])
-    ring = image[known & (distance >= radius) & (distance <= radius + settings.annulus)]
+    image, known, corner, inner = _cut(image, cube.good[k], mask.bbox, cube.annulus)
+    ring = image[known & _ring(image.shape, places - corner, beam, radius, cube.annulus)]
     if ring.size < _FEWEST:
         return "no background"
     inside, there = image[inner], known[inner]
-    if mask.data[~there].sum() > settings.max_masked * mask.data.sum():
+    if mask.data[~there].sum() > cube.max_masked * mask.data.sum():
         return "aperture masked"
-    if inside[(mask.data > 0) & there].max() >= settings.detector.saturation:
+    if inside[(mask.data > 0) & there].max() >= detector.saturation:
         return "saturated"
     if not there.all():
+        gauss = (cube.fits, beam * len(cube.cube) + k, cube.origin[beam])
         inside = _filled(image, known, gauss, corner)[inner]
-    return _flux(inside, mask.data, ring, settings.detector)
+    return _flux(inside, mask.data, ring, detector)
+
+
+def _ring(shape, places, beam, radius, annulus):
+    """Return the pixels of the ring around a star's image, without those near the other one."""
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    own, other = (np.hypot(columns - x, rows - y) for x, y in (places[beam], places[1 - beam]))
+    return (own >= radius) & (own <= radius + annulus) & (other > radius + annulus)
 
 
 def _flux(inside, weights, ring, detector):
@@ -325,32 +347,45 @@ def _filled(image, known, gauss, corner):
     return np.where(known, image, model + nearby)
 
 
-def _correct(result, fits, origin, cube, good, settings, reach):
+def _correct(result, cube, reach):
     """Scale fluxes to a larger radius by what both beams together have beyond their own."""
-    share = np.full(len(cube), np.nan)
+    share, spread = np.full((2, len(result.reasons)), np.nan)
     for k in np.flatnonzero(~result.failed):
-        wide = [
-            _aperture(
-                cube[k],
-                good[k],
-                (result.x[beam, k], result.y[beam, k]),
-                reach,
-                (fits, beam * len(cube) + k, origin[beam]),
-                settings,
-            )
-            for beam in range(2)
-        ]
-        if not any(isinstance(found, str) for found in wide):
-            share[k] = result.flux[:, k].sum() / sum(found[0] for found in wide)
+        wide = _both(result, cube, k, reach)
+        if isinstance(wide, str):
+            continue
+        total = wide[0].sum()
+        share[k] = result.flux[:, k].sum() / total
+        beyond = max((wide[1] - result.variance[:, k]).sum(), 1e-12 * wide[1].sum())
+        spread[k] = share[k] * np.sqrt(beyond) / total
     known = np.isfinite(share)
-    if known.sum() < 3:
+    if known.sum() < _CORRECTION_DEGREE + 1:
         result.flag(True, "no aperture correction")
         return
     # smooth over wavelength: the noise of the wide apertures must not enter the fluxes
-    bins = np.arange(len(cube))
-    smooth = Polynomial.fit(bins[known], share[known], deg=2, domain=[0, len(cube)])(bins)
-    result.flux /= smooth
-    result.variance /= smooth**2
+    smooth, error = _smooth(share, spread, known)
+    result.flag(smooth <= 0.0, "no aperture correction")
+    result.scale[:] = 1 / np.where(smooth > 0, smooth, 1.0)
+    result.scale_err[:] = error * result.scale**2
+    result.flux *= result.scale
+    relative = result.scale_err / result.scale
+    result.variance[:] = result.variance * result.scale**2 + (relative * result.flux) ** 2
+    both = relative**2 * result.flux.prod(axis=0)
+    result.covariance[:] = result.covariance * result.scale**2 + both
+
+
+def _smooth(values, errors, known):
+    """Return a polynomial over the slices through what is known, and its standard deviation."""
+    terms = legvander(np.linspace(-1, 1, len(values)), _CORRECTION_DEGREE)
+    weighted = terms[known] / errors[known, None]
+    inverse = np.linalg.pinv(weighted)
+    coefficients = inverse @ (values[known] / errors[known])
+    residuals = values[known] / errors[known] - weighted @ coefficients
+    freedom = known.sum() - terms.shape[1]
+    # a curve that is no polynomial makes errors larger, chance does not make them smaller
+    excess = max(1.0, (residuals**2).sum() / freedom) if freedom else 1.0
+    covariance = inverse @ inverse.T * excess
+    return terms @ coefficients, np.sqrt(np.einsum("ki,ij,kj->k", terms, covariance, terms))
 
 
 def curve_of_growth(image, place, radii):

@@ -112,8 +112,8 @@ def photometry_table(frames, instrument):
     Returns
     -------
     `~astropy.table.Table`
-        Columns such as ``x_right``, ``fwhm_left``, ``background_right``; masked where
-        a cell failed.
+        Columns such as ``x_right``, ``fwhm_left``, ``background_right``, and factor
+        and error of the aperture correction; masked where a cell failed.
 
     Examples
     --------
@@ -130,6 +130,9 @@ def photometry_table(frames, instrument):
     for name, unit in (units | {"background": u.Unit(frames[0].unit)}).items():
         for beam, values in zip(BEAMS, _stack(frames, name), strict=True):
             table[f"{name}_{beam}"] = _column(values, failed, unit)
+    for name in ("scale", "scale_err"):
+        values = np.concatenate([getattr(frame.photometry, name) for frame in frames])
+        table[name] = _column(values, failed, u.one)
     return table
 
 

@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.scripts._choosing import choose_calibration
 from astropolcal.scripts._common import check_outputs, write_json
 
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
@@ -28,7 +29,7 @@ def add_parser(commands):
         "--calibration",
         metavar="LIB_OR_FILE",
         required=True,
-        help="a calibration file, or a library, from which the one of the date is taken",
+        help="a calibration file, or a library, from which the one that holds is taken",
     )
     parser.add_argument("-o", "--output", metavar="OUT.fits", required=True, help="the product")
     parser.add_argument(
@@ -96,7 +97,18 @@ def _add_instrument(parser):
         "--optics-in",
         metavar="NAME,NAME,...",
         type=lambda text: [name.strip() for name in text.split(",") if name.strip()],
-        help="optional optics that were in the beam; an error if the calibration lacks one",
+        help="all optional optics that were in the beam ('' for none), where headers do not tell "
+        "and the calibration has several sets of them",
+    )
+    parser.add_argument(
+        "--filter",
+        metavar="MODE",
+        help="mode of the instrument, as the calibration calls it; default: what headers say",
+    )
+    parser.add_argument(
+        "--any-date",
+        action="store_true",
+        help="take the calibration even if it does not hold for the date of the frames",
     )
     parser.add_argument(
         "--interpolate",
@@ -150,20 +162,12 @@ def _sigma(text):
 def run(arguments):
     """Correct the cubes and write the product."""
     from astropolcal import instruments
-    from astropolcal.correction import (
-        ScienceFrames,
-        check_optics,
-        correct,
-        measurement_rows,
-        sky_chain,
-    )
+    from astropolcal.correction import ScienceFrames, correct, measurement_rows
 
     check_outputs(arguments.output, arguments.json, arguments.spectrum, arguments.plot)
     files = _files(arguments.cubes)
-    calibration, provenance = _calibration(arguments, files)
+    calibration, chain, provenance = choose_calibration(arguments, files)
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
-    chain = sky_chain(calibration)
-    check_optics(chain, arguments.optics_in or ())
     table, centres, scale = _headers(files, instrument, arguments)
     frames = ScienceFrames.from_files(
         files,
@@ -224,79 +228,6 @@ def _files(cubes):
     return found
 
 
-def _calibration(arguments, files):
-    """Return the calibration of the frames, and what is to be said of where it comes from."""
-    from astropolcal.calibration.validity import content_hash
-
-    path = Path(arguments.calibration)
-    if path.is_dir():
-        entry = _of_library(path, arguments, files)
-        calibration, path = entry.calibration, entry.path
-    else:
-        from astropolcal import Calibration
-
-        calibration = Calibration.read(path)
-        _warn_if_not_valid(calibration, path, arguments, files)
-    return calibration, {
-        "calibration": str(path),
-        "calibration_hash": content_hash(calibration),
-    }
-
-
-def _warn_if_not_valid(calibration, path, arguments, files):
-    """Warn of a calibration that says itself that it does not hold for the date."""
-    import warnings
-
-    from astropolcal.calibration.validity import validity_of
-    from astropolcal.exceptions import AstropolcalWarning
-
-    validity = validity_of(calibration)
-    for date in _dates(files, arguments.instrument or calibration.instrument):
-        if not validity.holds(date):
-            warnings.warn(
-                f"{path} does not hold for {date}: {validity}", AstropolcalWarning, stacklevel=2
-            )
-            return
-
-
-def _dates(files, name):
-    """Return the dates of the first and the last frame, as far as headers give them."""
-    from astropolcal import instruments
-
-    layout = instruments.get(name or "charis").files
-    dates = sorted(filter(None, (_date(file, layout) for file in files)))
-    return list(dict.fromkeys((dates[0], dates[-1]))) if dates else []
-
-
-def _of_library(path, arguments, files):
-    """Return the calibration that holds for the first and the last frame."""
-    from astropolcal.calibration.library import Library
-
-    dates = _dates(files, arguments.instrument)
-    if not dates:
-        raise ObservationError(f"{files[0]}: no date in its header to choose a calibration by")
-    library = Library(path)
-    found = [
-        library.find(arguments.instrument, date=date, optics_in=arguments.optics_in)
-        for date in dates
-    ]
-    if len({str(entry.path) for entry in found}) > 1:
-        raise AstropolcalError(
-            f"{path}: the frames from {dates[0]} to {dates[-1]} need two calibrations, "
-            f"{found[0].path} and {found[1].path}: correct them apart"
-        )
-    return found[0]
-
-
-def _date(file, layout):
-    from astropolcal.reduction.headers import observation_time, read_header
-
-    try:
-        return observation_time(read_header(file, layout).values).isot
-    except ObservationError:
-        return None
-
-
 def _headers(files, instrument, arguments):
     """Return the angles of all frames, the places of the star, and the relative exposures."""
     from astropy.table import QTable
@@ -304,8 +235,6 @@ def _headers(files, instrument, arguments):
     from astropolcal.reduction.headers import raw_frames
 
     layout = instrument.files
-    if layout is None:
-        raise AstropolcalError(f"{instrument.name}: it is not known how its files look")
     raw = None if arguments.raw is None else raw_frames(arguments.raw, layout)
     found = [_frame(file, layout, raw, arguments.centre) for file in files]
     table = QTable()
@@ -351,7 +280,8 @@ def _frame(file, layout, raw, centre):
             f"{', '.join(layout.identities)}"
         )
     if frame.errors:
-        raise ObservationError(f"{file}: {'; '.join(frame.errors)}")
+        hint = "; --raw names a folder of raw frames" if raw is None and layout.raw_columns else ""
+        raise ObservationError(f"{file}: {'; '.join(frame.errors)}{hint}")
     return frame
 
 

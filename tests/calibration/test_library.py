@@ -4,7 +4,7 @@
 import dataclasses
 import datetime
 import json
-import subprocess
+import multiprocessing
 import sys
 from pathlib import Path
 
@@ -252,38 +252,40 @@ def test_table_says_how_good_they_are(calibration, library):
     assert isinstance(library.entries[0], Entry)
 
 
-_WRITER = """
-import sys
-from astropolcal import Calibration
-from astropolcal.calibration.library import Library
-from astropolcal.exceptions import CalibrationFileError
-base = Calibration.read(sys.argv[1])
-for i in range(2):
-    try:
-        Library(sys.argv[2]).add(base, valid_from=f"20{sys.argv[3]}-01-0{i + 1}")
-        Library(sys.argv[2]).add(base, valid_from="2010-01-01", mode=f"of {sys.argv[3]}")
-    except CalibrationFileError as error:
-        assert "overlap" in str(error), error
-"""
+def write_two(base, folder, number, barrier):
+    barrier.wait(60)
+    Library(folder).add(base, valid_from=f"20{number}-01-01")
+    Library(folder).add(base, valid_from="2010-01-01", mode=f"of {number}")
 
 
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_concurrent_writers(tmp_path):
+    """Two of three write the same at the same time; each file is whole, and there once."""
     folder = tmp_path / "library"
     folder.mkdir()
+    base = Calibration.read(OLD)
+    # a fork need not import anything again
+    context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    barrier = context.Barrier(3)
     jobs = [
-        subprocess.Popen(
-            [sys.executable, "-c", _WRITER, str(OLD), str(folder), number],
-            stderr=subprocess.PIPE,
-        )
+        context.Process(target=write_two, args=(base, folder, number, barrier))
         for number in ("11", "12", "11")
     ]
     for job in jobs:
-        assert job.communicate()[1] == b""
-        assert job.returncode == 0
+        job.start()
+    for job in jobs:
+        job.join(100)
+        assert job.exitcode == 0
     library = Library(folder)
     assert not library.problems
     assert not library.overlaps()
-    assert sum(entry.validity.mode == "broadband JHK" for entry in library.entries) == 4
+    told = sorted((e.validity.valid_from, e.validity.mode) for e in library.entries)
+    assert told == [
+        ("2010-01-01", "of 11"),
+        ("2010-01-01", "of 12"),
+        ("2011-01-01", "broadband JHK"),
+        ("2012-01-01", "broadband JHK"),
+    ]
     assert {p.suffix for p in folder.iterdir() if p.name != ".lock"} == {".asdf"}
 
 

@@ -38,6 +38,7 @@ HEADER = {
     "ALTITUDE": 55.0,
     "PARANG": -30.0,
 }
+POSITIONS = {"hwp": 22.5 * u.deg, "derotator": 60 * u.deg}
 
 
 def meta(source, **more):
@@ -219,7 +220,7 @@ def test_library_is_looked_up_by_the_header(calibration, tmp_path):
     early = library.add(calibration, valid_from="2025-01-01", valid_until="2025-10-05")
     late = library.add(calibration)
     assert load(tmp_path, HEADER).path == late.resolve()
-    assert load(tmp_path, HEADER | {"MJD": 60800.0}).path == early.resolve()
+    assert load(tmp_path, HEADER | {"MJD": 60950.0}).path == early.resolve()
     assert load(library, HEADER, date="2025-02-01").path == early.resolve()
     iso = {k: v for k, v in HEADER.items() if k != "MJD"}
     iso |= {"UTC-DATE": "2025-11-01", "UTC-TIME": "10:11:12"}
@@ -260,13 +261,20 @@ def test_optics_in_the_beam(tmp_path):
     tables[1].meta["nasmyth_beam_switcher"] = "not installed"
     cal = calibrate(list(chains), list(tables), instrument="charis", cross_validate=False)
     cal.write(tmp_path / "a.asdf")
-    with pytest.raises(ChainError, match="which optics are in the beam"):
-        load(tmp_path / "a.asdf").system_mueller(HEADER, light="internal")
     values = {}
     for optics in ((), ("nbs",)):
         loaded = load(tmp_path / "a.asdf", optics_in=optics)
         values[optics] = loaded.system_mueller(HEADER, light="internal").value
     assert np.abs(values[()] - values[("nbs",)]).max() > 0.5
+    with pytest.raises(ChainError, match=r"apart: (none or nbs|nbs or none)"):
+        load(tmp_path / "a.asdf").system_mueller(positions=POSITIONS, light="internal")
+    # the date tells: the beam switcher came in 2025
+    stated = load(tmp_path / "a.asdf", date="2025-12-01", instrument="charis")
+    for optics, mjd in (((), 60800.0), (("nbs",), 60988.5)):
+        told = stated.system_mueller(HEADER | {"MJD": mjd}, light="internal")
+        np.testing.assert_array_equal(told.value, values[optics])
+    with pytest.raises(ChainError, match="nbs was in the beam in frame 0, and not in frame 1"):
+        stated.system_mueller([HEADER, HEADER | {"MJD": 60800.0}], light="internal")
     with pytest.raises(CalibrationFileError, match=r"optics_in dichroic\+nbs"):
         load(tmp_path / "a.asdf", optics_in=("dichroic", "nbs"))
 
@@ -394,3 +402,25 @@ def test_nothing_else_is_needed(tmp_path):
     value = load(OLD).system_mueller(HEADER, light="internal").value[0, 0, 1]
     assert done.stdout.strip() == repr(float(value))
     assert (tmp_path / "m.fits").exists()
+
+
+def test_beam_that_the_library_lacks(calibration, tmp_path):
+    """The date of the frame says that the beam switcher was not there yet."""
+    Library(tmp_path).add(calibration, valid_from="2025-01-01")
+    with pytest.raises(CalibrationFileError, match=r"for a beam without nbs; there is .* with nbs"):
+        load(tmp_path, HEADER | {"MJD": 60800.0})
+    assert load(tmp_path, HEADER | {"MJD": 60800.0}, optics_in=["nbs"]).path.parent == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("header", "told"),
+    [
+        ({"MJD": 60800.0}, {"nbs": False}),
+        ({"UTC-DATE": "2025-10-05"}, {"nbs": True}),
+        ({"UTC-DATE": "2025-09-01"}, {}),
+        ({"MJD": "soon"}, {}),
+        ({}, {}),
+    ],
+)
+def test_what_a_header_tells_of_optics(header, told):
+    assert CHARIS.optics_of(header) == told

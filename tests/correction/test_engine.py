@@ -24,6 +24,31 @@ def test_a_cluster_changes_no_number(star, sky, charis):
     np.testing.assert_array_equal(found.stokes, correct(sky, frames).stokes)
 
 
+def test_workers_that_are_processes(cubes_of_stars):
+    """Files are opened by each worker; nothing but their names and the solution is sent."""
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed")
+    sky, frames = cubes_of_stars
+    settings = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(processes=True, **settings) as cluster:
+        found = correct(sky, frames, cluster=cluster.scheduler_address, chunk=8)
+    here = correct(sky, frames)
+    np.testing.assert_array_equal(found.stokes, here.stokes)
+    np.testing.assert_array_equal(found.covariance, here.covariance)
+
+
+@pytest.fixture
+def cubes_of_stars(sky, charis, track, tmp_path):
+    _, positions = track(1)
+    rng = np.random.default_rng(2)
+    paths = [tmp_path / f"cube{i}.fits" for i in range(4)]
+    for path in paths:
+        cube = rng.uniform(1, 2, size=(22, 20, 30))
+        hdus = [fits.PrimaryHDU(), fits.ImageHDU(cube), fits.ImageHDU(np.full(cube.shape, 4.0))]
+        fits.HDUList(hdus).writeto(path)
+    source = CubeFiles(paths, CENTRES, 5)
+    return sky, ScienceFrames(source, charis.wavelength, positions)
+
+
 def test_a_cluster_that_does_not_answer(star, sky, charis, monkeypatch):
     pytest.importorskip("distributed", reason="distributed is not installed")
     from astropolcal.correction import engine

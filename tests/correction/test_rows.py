@@ -5,8 +5,8 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal import optics
-from astropolcal.chain import find_optic, insert_optic, system_mueller, with_beam
+from astropolcal import calibrate, optics
+from astropolcal.chain import find_optic, insert_optic, leaves, system_mueller, with_beam
 from astropolcal.correction import RowModel, check_optics, measurement_rows, sky_chain
 from astropolcal.exceptions import (
     AstropolcalWarning,
@@ -14,6 +14,7 @@ from astropolcal.exceptions import (
     ParameterError,
     WavelengthRangeError,
 )
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 
 def test_rows_are_the_first_rows_of_the_system_matrices(sky, charis, track):
@@ -136,3 +137,59 @@ def test_an_optic_that_the_model_lacks_is_named(sky):
 def test_a_chain_without_stages_has_no_sky():
     with pytest.raises(ChainError, match="no optic on a stage"):
         sky_chain(optics.LinearPolarizer() | optics.WollastonPrism())
+
+
+# ---- which chain -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two_beams(charis):
+    """Of the internal source with and without the beam switcher."""
+    frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    chains, tables = [], []
+    for seed, (optics_in, word) in enumerate([((), "not installed"), (("nbs",), "installed")]):
+        chains.append(charis.chain("polarized", optics_in, derotator="linear"))
+        meta = charis.published_meta() | {"nasmyth_beam_switcher": word, "yjh50_dichroic": "out"}
+        tables.append(
+            simulate(chains[-1], charis.wavelength, frames, seed=seed, meta=meta, name=word)
+        )
+    return calibrate(chains, tables, instrument="charis", cross_validate=False)
+
+
+def test_chain_of_the_optics_in_the_beam(two_beams):
+    with pytest.raises(ChainError, match="optics_in tells its chains apart: none or nbs"):
+        sky_chain(two_beams)
+    for optics_in, told in (([], {"nbs": False}), (["nbs"], {"nbs": True})):
+        for chain in (
+            sky_chain(two_beams, optics_in=optics_in),
+            sky_chain(two_beams, beam=told),
+            sky_chain(two_beams, dataset=len(optics_in)),
+        ):
+            names = [leaf.name for leaf in leaves(chain)]
+            assert names[:2] == ["parallactic", "m3"]
+            assert ("nbs" in names) == told["nbs"]
+    with pytest.raises(ChainError, match=r"a\.asdf: no chain with dichroic; it holds for"):
+        sky_chain(two_beams, optics_in=["dichroic"], label="a.asdf")
+    with pytest.raises(ChainError, match="no chain with dichroic, without nbs"):
+        sky_chain(two_beams, beam={"dichroic": True, "nbs": False})
+
+
+def test_optics_of_one_dataset_are_no_part_of_the_chain(charis):
+    """Gains of the beams that a fit has beside the instrument do not come on sky."""
+    frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    meta = charis.published_meta() | {"yjh50_dichroic": "out"}
+    tables = [
+        simulate(
+            charis.chain("polarized", ["nbs"]), charis.wavelength, frames, seed=s, meta=meta, name=n
+        )
+        for s, n in enumerate("ab")
+    ]
+    chains = charis.chains_for(tables, nuisance=["beam_gain"])
+    cal = calibrate(
+        chains,
+        tables,
+        instrument="charis",
+        cross_validate=False,
+        observable="normalized_single_difference",
+    )
+    assert not any(leaf.name.startswith("beam_gain") for leaf in leaves(sky_chain(cal)))

@@ -35,7 +35,14 @@ ANGLE = st.floats(-180, 180).map(lambda x: x * u.deg)
 @pytest.mark.parametrize("sign", ["", "-"])
 def test_only_some_optics_stand_on_numbers(name, coordinate, sign):
     mount = sign + coordinate
-    numeric = ("DriftRetarder", "DriftRotator", "FluxGain", "PolarizedBackground", "StrayLight")
+    numeric = (
+        "DriftRetarder",
+        "DriftRotator",
+        "FerroelectricLiquidCrystal",
+        "FluxGain",
+        "PolarizedBackground",
+        "StrayLight",
+    )
     if name in numeric:
         optic = OPTICS[name](mount=mount)
         assert optic.position.unit == u.one

@@ -246,6 +246,16 @@ CASES = {
         diagonal=DEGREES,
         circular=DEGREES,
     ),
+    "FerroelectricLiquidCrystal": case(
+        optics.FerroelectricLiquidCrystal,
+        lambda x, retardance, switching_angle: mueller.rotate(
+            mueller.linear_retarder(retardance), x * switching_angle
+        ),
+        mount="flc_state",
+        position=FRACTION,
+        retardance=DEGREES,
+        switching_angle=st.floats(-90, 90),
+    ),
     "FluxGain": case(
         optics.FluxGain,
         lambda x, right, left: gained(1 + right * x),

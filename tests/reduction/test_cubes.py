@@ -458,18 +458,14 @@ def agreement(observations, true):
 def on_sky(n_cycles, q, u_):
     """Frames of CHARIS on a star of known polarization, with the published optics."""
     charis = instruments.get("charis")
-    published = leaves(charis.published())
+    star, published = charis.chain("star"), leaves(charis.published())
     first = [leaf.stage for leaf in published].index("hwp")
-    telescope = (
-        optics.PolarizedSource(q=np.full(22, q), u=np.full(22, u_), name="star"),
-        optics.Rotator(mount="parallactic", name="sky"),
-        optics.DiattenuatorRetarder(diattenuation=0.012, retardance=170 * u.deg, name="m3"),
-        optics.Rotator(mount="-altitude", name="telescope"),
-    )
+    chain = join([*leaves(star)[: star.submodel_names.index("hwp")], *published[first:]])
+    chain["star"].q, chain["star"].u = np.full(22, q), np.full(22, u_)
     frames = half_wave_plate_cycles(PLATE, np.full(n_cycles, 97.0) * u.deg)
     frames["parallactic"] = np.linspace(24, 40, len(frames)) * u.deg
     frames["altitude"] = np.linspace(67, 60, len(frames)) * u.deg
-    return charis, join([*telescope, *published[first:]]), frames
+    return charis, chain, frames
 
 
 def test_internal_source_comes_back_unbiased(tmp_path):
@@ -490,7 +486,7 @@ def test_internal_source_comes_back_unbiased(tmp_path):
 
 def test_star_comes_back_unbiased_and_so_does_its_polarization(tmp_path):
     q, u_ = 0.008, -0.006
-    charis, chain, frames = on_sky(6, q, u_)
+    charis, chain, frames = on_sky(4, q, u_)
     paths = simulate_cubes(
         tmp_path, chain, charis, frames, source="star", psf="gaussian", fwhm=4.0, flux=5e5,
         motion=1.0, seeing=0.05, background=5.0, seed=8,
@@ -502,6 +498,19 @@ def test_star_comes_back_unbiased_and_so_does_its_polarization(tmp_path):
     assert abs(mean) < 0.1
     assert width == pytest.approx(1, abs=0.15)
     _polarization_agrees(chain, observations, charis, q, u_)
+
+
+def test_aperture_correction_recovers_the_wings_that_pass_the_field_stop(tmp_path):
+    charis, chain, frames = on_sky(1, 0.0, 0.0)
+    paths = simulate_cubes(
+        tmp_path, chain, charis, frames, source="star", fwhm=np.linspace(4, 6, 22), flux=5e5,
+        motion=1.0, background=5.0, noise=False, seed=8,
+    )  # fmt: skip
+    true = true_observations(chain, charis, frames, source="star", flux=5e5)
+    plain = agreement(reduced(paths, charis, source="star"), true)[0]
+    corrected = reduced(paths, charis, source="star", aperture_correction=True)
+    assert plain < -0.01
+    assert abs(agreement(corrected, true)[0]) < 1e-3
 
 
 def test_polarization_survives_wings_outside_the_aperture(tmp_path):

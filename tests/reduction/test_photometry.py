@@ -194,6 +194,39 @@ def test_radius_by_growth_and_aperture_correction(star_cube):
     )
 
 
+def test_aperture_correction_has_the_error_of_its_factor():
+    # light, noise and aperture such that the error of the factor is most of all
+    errors, offsets, both = [], [], []
+    for seed in range(40):
+        cube = expose(star_image(pair(LAYOUT), flux=4e5), LAYOUT, seed=seed)
+        result = measure_stars(cube, None, DETECTOR, LAYOUT, aperture_correction=True)
+        total = result.flux.sum(axis=0)
+        errors.append(np.sqrt(result.variance.sum(axis=0) + 2 * result.covariance))
+        offsets.append(total - 8e5)
+        both.append(result.covariance / np.sqrt(result.variance.prod(axis=0)))
+    pulls = np.array(offsets) / errors
+    assert abs(pulls.mean()) < 0.4
+    assert pulls.std() == pytest.approx(1.0, abs=0.2)
+    assert 0.2 < np.mean(both) < 0.95
+    assert (result.scale_err > 0).all()
+
+
+def test_aperture_correction_is_not_misled_by_the_other_beam():
+    """Wings as steep as those of a Moffat profile, on both images, without a field stop."""
+    y, x = np.indices((201, 201))
+    core = 5.0 / (2 * np.sqrt(2 ** (1 / 3) - 1))
+    image = np.full((201, 201), 20.0)
+    for x0, y0, _ in pair(LAYOUT):
+        squares = (x - x0) ** 2 + (y - y0) ** 2
+        image += 2e5 * 2 / (np.pi * core**2) * (1 + squares / core**2) ** -3.0
+    cube = np.repeat(image[None], 4, axis=0)
+    plain = measure_stars(cube, None, DETECTOR, LAYOUT)
+    corrected = measure_stars(cube, None, DETECTOR, LAYOUT, aperture_correction=True)
+    np.testing.assert_allclose(plain.flux, 2e5, rtol=0.02)
+    assert (plain.flux < 0.99 * 2e5).all()
+    np.testing.assert_allclose(corrected.flux, 2e5, rtol=1e-3)
+
+
 def test_pixels_without_values_are_filled(star_cube):
     rng = np.random.default_rng(4)
     good = rng.random(star_cube.shape) > 0.01
@@ -259,6 +292,21 @@ def test_flag_masked_aperture(star_cube):
     good = np.ones(star_cube.shape, dtype=bool)
     good[1, 88:96, 60:82] = False
     assert flags_of(star_cube, good) == ["", "aperture masked", "", ""]
+
+
+def test_flag_no_background(star_cube):
+    y, x = np.indices(star_cube.shape[1:])
+    distance = np.min([np.hypot(x - x0, y - y0) for x0, y0, _ in pair(LAYOUT)], axis=0)
+    known = np.broadcast_to(distance < 15.1, star_cube.shape)
+    cut = np.where(known, star_cube, np.nan)
+    assert set(flags_of(cut, known, radius=14.0)) == {""}
+    assert set(flags_of(cut, known, radius=15.0)) == {"no background"}
+
+
+def test_flag_no_aperture_correction():
+    image = star_image(pair(LAYOUT, 40.0, 85.0))
+    assert set(flags_of(image)) == {""}
+    assert set(flags_of(image, aperture_correction=True)) == {"no aperture correction"}
 
 
 def test_star_options_are_checked(star_cube):

@@ -1,12 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Runs: what is left out and why, resuming, processes, the table, other people's tables."""
 
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable
-from reduction_lab import Small, expose, pair, star_image, write_cube
+from reduction_lab import Small, expose, pair, reduce_frame_or_die, star_image, write_cube
 
 from astropolcal import instruments
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
@@ -178,10 +180,59 @@ def test_copies_other_modes_and_other_units_are_left_out(tmp_path, small):
     reduction = reduce_run([*good, copy, again, mode, unit], small, source="star")
     why = {path: "; ".join(reasons) for path, reasons in reduction.problems.items()}
     assert "the same data as CRSA00000001_cube.fits" in why[str(copy)]
-    assert "the same frame as CRSA00000002_cube.fits" in why[str(again)]
+    # of two files of one name the folder must be told
+    assert f"the same frame as {good[1]}" in why[str(again)]
     assert "filter 'H'" in why[str(mode)]
     assert "unit 'electron'" in why[str(unit)]
     assert len(reduction.frames) == 4
+
+
+def test_frames_of_another_star_pickoff_or_source_are_left_out(tmp_path, small):
+    good = star_frames(tmp_path, X_CHAPKO="mirror")
+    star = expose(star_image(pair(LAYOUT)), LAYOUT, seed=60)
+    spelt = write_cube(tmp_path / "CRSA00000011_cube.fits", star, OBJECT="HD293396")
+    other = write_cube(tmp_path / "CRSA00000012_cube.fits", star * 1.1, OBJECT="HD 30675")
+    pickoff = write_cube(tmp_path / "CRSA00000013_cube.fits", star * 1.2, X_CHAPKO="YJH50")
+    reduction = reduce_run([*good, spelt, other, pickoff], small, source="star")
+    assert len(reduction.frames) == 5
+    assert reduction.problems == {
+        str(other): ["object 'HD 30675', the others of the run have 'HD 293396'"],
+        str(pickoff): ["pickoff 'YJH50', the others of the run have 'mirror'"],
+    }
+
+
+def test_a_star_is_no_internal_source(tmp_path, small):
+    lamp = flat_frames(tmp_path, CYCLE)
+    (tmp_path / "sky").mkdir()
+    star = star_frames(tmp_path / "sky", 1)[0].rename(tmp_path / "CRSA00000020_cube.fits")
+    mixed = reduce_run([*lamp, star], small)
+    assert mixed.problems == {
+        str(star): ["light 'uneven', the others of the run have 'even'"],
+    }
+    # nothing else to compare it with
+    alone = reduce_run([star], small)
+    assert "as that of a star" in alone.doubts[str(star)][0]
+
+
+def test_lamp_is_no_star_and_says_so_without_warnings(tmp_path, small):
+    image = np.zeros((201, 201))
+    for rows, columns, weights in rectangles(LAYOUT.internal_apertures, (201, 201)):
+        image[rows, columns] += 400.0 * weights
+    path = write_cube(tmp_path / "CRSA00000001_cube.fits", expose(image, LAYOUT))
+    with pytest.raises(ObservationError, match="no slice can be used"):
+        reduce_run([path], small, source="star")
+
+
+def test_headers_say_which_optics_are_in_the_beam(tmp_path, small):
+    words = {"dichroic_x": ("pickoff", {"(?i)yjh": "in", ".": "out"})}
+    told = type("Told", (Small,), {"files": replace(LAYOUT, optics=words)})()
+    folders = {"YJH50": "in", "mirror": "out"}
+    for pickoff, word in folders.items():
+        (tmp_path / pickoff).mkdir()
+        paths = star_frames(tmp_path / pickoff, 2, X_CHAPKO=pickoff)
+        assert reduce_run(paths, told, source="star").meta["dichroic_x"] == word
+    given = reduce_run(paths, told, source="star", meta={"dichroic_x": "in"})
+    assert given.meta["dichroic_x"] == "in"
 
 
 def test_nothing_usable_is_an_error_that_says_why(tmp_path, small):
@@ -195,6 +246,8 @@ def test_wrong_options_are_errors_at_once(tmp_path, small):
     paths = star_frames(tmp_path, 1)
     with pytest.raises(ParameterError, match="radius"):
         reduce_cubes(paths, small, source="star", radius="best")
+    with pytest.raises(ParameterError, match="source = 'stars'; allowed are 'internal'"):
+        reduce_cubes(paths, small, source="stars")
     with pytest.raises(ParameterError, match="workers"):
         reduce_cubes(paths, small, source="star", workers=0)
     bare = type("Bare", (Small,), {"files": None, "name": "bare"})
@@ -289,6 +342,15 @@ def test_processes_give_the_same_and_report_progress(tmp_path, small):
     one = reduce_cubes(paths, small, source="star", workers=1)
     assert many.content_hash == one.content_hash
     assert counts == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_file_that_kills_its_process_does_not_take_the_others_with_it(tmp_path, small, monkeypatch):
+    paths = star_frames(tmp_path)
+    paths[1] = paths[1].rename(tmp_path / "deadly_00000002_cube.fits")
+    monkeypatch.setattr("astropolcal.reduction.run.reduce_frame", reduce_frame_or_die)
+    reduction = reduce_run(paths, small, source="star", workers=2)
+    assert len(reduction.frames) == 3
+    assert reduction.problems == {str(paths[1]): ["the process that measured it died"]}
 
 
 # --- pyPolCal --------------------------------------------------------------------

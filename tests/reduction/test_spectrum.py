@@ -73,6 +73,29 @@ def test_there_and_back_is_the_same_table(n, seed, some):
     assert back.meta == table.meta
 
 
+def test_table_of_a_correction_is_read(tmp_path):
+    table = QTable({"wavelength": [1.2, 1.6, 2.0] * u.um, "I": [900.0, 800.0, 700.0] * u.adu})
+    table["I_statistical"], table["I_systematic"] = [3, 3, 3] * u.adu, [1, 1, np.inf] * u.adu
+    for name in "qu":
+        table[name] = [0.010, 0.008, np.nan]
+        table[f"{name}_statistical"] = [2e-4, 2e-4, np.inf]
+        table[f"{name}_systematic"] = [1e-4, np.inf, np.inf]
+    table["covariance_qu_statistical"] = [1e-9, 1e-9, np.nan]
+    table["determined"] = [True, True, False]
+    path = tmp_path / "star.ecsv"
+    table.write(path, format="ascii.ecsv")
+    spectra = read_spectra(path)
+    assert spectra["q"].mask.tolist() == [False, False, True]
+    np.testing.assert_array_equal(spectra["u"].uncertainty.array[:2], 2e-4)
+    np.testing.assert_array_equal(spectra["q"].meta["systematic"], [1e-4, np.inf, np.inf])
+    again = tmp_path / "again.ecsv"
+    write_spectra(spectra, again)
+    same(table_from_spectra(read_spectra(again)), table_from_spectra(spectra))
+    table["q_systematic"][0] = -1.0
+    with pytest.raises(ObservationError, match=r"q_systematic = -1\.0"):
+        spectra_from_table(table)
+
+
 def test_file_reads_back(tmp_path):
     table = target(mask=[False, True, False, False, False])
     table["q"][1] = np.nan

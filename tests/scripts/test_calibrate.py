@@ -2,12 +2,19 @@
 """How ``astropolcal calibrate`` judges the accuracy: standards, groups, targets, gauge."""
 
 import json
+import sys
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal import Calibration, Observations, calibrate, instruments
+sys.path.append(str(Path(__file__).parents[1]))
+
+from star_data import WAVELENGTH as STAR_WAVELENGTH
+from star_data import observe_star, star_chain
+
+from astropolcal import Calibration, Observations, calibrate, instruments, standards
 from astropolcal.calibration.groups import GROUPS
 from astropolcal.calibration.standards import standard_accuracy
 from astropolcal.calibration.target_accuracy import target_accuracies
@@ -337,3 +344,96 @@ def test_start_on_bad_input(tables, tmp_path, capsys, more, complaint):
         assert main(["calibrate", str(tables["first"]), "-q", "-o", str(path)]) == 0
     assert main(["calibrate", str(tables["second"]), "--start", str(path), *more]) == 2
     assert complaint in capsys.readouterr().err
+
+
+# ---- nuisance, derotator, stars -----------------------------------------------------------
+
+
+def test_nuisance_of_one_dataset(tables, tmp_path):
+    chosen = ["--nuisance", "lamp", "--nuisance", f"background:{tables['first'].stem}"]
+    result = run(tmp_path, tables["first"], tables["dark"], *chosen, *HELD)
+    names = {name.split(".")[0] for name in result["parameters"]}
+    assert {"lamp_dark", "background_first"} <= names
+    assert "background_dark" not in names
+
+
+def test_unknown_nuisance_is_refused(tables, capsys):
+    line = complaint(capsys, tables["first"], "--nuisance", "fog")
+    assert "nuisance 'fog'; allowed are background, beam_gain, lamp" in line
+
+
+def test_derotator_of_three_mirrors(tables, tmp_path):
+    result = run(tmp_path, tables["first"], "--derotator", "kmirror", "--fix", "hwp.theta=0")
+    assert result["parameters"]["derotator.film_thickness"]["unit"] == "nm"
+
+
+@pytest.fixture
+def star(tmp_path):
+    """Write a table of the polarized standard HD 30675, changed as asked."""
+
+    def write(change=lambda table: None, **meta):
+        chain = star_chain("star")
+        known = standards.get("HD 30675").stokes(STAR_WAVELENGTH)
+        chain["star"].q, chain["star"].u = known.q, known.u
+        seen = observe_star(chain, 8, source="polarized standard star", target="HD 30675", seed=1)
+        table = seen.to_table()
+        table.meta |= meta
+        change(table)
+        path = tmp_path / "star.ecsv"
+        table.write(path, overwrite=True)
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def lamp(tmp_path_factory):
+    chain = CHARIS.chain("polarized", ["dichroic", "nbs"], wavelength=STAR_WAVELENGTH)
+    frames = half_wave_plate_cycles(derotator=[50, 62.5, 80, 100] * u.deg)
+    meta = CHARIS.published_meta()
+    path = tmp_path_factory.mktemp("lamp") / "lamp.ecsv"
+    simulate(chain, STAR_WAVELENGTH, frames, seed=3, meta=meta).write(path)
+    return path
+
+
+@pytest.fixture
+def unpolarized(tmp_path):
+    path = tmp_path / "unpolarized.ecsv"
+    observe_star(star_chain(), 8, seed=2).write(path)
+    return path
+
+
+def test_polarized_standard_is_held_against_the_catalogue(lamp, unpolarized, star, tmp_path):
+    result = run(tmp_path, lamp, unpolarized, "--standard", star(), *HELD)
+    (entry,) = result["stars"]
+    assert entry["star"] == "HD 30675"
+    assert np.abs(entry["dolp_error_percent"]).max() < 0.1
+    assert [mirror["name"] for mirror in result["mirrors"]] == ["m3"]
+
+
+def test_star_without_pointing_is_refused(star, capsys):
+    line = complaint(capsys, star(lambda table: table.remove_column("altitude")))
+    assert "a star needs its pointing" in line
+
+
+def test_altitude_beyond_the_zenith_is_refused(star, capsys):
+    def raise_it(table):
+        table["altitude"] = 95 * u.deg
+
+    assert "altitude = 95.0, allowed are -90 to 90 deg" in complaint(capsys, star(raise_it))
+
+
+def test_unknown_standard_is_refused(star, capsys):
+    line = complaint(capsys, star(object="HD 999999"))
+    assert "the catalogue has no standard star 'HD 999999'" in line
+
+
+@pytest.mark.filterwarnings("always::astropolcal.exceptions.AstropolcalWarning")
+def test_saturated_frames_are_masked_with_a_reason(lamp, unpolarized, tmp_path, capsys):
+    table = Observations.read(unpolarized).to_table()
+    table["saturated"] = np.isin(table["frame"], [4])
+    table.write(unpolarized, overwrite=True)
+    result = run(tmp_path, lamp, unpolarized, *HELD)
+    assert "1 of 32 frames masked, saturated: frame 4" in capsys.readouterr().err
+    reasons = result["datasets"][1]["masked"]
+    assert reasons == {"saturated": 3, "incomplete half-wave-plate cycle": 9}

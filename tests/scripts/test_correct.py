@@ -12,7 +12,7 @@ from astropy.table import QTable
 
 from astropolcal import calibrate, instruments
 from astropolcal.correction import Corrected, engine
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning
+from astropolcal.exceptions import AstropolcalError
 from astropolcal.reduction.cubes import simulate_cubes
 from astropolcal.scripts import _correct
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -124,18 +124,20 @@ def test_no_calibration_holds_for_the_date(night, tmp_path):
         command(night / "cubes", "--calibration", tmp_path / "lib", *words)
 
 
-def test_a_file_that_does_not_hold_is_warned_of(night, tmp_path):
+def test_a_file_that_does_not_hold_is_refused(night, tmp_path):
     from astropolcal import Calibration
     from astropolcal.calibration.validity import with_validity
 
     old = with_validity(Calibration.read(night / "charis.asdf"), valid_from="2026-01-01")
     old.write(tmp_path / "old.asdf")
     words = ["-o", tmp_path / "out.fits", "-q", "--size", 5, "--radius", 2]
-    with pytest.warns(AstropolcalWarning, match=r"old\.asdf does not hold for 2025-10-05"):
-        command(
-            night / "cubes", "--calibration", tmp_path / "old.asdf", *words,
-            "--centre", "69.9,84.7", "--brightness", "measured",
-        )  # fmt: skip
+    words = [night / "cubes", "--calibration", tmp_path / "old.asdf", *words]
+    words += ["--centre", "69.9,84.7", "--brightness", "measured"]
+    with pytest.raises(AstropolcalError, match=r"old\.asdf does not hold for 2025-10-05.*any-date"):
+        command(*words)
+    assert not (tmp_path / "out.fits").exists()
+    command(*words, "--any-date")
+    assert (tmp_path / "out.fits").exists()
 
 
 def test_another_instrument_is_refused(night, tmp_path):
@@ -164,7 +166,8 @@ def test_a_frame_without_angles_is_named(night, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--optics-in", "dichroic"], "dichroic was in the beam"),
+        (["--optics-in", "dichroic"], "no chain with dichroic; it holds for .* with nbs"),
+        (["--optics-in", ""], "no chain no optional optics; it holds for .* with nbs"),
         (["--centre", "300,5"], "outside the image"),
         (["--cluster", "tcp://127.0.0.1:1"], "cluster tcp"),
         (["--max-condition", "0.5"], "max_condition = 0.5"),
@@ -192,3 +195,37 @@ def test_too_few_angles(night, tmp_path):
 def test_no_calibration(night, tmp_path):
     with pytest.raises(AstropolcalError, match="nowhere"):
         command(night / "cubes", "--calibration", tmp_path / "nowhere", "-o", tmp_path / "o.fits")
+
+
+def changed(night, folder, *keywords):
+    """Copy two cubes and change keywords of the second, or of both."""
+    paths = []
+    for i, path in enumerate(sorted((night / "cubes").glob("*.fits"))[:2]):
+        paths.append(folder / path.name)
+        paths[-1].write_bytes(path.read_bytes())
+        for keyword, *values in keywords:
+            fits.setval(paths[-1], keyword, value=values[min(i, len(values) - 1)])
+    return paths
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ([("FILTNAME", "J", "K")], "is in mode 'J', .* in 'K': correct apart"),
+        ([("FILTNAME", "J")], "in mode 'J', but .*charis.asdf holds for .*--filter 'broadband"),
+        ([("MJD", 60950.5, 60800.5)], "nbs was in the beam in .*, and not in "),
+        ([("MJD", 60800.5)], r"charis\.asdf: no chain without nbs; it holds for .* with nbs"),
+    ],
+)
+def test_frames_of_another_set_up(night, tmp_path, keywords, message):
+    from astropolcal import Calibration
+    from astropolcal.calibration.validity import with_validity
+
+    calibration = Calibration.read(night / "charis.asdf")
+    stated = with_validity(calibration, mode="broadband JHK", valid_from="2025-01-01")
+    stated.write(tmp_path / "charis.asdf")
+    with pytest.raises(AstropolcalError, match=message):
+        command(
+            *changed(night, tmp_path, *keywords), "--calibration", tmp_path / "charis.asdf",
+            "-o", tmp_path / "o.fits", "-q", "--centre", "69.9,84.7",
+        )  # fmt: skip

@@ -1,0 +1,62 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Values of header keywords in the units of a file layout."""
+
+import astropy.units as u
+from astropy.io.fits.card import Undefined
+from astropy.time import Time
+
+#: Columns that are angles of a stage.
+ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
+#: Columns that are text, whatever they look like.
+TEXTS = (
+    "date",
+    "time",
+    "right_ascension",
+    "declination",
+    "object",
+    "instrument",
+    "filter",
+    "pickoff",
+)
+#: Beyond these, in degree, an angle in a header cannot be right.
+RANGES = dict.fromkeys(ANGLES, (-720.0, 720.0)) | {"altitude": (0.0, 90.0)}
+
+_MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
+
+
+def look_up(headers, column, layout):
+    """Return the first keyword that holds a value for a column, and the value or None."""
+    if column not in layout.keywords:
+        return None, None
+    for header in headers:
+        for keyword in (layout.keywords[column], *layout.alternatives.get(column, ())):
+            value = header.get(keyword)
+            if value is None or isinstance(value, Undefined):
+                continue
+            if str(value).strip().lower() not in _MISSING:
+                return keyword, value
+    return layout.keywords[column], None
+
+
+def convert(column, value, layout, target):
+    """Return a value as a number in a unit; TypeError or ValueError if it is none."""
+    factor, offset = layout.transforms.get(column, (1.0, 0.0))
+    unit = u.Unit(layout.units.get(column, "deg"))
+    return (factor * float(value) + offset) * unit.to(target)
+
+
+def frame_time(header, layout):
+    """
+    Return when a frame was taken, None if the header does not say.
+
+    A date alone is its midnight; TypeError or ValueError if it cannot be understood.
+    """
+    mjd, date, clock = (look_up([header], key, layout)[1] for key in ("mjd", "date", "time"))
+    if mjd is not None:
+        return Time(float(mjd), format="mjd", scale="utc")
+    if date is None:
+        return None
+    day = str(date).strip()
+    if "T" not in day and clock is not None:
+        day = f"{day}T{str(clock).strip()}"
+    return Time(day, scale="utc")

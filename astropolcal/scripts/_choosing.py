@@ -1,0 +1,113 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Which calibration a night of frames is corrected with, and which of its chains."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from astropolcal.exceptions import AstropolcalError, ObservationError
+
+
+@dataclass
+class Night:
+    """What the headers of all frames tell: dates of the first and the last, mode, optics."""
+
+    dates: list
+    mode: str | None = None
+    beam: dict = field(default_factory=dict)
+
+
+def read_night(files, instrument, raw=None):
+    """Return what headers tell; refuse frames that differ in their mode or optics."""
+    from astropy.io import fits
+
+    from astropolcal.calibration._beam import told_beam
+    from astropolcal.reduction.headers import observation_time, read_header
+
+    layout = instrument.files
+    if layout is None:
+        raise AstropolcalError(f"{instrument.name}: it is not known how its files look")
+    dates, modes, headers = [], {}, []
+    for file in files:
+        frame = read_header(file, layout, raw=raw)
+        if frame.values.get("filter"):
+            modes.setdefault(frame.values["filter"], file)
+        try:
+            dates.append(observation_time(frame.values).isot)
+        except ObservationError:
+            # only a choice by date needs it
+            pass
+        headers.append(fits.getheader(file))
+    if len(modes) > 1:
+        (one, first), (other, second) = list(modes.items())[:2]
+        raise ObservationError(f"{first} is in mode {one!r}, {second} in {other!r}: correct apart")
+    dates.sort()
+    ends = list(dict.fromkeys((dates[0], dates[-1]))) if dates else []
+    return Night(ends, next(iter(modes), None), told_beam(headers, instrument, files))
+
+
+def choose_calibration(arguments, files, raw=None):
+    """
+    Return the calibration of the frames, its chain and what is said of where it comes from.
+
+    A file that says itself that it does not hold for the frames is refused like one in a library,
+    unless the user wants it for any date.
+    """
+    from astropolcal import Calibration, instruments
+    from astropolcal.calibration.validity import content_hash
+    from astropolcal.correction import sky_chain
+
+    path = Path(arguments.calibration)
+    calibration = None if path.is_dir() else Calibration.read(path)
+    name = arguments.instrument or getattr(calibration, "instrument", None) or "charis"
+    night = read_night(files, instruments.get(name), raw)
+    beam = night.beam if arguments.optics_in is None else {}
+    if calibration is None:
+        entry = _of_library(path, arguments, night, beam, files)
+        calibration, path = entry.calibration, entry.path
+    else:
+        _check_validity(calibration, path, arguments, night)
+    chain = sky_chain(calibration, optics_in=arguments.optics_in, beam=beam, label=str(path))
+    return (
+        calibration,
+        chain,
+        {"calibration": str(path), "calibration_hash": content_hash(calibration)},
+    )
+
+
+def _check_validity(calibration, path, arguments, night):
+    from astropolcal.calibration.validity import validity_of
+
+    held = validity_of(calibration)
+    for date in () if arguments.any_date else night.dates:
+        if not held.holds(date):
+            raise AstropolcalError(
+                f"{path} does not hold for {date}: {held}; --any-date takes it all the same"
+            )
+    mode = None if arguments.filter else night.mode
+    if mode and held.mode and mode.casefold().split() != held.mode.casefold().split():
+        raise AstropolcalError(
+            f"the frames are in mode {mode!r}, but {path} holds for {held}; --filter {held.mode!r} "
+            "if it is the same by another name"
+        )
+
+
+def _of_library(path, arguments, night, beam, files):
+    """Return the calibration that holds for the first and the last frame."""
+    from astropolcal.calibration.library import Library
+
+    dates = [None] if arguments.any_date else night.dates
+    if not dates:
+        raise ObservationError(f"{files[0]}: no date in its header to choose a calibration by")
+    library, mode = Library(path), arguments.filter or night.mode
+    found = [
+        library.find(
+            arguments.instrument, mode=mode, date=date, optics_in=arguments.optics_in, beam=beam
+        )
+        for date in dates
+    ]
+    if len({str(entry.path) for entry in found}) > 1:
+        raise AstropolcalError(
+            f"{path}: the frames from {dates[0]} to {dates[-1]} need two calibrations, "
+            f"{found[0].path} and {found[1].path}: correct them apart"
+        )
+    return found[0]

@@ -1,0 +1,532 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Whether an instrument does what the rest of the package relies on.
+
+`check_instrument` takes any instrument, also one of another package, which can run it in its
+own tests.
+"""
+
+import inspect
+import io
+import warnings
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.chain import find_optic, leaves, stages, system_mueller, with_beam
+from astropolcal.exceptions import AstropolcalError, InstrumentError
+from astropolcal.instruments import Instrument
+from astropolcal.mueller import is_physical
+from astropolcal.observations import is_star
+from astropolcal.optics import COORDINATES, Optic
+from astropolcal.simulation import simulate
+
+__all__ = ["RULES", "Conformance", "check_instrument"]
+
+#: What is checked, in this order.
+RULES = {
+    "class": "it is an Instrument, its name is one word, and it answers to name and aliases",
+    "documentation": "its class has a docstring, and references say where the values are from",
+    "wavelengths": "they are lengths, each positive, finite and another",
+    "sources": "a chain is built for each of its sources, and an unknown source is refused",
+    "names": "every optic has a name of its own, and one of them splits the light",
+    "bounds": "starting values are finite, within their bounds and as many as the wavelengths",
+    "physical": "every optic is physical, at random positions, and so is the whole",
+    "mounts": "the position of every stage is a column of tables, or comes from a keyword",
+    "headers": "keywords are those of FITS, differ, and are the same in the file layout",
+    "setup": "a table is told source and optics of its chain, and a strange one is refused",
+    "published": "published values are within their bounds and physical, and their meta fit",
+    "round trip": "every chain is the same after an ASDF file",
+    "predicts": "both beams change with the modulator, and positions are those of the frames",
+    "calibrates": "a calibration of simulated frames predicts frames that it did not see",
+}
+
+# columns that every table may have
+_COLUMNS = ("hwp", "derotator", "parallactic", "altitude", "flc_state")
+_CYCLE = np.array([0, 45, 22.5, 67.5, 11.25, 56.25, 33.75, 78.75])
+# standard deviation by which the true values of free parameters are moved: in radian or 1,
+# and of other dimensions the share of them
+_MOVED, _MOVED_SHARE = 0.005, 0.0005
+# rms of the predicted double differences
+_LARGEST_ERROR = 1e-3
+
+
+@dataclass
+class Conformance:
+    """
+    What `check_instrument` found.
+
+    Attributes
+    ----------
+    name : str
+        Of the instrument.
+    passed : list of str
+        Rules that hold.
+    failed : dict of str to str
+        Rule to what is wrong.
+    skipped : dict of str to str
+        Rule to why it was not checked.
+
+    Examples
+    --------
+    >>> from astropolcal.testing import Conformance
+    >>> report = Conformance("mine", ["class"], {"headers": "twice the same keyword 'HWP'"})
+    >>> bool(report)
+    False
+    >>> print(report)
+    mine fails 1 of 2 rules
+    - headers: twice the same keyword 'HWP'
+    """
+
+    name: str
+    passed: list = field(default_factory=list)
+    failed: dict = field(default_factory=dict)
+    skipped: dict = field(default_factory=dict)
+
+    def __bool__(self):
+        return not self.failed
+
+    def __str__(self):
+        count = len(self.passed) + len(self.failed)
+        words = f"fails {len(self.failed)} of {count} rules" if self.failed else "passes"
+        lines = [f"{self.name} {words}" + ("" if self.failed else f" {count} rules")]
+        lines += [f"- {rule}: {what}" for rule, what in self.failed.items()]
+        lines += [f"- {rule} not checked: {why}" for rule, why in self.skipped.items()]
+        return "\n".join(lines)
+
+
+def check_instrument(instrument, *, skip=(), seed=0, raises=True):
+    """
+    Check that an instrument conforms to what calibration, correction and files rely on.
+
+    Parameters
+    ----------
+    instrument : Instrument or type
+        The instrument, or its class; it need not be registered.
+    skip : sequence of str
+        Rules that are left out, see `RULES`.
+    seed : int
+        Of the random positions and of the noise.
+    raises : bool
+        Whether a rule that fails is an error.
+
+    Returns
+    -------
+    Conformance
+        Rules that hold, fail, or were not checked.
+
+    Raises
+    ------
+    InstrumentError
+        If a rule fails; the message names every one and what is wrong. Or if a rule to
+        be skipped is unknown.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.testing import check_instrument
+    >>> print(check_instrument(instruments.get("irdis"), skip=["calibrates"]))
+    irdis passes 13 rules
+    - calibrates not checked: skipped
+    """
+    unknown = sorted(set(skip) - set(RULES))
+    if unknown:
+        raise InstrumentError(f"no rules {unknown}; there are {', '.join(RULES)}")
+    if inspect.isclass(instrument) and not inspect.isabstract(instrument):
+        instrument = instrument()
+    if not isinstance(instrument, Instrument):
+        raise InstrumentError(f"class: {instrument!r} is not an Instrument, nor a class of one")
+    report = Conformance(instrument.name or type(instrument).__name__)
+    probe = _Probe(instrument, seed)
+    for rule in RULES:
+        if rule in skip:
+            report.skipped[rule] = "skipped"
+        elif rule not in ("class", "documentation", "headers") and report.failed.get("sources"):
+            report.skipped[rule] = "there are no chains"
+        else:
+            _apply(rule, probe, report)
+    if raises and not report:
+        raise InstrumentError(str(report))
+    return report
+
+
+def _apply(rule, probe, report):
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            getattr(probe, f"check_{rule.replace(' ', '_')}")()
+    except _Absent as absent:
+        report.skipped[rule] = str(absent)
+    except _Broken as broken:
+        report.failed[rule] = str(broken)
+    except Exception as error:  # whatever the code of an instrument raises is a finding
+        report.failed[rule] = f"{type(error).__name__}: {error}"
+    else:
+        report.passed.append(rule)
+
+
+class _Broken(Exception):
+    """A rule does not hold."""
+
+
+class _Absent(Exception):
+    """A rule has nothing to be applied to."""
+
+
+def _require(condition, words):
+    if not condition:
+        raise _Broken(words)
+
+
+class _Probe:
+    """The rules, each a method that raises where it does not hold."""
+
+    def __init__(self, instrument, seed):
+        self.instrument, self.seed = instrument, seed
+        self.rng = np.random.default_rng(seed)
+        default = inspect.signature(instrument.chain).parameters.get("source")
+        own = None if default is None else default.default
+        self.sources = tuple(getattr(instrument, "sources", None) or (own,))
+
+    # ---- what it says of itself
+
+    def check_class(self):
+        instrument = self.instrument
+        name = instrument.name
+        _require(isinstance(name, str) and name.strip(), "it has no name")
+        _require(len(name.split()) == 1, f"name = {name!r} has blanks; the command line has none")
+        aliases = instrument.aliases
+        _require(not isinstance(aliases, str), f"aliases = {aliases!r}; a tuple of texts is needed")
+        for spelled in (name, name.upper(), *aliases):
+            _require(instrument.answers_to(spelled), f"it does not answer to {spelled!r}")
+
+    def check_documentation(self):
+        cls = type(self.instrument)
+        _require((cls.__dict__.get("__doc__") or "").strip(), f"class {cls.__name__}: no docstring")
+        references = self.instrument.references
+        _require(
+            not isinstance(references, str) and len(references) > 0,
+            f"references = {references!r}; a tuple of at least one text is needed",
+        )
+        _require(all(str(text).strip() for text in references), "one of its references is empty")
+
+    def check_wavelengths(self):
+        grid = self.grid
+        _require(grid.ndim == 1 and grid.size > 0, f"wavelength has shape {grid.shape}; (n,) is it")
+        values = grid.to_value(u.um)
+        good = np.isfinite(values) & (values > 0)
+        _require(good.all(), f"wavelength = {grid[~good]} must be positive and finite")
+        _require(len(set(values)) == values.size, "wavelength: one of them occurs twice")
+
+    @property
+    def grid(self):
+        grid = self.instrument.wavelength
+        _require(isinstance(grid, u.Quantity), f"wavelength = {grid!r}; a Quantity is needed")
+        _require(grid.unit.is_equivalent(u.m), f"wavelength is in {grid.unit}; a length is needed")
+        return grid
+
+    @property
+    def few(self):
+        """At most three of the wavelengths."""
+        return self.grid[np.unique(np.linspace(0, self.grid.size - 1, 3).round().astype(int))]
+
+    # ---- chains
+
+    def chains(self, grid=None):
+        """Yield source and chain."""
+        for source in self.sources:
+            yield source, self.instrument.chain(source, (), wavelength=grid)
+
+    def check_sources(self):
+        for source, chain in self.chains():
+            for leaf in leaves(chain):
+                _require(isinstance(leaf, Optic), f"{source}: {leaf!r} is not an Optic")
+        try:
+            self.instrument.chain("no such source")
+        except AstropolcalError:
+            return
+        _require(
+            len(self.sources) == 1 and not hasattr(self.instrument, "sources"),
+            "its chain takes the source 'no such source'; InstrumentError is expected",
+        )
+
+    def check_names(self):
+        for source, chain in self.chains():
+            found = [leaf.name for leaf in leaves(chain)]
+            _require(all(found), f"{source}: an optic has no name: {found}")
+            odd = [name for name in found if not name.replace("-", "_").isidentifier()]
+            _require(not odd, f"{source}: {odd} cannot be used as optic.parameter")
+            splitters = [leaf.name for leaf in leaves(chain) if leaf.splits_light]
+            _require(
+                len(splitters) == 1, f"{source}: one optic must split the light, not {splitters}"
+            )
+
+    def check_bounds(self):
+        for grid in (None, self.few):
+            size = self.grid.size if grid is None else grid.size
+            for source, chain in self.chains(grid):
+                _check_values(source, chain, size)
+
+    def check_physical(self):
+        for source, chain in self.chains(self.few):
+            self._check_physical(source, chain, self.few)
+
+    def _check_physical(self, label, chain, grid):
+        for leaf in leaves(chain):
+            matrix = system_mueller(leaf, grid, self._positions(leaf))
+            _require(np.all(is_physical(matrix)), f"{label}: {leaf.name} is not physical")
+        for beam in ("right", "left"):
+            whole = system_mueller(with_beam(chain, beam), grid, self._positions(chain))
+            _require(np.all(is_physical(whole)), f"{label}: the {beam} beam is not physical")
+
+    def _positions(self, chain, n=16):
+        found = {}
+        for stage in stages(chain):
+            number = stage in COORDINATES
+            found[stage] = (
+                self.rng.uniform(0.1, 1, n) * (1 if number else 180) * (u.one if number else u.deg)
+            )
+        return found
+
+    # ---- tables and headers
+
+    def check_mounts(self):
+        layout = self.instrument.files
+        known = {*_COLUMNS, *self.instrument.keywords, *(layout.keywords if layout else ())}
+        for source, chain in self.chains():
+            angles = [s for s in stages(chain) if s not in COORDINATES]
+            lost = [s for s in angles if s not in known]
+            _require(
+                not lost,
+                f"{source}: the stage {', '.join(lost)} is no column of tables and in no keyword; "
+                f"known are {', '.join(sorted(known))}",
+            )
+            _require(
+                not is_star(source) or self.instrument.location is not None or not angles,
+                f"{source}: a star needs the site of the telescope",
+            )
+
+    def check_headers(self):
+        keywords, layout = self.instrument.keywords, self.instrument.files
+        if not keywords and layout is None:
+            raise _Absent("it has no keywords")
+        every = dict(keywords) | (dict(layout.keywords) if layout else {})
+        for column, keyword in keywords.items():
+            inside = every[column]
+            _require(inside == keyword, f"{column} is {keyword} here, {inside} in its file layout")
+        seen = {}
+        for column, keyword in every.items():
+            _check_keyword(column, keyword)
+            _require(keyword not in seen, f"{seen.get(keyword)} and {column} are both {keyword}")
+            seen[keyword] = column
+
+    def check_setup(self):
+        for source, chain in self.chains(self.few):
+            observations = self._observe(chain, source)
+            told, present = self.instrument.setup(observations)
+            _require(told == source, f"a table of source {source!r} is set up as {told!r}")
+            (built,) = self.instrument.chains_for([observations])
+            lost = set(_optics(chain)) - set(_optics(built))
+            # the source optic may have the name of the star
+            _require(len(lost) <= 1, f"{source}: its table's chain lacks {', '.join(sorted(lost))}")
+            _require(
+                all(name in _optics(built) for name in present),
+                f"{source}: setup says {present} is in the beam, the chain lacks it",
+            )
+        observations.meta["instrument"] = "another polarimeter"
+        try:
+            self.instrument.check(observations)
+        except AstropolcalError:
+            return
+        raise _Broken("a table of 'another polarimeter' is not refused")
+
+    def check_published(self):
+        try:
+            chain = self.instrument.published()
+        except InstrumentError as none:
+            raise _Absent(str(none)) from None
+        _check_values("published", chain, self.grid.size)
+        self._check_physical("published", chain, self.grid)
+        meta = self.instrument.published_meta()
+        observations = self._observe(chain, meta.get("source", self.sources[0]), self.grid)
+        (built,) = self.instrument.chains_for([observations])
+        _require(
+            _optics(built) == _optics(chain),
+            f"published_meta lead to {_optics(built)}, published to {_optics(chain)}",
+        )
+
+    def check_round_trip(self):
+        for source, chain in self.chains():
+            read = _read_back(chain)
+            _require(_optics(read) == _optics(chain), f"{source}: read as {_optics(read)}")
+            for old, new in zip(leaves(chain), leaves(read), strict=True):
+                _require(type(old) is type(new), f"{source}: {old.name} is a {type(new).__name__}")
+                _require(old.mount == new.mount, f"{source}: {old.name} is on {new.mount}")
+                for key in old.param_names:
+                    _check_same(source, old, getattr(old, key), getattr(new, key))
+
+    # ---- observing
+
+    def check_predicts(self):
+        from astropolcal.measurement import Measurement
+
+        largest = 0.0
+        for source, chain in self.chains(self.few):
+            observations = self._observe(chain, source, noise=False)
+            measurement = Measurement(
+                chain, observations, positions=[self.instrument.positions(observations, chain)]
+            )
+            off = np.abs(measurement.residuals()).max()
+            _require(
+                off < 1e-9,
+                f"{source}: double differences are off by {off:.2g} from those of the frames; "
+                "do stages stand where its positions say?",
+            )
+            change = np.ptp(observations.flux_right / observations.flux_left)
+            largest = max(largest, float(change))
+        _require(largest > 1e-6, "no source gives fluxes that change with the modulator")
+
+    def check_calibrates(self):
+        from astropolcal.calibration import calibrate
+        from astropolcal.measurement import Measurement
+
+        internal = [source for source in self.sources if not is_star(source)]
+        source = (internal or self.sources)[0]
+        start = self.instrument.chain(source, (), wavelength=self.few)
+        if not any(not getattr(o, k).fixed for o in leaves(start) for k in o.param_names):
+            raise _Absent("no parameter is free")
+        # the optics that the tables of its published chain say are in the beam
+        chains = self.instrument.chains_for([self._observe(start, source)])
+        truth = self._moved(chains[0])
+        seen = self._observe(truth, source)
+        positions = [self.instrument.positions(seen, chains[0])]
+        found = calibrate(chains, [seen], positions=positions, cross_validate=False)
+        unseen = self._observe(truth, source, shift=7.0, noise=False)
+        placed = [self.instrument.positions(unseen, truth)]
+        residuals = Measurement(found.chains, [unseen], positions=placed).residuals()
+        rms = np.sqrt(np.mean(residuals**2))
+        _require(
+            rms < _LARGEST_ERROR,
+            f"{source}: calibrated with simulated frames, it predicts others to {rms:.2g} rms; "
+            f"up to {_LARGEST_ERROR:g} is allowed",
+        )
+
+    def _moved(self, chain):
+        """Return the chain with its free parameters moved a little, within their bounds."""
+        chain, rng = chain.copy(), np.random.default_rng(self.seed)
+        for leaf in leaves(chain):
+            for key in (k for k in leaf.param_names if not getattr(leaf, k).fixed):
+                value = _moved_value(getattr(leaf, key), rng)
+                setattr(find_optic(chain, leaf.name), key, value)
+        return chain
+
+    def _observe(self, chain, source, grid=None, *, shift=0.0, noise=True):
+        """Return simulated frames of a source, with everything that stands on a stage."""
+        frames = self._frames(chain, shift)
+        meta = {"instrument": self.instrument.name, "date": "2020-01-01"}
+        meta |= self.instrument.published_meta() | {"source": source}
+        return simulate(
+            chain,
+            self.few if grid is None else grid,
+            frames,
+            flux=1e8,
+            noise=noise,
+            seed=self.seed,
+            meta=meta,
+            name=f"simulated {source}",
+        )
+
+    def _frames(self, chain, shift):
+        n_cycles = 6
+        hwp = np.tile(_CYCLE, n_cycles)
+        steps = np.linspace(0, 1, n_cycles).repeat(_CYCLE.size)
+        frames = QTable({"hwp": hwp * u.deg, "derotator": (20 + shift + 75 * steps) * u.deg})
+        known = {"parallactic": -60 + shift + 100 * steps, "altitude": 40 + shift + 30 * steps}
+        wanted = set(stages(chain)) - {*COORDINATES, "hwp", "derotator"}
+        on_sky = bool(wanted & set(known))
+        for stage in sorted(wanted | (set(known) if on_sky else set())):
+            frames[stage] = known.get(stage, 10 + shift + 60 * steps) * u.deg
+        if on_sky:
+            # where the plate stands is given, so that any tracking law will do
+            frames["hwp_true"] = frames["hwp"] + 33 * u.deg
+        return frames
+
+
+def _optics(chain):
+    return [leaf.name for leaf in leaves(chain)]
+
+
+def _check_values(label, chain, size):
+    for leaf in leaves(chain):
+        for key in leaf.param_names:
+            parameter, name = getattr(leaf, key), f"{label}: {leaf.name}.{key}"
+            value = np.asarray(parameter.value)
+            low, high = (
+                np.inf * sign if bound is None else bound
+                for bound, sign in zip(parameter.bounds, (-1, 1), strict=True)
+            )
+            good = np.isfinite(value) & (value >= low) & (value <= high)
+            _require(
+                good.all(), f"{name} = {value[~good]} is outside of its bounds, {low} to {high}"
+            )
+            _require(
+                value.size in (1, size), f"{name} has {value.size} values; allowed are 1 or {size}"
+            )
+
+
+def _check_keyword(column, keyword):
+    _require(isinstance(keyword, str) and keyword.strip(), f"{column}: keyword {keyword!r}")
+    plain = keyword.replace("-", "").replace("_", "")
+    short = len(keyword) <= 8 and plain.isalnum()
+    # a keyword of several words is a hierarchical one
+    words = keyword.split(" ")
+    long = len(words) > 1 and all(w.replace("-", "").replace("_", "").isalnum() for w in words)
+    _require(
+        keyword == keyword.upper() and (short or long), f"{column}: {keyword!r} is no FITS keyword"
+    )
+
+
+def _check_same(source, optic, old, new):
+    name = f"{source}: {optic.name}.{old.name} after a file"
+    _require(np.array_equal(old.value, new.value), f"{name} is {new.value}, not {old.value}")
+    for what in ("unit", "bounds", "fixed"):
+        before, after = getattr(old, what), getattr(new, what)
+        _require(before == after, f"{name}: {what} {after}, not {before}")
+    _require((old.prior is None) == (new.prior is None), f"{name}: its prior is {new.prior}")
+
+
+def _read_back(chain):
+    import asdf
+
+    from astropolcal.converters.priors import node_from_priors, restore_priors, without_priors
+
+    buffer = io.BytesIO()
+    # a calibration file has priors beside the chains
+    content = {"chain": without_priors(chain), "priors": node_from_priors([chain])}
+    asdf.AsdfFile(content).write_to(buffer)
+    buffer.seek(0)
+    with asdf.config_context() as config:
+        config.warn_on_failed_conversion = False
+        with asdf.open(buffer, lazy_load=False, memmap=False) as file:
+            read = file["chain"]
+            restore_priors([read], file["priors"])
+    return read
+
+
+def _moved_value(parameter, rng):
+    low, high = (
+        np.inf * sign if bound is None else bound
+        for bound, sign in zip(parameter.bounds, (-1, 1), strict=True)
+    )
+    value = np.asarray(parameter.value, dtype=float)
+    angle = parameter.unit is not None and parameter.unit.is_equivalent(u.rad)
+    step = rng.normal(size=value.shape)
+    if angle:
+        step = (_MOVED * step * u.rad).to_value(parameter.unit)
+    else:
+        step = step * (_MOVED if parameter.unit is None else _MOVED_SHARE * np.abs(value))
+    moved = np.where((value + step < low) | (value + step > high), value - step, value + step)
+    moved = np.clip(moved, low, high)
+    return moved if parameter.unit is None else moved * parameter.unit
