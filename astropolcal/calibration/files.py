@@ -154,6 +154,8 @@ def _from_bytes(content):
 @contextmanager
 def _strict_asdf():
     """Switch on what ASDF leaves off: validation, and errors for what cannot be converted."""
+    # loaded once and kept by every context, which would load them anew
+    asdf.get_config().extensions  # noqa: B018
     with asdf.config_context() as config, warnings.catch_warnings():
         # other versions of asdf and its plugins do not matter, what is in the file does
         warnings.simplefilter("ignore", AsdfWarning)

@@ -51,13 +51,11 @@ def _add_model_options(parser):
     parser.add_argument(
         "--derotator",
         metavar="MODEL",
-        default="elliptical",
         help="elliptical (default) or linear retarder, or kmirror: three silver mirrors with films",
     )
     parser.add_argument(
         "--bounds",
         metavar="KIND",
-        default="physical",
         help="physical (default), or those of the paper",
     )
     parser.add_argument(
@@ -206,8 +204,8 @@ def run(arguments):
         datasets = [instrument.prepare(table) for table in datasets]
         standards = [instrument.prepare(table) for table in standards]
     tables = [*datasets, *standards]
-    options = {"derotator": arguments.derotator, "bounds": arguments.bounds}
-    options |= {"m3": arguments.m3} if arguments.m3 else {}
+    stated = {key: getattr(arguments, key) for key in ("derotator", "bounds", "m3")}
+    options = {key: value for key, value in stated.items() if value is not None}
     chains = instrument.chains_for(datasets, nuisance=arguments.nuisance, **options)
     # each on its own wavelengths
     chains += [instrument.chains_for([table], **options)[0] for table in standards]

@@ -147,7 +147,8 @@ def _nominal(arguments):
     if known:
         return _of_calibration(known, files, datasets, edits, arguments)
     instrument = instruments.get(arguments.instrument or _stated(datasets))
-    chains = instrument.chains_for(datasets, derotator=arguments.derotator or "elliptical")
+    options = {"derotator": arguments.derotator} if arguments.derotator else {}
+    chains = instrument.chains_for(datasets, **options)
     return edit_chains(chains, **edits), datasets, instrument.name
 
 

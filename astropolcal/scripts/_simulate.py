@@ -266,14 +266,11 @@ def _behind_telescope(chain, instrument, wavelength):
 
     if "parallactic" in stages(chain):
         return chain
-    star = leaves(instrument.chain(source="star", wavelength=wavelength))
-    parts = []
-    for train in (star, leaves(chain)):
-        first = next((i for i, leaf in enumerate(train) if leaf.stage == "hwp"), None)
-        if first is None:
-            raise AstropolcalError("a star needs a chain with an optic on the stage hwp")
-        parts.append((train[:first], train[first:]))
-    return join([*parts[0][0], *parts[1][1]])
+    if not any(leaf.stage == "hwp" for leaf in leaves(chain)):
+        raise AstropolcalError("a star needs a chain with an optic on the stage hwp")
+    star = leaves(instrument.chain(source="star", wavelength=wavelength))[0]
+    # the telescope as published, behind a star of its own polarization
+    return join([star, *leaves(instrument.on_sky(chain))])
 
 
 def _meta(meta, arguments):

@@ -166,7 +166,12 @@ class Roles:
 
 
 def _retards(optic):
-    kinds = (optics.LinearRetarder, optics.EllipticalRetarder, optics.TwoLayerWaveplate)
+    kinds = (
+        optics.LinearRetarder,
+        optics.EllipticalRetarder,
+        optics.TwoLayerWaveplate,
+        optics.DiattenuatorRetarder,
+    )
     return isinstance(optic, kinds)
 
 
