@@ -109,8 +109,9 @@ def remainder(model, *, alpha=_ALPHA):
         problem.datasets, problem.channels, problem.segments, strict=True
     ):
         tables = residual[rows].reshape(channel.shape)
+        wavelength = problem.wavelength[dataset.bins]
         for name, table in zip(CHANNELS, tables, strict=True):
-            found += _shapes(table, name, dataset.observations, problem.wavelength, alpha / looks)
+            found += _shapes(table, name, dataset.observations, wavelength, alpha / looks)
     for one in found:
         one.share = float(np.clip(one.share / scale, 0, 1))
     found = [one for one in found if one.share > _LEAST_SHARE]

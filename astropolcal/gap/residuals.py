@@ -237,12 +237,13 @@ def _terms(model):
 def _outer(parts, law, problem):
     """Return the products of a law and patterns, arrays (k, W, F)."""
     out = []
-    for part, channel in zip(parts, problem.channels, strict=True):
+    for part, channel, dataset in zip(parts, problem.channels, problem.datasets, strict=True):
         shape = channel.shape[1:]
         if part is None:
             out.append(np.zeros((0, *shape)))
             continue
-        product = law.T[:, None, :, None] * part[None, :, None, :]
+        # a dataset may have some of the wavelengths only
+        product = law[dataset.bins].T[:, None, :, None] * part[None, :, None, :]
         out.append(product.reshape(-1, *shape))
     return out
 
@@ -407,19 +408,19 @@ def _places(model):
     order = np.argsort(nm)
     yield (
         "wavelength",
-        _labels(problem, lambda o, s: _on(np.argsort(order), s, 0)),
+        _labels(problem, lambda d, s: _on(np.argsort(order)[d.bins], s, 0)),
         nm[order],
         "{} nm",
     )
     if len(problem.datasets) > 1:
         names = [f'dataset "{o.name}"' for o in model.observations]
         numbers = iter(range(len(names)))
-        label = _labels(problem, lambda o, s: np.full(s, next(numbers)))
+        label = _labels(problem, lambda d, s: np.full(s, next(numbers)))
         yield "dataset", label, names, None
     beams = ["the differences of the beams", "the sums of the beams"]
     yield (
         "beam",
-        _labels(problem, lambda o, s: np.arange(2)[:, None, None] + np.zeros(s, int)),
+        _labels(problem, lambda d, s: np.arange(2)[:, None, None] + np.zeros(s, int)),
         beams,
         None,
     )
@@ -427,7 +428,7 @@ def _places(model):
         every = np.concatenate([o.position("derotator") for o in model.observations])
         kinds = np.unique(np.round(every / SAME_ANGLE))
         if 2 < len(kinds) <= _MOST_BLOCKS:
-            label = _labels(problem, lambda o, s: _on(_angle_number(o, kinds), s, 1))
+            label = _labels(problem, lambda d, s: _on(_angle_number(d.observations, kinds), s, 1))
             angles = [f"{a:g}" for a in np.round(np.rad2deg(kinds * SAME_ANGLE), 1)]
             yield "derotator", label, angles, "derotator at {} deg"
     shortest = min(o.n_frames for o in model.observations)
@@ -447,7 +448,7 @@ def _places(model):
 def _labels(problem, rule):
     return np.concatenate(
         [
-            np.asarray(rule(d.observations, c.shape)).ravel()
+            np.asarray(rule(d, c.shape)).ravel()
             for d, c in zip(problem.datasets, problem.channels, strict=True)
         ]
     )

@@ -45,7 +45,8 @@ def frame_coordinate(observations, name):
     Returns
     -------
     `~numpy.ndarray`
-        Shape (F,) for the sequence, the state and the rates, (2, B, F) for the fluxes, the right beam first.
+        Shape (F,) for the sequence, the state and the rates, (2, B, F) for the fluxes, the
+        right beam first.
 
     Raises
     ------

@@ -49,7 +49,7 @@ class FerroelectricLiquidCrystal(FrameOptic):
         default=0.0, unit=u.deg, bounds=(-360, 360), description="retardance in both states"
     )
     switching_angle = Parameter(
-        default=45.0,
+        default=0.0,
         unit=u.deg,
         bounds=(-90, 90),
         description="angle of the fast axis in state B from that in state A",
