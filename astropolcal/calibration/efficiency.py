@@ -96,7 +96,7 @@ def polarimetric_efficiency(
     Parameters
     ----------
     chain : Optic or `~astropy.modeling.CompoundModel`
-        A calibrated chain, from the sky or of an internal source, see `sky_path`.
+        A calibrated chain, from the sky or of an internal source, see ``sky_path``.
     wavelength : `~astropy.units.Quantity`
         Shape (n_wavelengths,); that of the chain's parameters where these are given per
         wavelength.

@@ -30,9 +30,9 @@ def restart(calibration, observations, free, *, chain=None, positions=None, **op
         One a dataset, whose optics take the values of those of the same name; by default as the
         instrument makes them, or the first of the calibration.
     positions : sequence of dict, optional
-        As for `~astropolcal.calibrate`; by default as the instrument reads them.
+        As for ``calibrate``; by default as the instrument reads them.
     **options
-        Passed to `~astropolcal.calibrate`; by default the old observable, and no search of
+        Passed to ``calibrate``; by default the old observable, and no search of
         other mirror branches.
 
     Returns
@@ -46,7 +46,7 @@ def restart(calibration, observations, free, *, chain=None, positions=None, **op
     ParameterError
         If nothing of a name in ``free`` exists, or the wavelengths differ.
     FitError
-        As `~astropolcal.calibrate`.
+        As ``calibrate``.
 
     Examples
     --------

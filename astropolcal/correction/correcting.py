@@ -76,7 +76,7 @@ def correct(
     seed : int, optional
         Of the samples.
     workers, cluster, chunk, progress
-        See `run_blocks`.
+        See ``run_blocks``.
     provenance : dict, optional
         What goes into the header of the product besides versions and names of the frames.
 

@@ -135,7 +135,7 @@ class ScienceFrames:
         Parameters
         ----------
         right, left, variance_right, variance_left, names, batch
-            As for `ArraySource`; images or spectra.
+            As for ``ArraySource``; images or spectra.
         wavelength, positions
             As the attributes.
         hwp : `~astropy.units.Quantity`, optional
@@ -224,11 +224,11 @@ class ScienceFrames:
         wavelength : `~astropy.units.Quantity`, optional
             Of the slices; by default the instrument's.
         centres : array_like, optional
-            As for `CubeFiles`, shape (2, 2) or (n_frames, 2, 2); or of the left beam only, shape
+            As for ``CubeFiles``, shape (2, 2) or (n_frames, 2, 2); or of the left beam only, shape
             (2,) or (n_frames, 2), with the right beam where the layout says; by default in the
             middle of the field.
         size, position_angle, mirrored, order
-            As for `CubeFiles`.
+            As for ``CubeFiles``.
         **settings
             More attributes.
 

@@ -50,7 +50,7 @@ def write_product(corrected, path, *, overwrite=False, maps=True):
     overwrite : bool
         Whether an existing file may be replaced.
     maps : bool
-        See `Corrected.write`.
+        See ``Corrected.write``.
 
     Raises
     ------

@@ -129,7 +129,7 @@ def estimator(
         What to solve for. Without V it is taken as zero, see ``leakage``. Where V is asked for
         and cannot be determined, it is taken as zero and flagged.
     observable : {"intensity", "single", "double"}
-        What is fitted, see `Channels`.
+        What is fitted, see ``Channels``.
     pairs : array_like of int, optional
         Frames of the pairs of double differences, (n_pairs, 2).
     weights : array_like, optional

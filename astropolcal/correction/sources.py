@@ -102,7 +102,7 @@ class TurnedSource:
     position_angle : `~astropy.units.Quantity`
         Of the +y axis of every frame, from north through east, shape (n_frames,).
     **options
-        Of `derotate`: ``centre``, ``size``, ``mirrored``, ``order``.
+        Of ``derotate``: ``centre``, ``size``, ``mirrored``, ``order``.
 
     Raises
     ------
@@ -178,7 +178,7 @@ class CubeFiles:
     extension : int
         That holds the cube; inverse variances may follow in ``extension + 1``.
     mirrored, order
-        As for `derotate`.
+        As for ``derotate``.
 
     Raises
     ------

@@ -148,7 +148,8 @@ def exposures(model, *, flux_matters=False):
     """
     found = []
     for i, (chain, observations) in enumerate(zip(model.chains, model.observations, strict=True)):
-        if "hwp" not in observations.frames.colnames:
+        # a plan has no states of a modulator yet
+        if "hwp" not in observations.frames.colnames or "flc_state" in stages(chain):
             continue
         taken = np.unique(np.round(np.rad2deg(observations.position("hwp")), 2))
         cycles = [tuple(float(a) for a in taken[:8]), _TURN]

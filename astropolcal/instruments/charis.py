@@ -305,7 +305,7 @@ class CHARIS(Instrument):
         }
 
     def published_mirrors(self):
-        """Return the law of M3 that is published, see `published_mirror`."""
+        """Return the law of M3 that is published, see ``published_mirror``."""
         return {"m3": {"McIntosh et al. (2026)": published_mirror()}}
 
     def setup(self, observations):

@@ -307,7 +307,7 @@ class IRDIS(Instrument):
 
         Parameters
         ----------
-        date : str or `datetime.date`
+        date : str or ``datetime.date``
             ISO date of the observation.
 
         Returns

@@ -108,7 +108,7 @@ class _Ranged:
         Raises
         ------
         WavelengthRangeError
-            If a wavelength lies outside `valid_range` or is not a number.
+            If a wavelength lies outside ``valid_range`` or is not a number.
         ParameterError
             If the wavelength has no unit of length.
 
@@ -259,7 +259,7 @@ class UniaxialMaterial(_Ranged):
         Raises
         ------
         WavelengthRangeError
-            If a wavelength lies outside `valid_range` or is not a number.
+            If a wavelength lies outside ``valid_range`` or is not a number.
         ParameterError
             If the wavelength has no unit of length.
 
@@ -289,7 +289,7 @@ class UniaxialMaterial(_Ranged):
         Raises
         ------
         WavelengthRangeError
-            If a wavelength lies outside `valid_range` or is not a number.
+            If a wavelength lies outside ``valid_range`` or is not a number.
         ParameterError
             If the wavelength has no unit of length.
 
@@ -321,7 +321,7 @@ class UniaxialMaterial(_Ranged):
         Raises
         ------
         WavelengthRangeError
-            If a wavelength lies outside `valid_range` or is not a number.
+            If a wavelength lies outside ``valid_range`` or is not a number.
         ParameterError
             If the wavelength has no unit of length.
 

@@ -181,7 +181,7 @@ class Metal(IsotropicMaterial):
         Raises
         ------
         WavelengthRangeError
-            If a wavelength lies outside `valid_range` or is not a number.
+            If a wavelength lies outside ``valid_range`` or is not a number.
         ParameterError
             If the wavelength has no unit of length.
 
