@@ -241,3 +241,16 @@ def test_a_diagnosis_that_fails_counts_as_wrong(monkeypatch):
 def test_a_run_that_makes_no_sense_is_refused(options, words):
     with pytest.raises(GapError, match=words):
         run_challenge(**options)
+
+
+def test_a_cluster_of_dask_gives_the_same_answers():
+    distributed = pytest.importorskip("distributed")
+    small = Setup(n_wavelengths=5, n_derotator=4)
+    here = run_challenge(2, seed=3, kinds=("single",), setup=small)
+    with distributed.Client(processes=False, n_workers=1, dashboard_address=None) as client:
+        there = run_challenge(2, seed=3, kinds=("single",), setup=small, client=client)
+    timeless = [
+        [{k: v for k, v in record.items() if k != "seconds"} for record in run.records]
+        for run in (here, there)
+    ]
+    assert timeless[0] == timeless[1]
