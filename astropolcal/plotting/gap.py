@@ -115,8 +115,6 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
     """
     nominal, improved = diagnosis.nominal, diagnosis.improved
     before, after = _gaps(nominal, nominal), _gaps(improved, nominal)
-    nm = 1000 * nominal.problem.wavelength
-    order = np.argsort(nm)
     n = len(before)
     with style():
         figure = canvas(figure, 10, 1.6 + 3.3 * n)
@@ -124,6 +122,8 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
         for i, row in enumerate(grid):
             sigma = nominal.problem.channels[i].sigma
             valid = nominal.problem.channels[i].valid
+            nm = 1000 * nominal.problem.wavelength[nominal.problem.datasets[i].bins]
+            order = np.argsort(nm)
             for c, axes in enumerate(row):
                 floor = _rms(np.where(valid, 100 * sigma[c], np.nan), axis=1)[order]
                 axes.fill_between(nm[order], floor, color="0.85", label="noise")
@@ -220,10 +220,12 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     limit = max(np.nanpercentile(sizes, _COVERED), 1e-12)
     with style():
         figure = canvas(figure, 12, 1.5 + 3.2 * len(pairs))
-        grid = figure.subplots(len(pairs), 2, sharey=True, squeeze=False)
-        for row, pair, observations in zip(grid, pairs, nominal.observations, strict=True):
+        grid = figure.subplots(len(pairs), 2, sharey="row", squeeze=False)
+        for row, pair, dataset in zip(grid, pairs, nominal.problem.datasets, strict=True):
+            observations = dataset.observations
+            wavelength = nominal.problem.wavelength[dataset.bins]
             for axes, gap, when in zip(row, pair, ("before", "after"), strict=True):
-                drawn = _map(axes, gap[c], nominal.problem.wavelength, limit)
+                drawn = _map(axes, gap[c], wavelength, limit)
                 rms = _rms(gap[c])
                 name = shortened(observations.name, _LONGEST_NAME)
                 axes.set_title(f"{name}, {when}: rms {rms:.2g} %", loc="left")

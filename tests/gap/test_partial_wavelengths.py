@@ -9,6 +9,7 @@ from astropolcal.gap import diagnose
 from astropolcal.gap.remainder import remainder
 from astropolcal.gap.residuals import locate
 from astropolcal.optics import BeamGain
+from astropolcal.plotting import plot_gap_maps, plot_gap_spectrum
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
@@ -37,3 +38,6 @@ def test_one_wavelength_a_dataset_as_filters_have_it():
     found = diagnose([chain] * 6, data)
     assert found.verdict == "none"
     assert locate(found.nominal).told is not None
+    assert len(plot_gap_spectrum(found).axes) == 12
+    # a map before and after for each, and the bar of colours
+    assert len(plot_gap_maps(found).axes) == 13
