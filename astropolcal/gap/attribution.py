@@ -303,7 +303,7 @@ def _polished(model, candidate, freedom):
 
 
 def _candidate(model, score, fresh, freedom):
-    physical = all(fresh.is_physical(name) for name in fresh.added)
+    physical = fresh.is_physical(score.effect.name)
     gain = model.fit.chi2 - fresh.fit.chi2
     scale = max(1.0, fresh.fit.chi2 / max(freedom, 1))
     return Candidate(score, fresh, gain, gain / scale - score.rank * np.log(freedom), physical)
@@ -356,7 +356,7 @@ def freed(model, candidate):
     gain = (stiff.fit.chi2 - loose.fit.chi2) / scale
     if after == before or gain < (after - before) * np.log(freedom):
         return candidate
-    if not all(loose.is_physical(name) for name in loose.added):
+    if not loose.is_physical(candidate.name):
         return candidate
     lowered = (model.fit.chi2 - loose.fit.chi2) / scale
     evidence = lowered - (candidate.score.rank + after - before) * np.log(freedom)

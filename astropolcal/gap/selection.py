@@ -122,17 +122,20 @@ def _looking_ahead(model, scores, *, alpha):
     if not fitted or fitted[0].model.mean_square < _STRUCTURED:
         return choose(model, scores, alpha=alpha)
     library = [score.effect for score in scores]
-    ends = {}
+    ends = []
     for one in [c for c in fitted if c.physical][:_LOOKED_AHEAD]:
         second = choose(one.model, scan(one.model, library), alpha=alpha, most=_RIVALS)
-        ends[one.name] = one, one.model if second is None else second.model
+        # with its name, and the model with both
+        end = (None, one.model) if second is None else (second.name, second.model)
+        ends.append((one, *end))
     if not ends:
         return fitted[0]
-    best, end = max(ends.values(), key=lambda pair: _advantage(pair[1], model))
+    best, next_to, end = max(ends, key=lambda item: _advantage(item[2], model))
+    # next to the same second effect: two that are both needed do as well in either order
     best.aliases = [
         one
-        for one, other in ends.values()
-        if one is not best and _advantage(end, other) < SAME_EVIDENCE
+        for one, second, other in ends
+        if one is not best and second == next_to and _advantage(end, other) < SAME_EVIDENCE
     ]
     return best
 

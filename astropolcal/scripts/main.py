@@ -90,6 +90,8 @@ def main(argv=None):
     >>> from astropolcal.scripts.main import main
     >>> main(["info", "--instruments"])
     charis
+    irdis
+    vampires
     0
     """
     arguments = build_parser().parse_args(argv)

@@ -16,7 +16,7 @@ from astropy.table import QTable
 from sky_data import sky_track
 
 from astropolcal import Calibration, calibrate, instruments, optics
-from astropolcal.chain import insert_optic, leaves
+from astropolcal.chain import insert_optic, leaves, remove_optic
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import scan
 from astropolcal.gap.effects import (
@@ -108,6 +108,13 @@ def _hold_mirror(chains):
     return chains
 
 
+def _without_mirror(chains):
+    return [
+        remove_optic(chain, "fold_mirror") if "fold_mirror" in chain.submodel_names else chain
+        for chain in chains
+    ]
+
+
 @dataclass
 class Case:
     """How an effect is tested."""
@@ -184,6 +191,7 @@ CASES = {
     "sky_background": Case(sky=True),
     "sky_motion": Case((2.0,), sky=True, frames=TRANSIT),
     "source_circular": Case(),
+    "source_linear": Case(prepare=_without_mirror),
     "source_rotation_drift": Case((5.0,)),
     "standard_polarization": Case(sky=True),
     "static_diattenuator": Case(),
