@@ -31,8 +31,8 @@ _RIVALS = 4
 # so many first effects are tried with a second one
 _LOOKED_AHEAD = 4
 _EXCHANGED_AT = (2,)
-# an effect that explains this share gives way to one other alone, and only if what is left
-# falls to this share
+# an effect that explains this share gives way to one other alone, and only if that is simpler
+# or what is left falls to this share
 _MAIN, _CLEARLY = 0.5, 2 / 3
 
 
@@ -188,7 +188,7 @@ def _exchanged(base, selected, history, library, alpha, groups, say):
             chosen[i] = freed(model, replace(chosen[i], model=now))
             now = chosen[i].model
         rival = _rival(model, chosen[i], others, library, alpha)
-        if rival is None or (main and rival.model.fit.chi2 > _CLEARLY * now.fit.chi2):
+        if rival is None or (main and not _supersedes(rival.model, now)):
             continue
         if _advantage(rival.model, now) > SAME_EVIDENCE:
             chosen[i], now = rival, rival.model
@@ -201,6 +201,11 @@ def _exchanged(base, selected, history, library, alpha, groups, say):
         if others and _advantage(model, now) > 0 and not _is_main(base, selected, chosen[i]):
             chosen, now = others, model
     return _retraced(base, chosen, now, groups, history[0])
+
+
+def _supersedes(new, old):
+    """Whether a model is simpler than another, or leaves clearly less."""
+    return new.problem.size < old.problem.size or new.fit.chi2 < _CLEARLY * old.fit.chi2
 
 
 def _outline(chosen):
