@@ -261,7 +261,8 @@ def _conclude(nominal, improved, causes, selected, scores, history, alpha, start
                 explained=float(share),
                 before=earlier,
                 after=after,
-                physical=candidate.physical,
+                # what was possible when it was chosen need not be so next to the others
+                physical=candidate.physical and improved.is_physical(candidate.name),
                 evidence=float(candidate.evidence),
             )
         )
