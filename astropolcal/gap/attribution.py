@@ -17,7 +17,16 @@ from scipy import stats
 
 from astropolcal.gap.model import effect_tangent
 
-__all__ = ["Candidate", "Score", "choose", "contenders", "false_discovery", "freed", "scan"]
+__all__ = [
+    "Candidate",
+    "Score",
+    "best_of",
+    "choose",
+    "contenders",
+    "false_discovery",
+    "freed",
+    "scan",
+]
 
 #: False discovery rate of the scan.
 ALPHA = 0.01
@@ -230,7 +239,29 @@ def choose(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
     >>> choose(None, []) is None
     True
     """
-    fitted = contenders(model, scores, alpha=alpha, most=most)
+    return best_of(contenders(model, scores, alpha=alpha, most=most))
+
+
+def best_of(fitted):
+    """
+    Return the best of fitted effects with its alias group.
+
+    Parameters
+    ----------
+    fitted : list of Candidate
+        As `contenders` gives them.
+
+    Returns
+    -------
+    Candidate or None
+        None if there is none.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.attribution import best_of
+    >>> best_of([]) is None
+    True
+    """
     if not fitted:
         return None
     top = fitted[0]

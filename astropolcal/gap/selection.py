@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from astropolcal.gap.attribution import SAME_EVIDENCE, choose, contenders, freed, scan
+from astropolcal.gap.attribution import SAME_EVIDENCE, best_of, choose, contenders, freed, scan
 from astropolcal.gap.shrinkage import held_out
 
 __all__ = ["REMAINDER", "select"]
@@ -120,7 +120,7 @@ def _looking_ahead(model, scores, *, alpha):
     """
     fitted = contenders(model, scores, alpha=alpha)
     if not fitted or fitted[0].model.mean_square < _STRUCTURED:
-        return choose(model, scores, alpha=alpha)
+        return best_of(fitted)
     library = [score.effect for score in scores]
     ends = []
     for one in [c for c in fitted if c.physical][:_LOOKED_AHEAD]:
