@@ -26,6 +26,10 @@ _FAR = 2.0
 # noise, are not looked at; nor those of which the model takes up all but this share
 _VISIBLE = 1.0
 _ABSORBED = 1e-6
+# a size so near to its limit, in units of that, is at it; the share of the wavelengths at
+# which the data may leave a size there
+_AT_LIMIT = 1e-6
+_MOST_PRESSED = 0.1
 
 
 @dataclass
@@ -126,6 +130,7 @@ class Model:
             laws=self.problem.laws | _laws(edit.parameters),
             priors=self.problem.priors | _priors(edit),
             neutral=self.problem.neutral | {p.name: _neutral(p) for p in edit.parameters},
+            limits=self.problem.limits | _limits(edit),
             like=self.problem,
         )
         return problem, edit.parameters
@@ -220,14 +225,24 @@ class Model:
         return found
 
     def is_physical(self, name):
-        """Return whether the fitted values of an effect are within its limits."""
+        """
+        Return whether the fitted values of an effect are within its limits.
+
+        A parameter that the fit left at its limit at more than one wavelength in
+        ten wants to be beyond it.
+        """
         vector = self.problem.vector(self.fit.coefficients)
         for parameter in self.added[name]:
             slot = self.problem.free.by_name[parameter.name]
-            size = np.abs(vector[slot.slice] - _neutral(parameter))
-            if size.max() > _canonical(parameter.limit):
+            size = np.abs(vector[slot.slice] - _neutral(parameter)) / _canonical(parameter.limit)
+            pressed = np.mean(size > 1 - _AT_LIMIT)
+            if size.max() > 1 + _AT_LIMIT or pressed > _MOST_PRESSED:
                 return False
         return True
+
+    def impossible(self):
+        """Return the names of the effects whose fitted values are out of their limits."""
+        return {name for name in self.added if not self.is_physical(name)}
 
 
 def _neutral(parameter):
@@ -242,8 +257,12 @@ def _laws(parameters):
     return {p.name: p.basis for p in parameters if p.basis is not None}
 
 
+def _limits(edit):
+    return {p.name: _canonical(p.limit) for p in edit.parameters}
+
+
 def _priors(edit):
-    return {p.name: _canonical(p.limit) / 2 for p in edit.parameters}
+    return {name: limit / 2 for name, limit in _limits(edit).items()}
 
 
 def _canonical(value):

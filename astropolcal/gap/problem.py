@@ -82,8 +82,11 @@ class GapProblem:
         Standard deviation (canonical) of a normal prior on the coefficients of
         a parameter.
     neutral : dict of str to float, optional
-        Value (canonical) about which a parameter's prior is, by default 0: that
-        at which an effect is absent.
+        Value (canonical) about which a parameter's prior and limits are, by
+        default 0: that at which an effect is absent.
+    limits : dict of str to float, optional
+        The most (canonical) by which a parameter may differ from that value. A
+        parameter that follows a law is not held to it.
     like : GapProblem, optional
         Another problem of the same data whose noise, lamp and fluxes are taken
         over; by default `settle_noise` must be called.
@@ -114,11 +117,12 @@ class GapProblem:
         laws=None,
         priors=None,
         neutral=None,
+        limits=None,
         like=None,
         copy=True,
     ):
         self.ties, self.laws, self.priors = dict(ties or {}), dict(laws or {}), dict(priors or {})
-        self.neutral = dict(neutral or {})
+        self.neutral, self.limits = dict(neutral or {}), dict(limits or {})
         chains, observations = list(chains), list(observations)
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
         self.measurement = Measurement(
@@ -157,11 +161,11 @@ class GapProblem:
     def _set_laws(self, laws):
         """Note the linear map from the coefficients to the flat vector."""
         blocks, self.names, self.slices = [], [], {}
-        low, high = self.free.bounds()
+        low, high = self._bounds()
         self.low, self.high, start = [], [], 0
         for slot in self.free.slots:
             basis = laws.get(slot.name)
-            follows = basis is not None and slot.per_wavelength
+            follows = basis is not None and slot.per_wavelength and np.shape(basis)[1] < slot.size
             block = basis if follows else np.eye(slot.size)
             blocks.append(block)
             k = block.shape[1]
@@ -173,6 +177,16 @@ class GapProblem:
         self._blocks = blocks
         self.low, self.high = np.array(self.low), np.array(self.high)
         self.size = start
+
+    def _bounds(self):
+        """Return the bounds of the flat vector: those of the chains, or narrower limits."""
+        low, high = (np.array(bound, dtype=float) for bound in self.free.bounds())
+        absent = self._absent()
+        for slot in self.free.slots:
+            room, where = self.limits.get(slot.name, np.inf), slot.slice
+            low[where] = np.maximum(low[where], absent[where] - room)
+            high[where] = np.minimum(high[where], absent[where] + room)
+        return low, high
 
     def _coefficients(self, vector):
         parts = [

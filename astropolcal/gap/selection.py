@@ -32,7 +32,7 @@ _RIVALS = 4
 _LOOKED_AHEAD = 4
 _EXCHANGED_AT = (2,)
 # an effect that explains this share gives way to one other alone, and only if that is simpler
-# or what is left falls to this share
+# or what is left falls to this share; what takes another out of its limits has to do as well
 _MAIN, _CLEARLY = 0.5, 2 / 3
 
 
@@ -95,9 +95,10 @@ def _forward(base, scores, library, alpha, groups, say):
             break
         candidate = freed(model, candidate)
         say(f"left-out frames with: {candidate.score.effect.title}")
-        errors = _errors(candidate.model, groups) if candidate.physical else None
+        possible = candidate.physical and not _pushes(candidate.model, model)
+        errors = _errors(candidate.model, groups) if possible else None
         scatter = candidate.model.mean_square
-        if not (candidate.physical and _holds(errors, history[-1], scatter)):
+        if not (possible and _holds(errors, history[-1], scatter)):
             refused += 1
             scores = [score for score in scores if score.effect.name != candidate.name]
             continue
@@ -154,6 +155,12 @@ def _worthy(model, candidate):
     return left > REMAINDER or lowered > _LEAST_SHARE * max(excess, 1e-300)
 
 
+def _pushes(new, old):
+    """Whether a model takes an effect out of its limits that another leaves within, for little."""
+    pushed = (new.impossible() & old.added.keys()) - old.impossible()
+    return bool(pushed) and new.fit.chi2 > _CLEARLY * old.fit.chi2
+
+
 def _holds(errors, before, scatter):
     if errors is None:
         return True
@@ -180,17 +187,18 @@ def _exchanged(base, selected, history, library, alpha, groups, say):
         others = chosen[:i] + chosen[i + 1 :]
         model = base.with_effects([c.recipe for c in others], like=now)
         main = _is_main(base, selected, chosen[i])
-        if _advantage(model, now) > 0 and not main:
+        if _advantage(model, now) > 0 and not main and not _pushes(model, now):
             chosen, now = others, model
             continue
         if chosen[i].context is None:
             # a law that was stiff enough while others were missing need not be so now
-            chosen[i] = freed(model, replace(chosen[i], model=now))
-            now = chosen[i].model
+            loose = freed(model, replace(chosen[i], model=now))
+            if not _pushes(loose.model, now):
+                chosen[i], now = loose, loose.model
         rival = _rival(model, chosen[i], others, library, alpha)
         if rival is None or (main and not _supersedes(rival.model, now)):
             continue
-        if _advantage(rival.model, now) > SAME_EVIDENCE:
+        if _advantage(rival.model, now) > SAME_EVIDENCE and not _pushes(rival.model, now):
             chosen[i], now = rival, rival.model
     if _outline(chosen) == _outline(selected):
         return selected, history
@@ -198,7 +206,8 @@ def _exchanged(base, selected, history, library, alpha, groups, say):
     for i in reversed(range(len(chosen))):
         others = chosen[:i] + chosen[i + 1 :]
         model = base.with_effects([c.recipe for c in others], like=now)
-        if others and _advantage(model, now) > 0 and not _is_main(base, selected, chosen[i]):
+        main = _is_main(base, selected, chosen[i])
+        if others and _advantage(model, now) > 0 and not main and not _pushes(model, now):
             chosen, now = others, model
     return _retraced(base, chosen, now, groups, history[0])
 
