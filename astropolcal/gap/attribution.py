@@ -84,7 +84,7 @@ class Score:
         return self.statistic / self.scale - self.rank * np.log(n_data)
 
 
-def scan(model, effects, *, residual=None, nominal=None):
+def scan(model, effects, *, residual=None, nominal=None, context=None):
     """
     Score all effects at a fitted model.
 
@@ -97,6 +97,8 @@ def scan(model, effects, *, residual=None, nominal=None):
         chains are left out, as are those that the model takes up entirely.
     residual, nominal : `~numpy.ndarray`, optional
         Whitened residual and tangent space, if known already.
+    context : Context, optional
+        By default that of the data.
 
     Returns
     -------
@@ -123,7 +125,7 @@ def scan(model, effects, *, residual=None, nominal=None):
     residual = model.residual if residual is None else residual
     residual = residual - nominal @ (nominal.T @ residual)
     total, freedom = residual @ residual, model.degrees_of_freedom(nominal)
-    context, chains, scores = model.context, model.chains, []
+    context, chains, scores = context or model.context, model.chains, []
     for effect in effects:
         if effect.name in model.added or effect.absorbed_by or not effect.applies(chains):
             continue
