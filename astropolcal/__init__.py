@@ -12,32 +12,49 @@ from astropolcal.version import version as __version__
 
 __all__ = [
     "Calibration",
+    "Diagnosis",
+    "Library",
     "Observations",
     "__version__",
     "calibrate",
     "correct",
+    "diagnose",
+    "gap",
     "instruments",
+    "load",
+    "materials",
+    "mueller",
     "optics",
+    "plotting",
+    "reduce_cubes",
+    "simulate",
+    "standards",
 ]
 
 _WHERE = {
-    "Calibration": "astropolcal.calibration",
-    "Observations": "astropolcal.observations",
-    "calibrate": "astropolcal.calibration",
-    "correct": "astropolcal.correction",
-    "instruments": None,
-    "optics": None,
+    "Calibration": "calibration",
+    "Diagnosis": "gap",
+    "Library": "calibration",
+    "Observations": "observations",
+    "calibrate": "calibration",
+    "correct": "correction",
+    "diagnose": "gap",
+    "load": "calibration",
+    "reduce_cubes": "reduction",
+    "simulate": "simulation",
 }
+_MODULES = {"gap", "instruments", "materials", "mueller", "optics", "plotting", "standards"}
 
 
 def __getattr__(name):
-    if name not in _WHERE:
-        raise AttributeError(f"module 'astropolcal' has no attribute {name!r}")
     from importlib import import_module
 
-    module = _WHERE[name]
-    return getattr(import_module(module), name) if module else import_module(f"astropolcal.{name}")
+    if name in _MODULES:
+        return import_module(f"astropolcal.{name}")
+    if name in _WHERE:
+        return getattr(import_module(f"astropolcal.{_WHERE[name]}"), name)
+    raise AttributeError(f"module 'astropolcal' has no attribute {name!r}")
 
 
 def __dir__():
-    return sorted([*globals(), *_WHERE])
+    return sorted([*globals(), *_WHERE, *_MODULES])

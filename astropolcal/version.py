@@ -6,14 +6,14 @@ A source tree that was never built has no such file; the version is then that
 of the installed distribution, or ``"0.0.0+unknown"`` if there is none.
 """
 
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as _installed_version
-
 __all__ = ["version"]
 
 try:
     from astropolcal._version import version
 except ImportError:
+    from importlib.metadata import PackageNotFoundError
+    from importlib.metadata import version as _installed_version
+
     try:
         version = _installed_version("astropolcal")
     except PackageNotFoundError:
