@@ -160,6 +160,8 @@ class Model:
         """
         Return the model with several effects added, and fitted once.
 
+        One that has no place without another that is not among them is left out.
+
         Parameters
         ----------
         effects : sequence of tuple
@@ -174,6 +176,8 @@ class Model:
         """
         model = self
         for effect, context in effects:
+            if not effect.applies(model.chains):
+                continue
             problem, parameters = model.edited(effect, context)
             added = model.added | {effect.name: parameters}
             model = Model(problem, Fit(problem.start, np.inf, False), added)

@@ -184,8 +184,7 @@ def _exchanged(base, selected, history, library, alpha, groups, say):
     # and are the last to be dropped
     for i in reversed(range(len(chosen) - 1)):
         say(f"in exchange for: {chosen[i].score.effect.title}")
-        others = chosen[:i] + chosen[i + 1 :]
-        model = base.with_effects([c.recipe for c in others], like=now)
+        model, others = _with(base, chosen[:i] + chosen[i + 1 :], now)
         main = _is_main(base, selected, chosen[i])
         if _advantage(model, now) > 0 and not main and not _pushes(model, now):
             chosen, now = others, model
@@ -199,17 +198,23 @@ def _exchanged(base, selected, history, library, alpha, groups, say):
         if rival is None or (main and not _supersedes(rival.model, now)):
             continue
         if _advantage(rival.model, now) > SAME_EVIDENCE and not _pushes(rival.model, now):
-            chosen[i], now = rival, rival.model
+            place = len({one.name for one in others} & {one.name for one in chosen[:i]})
+            chosen, now = [*others[:place], rival, *others[place:]], rival.model
     if _outline(chosen) == _outline(selected):
         return selected, history
     # a law that was freed may do what needed another effect before
     for i in reversed(range(len(chosen))):
-        others = chosen[:i] + chosen[i + 1 :]
-        model = base.with_effects([c.recipe for c in others], like=now)
+        model, others = _with(base, chosen[:i] + chosen[i + 1 :], now)
         main = _is_main(base, selected, chosen[i])
         if others and _advantage(model, now) > 0 and not main and not _pushes(model, now):
             chosen, now = others, model
     return _retraced(base, chosen, now, groups, history[0])
+
+
+def _with(base, chosen, like):
+    """Return the model with effects, and those of them that have a place in it."""
+    model = base.with_effects([c.recipe for c in chosen], like=like)
+    return model, [c for c in chosen if c.name in model.added]
 
 
 def _supersedes(new, old):
