@@ -14,6 +14,7 @@ from astropolcal.calibration import Calibration
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import Candidate, Score
+from astropolcal.gap.effects import Context, adapted, tracking_laws
 from astropolcal.gap.model import nominal_calibration, nominal_model
 from astropolcal.observations import common_wavelengths
 
@@ -80,11 +81,12 @@ def starting_model(calibration, observations, library, say):
     elif given.measurement is None:
         given = given.with_observations(observations)
     if _may_be_wrong(given):
-        discrete = [e for e in library if e.kind == "discrete" and e.applies(chains)]
+        discrete = [e for e in adapted(library, chains) if e.kind == "discrete"]
         found = _tried(chains, observations, discrete, say)
         if found and found[0][0] < _FAR_BETTER * _misfit(given):
             say(f"calibrating: {found[0][1].title}")
-            best = nominal_calibration(found[0][1].edit(chains, None).chains, observations)
+            edited = found[0][1].edit(chains, _context(observations)).chains
+            best = nominal_calibration(edited, observations)
             if _misfit(best) < _FAR_BETTER * _misfit(given):
                 return _with_alternative(chains, observations, given, best, found)
     return nominal_model(chains, observations, calibration=given), []
@@ -94,13 +96,18 @@ def _tried(chains, observations, effects, say):
     """Return misfit and effect of every alternative at a few wavelengths, best first."""
     if not effects:
         return []
-    few = thinned(chains, observations, _FEW)
+    few, context = thinned(chains, observations, _FEW), _context(observations)
     found = []
     for effect in effects:
         say(f"trying: {effect.title}")
-        trial = nominal_calibration(effect.edit(few[0], None).chains, few[1])
+        trial = nominal_calibration(effect.edit(few[0], context).chains, few[1])
         found.append((_misfit(trial), effect))
     return sorted(found, key=lambda item: item[0])
+
+
+def _context(observations):
+    """Return what a discrete effect may know: how the plates follow the sky."""
+    return Context(common_wavelengths(observations), tracking=tracking_laws(observations))
 
 
 def _misfit(calibration):

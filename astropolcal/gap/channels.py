@@ -185,6 +185,27 @@ class _Lamp:
         direction = weight / np.where(norm > 0, norm, 1.0)
         return direction, 1 - 1 / np.sqrt(1 + (self.flicker * norm) ** 2)
 
+    def brightness(self, shift, weight):
+        """
+        Return the brightness of each frame, less what is but its noise.
+
+        Parameters
+        ----------
+        shift : `~numpy.ndarray`
+            As measured, in the logarithm of the flux, shape (F,).
+        weight : `~numpy.ndarray`
+            One over its variance, shape (F,).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            The drift, and the flicker about it as far as it exceeds the noise.
+        """
+        curve, root = self._curve(self.degree), np.sqrt(weight)
+        drift = curve @ np.linalg.lstsq(curve * root[:, None], shift * root, rcond=None)[0]
+        signal = weight * self.flicker**2
+        return drift + signal / (1 + signal) * (shift - drift)
+
     def design(self, valid):
         """Return the columns of the lamp, shape (k, W, F)."""
         n = len(valid)

@@ -15,7 +15,7 @@ import numpy as np
 from astropolcal.exceptions import GapError
 from astropolcal.gap.alternatives import starting_model
 from astropolcal.gap.attribution import ALPHA, scan
-from astropolcal.gap.effects import EFFECTS, get_effect
+from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.model import Model
 from astropolcal.gap.selection import REMAINDER, select
 from astropolcal.gap.shrinkage import frame_groups
@@ -220,6 +220,7 @@ def diagnose(
     nominal, causes = starting_model(calibration, observations, library, say)
     base = causes[-1].model if causes else nominal
     say("scanning the effects")
+    library = adapted(library, base.chains)
     smooth = [effect for effect in library if effect.kind != "discrete"]
     scores = scan(base, smooth)
     selected, improved, history = select(base, scores, smooth, alpha, groups, say)

@@ -12,7 +12,7 @@ from scipy import stats
 from astropolcal.calibration import calibrate
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
-from astropolcal.gap.effects import Context
+from astropolcal.gap.effects import Context, tracking_laws
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.units import canonical_factor
@@ -20,8 +20,8 @@ from astropolcal.units import canonical_factor
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
 _ROUNDS = 3
-# a fit with more than this mean square may sit in a wrong minimum
-_FAR = 2.0
+# a fit whose residuals are less probable than this may sit in a wrong minimum
+_NOISE = 1e-3
 # directions in which a size at its limit does less than this to the data, in units of the
 # noise, are not looked at; nor those of which the model takes up all but this share
 _VISIBLE = 1.0
@@ -89,7 +89,8 @@ class Model:
     def context(self):
         """What an effect may know of the data."""
         fluxes = [np.nanmedian(o.flux_right + o.flux_left) / 2 for o in self.observations]
-        return Context(self.problem.wavelength, float(np.median(fluxes)))
+        laws = tracking_laws(self.observations)
+        return Context(self.problem.wavelength, float(np.median(fluxes)), tracking=laws)
 
     def degrees_of_freedom(self, tangent):
         """Return the number of data less that of the directions fitted."""
@@ -335,9 +336,9 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
 
 
 def _lowest(problem, chains):
-    """Fit from the calibration and, where that is far from the data, from the chains given."""
+    """Fit from the calibration and, where noise does not explain what is left, from the chains."""
     found = problem.fit()
-    if found.chi2 < _FAR * problem.n_data:
+    if stats.chi2.sf(found.chi2, max(problem.n_data - problem.size, 1)) > _NOISE:
         return found
     known = parameter_table(chains)
     vector = problem.vector(problem.start)

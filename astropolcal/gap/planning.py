@@ -33,6 +33,7 @@ _TURN = tuple(float(a) for a in np.mod(np.arange(8) * 56.25, 360))
 _DEROTATOR = tuple(float(a) for a in np.arange(0, 180, 20))
 _ALTITUDE = (25.0, 45.0, 65.0, 80.0)
 _LEVELS = (0.5, 2.0)
+_MODULATOR, _STATES = "flc_state", ("A", "B")
 # singular values of unit columns below this are open directions
 _OPEN = 1e-6
 # a change of this size (radian or relative) has to be seen
@@ -64,6 +65,9 @@ class Exposure:
         Brightness of the lamp, relative to that of the dataset.
     without : tuple of str
         Optics that are taken out.
+    states : tuple of str
+        States of a modulator, "A" and "B", in which each angle is taken, one frame each; empty
+        where there is no modulator.
 
     Examples
     --------
@@ -79,11 +83,27 @@ by 45 deg'
     polarizer_turned: float = 0.0
     lamp: float = 1.0
     without: tuple = ()
+    states: tuple = ()
 
     @property
     def setup(self):
         """What is the same in exposures that are computed together."""
-        return self.dataset, self.polarizer_turned, self.lamp, self.without
+        return self.dataset, self.polarizer_turned, self.lamp, self.without, bool(self.states)
+
+    @property
+    def n_frames(self):
+        """Number of frames: each angle in each state."""
+        return len(self.hwp) * max(len(self.states), 1)
+
+    @property
+    def plate(self):
+        """Half-wave-plate angle of every frame, degree."""
+        return np.repeat(self.hwp, max(len(self.states), 1))
+
+    @property
+    def modulator(self):
+        """State of the modulator in every frame, A or B."""
+        return np.tile(self.states, len(self.hwp))
 
     @property
     def kind(self):
@@ -107,6 +127,9 @@ by 45 deg'
             steps = ", ".join(f"{angle:g}" for angle in self.hwp[:3])
             span = f"over a full turn ({steps}, ... deg)"
         parts = [f"{len(self.hwp)} half-wave-plate angles {span}"]
+        if self.states:
+            plural = "s" * (len(self.states) > 1)
+            parts[0] += f" in state{plural} {' and '.join(self.states)} of the modulator"
         parts += [f"{name} at {angle:g} deg" for name, angle in self.positions]
         if self.polarizer_turned:
             parts.append(f"the polarizer turned by {self.polarizer_turned:g} deg")
@@ -148,12 +171,16 @@ def exposures(model, *, flux_matters=False):
     """
     found = []
     for i, (chain, observations) in enumerate(zip(model.chains, model.observations, strict=True)):
-        # a plan has no states of a modulator yet
-        if "hwp" not in observations.frames.colnames or "flc_state" in stages(chain):
+        if "hwp" not in observations.frames.colnames:
             continue
         taken = np.unique(np.round(np.rad2deg(observations.position("hwp")), 2))
         cycles = [tuple(float(a) for a in taken[:8]), _TURN]
-        base = [Exposure(i, cycle, where) for cycle in cycles for where in _settings(chain)]
+        states = _STATES if _MODULATOR in stages(chain) else ()
+        base = [
+            Exposure(i, cycle, where, states=states)
+            for cycle in cycles
+            for where in _settings(chain)
+        ]
         found += base
         roles = Roles(chain)
         if roles.polarizer is not None:
@@ -228,7 +255,8 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=4):
     pairs = list(combinations(members, 2))
     everyone = [model, *members.values()]
     if candidates is None:
-        matters = any(s in COORDINATES for m in everyone for c in m.chains for s in stages(c))
+        used = {s for m in everyone for c in m.chains for s in stages(c)}
+        matters = bool(used & set(COORDINATES) - {_MODULATOR})
         candidates = exposures(model, flux_matters=matters)
     candidates = list(candidates)
     _check(candidates, model)
@@ -257,7 +285,8 @@ def _with_effect(model, name):
     if not effect.applies(model.chains):
         raise GapError(f"effect {name!r} has no place in these chains")
     if effect.kind == "discrete":
-        return nominal_model(effect.edit(model.chains, None).chains, model.observations)
+        edited = effect.edit(model.chains, model.context).chains
+        return nominal_model(edited, model.observations)
     return model if name in model.added else model.with_effect(effect)
 
 
@@ -272,6 +301,13 @@ def _check(candidates, model):
             )
         if not (np.isfinite(one.lamp) and one.lamp > 0):
             raise GapError(f"exposure with lamp = {one.lamp}: it must be positive")
+        if not set(one.states) <= set(_STATES):
+            raise GapError(f"exposure with states {one.states}: allowed are {', '.join(_STATES)}")
+        if bool(one.states) != (_MODULATOR in stages(model.chains[one.dataset])):
+            raise GapError(
+                f"exposure of dataset {one.dataset} with states {one.states}: they are needed "
+                "where the chain has a modulator, and nowhere else"
+            )
 
 
 def _groups(candidates):
@@ -449,7 +485,7 @@ class _New:
         self.slopes = np.zeros((member.problem.size, *channel.shape))
         for name, where in problem.slices.items():
             self.slopes[member.problem.slices[name]] = slopes[where]
-        edges = np.cumsum([0, *(len(one.hwp) for one in group)])
+        edges = np.cumsum([0, *(one.n_frames for one in group)])
         self.frames = [slice(a, b) for a, b in pairwise(edges)]
         self.noise = _Noise(base, first)
 
@@ -498,15 +534,21 @@ def _hypothetical(base, group):
     problem, observations = base.problem, base.observations[group[0].dataset]
     chain = _set_up(base.chains[i], exposure)
     for leaf in leaves(chain):
-        if leaf.stage in COORDINATES:
+        if leaf.stage in COORDINATES and leaf.stage != _MODULATOR:
             chain = remove_optic(chain, leaf.name)
     sweep = problem.datasets[i].forward(problem.vector(base.fit.coefficients))
     expected = np.median(np.sum(sweep.fluxes, axis=0), axis=1)
     measured = np.exp(np.median(problem.channels[i].observed[1], axis=1))
-    frames = QTable({"hwp": np.concatenate([one.hwp for one in group]) * u.deg})
+    frames = QTable({"hwp": np.concatenate([one.plate for one in group]) * u.deg})
     for name, _ in exposure.positions:
-        values = [np.full(len(one.hwp), dict(one.positions)[name]) for one in group]
+        values = [np.full(one.n_frames, dict(one.positions)[name]) for one in group]
         frames[name] = np.concatenate(values) * u.deg
+    if "derotator" not in frames.colnames:
+        # tables have it, also those of instruments without one
+        frames["derotator"] = np.zeros(len(frames)) * u.deg
+    if exposure.states:
+        states = np.concatenate([one.modulator for one in group])
+        frames[_MODULATOR] = (states == _STATES[1]).astype(float)
     return simulate(
         chain,
         problem.wavelength * u.um,

@@ -461,7 +461,9 @@ def _expected_fluxes(channel, sweep):
     weight = channel.valid / np.square(channel.sigma[1])
     level = np.where(channel.valid, level, 0.0)
     scale = (level * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
-    shift = ((level - scale[:, None]) * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+    certain = np.maximum(weight.sum(axis=0), 1e-300)
+    shift = ((level - scale[:, None]) * weight).sum(axis=0) / certain
+    shift = channel.lamp.brightness(shift, certain)
     lamp = np.exp(scale[:, None] + shift)
     return np.stack([right * lamp, left * lamp])
 
@@ -480,6 +482,16 @@ def _positions(chain, observations, fluxes):
     return found | {stage: expected[stage] for stage in expected.keys() & found.keys()}
 
 
+def _by_state(waves, angles):
+    """Return the waves, and for a modulator with two states those that change sign with them."""
+    state = angles.get("flc_state", np.zeros(1))
+    return (
+        waves
+        if np.ptp(state) == 0
+        else [w for wave in waves for w in (wave, wave * (1 - 2 * state))]
+    )
+
+
 def _settings(angles, n):
     """
     Return what optics could do to the sums: columns of the plate angle, (F, k).
@@ -495,7 +507,7 @@ def _settings(angles, n):
         turn = np.exp(2j * angles["derotator"])
         columns += [wave * other for wave in waves for other in (turn, turn.conj())]
     columns += [np.exp(1j * k * plate) for k in (1, 3, 6, 8)]
-    columns = columns[: n // 6]
+    columns = _by_state(columns, angles)[: n // 6]
     return np.stack([part(c) for c in columns for part in (np.real, np.imag)], axis=1).reshape(
         n, -1
     )
@@ -532,6 +544,7 @@ def _turning(angles, valid):
         if stage in angles:
             turns = [np.exp(1j * k * angles[stage]) for k in orders]
             waves += [wave * t for wave in waves for turn in turns for t in (turn, turn.conj())]
+    waves = _by_state(waves, angles)
     whole = valid.all(axis=0)
     columns = np.concatenate([part(np.array(waves)) for part in (np.real, np.imag)]).T
     basis = orthonormal(columns * whole[:, None], keep=1e-6)

@@ -148,9 +148,9 @@ def _cause(diagnosis, i, fitted):
 
 
 def _title(name):
-    from astropolcal.gap.effects import EFFECTS
+    from astropolcal.gap.effects import EFFECTS, get_effect
 
-    return EFFECTS[name].title if name in EFFECTS else name
+    return get_effect(name).title if name.partition(":")[0] in EFFECTS else name
 
 
 def _score(score):

@@ -100,7 +100,9 @@ class HeldOut:
         """
         difference = (other.whitened - self.whitened) / self.counts
         error = difference.std(ddof=1) / np.sqrt(len(difference))
-        return float(difference.mean() / error) if error > 0 else np.inf * difference.mean()
+        if error > 0:
+            return float(difference.mean() / error)
+        return float(np.inf * difference.mean()) if difference.mean() else 0.0
 
 
 def frame_groups(observations):

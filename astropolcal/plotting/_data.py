@@ -86,8 +86,17 @@ class DataGrid:
         """Return the data by setting of the half-wave plate, ordered by its angle."""
         # half a turn does not matter; a value just below it belongs to zero
         angle = np.mod(np.rad2deg(self._plate()) + SAME_ANGLE, 180) - SAME_ANGLE
-        number = clusters(angle[0], SAME_ANGLE)
-        return [self._one_series(angle, number == n) for n in range(number.max() + 1)]
+        number, state = clusters(angle[0], SAME_ANGLE), self._state()
+        settings = sorted(set(zip(number, state, strict=True)))
+        return [self._one_series(angle, (number == n) & (state == now), now) for n, now in settings]
+
+    def _state(self):
+        """Return the states of a modulator in the frames of a datum, empty without one."""
+        if "flc_state" not in stages(self.chain):
+            return np.full(self.part.frames.shape[0], "")
+        state = self.part.observations.position("flc_state")[self.part.frames] > 0.5
+        names = [["AB"[one] for one in states] for states in state.astype(int)]
+        return np.array([one[0] if len(set(one)) == 1 else f" {MINUS} ".join(one) for one in names])
 
     def _plate(self):
         """Return the angle of the plate: as commanded where it follows the sky."""
@@ -95,10 +104,10 @@ class DataGrid:
             return self.part.observations.position("hwp")[self.part.frames.T]
         return self.position("hwp")
 
-    def _one_series(self, angle, member):
+    def _one_series(self, angle, member, state):
         middle = np.median(angle[:, member], axis=1)
         return Series(
-            label=f" {MINUS} ".join(degrees(value) for value in middle),
+            label=_label([degrees(value) for value in middle], state),
             data=np.flatnonzero(member),
             positions=self._steady(member),
         )
@@ -123,7 +132,11 @@ class DataGrid:
         positions = {stage: np.repeat(p, n) for stage, p in series.positions.items()}
         positions["derotator"] = np.tile(angle, per_datum)
         # between the data there is neither a time nor a flux: such optics do nothing there
-        positions |= {stage: np.zeros(1) for stage in stages(self.chain) if stage in COORDINATES}
+        others = [s for s in stages(self.chain) if s in COORDINATES and s != "flc_state"]
+        positions |= {stage: np.zeros(1) for stage in others}
+        if "flc_state" in stages(self.chain):
+            state = self.part.observations.position("flc_state")
+            positions["flc_state"] = np.repeat(state[self.part.frames[series.data[0]]], n)
         # the chain's parameters are given on the calibration's own grid of wavelengths
         propagator = Propagator(self.chain, self.calibrated_um, positions)
         right, left = (
@@ -165,3 +178,12 @@ def check_dataset(calibration, dataset):
     if isinstance(dataset, bool) or dataset not in range(count):
         raise ParameterError(f"dataset = {dataset!r}; allowed are whole numbers 0 to {count - 1}")
     return int(dataset)
+
+
+def _label(angles, state):
+    """Return the angles of the plate, and the states of a modulator."""
+    if not state:
+        return f" {MINUS} ".join(angles)
+    # where the states make the difference the plate stands still
+    plate = angles[0] if len(set(angles)) == 1 else f" {MINUS} ".join(angles)
+    return f"{plate}, {state}"

@@ -79,7 +79,9 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
     with style():
         columns = min(2, len(bins))
         rows = -(-len(bins) // columns)
-        figure = canvas(figure, 3.0 + 4.4 * columns, 1.2 + 4.1 * rows)
+        # as high as a legend of all settings beside the panels, and a title above it
+        height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
+        figure = canvas(figure, 3.0 + 4.4 * columns, height)
         pairs = _panels(figure, len(bins), rows, columns)
         fine = _fine(grid.abscissa[0])
         curves = [_curve(grid, one, bins, fine) for one in series]

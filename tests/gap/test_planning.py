@@ -10,7 +10,8 @@ from astropolcal import instruments
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import get_effect
 from astropolcal.gap.planning import Exposure, exposures, few, plan
-from astropolcal.simulation import half_wave_plate_cycles
+from astropolcal.reduction.cubes import both_states
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 PAIR = ("source_circular", "static_retarder")
 
@@ -171,3 +172,62 @@ def test_an_exposure_with_two_purposes_is_named_once():
     (both,) = few([two, one])
     assert both["words"] == "Take x: tells a from b; fixes c"
     assert (both["separates"], both["gain"]) == (["a", "b", "c"], 9.0)
+
+
+# --- instruments with a modulator ----------------------------------------------------------------
+
+FIELDS = [610, 670, 720] * u.nm
+
+
+@pytest.fixture(scope="module")
+def modulated():
+    vampires = instruments.get("vampires")
+    true = vampires.chain(wavelength=FIELDS, derotator="linear")
+    table = both_states(half_wave_plate_cycles(derotator=[45, 60] * u.deg))
+    meta = {"instrument": "vampires", "source": "polarized", "pairing": "flc_state"}
+    data = simulate(true, FIELDS, table, flux=1e6, seed=1, meta=meta, name="lamp")
+    return fitted(data, [true])
+
+
+def test_candidates_carry_the_state_of_the_modulator(modulated):
+    found = exposures(modulated)
+    assert found
+    assert {one.states for one in found} == {("A", "B")}
+    one = found[0]
+    assert one.n_frames == 2 * len(one.hwp)
+    assert one.plate[:4].tolist() == [0, 0, 11.25, 11.25]
+    assert one.modulator[:4].tolist() == ["A", "B", "A", "B"]
+    assert "8 half-wave-plate angles from 0 to 78.75 deg in states A and B of the" in one.words
+    assert {one.states for one in exposures(fitted(observed()))} == {()}
+
+
+def test_a_modulator_alone_is_no_reason_for_another_lamp(modulated):
+    assert {one.lamp for one in exposures(modulated)} == {1.0}
+    assert all("lamp" not in entry["words"] for entry in plan(modulated))
+
+
+def test_both_states_tell_more_than_one(modulated):
+    """The state that is left out cannot be made up for by the other."""
+    hwp, where = tuple(np.arange(8) * 11.25), (("derotator", 110.0),)
+    members = {name: modulated.with_effect(get_effect(name)) for name in PAIR}
+    gains = {}
+    for states in (("A",), ("B",), ("A", "B")):
+        entries = plan(
+            modulated, members=members, candidates=[Exposure(0, hwp, where, states=states)]
+        )
+        gains[states] = max(
+            (e["gain"] for e in entries if set(e["separates"]) == set(PAIR)), default=0
+        )
+    assert gains["A", "B"] > max(gains[("A",)], gains[("B",)])
+    assert gains["A", "B"] > 1
+
+
+@pytest.mark.parametrize("states", [(), ("C",), ("A", "C")])
+def test_states_that_an_exposure_cannot_have(modulated, states):
+    with pytest.raises(GapError, match="states"):
+        plan(modulated, candidates=[Exposure(0, (0.0, 45.0), (("derotator", 9.0),), states=states)])
+
+
+def test_states_where_there_is_no_modulator(model):
+    with pytest.raises(GapError, match="nowhere else"):
+        plan(model, candidates=[Exposure(0, (0.0, 45.0), (("derotator", 9.0),), states=("A",))])

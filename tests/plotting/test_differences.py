@@ -10,6 +10,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
 from astropolcal import Observations, calibrate, instruments, optics
+from astropolcal.chain import leaves
 from astropolcal.exceptions import CalibrationFileError, ParameterError, WavelengthRangeError
 from astropolcal.observations import get_observable
 from astropolcal.plotting import plot_double_differences, plot_residuals
@@ -74,7 +75,24 @@ def test_one_color_and_marker_a_half_wave_plate_angle(elliptical):
     assert labels[0].endswith("45°")
 
 
-@pytest.mark.parametrize("name", ["elliptical", "masked", "two_step", "single_angle"])
+@pytest.fixture(scope="module")
+def modulated():
+    """VAMPIRES with its liquid crystal: the two frames of a pair differ in its state."""
+    vampires = instruments.get("vampires")
+    wavelength = [625, 675, 720, 750] * u.nm
+    chain = vampires.chain("polarized", ("flc",), wavelength=wavelength, derotator="linear")
+    for leaf in leaves(chain):
+        for key in leaf.param_names:
+            getattr(leaf, key).fixed = (leaf.name, key) != ("derotator", "retardance")
+    cycles = half_wave_plate_cycles(derotator=[45, 75, 105] * u.deg)
+    frames = cycles[np.repeat(np.arange(len(cycles)), 2)]
+    frames["flc_state"] = np.tile([0, 1], len(cycles))
+    meta = {"instrument": "SCExAO/VAMPIRES", "source": "polarized", "flc": "in"}
+    observations = simulate(chain, wavelength, frames, flux=1e6, seed=1, meta=meta)
+    return calibrate(chain, observations, cross_validate=False)
+
+
+@pytest.mark.parametrize("name", ["elliptical", "masked", "two_step", "single_angle", "modulated"])
 def test_curve_goes_through_the_model_at_the_data(name, request):
     calibration = request.getfixturevalue(name)
     grid = DataGrid(calibration, 0)

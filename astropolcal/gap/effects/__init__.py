@@ -26,6 +26,8 @@ from astropolcal.gap.effects.base import (
     EffectParameter,
     Insertion,
     Roles,
+    adapted,
+    tracking_laws,
 )
 from astropolcal.gap.effects.check import check_against, check_declared
 
@@ -38,9 +40,11 @@ __all__ = [
     "EffectParameter",
     "Insertion",
     "Roles",
+    "adapted",
     "check_effect",
     "get_effect",
     "register_effect",
+    "tracking_laws",
 ]
 
 #: Every effect by name.
@@ -140,7 +144,8 @@ def get_effect(name):
     Parameters
     ----------
     name : str or Effect
-        An `Effect` is returned as it is.
+        Its name, or ``"name:optic"`` for that of one optic among several of a kind; an `Effect` is
+        returned as it is.
 
     Returns
     -------
@@ -161,6 +166,9 @@ def get_effect(name):
         return name
     if name in EFFECTS:
         return EFFECTS[name]
+    whole, _, optic = str(name).partition(":")
+    if optic and whole in EFFECTS and EFFECTS[whole].acts_on:
+        return EFFECTS[whole].at(optic)
     near = difflib.get_close_matches(str(name), EFFECTS, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise GapError(f"no effect {name!r}; there are {', '.join(EFFECTS)}{hint}")

@@ -8,18 +8,33 @@ zero tell what the effect would do to the data; fitted, the edited chains are
 ordinary chains again.
 """
 
+import copy
+import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal import optics
+from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic, leaves
+from astropolcal.exceptions import InstrumentError
 from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
+from astropolcal.observations.pointing import TRACKING
+from astropolcal.optics import COORDINATES
 
-__all__ = ["KINDS", "Context", "Edit", "Effect", "EffectParameter", "Insertion", "Roles"]
+__all__ = [
+    "KINDS",
+    "Context",
+    "Edit",
+    "Effect",
+    "EffectParameter",
+    "Insertion",
+    "Roles",
+    "adapted",
+    "tracking_laws",
+]
 
 #: What an effect may be.
 KINDS = ("optic", "parameter", "bound", "detector", "source", "discrete")
@@ -99,6 +114,9 @@ class Context:
     degree : int or None
         Degree of the laws in wavelength, None for one value a wavelength, or
         "default" for that of each effect.
+    tracking : tuple of (float, float)
+        Law by which the half-wave plate of each dataset follows the sky, see
+        `tracking_laws`.
 
     Examples
     --------
@@ -111,6 +129,7 @@ class Context:
     wavelength: np.ndarray
     flux: float = 1.0
     degree: object = "default"
+    tracking: tuple = ()
 
     def basis(self, degree, constant=True):
         """Return the law's basis; without its constant where that is known already."""
@@ -125,14 +144,55 @@ class Context:
         return found[:, 1:]
 
 
+def tracking_laws(observations):
+    """
+    Return the law of the half-wave plate of every dataset, as its instrument tells it.
+
+    Parameters
+    ----------
+    observations : sequence of Observations
+        The datasets.
+
+    Returns
+    -------
+    tuple of (float, float)
+        Factors of parallactic angle and altitude; those of
+        `~astropolcal.observations.tracked` for tables of no known instrument.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects.base import tracking_laws
+    >>> from astropolcal.observations import Observations, example_table
+    >>> tracking_laws([Observations.from_table(example_table())])
+    ((0.5, 1.0),)
+    """
+    return tuple(_tracking_law(one) for one in observations)
+
+
+def _tracking_law(observations):
+    if observations.instrument is None:
+        return TRACKING
+    try:
+        return instruments.get(observations.instrument).plate_law(observations)
+    except InstrumentError:
+        return TRACKING
+
+
 class Roles:
     """
     The optics of a chain by what they are for.
+
+    There may be several of a kind. The plates are the retarders on the stage ``hwp``, and those
+    on a stage in front of it; the derotators are retarders on a stage behind the plate, whatever
+    it is called; the telescope's mirrors stand between the rotation by the parallactic angle and
+    the plate.
 
     Parameters
     ----------
     chain : Optic or `~astropy.modeling.CompoundModel`
         The chain.
+    **chosen
+        Role to the name of the optic that has it, where that is not the first of its kind.
 
     Examples
     --------
@@ -141,28 +201,76 @@ class Roles:
     >>> roles = Roles(instruments.get("charis").chain())
     >>> roles.plate.name, roles.derotator.name, roles.splitter.name
     ('hwp', 'derotator', 'wollaston')
+    >>> irdis = Roles(instruments.get("irdis").chain("star"))
+    >>> [mirror.name for mirror in irdis.all("telescope_mirror")]
+    ['ut', 'm4']
     """
 
-    def __init__(self, chain):
+    def __init__(self, chain, **chosen):
         self.leaves = leaves(chain)
-        self.polarizer = self._first(lambda o: isinstance(o, optics.LinearPolarizer))
-        self.mirror = self._mirror()
-        self.plate = self._first(lambda o: o.stage == "hwp" and _retards(o))
-        self.derotator = self._first(lambda o: o.stage == "derotator" and _retards(o))
-        self.splitter = self._first(lambda o: isinstance(o, optics.WollastonPrism))
-        #: The plate, where the model has nothing in front of it.
-        self.entrance = self.plate if self._first(lambda o: True) is self.plate else None
+        # what an effect has added stands for nothing else
+        self._own = [o for o in self.leaves if o.name and not o.name.startswith("gap_")]
+        self._kinds = {
+            "polarizer": [o for o in self._own if isinstance(o, optics.LinearPolarizer)],
+            "mirror": self._source_mirrors(),
+            **self._turning(),
+        }
+        self._kinds["telescope_mirror"] = self._telescope_mirrors()
+        for role, found in self._kinds.items():
+            name = chosen.get(role)
+            own = (o for o in found if name in (None, o.name))
+            setattr(self, role, next(own, None))
+        self.splitter = next((o for o in self._own if isinstance(o, optics.WollastonPrism)), None)
+        #: What static optics of the relay stand behind.
+        self.relay = self.derotator or self.plate
+        #: The plate, where the model has nothing in front of it that could polarize.
+        self.entrance = self.plate if self._is_entrance() else None
 
-    def _mirror(self):
+    def all(self, role):
+        """Return all optics of a role, in the order in which light meets them."""
+        return self._kinds.get(role, [])
+
+    def _source_mirrors(self):
         """Return what stands in the place of the polarizer for unpolarized light."""
         first = self.leaves[0]
         kinds = (optics.Diattenuator, optics.DiattenuatorRetarder)
-        return first if isinstance(first, kinds) and first.stage is None else None
+        return [first] if isinstance(first, kinds) and first.stage is None else []
 
-    def _first(self, test):
-        # what an effect has added stands for nothing else
-        own = (leaf for leaf in self.leaves if leaf.name and not leaf.name.startswith("gap_"))
-        return next((leaf for leaf in own if test(leaf)), None)
+    def _turning(self):
+        """Return plates and derotators."""
+        found = [o for o in self._own if _retards(o) and o.stage not in (None, *_NO_STAGES)]
+        names = [o.stage for o in found]
+        middle = names.index("hwp") if "hwp" in names else -1
+        plates = [o for o in found if o.stage == "hwp"]
+        plates += found[: max(middle, 0)]
+        behind = [o for o in found if not any(o is plate for plate in plates)]
+        return {"plate": plates, "derotator": sorted(behind, key=lambda o: o.stage != "derotator")}
+
+    def _in_front(self):
+        """Return what stands between the rotation by the parallactic angle and the plate."""
+        names = [o.stage for o in self._own]
+        start = names.index("parallactic") + 1 if "parallactic" in names else len(names)
+        plate = self._kinds["plate"]
+        end = next((i for i, o in enumerate(self._own) if plate and o is plate[0]), start)
+        return [o for o in self._own[start:end] if not isinstance(o, optics.Rotator)]
+
+    def _telescope_mirrors(self):
+        return [o for o in self._in_front() if hasattr(o, "diattenuation")]
+
+    def _is_entrance(self):
+        if self.plate is None:
+            return False
+        if self._own[0] is self.plate:
+            return True
+        on = {o.stage for o in self._own}
+        if "parallactic" not in on or "altitude" in on:
+            return False
+        # the sky turns, and the instrument with the telescope
+        return all(getattr(o, key).fixed for o in self._in_front() for key in o.param_names)
+
+
+# positions that are not those of a stage which carries a retarder
+_NO_STAGES = ("parallactic", "altitude", *COORDINATES)
 
 
 def _retards(optic):
@@ -171,8 +279,53 @@ def _retards(optic):
         optics.EllipticalRetarder,
         optics.TwoLayerWaveplate,
         optics.DiattenuatorRetarder,
+        optics.KMirror,
     )
     return isinstance(optic, kinds)
+
+
+def adapted(effects, chains):
+    """
+    Return the effects of a library that chains have a place for, one for each optic of a kind.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        The library.
+    chains : sequence
+        One a dataset.
+
+    Returns
+    -------
+    list of Effect
+        An effect that acts on one kind of optic comes once for each such optic: under its own name
+        for the first, as ``"name:optic"`` for the others. Where there is no derotator, the words
+        of what stands behind it name the half-wave plate.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import EFFECTS, adapted
+    >>> chain = instruments.get("irdis").chain("star")
+    >>> chain["ut"].diattenuation.fixed = chain["m4"].diattenuation.fixed = True
+    >>> [effect.name for effect in adapted([EFFECTS["m3_diattenuation"]], [chain])]
+    ['m3_diattenuation', 'm3_diattenuation:m4']
+    """
+    chains = list(chains)
+    found = [one for effect in effects for one in effect.per_optic(chains)]
+    found = [one for one in found if one.applies(chains)]
+    if any(Roles(chain).derotator is not None for chain in chains):
+        return found
+    return [_reworded(one) for one in found]
+
+
+def _reworded(effect):
+    words = {"title": effect.title, "place": effect.place}
+    new = {key: text.replace(_BEHIND, _BEHIND_PLATE) for key, text in words.items()}
+    return effect if new == words else effect.changed(**new)
+
+
+_BEHIND, _BEHIND_PLATE = "behind the derotator", "behind the half-wave plate"
 
 
 class Effect(ABC):
@@ -210,6 +363,61 @@ class Effect(ABC):
     name = title = kind = place = shows = reference = absorbed_by = None
     #: Degree of the law in wavelength.
     degree = 2
+    #: Role of the optic that it acts on, see `Roles`; None where that is no single one.
+    acts_on = None
+    #: Name of that optic, where it is not the first of its kind.
+    optic = None
+
+    def roles(self, chain):
+        """Return the optics of a chain by what they are for, with the one that it acts on."""
+        chosen = {} if self.optic is None else {self.acts_on: self.optic}
+        return Roles(chain, **chosen)
+
+    def changed(self, **attributes):
+        """Return a copy with other attributes."""
+        new = copy.copy(self)
+        for key, value in attributes.items():
+            setattr(new, key, value)
+        return new
+
+    def at(self, optic):
+        """
+        Return the effect of one optic of its kind.
+
+        Parameters
+        ----------
+        optic : str
+            Its name.
+
+        Returns
+        -------
+        Effect
+            With the name ``"effect:optic"``.
+        """
+        return self.changed(
+            optic=optic, name=f"{self.name}:{optic}", title=f"{self.title} ({optic})"
+        )
+
+    def per_optic(self, chains):
+        """
+        Return the effect once for each optic of the kind that it acts on.
+
+        Parameters
+        ----------
+        chains : sequence
+            One a dataset.
+
+        Returns
+        -------
+        list of Effect
+            Itself for the optic that is the first of its kind, and one for each other.
+        """
+        if self.acts_on is None or self.optic is not None:
+            return [self]
+        every = [Roles(chain).all(self.acts_on) for chain in chains]
+        first = {found[0].name for found in every if found}
+        others = dict.fromkeys(o.name for found in every for o in found if o.name not in first)
+        return [self, *(self.at(name) for name in others)]
 
     def applies(self, chains):
         """
@@ -224,7 +432,7 @@ class Effect(ABC):
         -------
         bool
         """
-        return any(self.applies_to(Roles(chain)) for chain in chains)
+        return any(self.applies_to(self.roles(chain)) for chain in chains)
 
     @abstractmethod
     def applies_to(self, roles):
@@ -268,6 +476,15 @@ class Effect(ABC):
         return f"<Effect {self.name}: {self.title}>"
 
 
+# roles of which a chain may have several optics
+_SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
+
+
+def label_of(name):
+    """Return the name of an optic that an effect adds."""
+    return "gap_" + re.sub(r"\W", "_", name)
+
+
 class Insertion(Effect):
     """
     An effect that is one more optic, at a place given by another.
@@ -292,16 +509,21 @@ class Insertion(Effect):
     True
     """
 
-    anchor = "derotator"
+    anchor = "relay"
     side = "after"
     follows = False
     constant = True
     free = ()
 
     @property
+    def acts_on(self):
+        """Role of the optic that it acts on, where there may be several of a kind."""
+        return self.anchor if self.anchor in _SEVERAL else None
+
+    @property
     def label(self):
         """Name of the optic in the chain."""
-        return f"gap_{self.name}"
+        return label_of(self.name)
 
     def applies_to(self, roles):
         """Return whether one chain has the optic to stand next to."""
@@ -316,7 +538,7 @@ class Insertion(Effect):
         edited, ties = [], {}
         size = len(context.wavelength)
         for chain in chains:
-            anchor = getattr(Roles(chain), self.anchor)
+            anchor = getattr(self.roles(chain), self.anchor)
             if anchor is None:
                 edited.append(chain)
                 continue

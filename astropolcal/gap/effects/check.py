@@ -5,7 +5,7 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, GapError
-from astropolcal.gap.effects.base import KINDS, Context, Effect
+from astropolcal.gap.effects.base import KINDS, Context, Effect, tracking_laws
 from astropolcal.gap.problem import GapProblem
 from astropolcal.units import canonical_factor, to_unit
 
@@ -122,7 +122,8 @@ def _state(chain):
 
 def _context(problem, observations):
     fluxes = [np.nanmedian(o.flux_right + o.flux_left) / 2 for o in observations]
-    return Context(problem.wavelength, float(np.median(fluxes)))
+    flux = float(np.median(fluxes))
+    return Context(problem.wavelength, flux, tracking=tracking_laws(observations))
 
 
 def _check_discrete(effect, edit, observations):

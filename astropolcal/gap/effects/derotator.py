@@ -5,10 +5,11 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import replace_optic
-from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion, Roles
+from astropolcal.chain import insert_optic, replace_optic
+from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion, label_of
 from astropolcal.gap.effects.plate import _Around
 from astropolcal.gap.effects.relay import _BandAverage
+from astropolcal.measurement import Tie
 
 __all__ = [
     "DerotatorBandAverage",
@@ -20,6 +21,10 @@ __all__ = [
     "DerotatorMotion",
     "DerotatorTwoLobes",
 ]
+
+
+# what an elliptical retarder can stand for
+_EXCHANGED = (optics.LinearRetarder, optics.EllipticalRetarder)
 
 
 class DerotatorDiagonal(Effect):
@@ -37,7 +42,7 @@ class DerotatorDiagonal(Effect):
     title = "retardance of the derotator at 45 deg"
     shows = "rotation of Q and U that depends on wavelength and derotator angle"
     reference = "McIntosh et al. 2026, Sec. 4"
-    component = "diagonal"
+    component, acts_on = "diagonal", "derotator"
     scale, limit = 2 * u.deg, 60 * u.deg
 
     @property
@@ -47,29 +52,48 @@ class DerotatorDiagonal(Effect):
 
     def applies_to(self, roles):
         """Return whether the derotator lacks this component."""
-        if isinstance(roles.derotator, optics.LinearRetarder):
-            return True
-        if not isinstance(roles.derotator, optics.EllipticalRetarder):
+        if roles.derotator is None:
             return False
-        return all(getattr(roles.derotator, key).fixed for key in self.components)
+        if isinstance(roles.derotator, optics.EllipticalRetarder):
+            return all(getattr(roles.derotator, key).fixed for key in self.components)
+        return not any(leaf.name == label_of(self.name) for leaf in roles.leaves)
 
     def edit(self, chains, context):
         """Return the chains with an elliptical derotator; see `Effect.edit`."""
-        edited = []
+        edited, names, ties = [], {}, {}
         for chain in chains:
-            derotator = Roles(chain).derotator
-            if derotator is not None:
+            derotator = self.roles(chain).derotator
+            if isinstance(derotator, _EXCHANGED):
                 chain = replace_optic(chain, derotator.name, self._elliptical(derotator, context))
+                names[derotator.name] = None
+            elif derotator is not None:
+                added = self._behind(derotator, context)
+                chain = insert_optic(chain, added, after=derotator.name)
+                names[added.name] = None
+                if not derotator.theta.fixed:
+                    ties[f"{added.name}.theta"] = Tie(f"{derotator.name}.theta")
             edited.append(chain)
-        name = next(r.derotator.name for r in map(Roles, edited) if r.derotator is not None)
         basis = None if len(context.wavelength) == 1 else context.basis(self.degree)
-        return Edit(
-            edited,
-            [
-                EffectParameter(f"{name}.{key}", self.scale, self.limit, basis)
-                for key in self.components
-            ],
+        parameters = [
+            EffectParameter(f"{name}.{key}", self.scale, self.limit, basis)
+            for name in names
+            for key in self.components
+        ]
+        return Edit(edited, parameters, ties)
+
+    def _behind(self, derotator, context):
+        """Return what turns with a derotator that is more than a retarder, and adds to it."""
+        zero = np.zeros(len(context.wavelength)) * u.deg
+        added = optics.EllipticalRetarder(
+            theta=derotator.theta.value * u.deg,
+            mount=derotator.mount,
+            name=label_of(self.name),
+            **dict.fromkeys(self.components, zero),
         )
+        added.theta.bounds = (None, None)
+        for key in added.param_names:
+            getattr(added, key).fixed = key not in self.components
+        return added
 
     def _elliptical(self, old, context):
         size = len(context.wavelength)
@@ -148,6 +172,7 @@ class DerotatorBandAverage(_BandAverage):
     name, kind, place = "derotator_band_average", "optic", "derotator"
     title = "retardance of the derotator that changes within a wavelength bin"
     shows = "less modulation where the retardance is steep, most between the axes of the derotator"
+    acts_on = "derotator"
 
     def retarder(self, roles):
         """Return the derotator."""
@@ -169,7 +194,7 @@ class DerotatorDiattenuation(Insertion):
     title = "diattenuation of the derotator"
     shows = "harmonic 2 of the derotator angle, constant with the plate"
     reference = "van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
-    follows = True
+    anchor, follows = "derotator", True
     free = {"diattenuation": (0.005, 0.2)}
 
     def build(self, size, anchor, context):
@@ -245,7 +270,7 @@ class DerotatorMotion(_Around):
 
     def edit(self, chains, context):
         """Return the chains with the pair at zero, in those of stars; see `Effect.edit`."""
-        moves = [self.applies_to(Roles(chain)) for chain in chains]
+        moves = [self.applies_to(self.roles(chain)) for chain in chains]
         edit = super().edit([c for c, moving in zip(chains, moves, strict=True) if moving], context)
         ready = iter(edit.chains)
         edited = [next(ready) if moving else c for c, moving in zip(chains, moves, strict=True)]

@@ -6,8 +6,8 @@ from abc import abstractmethod
 import astropy.units as u
 
 from astropolcal import optics
-from astropolcal.chain import insert_optic, remove_optic
-from astropolcal.gap.effects.base import Edit, Effect, Roles
+from astropolcal.chain import insert_optic, leaves, remove_optic
+from astropolcal.gap.effects.base import Edit, Effect, label_of
 
 __all__ = [
     "DerotatorOffset",
@@ -34,7 +34,7 @@ class _Discrete(Effect):
         """Return the changed chains; nothing is added that could be fitted."""
         edited = []
         for chain in chains:
-            roles = Roles(chain)
+            roles = self.roles(chain)
             edited.append(self.change(chain.copy(), roles) if self.applies_to(roles) else chain)
         return Edit(edited, [])
 
@@ -55,17 +55,17 @@ class MirrorFlip(_Discrete):
     shows = "everywhere: U and V have the wrong sign"
 
     def applies_to(self, roles):
-        """Return whether there are derotator and splitter."""
-        return roles.derotator is not None and roles.splitter is not None
+        """Return whether there are derotator, or plate, and splitter."""
+        return roles.relay is not None and roles.splitter is not None
 
     def change(self, chain, roles):
         """Return the chain with a parity flip taken out, or put in."""
         order = [leaf.name for leaf in roles.leaves]
-        behind = roles.leaves[order.index(roles.derotator.name) :]
+        behind = roles.leaves[order.index(roles.relay.name) :]
         flips = [leaf for leaf in behind if isinstance(leaf, optics.ParityFlip)]
         if flips:
             return remove_optic(chain, flips[0].name)
-        flip = optics.ParityFlip(name=f"gap_{self.name}")
+        flip = optics.ParityFlip(name=label_of(self.name))
         return insert_optic(chain, flip, before=roles.splitter.name)
 
 
@@ -90,7 +90,7 @@ class MirrorBeforePlate(_Discrete):
 
     def change(self, chain, roles):
         """Return the chain with a parity flip in front of the plate."""
-        flip = optics.ParityFlip(name=f"gap_{self.name}")
+        flip = optics.ParityFlip(name=label_of(self.name))
         return insert_optic(chain, flip, before=roles.plate.name)
 
 
@@ -110,13 +110,18 @@ class PlateSign(_Discrete):
     shows = "everywhere: the polarization turns the other way"
     role = "plate"
 
+    @property
+    def acts_on(self):
+        """Role of the optic whose angle it is."""
+        return self.role
+
     def applies_to(self, roles):
         """Return whether there is an optic on the stage."""
         return getattr(roles, self.role) is not None
 
     def change(self, chain, roles):
         """Return the chain with the sign of the stage turned."""
-        leaf = next(o for o in Roles(chain).leaves if o.name == getattr(roles, self.role).name)
+        leaf = next(o for o in leaves(chain) if o.name == getattr(roles, self.role).name)
         leaf.mount = leaf.stage if leaf.stage_sign < 0 else f"-{leaf.stage}"
         return chain
 
@@ -158,7 +163,7 @@ class SwappedBeams(_Discrete):
 
     def change(self, chain, roles):
         """Return the chain with the splitter turned by 90 deg."""
-        leaf = next(o for o in Roles(chain).leaves if o.name == roles.splitter.name)
+        leaf = next(o for o in leaves(chain) if o.name == roles.splitter.name)
         leaf.theta = (leaf.theta.value + 90) * u.deg
         return chain
 
@@ -182,7 +187,7 @@ class PlateOffset(PlateSign):
     def change(self, chain, roles):
         """Return the chain with the optic turned, and the bounds of its angle with it."""
         name, offset = getattr(roles, self.role).name, self.offset.to_value(u.deg)
-        leaf = next(o for o in Roles(chain).leaves if o.name == name)
+        leaf = next(o for o in leaves(chain) if o.name == name)
         bounds = [None if b is None else b + offset for b in leaf.theta.bounds]
         leaf.theta = (leaf.theta.value + offset) * u.deg
         leaf.theta.bounds = tuple(bounds)

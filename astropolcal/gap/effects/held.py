@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.chain import replace_optic
-from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Roles
+from astropolcal.gap.effects.base import Edit, Effect, EffectParameter
 
 __all__ = [
     "DerotatorAngleBound",
@@ -28,6 +28,12 @@ class _Freed(Effect):
 
     kind = "parameter"
     role = "plate"
+
+    @property
+    def acts_on(self):
+        """Role of the optic."""
+        return self.role
+
     #: Parameter to (size to expect, largest change that is physical).
     free = {"theta": (0.5 * u.deg, 5 * u.deg)}
 
@@ -49,7 +55,7 @@ class _Freed(Effect):
         """Return the chains with the parameters free; see `Effect.edit`."""
         edited, added = [], {}
         for chain in chains:
-            optic = getattr(Roles(chain), self.role)
+            optic = getattr(self.roles(chain), self.role)
             if optic is not None:
                 fresh = optic.copy()
                 added |= self._release(fresh)

@@ -6,7 +6,7 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import insert_optic
-from astropolcal.gap.effects.base import Edit, EffectParameter, Insertion, Roles
+from astropolcal.gap.effects.base import Edit, EffectParameter, Insertion
 from astropolcal.measurement import Tie
 
 __all__ = [
@@ -88,7 +88,8 @@ class WavelengthScale(PlateRetardance):
 
     def edit(self, chains, context):
         """Return the chains with a retarder whose law is the plate's slope."""
-        plate = next(p for p in (Roles(chain).plate for chain in chains) if self._has_law(p))
+        plates = (self.roles(chain).plate for chain in chains)
+        plate = next(plate for plate in plates if self._has_law(plate))
         step = 1e-4
         up, down = (
             plate.retardance(context.wavelength * (1 + s) * u.um).to_value(u.rad)
@@ -194,7 +195,7 @@ class PlateBeamWander(Insertion):
 
     def build(self, size, anchor, context):
         """Return a gain of opposite sign in the two beams."""
-        return optics.HarmonicGain(differential=True, mount="hwp", name=self.label)
+        return optics.HarmonicGain(differential=True, mount=self.stage, name=self.label)
 
 
 class PlateTilt(Insertion):
@@ -234,7 +235,7 @@ class _Around(Insertion):
         edit = super().edit(chains, context)
         edited, ties = [], dict(edit.ties)
         for chain in edit.chains:
-            anchor = getattr(Roles(chain), self.anchor)
+            anchor = getattr(self.roles(chain), self.anchor)
             if anchor is not None:
                 back = self._freed(self.build(len(context.wavelength), anchor, context))
                 back.name = self.inverse_name()

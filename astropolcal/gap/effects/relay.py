@@ -8,7 +8,7 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import insert_optic
-from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion, Roles
+from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion, label_of
 from astropolcal.measurement import Tie
 
 __all__ = [
@@ -119,7 +119,7 @@ class Fringes(StaticRetarder):
     @property
     def label(self):
         """Name of the optic in the chain."""
-        return "gap_" + self.name.replace(".", "_")
+        return label_of(self.name)
 
     def law(self, key, context):
         """Return a sine and a cosine in the wavenumber."""
@@ -255,7 +255,7 @@ class _BandAverage(Effect):
     @property
     def label(self):
         """Name of the depolarizer in the chain."""
-        return f"gap_{self.name}"
+        return label_of(self.name)
 
     @abstractmethod
     def retarder(self, roles):
@@ -270,7 +270,7 @@ class _BandAverage(Effect):
         """Return the chains with the depolarizer at zero; see `Effect.edit`."""
         edited, law = [], None
         for chain in chains:
-            roles = Roles(chain)
+            roles = self.roles(chain)
             if self.applies_to(roles):
                 law, chain = self._behind(chain, self.retarder(roles))
             edited.append(chain)

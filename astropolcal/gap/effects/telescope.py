@@ -11,7 +11,7 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import insert_optic
-from astropolcal.gap.effects.base import Edit, EffectParameter, Insertion, Roles
+from astropolcal.gap.effects.base import Edit, EffectParameter, Insertion, label_of
 from astropolcal.gap.effects.discrete import _Discrete
 from astropolcal.observations.pointing import TRACKING
 
@@ -35,25 +35,27 @@ _SIGNS = "McIntosh et al. 2026, Sec. 6.1; van Holstein et al. 2020, doi:10.1051/
 
 
 class _Telescope:
-    """The optics of a star's chain from the star to the altitude axis; None where one lacks."""
+    """What stands between a star and the half-wave plate; None where one lacks."""
 
     def __init__(self, roles):
-        before, last = [], next((o for o in roles.leaves if _turns(o, "altitude")), None)
-        if last is not None:
-            before = roles.leaves[: roles.leaves.index(last)]
-        self.altitude = last
-        self.parallactic = next((o for o in before if _turns(o, "parallactic")), None)
-        self.star = next((o for o in before if isinstance(o, optics.PolarizedSource)), None)
-        self.mirror = None
+        self.parallactic = next((o for o in roles.leaves if _turns(o, "parallactic")), None)
+        self.star = self.altitude = None
         if self.parallactic is not None:
-            between = before[before.index(self.parallactic) + 1 :]
-            own = (o for o in between if not (o.name or "").startswith("gap_"))
-            self.mirror = next(own, None)
+            i = next(i for i, o in enumerate(roles.leaves) if o is self.parallactic)
+            before, behind = roles.leaves[:i], roles.leaves[i:]
+            self.star = next((o for o in before if isinstance(o, optics.PolarizedSource)), None)
+            self.altitude = next((o for o in behind if _turns(o, "altitude")), None)
+        self.mirror = roles.telescope_mirror
 
     @property
-    def complete(self):
-        """Whether both axes are there."""
-        return self.altitude is not None and self.parallactic is not None
+    def is_there(self):
+        """Whether the light comes from the sky."""
+        return self.parallactic is not None
+
+    @property
+    def has_mirror(self):
+        """Whether there is a mirror, or the place of one at the altitude axis."""
+        return self.is_there and (self.mirror is not None or self.altitude is not None)
 
     def mirror_leaves(self, *keys):
         """Return whether no parameter of the mirror is free, its angle and ``keys`` aside."""
@@ -75,17 +77,19 @@ def _turns(optic, stage):
 
 
 class _OnSky(Insertion):
-    """One more optic in front of the altitude axis of the telescope."""
+    """One more optic in front of the rotation by the parallactic angle."""
+
+    anchor = None
 
     def applies_to(self, roles):
         """Return whether one chain has the telescope."""
-        return _Telescope(roles).complete
+        return _Telescope(roles).is_there
 
     def edit(self, chains, context):
         """Return the chains with the optic at zero; see `Effect.edit`."""
         edited = []
         for chain in chains:
-            roles = Roles(chain)
+            roles = self.roles(chain)
             if self.applies_to(roles):
                 chain = self._with(chain, _Telescope(roles), self.label, context)
             edited.append(chain)
@@ -94,11 +98,28 @@ class _OnSky(Insertion):
     def _with(self, chain, telescope, name, context):
         optic = self._freed(self.build(len(context.wavelength), telescope, context))
         optic.name = name
-        return insert_optic(chain, optic, before=self.neighbour(telescope).name)
+        return insert_optic(chain, optic, **self.place_in(telescope))
 
-    def neighbour(self, telescope):
-        """Return the optic behind the new one."""
-        return telescope.altitude
+    def place_in(self, telescope):
+        """Return next to what the new optic stands, and on which side."""
+        return {"before": telescope.parallactic.name}
+
+
+class _OfMirror(_OnSky):
+    """One more optic behind a mirror of the telescope, or in front of the altitude axis."""
+
+    anchor = "telescope_mirror"
+
+    def applies_to(self, roles):
+        """Return whether one chain has the mirror, or its place."""
+        telescope = _Telescope(roles)
+        return telescope.has_mirror and (self.optic is None or telescope.mirror is not None)
+
+    def place_in(self, telescope):
+        """Return next to what the new optic stands, and on which side."""
+        if telescope.mirror is not None:
+            return {"after": telescope.mirror.name}
+        return {"before": telescope.altitude.name}
 
 
 def _along(mirror):
@@ -106,7 +127,7 @@ def _along(mirror):
     return {} if mirror is None else {"theta": mirror.theta.value * u.deg, "mount": mirror.mount}
 
 
-class TertiaryDiattenuation(_OnSky):
+class TertiaryDiattenuation(_OfMirror):
     """
     Diattenuation of the tertiary mirror that the model lacks or holds fixed.
 
@@ -129,15 +150,15 @@ class TertiaryDiattenuation(_OnSky):
 
     def applies_to(self, roles):
         """Return whether there is a telescope whose mirror has no free diattenuation."""
-        telescope = _Telescope(roles)
-        return telescope.complete and telescope.mirror_leaves("theta", "retardance")
+        open_ = _Telescope(roles).mirror_leaves("theta", "retardance")
+        return open_ and super().applies_to(roles)
 
     def build(self, size, telescope, context):
         """Return a diattenuator in the plane of the mirror."""
         return optics.Diattenuator(diattenuation=np.zeros(size), **_along(telescope.mirror))
 
 
-class TertiaryRetardance(_OnSky):
+class TertiaryRetardance(_OfMirror):
     """
     Retardance of the tertiary mirror that the model lacks or holds fixed.
 
@@ -161,8 +182,8 @@ class TertiaryRetardance(_OnSky):
     def applies_to(self, roles):
         """Return whether a star that may be polarized is behind a mirror of fixed retardance."""
         telescope = _Telescope(roles)
-        open_ = telescope.complete and not telescope.unpolarized
-        return open_ and telescope.mirror_leaves("theta", "diattenuation")
+        open_ = not telescope.unpolarized and telescope.mirror_leaves("theta", "diattenuation")
+        return open_ and super().applies_to(roles)
 
     def build(self, size, telescope, context):
         """Return a retarder in the plane of the mirror."""
@@ -170,7 +191,7 @@ class TertiaryRetardance(_OnSky):
         return optics.LinearRetarder(retardance=zero, **_along(telescope.mirror))
 
 
-class TertiaryRecoating(_OnSky):
+class TertiaryRecoating(_OfMirror):
     """
     Diattenuation of the tertiary mirror that changes from one dataset to the next.
 
@@ -196,7 +217,7 @@ class TertiaryRecoating(_OnSky):
 
     def applies(self, chains):
         """Return whether there are two datasets of stars; see `Effect.applies`."""
-        return sum(self.applies_to(Roles(chain)) for chain in chains) > 1
+        return sum(self.applies_to(self.roles(chain)) for chain in chains) > 1
 
     def build(self, size, telescope, context):
         """Return a diattenuator in the plane of the mirror."""
@@ -206,7 +227,7 @@ class TertiaryRecoating(_OnSky):
         """Return the chains with a diattenuator in all but the first; see `Effect.edit`."""
         edited, added, seen = [], [], 0
         for chain in chains:
-            roles = Roles(chain)
+            roles = self.roles(chain)
             if self.applies_to(roles):
                 if seen:
                     name = f"{self.label}_{seen}"
@@ -247,10 +268,6 @@ class SkyBackground(_OnSky):
             q=np.zeros(size), u=np.zeros(size), reference=2 * context.flux, mount="total_flux"
         )
 
-    def neighbour(self, telescope):
-        """Return the optic behind the new one."""
-        return telescope.parallactic
-
 
 class SkyMotion(_OnSky):
     """
@@ -273,15 +290,11 @@ class SkyMotion(_OnSky):
     def applies_to(self, roles):
         """Return whether a star that may be polarized is behind a telescope."""
         telescope = _Telescope(roles)
-        return telescope.complete and not telescope.unpolarized
+        return telescope.is_there and not telescope.unpolarized
 
     def build(self, size, telescope, context):
         """Return a rotator by the lag times the rate."""
         return _lagging("parallactic", self.label)
-
-    def neighbour(self, telescope):
-        """Return the optic behind the new one."""
-        return telescope.parallactic
 
 
 def _lagging(stage, name):
@@ -311,12 +324,12 @@ class ParallacticSign(_Discrete):
     reference = _SIGNS
 
     def applies_to(self, roles):
-        """Return whether one chain has the telescope."""
-        return _Telescope(roles).complete
+        """Return whether one chain has the axis."""
+        return getattr(_Telescope(roles), self.axis) is not None
 
     def change(self, chain, roles):
         """Return the chain with the axis turned the other way."""
-        axis = getattr(_Telescope(Roles(chain)), self.axis)
+        axis = getattr(_Telescope(self.roles(chain)), self.axis)
         axis.mount = axis.stage if axis.stage_sign < 0 else f"-{axis.stage}"
         return chain
 
@@ -341,33 +354,45 @@ class PlateTrackingParallacticSign(_Discrete):
     """
     Half-wave plate that follows the parallactic angle the other way.
 
+    By which law it should follow is the instrument's, see `~astropolcal.instruments.SkyLaw`.
+
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("hwp_tracking_parallactic_sign").law
-    (-0.5, 1.0)
+    >>> get_effect("hwp_tracking_parallactic_sign").factors
+    (-1.0, 1.0)
     """
 
     name, place = "hwp_tracking_parallactic_sign", "stage of the half-wave plate"
     title = "half-wave plate that follows the parallactic angle with the wrong sign"
     shows = "everywhere on sky: the polarization turns with the parallactic angle"
     reference = _SIGNS
-    #: Factors of parallactic angle and altitude in the plate's true angle.
-    law = (-TRACKING[0], TRACKING[1])
+    acts_on = "plate"
+    #: By what the factors of parallactic angle and altitude in the plate's law are multiplied.
+    factors = (-1.0, 1.0)
 
     def applies_to(self, roles):
         """Return whether there are a telescope and a plate."""
-        return roles.plate is not None and _Telescope(roles).complete
+        return roles.plate is not None and _Telescope(roles).is_there
 
-    def change(self, chain, roles):
+    def edit(self, chains, context):
+        """Return the chains with the plate following another law; see `Effect.edit`."""
+        laws = () if context is None else context.tracking
+        laws = laws if len(laws) == len(chains) else [TRACKING] * len(chains)
+        edited = []
+        for chain, law in zip(chains, laws, strict=True):
+            roles = self.roles(chain)
+            applies = self.applies_to(roles)
+            edited.append(self.change(chain.copy(), roles, law) if applies else chain)
+        return Edit(edited, [])
+
+    def change(self, chain, roles, law=TRACKING):
         """Return the chain with the plate turned by the difference of the laws."""
-        plate = roles.plate.name
-        for stage, new, old in zip(("parallactic", "altitude"), self.law, TRACKING, strict=True):
-            if new != old:
-                sides = {"before": 1, "after": -1}
-                for side, sign in sides.items():
-                    name = f"gap_{self.name}_{stage}_{side}"
-                    turn = _follower(sign * (new - old), stage, name)
+        plate, label = roles.plate.name, label_of(self.name)
+        for stage, factor, old in zip(("parallactic", "altitude"), self.factors, law, strict=True):
+            if factor * old != old:
+                for side, sign in {"before": 1, "after": -1}.items():
+                    turn = _follower(sign * (factor - 1) * old, stage, f"{label}_{stage}_{side}")
                     chain = insert_optic(chain, turn, **{side: plate})
         return chain
 
@@ -379,14 +404,18 @@ class PlateTrackingAltitudeSign(PlateTrackingParallacticSign):
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("hwp_tracking_altitude_sign").law
-    (0.5, -1.0)
+    >>> get_effect("hwp_tracking_altitude_sign").factors
+    (1.0, -1.0)
     """
 
     name = "hwp_tracking_altitude_sign"
     title = "half-wave plate that follows the altitude with the wrong sign"
     shows = "everywhere on sky: the polarization turns with four times the altitude"
-    law = (TRACKING[0], -TRACKING[1])
+    factors = (1.0, -1.0)
+
+    def applies_to(self, roles):
+        """Return whether there is an altitude axis, too."""
+        return super().applies_to(roles) and _Telescope(roles).altitude is not None
 
 
 class PlateNotTracking(PlateTrackingParallacticSign):
@@ -396,14 +425,14 @@ class PlateNotTracking(PlateTrackingParallacticSign):
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("hwp_not_tracking").law
+    >>> get_effect("hwp_not_tracking").factors
     (0.0, 0.0)
     """
 
     name = "hwp_not_tracking"
     title = "half-wave plate that stands still between the commands"
     shows = "everywhere on sky: the polarization turns with parallactic angle and altitude"
-    law = (0.0, 0.0)
+    factors = (0.0, 0.0)
 
 
 def _follower(factor, stage, name):
