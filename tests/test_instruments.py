@@ -121,6 +121,20 @@ def test_entry_point_with_something_else_is_refused(registry, monkeypatch):
         instruments.get("broken")
 
 
+def test_package_that_cannot_be_loaded_is_named_and_stands_in_nobodys_way(registry, monkeypatch):
+    def fail():
+        raise ModuleNotFoundError("No module named 'missing'")
+
+    points = [
+        SimpleNamespace(name="broken", load=fail),
+        SimpleNamespace(name=Plugin.name, load=lambda: Plugin),
+    ]
+    monkeypatch.setattr(instruments, "entry_points", lambda group: points)
+    assert isinstance(instruments.get("PIP"), Plugin)
+    with pytest.raises(InstrumentError, match=r"'broken' cannot be loaded: ModuleNotFoundError"):
+        instruments.get("broken")
+
+
 def test_base_class_cannot_be_used_itself():
     with pytest.raises(TypeError, match="abstract"):
         Instrument()

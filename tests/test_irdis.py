@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """SPHERE/IRDIS: its chain against the published formulae, its headers, correction, diagnosis."""
 
+import datetime
 import io
 
 import asdf
@@ -9,13 +10,19 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table
+from astropy.time import Time
 
 from astropolcal import optics
 from astropolcal.calibration import calibrate
 from astropolcal.chain import insert_optic, leaves, remove_optic, system_mueller, with_beam
 from astropolcal.correction import ScienceFrames, correct, frame_positions, measurement_rows
-from astropolcal.exceptions import ChainError, InstrumentError, ObservationError
-from astropolcal.gap.effects import EFFECTS, Context, Roles, base, check_effect, get_effect
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    ChainError,
+    InstrumentError,
+    ObservationError,
+)
+from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, base, check_effect, get_effect
 from astropolcal.instruments import IRDIS
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
@@ -196,8 +203,48 @@ def test_on_sky_asks_which_filter_a_chain_of_one_is_of():
     chain = IRDIS_.chain("polarized", wavelength=[1.245] * u.um)
     with pytest.raises(ChainError, match=r"which of the filters Y, J, H, Ks"):
         IRDIS_.on_sky(chain)
-    sky = IRDIS_.on_sky(chain, wavelength=[1.245] * u.um)
+    sky = IRDIS_.on_sky(chain, wavelength=[1.245] * u.um, coating="after")
     assert sky["ut"].retardance.value == pytest.approx(173.414169049)
+
+
+def _ut(chain):
+    return chain["ut"].diattenuation.value
+
+
+@pytest.mark.parametrize(
+    ("date", "coating"),
+    [
+        ("2017-04-15", "before"),
+        (Time("2017-04-16T00:10"), "after"),
+        (datetime.date(2016, 1, 1), "before"),
+        (["2016-01-01", "2016-01-02"], "before"),
+        (Time(["2019-01-01", "2019-01-02"]), "after"),
+    ],
+)
+def test_telescope_on_sky_is_that_of_the_date(date, coating):
+    found = IRDIS_.on_sky(IRDIS_.published(), date=date)
+    np.testing.assert_array_equal(_ut(found), _ut(IRDIS_.chain("star", coating=coating)))
+
+
+def test_telescope_of_no_date_is_the_newer_one_and_says_so():
+    with pytest.warns(AstropolcalWarning, match=r"neither date nor coating.*from 2017-04-16 on"):
+        found = IRDIS_.on_sky(IRDIS_.published())
+    np.testing.assert_array_equal(_ut(found), _ut(IRDIS_.chain("star", coating="after")))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"coating": "new"}, "coating = 'new'; allowed are before, after"),
+        ({"date": "last night"}, "date = 'last night'; an ISO date"),
+        ({"date": ["2017-04-15", "2017-04-17"]}, "of before and of after the recoating"),
+        ({"date": "2019-01-01", "coating": "before"}, "coating = 'before', but the date 2019"),
+        ({"date": []}, "dates are none"),
+    ],
+)
+def test_telescope_that_cannot_be_is_refused(options, words):
+    with pytest.raises(InstrumentError, match=words):
+        IRDIS_.on_sky(IRDIS_.published(), **options)
 
 
 def test_on_sky_needs_a_plate():
@@ -455,13 +502,14 @@ def test_calibrated_internal_source_corrects_a_star():
     calibration = calibrate(
         IRDIS_.chains_for([table]), [table], instrument="irdis", search=False, cross_validate=False
     )
-    sky = IRDIS_.on_sky(truth)
+    sky = IRDIS_.on_sky(truth, coating="after")
     star = star_table("after", n=16).frames
     positions = frame_positions(IRDIS_, star, sky)
     rows = measurement_rows(sky, positions, IRDIS_.wavelength)
     right, left = np.moveaxis(rows @ [1000, 30, -20, 0], 1, 2)
     science = ScienceFrames.from_arrays(right, left, IRDIS_.wavelength, positions, hwp=star["hwp"])
-    done = correct(calibration, science, observable="double", open_directions="ignore")
+    with pytest.warns(AstropolcalWarning, match="neither date nor coating"):
+        done = correct(calibration, science, observable="double", open_directions="ignore")
     np.testing.assert_allclose(done.q, 0.03, atol=3e-4)
     np.testing.assert_allclose(done.u, -0.02, atol=3e-4)
 
@@ -503,11 +551,21 @@ def diattenuating_plates(monkeypatch):
     )
 
 
-@pytest.mark.parametrize("place", ["derotator", "telescope", "tertiary", "sky", "relay"])
+@pytest.mark.parametrize("place", ["derotator", "telescope", "tertiary", "sky"])
 def test_no_effect_of_an_optic_that_is_absent(place):
-    found = {name for name in applicable(minimal()) if place in EFFECTS[name].place}
-    assert not found
+    found = {effect.name for effect in adapted(EFFECTS.values(), [minimal()])}
+    words = {effect.name: effect.place for effect in adapted(EFFECTS.values(), [minimal()])}
+    assert found <= applicable(minimal())
+    assert not {name for name, where in words.items() if place in where}
     assert any(place in effect.place for effect in EFFECTS.values())
+
+
+def test_relay_stands_behind_the_plate_where_there_is_no_derotator():
+    named = {effect.name: effect for effect in adapted(EFFECTS.values(), [minimal()])}
+    assert named["static_retarder"].place == "relay behind the half-wave plate"
+    assert "derotator" not in named["mirror_flip"].title
+    with_one = adapted([EFFECTS["static_retarder"]], [IRDIS_.chain("polarized")])
+    assert with_one == [EFFECTS["static_retarder"]]
 
 
 def test_effects_of_the_plate_need_a_plate():

@@ -8,6 +8,7 @@ from astropolcal.calibration.accuracy import (
     cross_validated_residuals,
     leave_out_groups,
 )
+from astropolcal.calibration.comparison import compare
 from astropolcal.calibration.convergence import Convergence
 from astropolcal.calibration.covariance import Covariance, full_covariance
 from astropolcal.calibration.derived import Derived, propagate
@@ -110,6 +111,7 @@ __all__ = [
     "bootstrap",
     "calibrate",
     "changes",
+    "compare",
     "complete",
     "content_hash",
     "cross_validated_residuals",

@@ -1,14 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What stars leave open of the telescope's tertiary mirror, and what would determine it."""
+"""What stars leave open of the telescope's mirrors, and what would determine it."""
 
 from astropolcal.chain import leaves
+from astropolcal.optics import Rotator
 
 __all__ = ["telescope_words"]
 
 
 def telescope_words(finding, measurement):
     """
-    Say which parameters of the mirror before the altitude rotation the stars leave open.
+    Say which parameters of the mirrors before the half-wave plate the stars leave open.
 
     Parameters
     ----------
@@ -54,12 +55,14 @@ def _names(measurement):
 
 
 def _mirrors(measurement):
-    """Return the names of what stands between the rotations by parallactic angle and altitude."""
+    """Return the names of what stands between the parallactic angle and the half-wave plate."""
     found = set()
     for chain, _ in zip(getattr(measurement, "chains", ()), measurement.datasets, strict=False):
         train = leaves(chain)
         stages = [leaf.stage for leaf in train]
-        if "parallactic" in stages and "altitude" in stages:
-            inner = train[stages.index("parallactic") + 1 : stages.index("altitude")]
-            found |= {leaf.name for leaf in inner}
+        # the plate ends the telescope, or where there is none its last axis
+        last = next((s for s in ("hwp", "altitude") if s in stages), None)
+        if "parallactic" in stages and last is not None:
+            inner = train[stages.index("parallactic") + 1 : stages.index(last)]
+            found |= {leaf.name for leaf in inner if not isinstance(leaf, Rotator)}
     return found

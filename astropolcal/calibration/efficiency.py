@@ -15,9 +15,11 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from astropolcal import instruments
 from astropolcal.chain import join, leaves, stages, system_mueller
 from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.observations.pointing import TRACKING, horizontal, tracked
+from astropolcal.instruments import SkyLaw
+from astropolcal.observations.pointing import horizontal, tracked
 from astropolcal.optics import COORDINATES, Rotator
 from astropolcal.units import angle_to_rad
 
@@ -25,16 +27,19 @@ __all__ = [
     "DEROTATOR_LAWS",
     "BestDerotator",
     "best_derotator",
+    "has_derotator",
     "polarimetric_efficiency",
     "sky_path",
 ]
 
-#: Derotator angle = offset + f * altitude + g * parallactic angle, as (f, g). The first is what
-#: the tables of three stars show; the second keeps the image instead of the pupil still.
-DEROTATOR_LAWS = {"pupil": (0.5, 0.0), "field": (0.5, 0.5)}
+#: Derotator angle = offset + f * parallactic angle + g * altitude, as (f, g), where no instrument
+#: is given.
+DEROTATOR_LAWS = SkyLaw().derotator
 
-# plus and minus angles of the half-wave plate
+# plus and minus angles of the half-wave plate, and where a modulator has exchanged the beams
 _CYCLE = [0, 45, 22.5, 67.5] * u.deg
+_EXCHANGED = [45, 0, 67.5, 22.5] * u.deg
+_SKY = {"parallactic", "altitude"}
 _MOST_CELLS = 2_000_000
 
 
@@ -76,15 +81,41 @@ def sky_path(chain):
     return join(train)
 
 
+def has_derotator(chain):
+    """
+    Return whether a chain has a derotator: an optic on a stage that is not the plate's.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        A chain, from the sky or of an internal source.
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration.efficiency import has_derotator
+    >>> has_derotator(instruments.get("irdis").published())
+    True
+    """
+    angles = set(stages(sky_path(chain))) - {*COORDINATES, *_SKY, "hwp"}
+    return bool(angles)
+
+
 def polarimetric_efficiency(
     chain,
     wavelength,
     *,
-    derotator,
+    derotator=None,
     altitude=None,
     parallactic=None,
     aolp=90 * u.deg,
-    law=TRACKING,
+    instrument=None,
+    mode=None,
+    law=None,
 ):
     r"""
     Return the degree of linear polarization measured of a completely polarized source.
@@ -100,21 +131,29 @@ def polarimetric_efficiency(
     wavelength : `~astropy.units.Quantity`
         Shape (n_wavelengths,); that of the chain's parameters where these are given per
         wavelength.
-    derotator : `~astropy.units.Quantity`
-        Derotator angle; the angles broadcast against each other.
+    derotator : `~astropy.units.Quantity`, optional
+        Angle of the derotator, whatever its stage is called; needed if there is one. The angles
+        broadcast against each other.
     altitude, parallactic : `~astropy.units.Quantity`, optional
-        Where the telescope points; needed for a chain from the sky. The half-wave plate then
-        follows the tracking law.
+        Where the telescope points; needed for a chain from the sky, the altitude only if it
+        turns an optic. The half-wave plate then follows the tracking law.
     aolp : `~astropy.units.Quantity` or None
         Angle of the source's polarization, on sky or behind an internal source; 90 deg, the
         paper's choice, is -Q. With None the angle that is measured worst.
-    law : (float, float)
-        Tracking law of the half-wave plate, see `~astropolcal.observations.tracked`.
+    instrument : str or Instrument, optional
+        Whose half-wave plate it is: its ``sky_law`` is the tracking law. Without it that of
+        `~astropolcal.instruments.SkyLaw`.
+    mode : str, optional
+        What the derotator keeps still, such as ``"field"``; needed where the law of the plate
+        depends on it.
+    law : (float, float), optional
+        Another tracking law of the half-wave plate, see `~astropolcal.observations.tracked`.
 
     Returns
     -------
     `~numpy.ndarray`
-        Between 0 and 1, of the broadcast shape of the angles and (n_wavelengths,).
+        Of the broadcast shape of the angles and (n_wavelengths,); between 0 and 1, up to the
+        polarization that the optics make themselves.
 
     Raises
     ------
@@ -124,6 +163,12 @@ def polarimetric_efficiency(
         If an angle is missing or not finite, or too many values are asked for.
     ObservationError
         If the altitude is not above 0 to 90 deg.
+    InstrumentError
+        If the instrument or the mode is unknown.
+
+    Notes
+    -----
+    A modulator on the stage ``flc_state`` is averaged over both of its states.
 
     Examples
     --------
@@ -133,11 +178,13 @@ def polarimetric_efficiency(
     >>> charis = instruments.get("charis")
     >>> chain = charis.on_sky(charis.published())
     >>> efficiency = polarimetric_efficiency(chain, charis.wavelength, derotator=[45, 90] * u.deg,
-    ...                                      altitude=60 * u.deg, parallactic=94 * u.deg)
+    ...                                      altitude=60 * u.deg, parallactic=94 * u.deg,
+    ...                                      instrument=charis)
     >>> efficiency.shape, efficiency[:, 9].round(2).tolist()
     ((2, 22), [0.28, 0.99])
     """
     path = sky_path(chain)
+    law = _plate_law(path, instrument, mode) if law is None else law
     positions = _positions(path, derotator, altitude, parallactic, law)
     lam = np.atleast_1d(u.Quantity(wavelength))
     shape = np.broadcast_shapes(*(np.shape(angle) for angle in positions.values()))
@@ -146,8 +193,17 @@ def polarimetric_efficiency(
             f"{shape} angles at {lam.size} wavelengths are too many; allowed are {_MOST_CELLS}"
         )
     flat = {stage: np.broadcast_to(a, shape).ravel() * u.rad for stage, a in positions.items()}
-    matrices = np.stack([_at(path, lam, flat, hwp) for hwp in _CYCLE])
-    return _measured(matrices, aolp).reshape(*shape, lam.size)
+    return _measured(_cycle(path, lam, flat), aolp).reshape(*shape, lam.size)
+
+
+def _cycle(path, lam, positions):
+    """Return the first two rows of the matrices at the four angles of the plate."""
+    if "flc_state" not in stages(path):
+        return np.stack([_at(path, lam, positions, hwp) for hwp in _CYCLE])
+    n = len(next(iter(positions.values())))
+    a, b = (positions | {"flc_state": np.full(n, state)} for state in (0.0, 1.0))
+    pairs = zip(_CYCLE, _EXCHANGED, strict=True)
+    return np.stack([(_at(path, lam, a, one) + _at(path, lam, b, two)) / 2 for one, two in pairs])
 
 
 def _at(path, lam, positions, hwp):
@@ -157,21 +213,56 @@ def _at(path, lam, positions, hwp):
     return np.asarray(system_mueller(path, lam, positions))[..., :2, :]
 
 
+def _law_of(instrument):
+    if instrument is None:
+        return SkyLaw()
+    return (instruments.get(instrument) if isinstance(instrument, str) else instrument).sky_law
+
+
+def _plate_law(path, instrument, mode):
+    """Return the law of the plate, which only counts on sky."""
+    if not _SKY & set(stages(path)):
+        return 0.0, 0.0
+    return _law_of(instrument).plate_law(mode)
+
+
+def _derotator_stage(path):
+    """Return the stage that turns with the derotator, None where there is none."""
+    angles = set(stages(path)) - {*COORDINATES, *_SKY, "hwp"}
+    if "derotator" in angles or not angles:
+        return "derotator" if angles else None
+    return angles.pop() if len(angles) == 1 else None
+
+
 def _positions(path, derotator, altitude, parallactic, law):
-    wanted = set(stages(path)) - set(COORDINATES)
-    found = {"derotator": angle_to_rad(derotator, "derotator"), "hwp": 0.0}
-    if {"altitude", "parallactic"} & wanted:
-        if altitude is None or parallactic is None:
-            raise ParameterError("a chain from the sky needs altitude= and parallactic=")
-        a, p = horizontal(altitude, parallactic)
-        found |= {"altitude": a, "parallactic": p, "hwp": tracked(0.0, p, a, law)}
+    """Return the position of every stage in radian."""
+    wanted, turning = set(stages(path)) - set(COORDINATES), _derotator_stage(path)
+    found = {"hwp": 0.0}
+    if derotator is not None:
+        found[turning or "derotator"] = angle_to_rad(derotator, "derotator")
+    elif turning is not None:
+        raise ParameterError(f"the chain has an optic on the stage {turning}: derotator= is needed")
+    found |= _pointing(wanted, altitude, parallactic, law)
     unknown = wanted - set(found)
     if unknown:
         raise ChainError(f"no position of the stages {', '.join(sorted(unknown))}")
     for name, angle in found.items():
         if not np.all(np.isfinite(angle)):
             raise ParameterError(f"{name} = {angle} must be finite")
-    return {stage: found[stage] for stage in wanted} | {"derotator": found["derotator"]}
+    keep = {"derotator", *wanted} & set(found)
+    return {stage: found[stage] for stage in keep} or {"hwp": 0.0}
+
+
+def _pointing(wanted, altitude, parallactic, law):
+    """Return the positions of what follows the sky."""
+    if not _SKY & wanted:
+        return {}
+    needs_altitude = "altitude" in wanted or (law[1] and "hwp" in wanted)
+    if parallactic is None or (altitude is None and needs_altitude):
+        lacking = "altitude= and parallactic=" if needs_altitude else "parallactic="
+        raise ParameterError(f"a chain from the sky needs {lacking}")
+    a, p = horizontal(90 * u.deg if altitude is None else altitude, parallactic)
+    return {"altitude": a, "parallactic": p, "hwp": tracked(0.0, p, a, law)}
 
 
 def _measured(rows, aolp):
@@ -207,7 +298,7 @@ class BestDerotator:
         the wavelengths, at the worst angle of polarization; and ``now``, the same at the first
         moment.
     law : str
-        How the derotator follows, a key of `DEROTATOR_LAWS`.
+        What the derotator keeps still.
 
     Examples
     --------
@@ -224,7 +315,15 @@ class BestDerotator:
 
 
 def best_derotator(
-    chain, wavelength, altitude, parallactic, *, law="pupil", offsets=None, by="least"
+    chain,
+    wavelength,
+    altitude,
+    parallactic,
+    *,
+    law="pupil",
+    offsets=None,
+    by="least",
+    instrument=None,
 ):
     """
     Find the offset of the derotator that loses least polarization in an observation.
@@ -238,12 +337,16 @@ def best_derotator(
     altitude, parallactic : `~astropy.units.Quantity`
         Over the observation, shape (n_times,); `~astropolcal.observations.pointing` gives them for
         target, time and site.
-    law : {"pupil", "field"}
-        How the derotator follows the sky, see `DEROTATOR_LAWS`.
+    law : str
+        What the derotator keeps still, usually ``"pupil"`` or ``"field"``: one of the modes of the
+        instrument's law.
     offsets : `~astropy.units.Quantity`, optional
         Offsets to try, by default 0 to 179 deg in steps of 1 deg.
     by : {"least", "mean"}
         Whether the worst or the mean moment and wavelength decides.
+    instrument : str or Instrument, optional
+        Whose plate and derotator they are: its ``sky_law`` counts, without it
+        `DEROTATOR_LAWS`.
 
     Returns
     -------
@@ -253,6 +356,8 @@ def best_derotator(
     ------
     ParameterError
         If a choice is unknown.
+    ChainError
+        If the chain, or the instrument, has no derotator.
     ObservationError
         If the target is below the horizon.
 
@@ -268,20 +373,23 @@ def best_derotator(
     >>> bool(best.table["least"].max() > 0.9)
     True
     """
-    if law not in DEROTATOR_LAWS or by not in ("least", "mean"):
-        raise ParameterError(
-            f"law = {law!r}, by = {by!r}; allowed are {', '.join(DEROTATOR_LAWS)}, and least, mean"
-        )
+    sky_law = _law_of(instrument)
+    if not sky_law.derotator or _derotator_stage(sky_path(chain)) is None:
+        raise ChainError("there is no derotator whose offset could be chosen")
+    if law not in sky_law.derotator or by not in ("least", "mean"):
+        allowed = ", ".join(sky_law.derotator)
+        raise ParameterError(f"law = {law!r}, by = {by!r}; allowed are {allowed}, and least, mean")
     offsets = np.arange(180) * u.deg if offsets is None else np.atleast_1d(u.Quantity(offsets))
     a, p = (np.atleast_1d(angle) * u.rad for angle in horizontal(altitude, parallactic))
-    f, g = DEROTATOR_LAWS[law]
+    f, g = sky_law.derotator_law(law)
     efficiency = polarimetric_efficiency(
         chain,
         wavelength,
-        derotator=offsets[:, None] + f * a + g * p,
+        derotator=offsets[:, None] + f * p + g * a,
         altitude=a,
         parallactic=p,
         aolp=None,
+        law=sky_law.plate_law(law),
     )
     table = QTable({"offset": offsets.to(u.deg)})
     table["mean"] = efficiency.mean(axis=(1, 2))

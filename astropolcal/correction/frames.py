@@ -205,6 +205,7 @@ class ScienceFrames:
         position_angle=None,
         mirrored=False,
         order=3,
+        left_scale=1.0,
         **settings,
     ):
         """
@@ -218,16 +219,18 @@ class ScienceFrames:
             With a file layout.
         table : `~astropy.table.QTable`
             One row a file, the angles that its headers give: ``hwp`` and ``derotator``, for a
-            star ``parallactic`` and ``altitude``, and ``hwp_true`` if it is known.
+            star ``parallactic`` and ``altitude``, and ``hwp_true`` if it is known; ``flc_state`` if
+            the chain has a modulator.
         chain : `~astropy.modeling.CompoundModel`
             From the sky to the detector, see `sky_chain`.
         wavelength : `~astropy.units.Quantity`, optional
             Of the slices; by default the instrument's.
         centres : array_like, optional
-            As for ``CubeFiles``, shape (2, 2) or (n_frames, 2, 2); or of the left beam only, shape
+            As for ``CubeFiles``, in both images side by side where each beam has files of its own,
+            shape (2, 2) or (n_frames, 2, 2); or of the left beam only, shape
             (2,) or (n_frames, 2), with the right beam where the layout says; by default in the
             middle of the field.
-        size, position_angle, mirrored, order
+        size, position_angle, mirrored, order, left_scale
             As for ``CubeFiles``.
         **settings
             More attributes.
@@ -243,14 +246,18 @@ class ScienceFrames:
         """
         layout = instrument.files
         positions = frame_positions(instrument, table, chain, names=files)
+        left = [layout.left_file(path) for path in files] if layout.beam_files else None
         source = CubeFiles(
             files,
-            _centres(centres, layout),
+            _in_files(_centres(centres, layout), layout),
             size,
             position_angle=position_angle,
             extension=layout.cube_extension,
             mirrored=mirrored,
             order=order,
+            left_files=left,
+            left_scale=left_scale,
+            weights=layout.weights,
         )
         if settings.get("pairs") is None and "hwp" in table.colnames:
             settings["pairs"] = _pairs(table["hwp"], positions, source.names)
@@ -280,6 +287,7 @@ def _pairs(hwp, positions, names):
             found = pair_frames(
                 hwp,
                 None if derotator is None else np.broadcast_to(derotator, hwp.shape, subok=True),
+                positions.get("flc_state"),
                 derotator_tolerance=2 * u.deg,
                 labels=names,
             )
@@ -302,6 +310,16 @@ def _centres(centres, layout):
     return centres
 
 
+def _in_files(centres, layout):
+    """Return centres in the image of each beam, whose files may be apart."""
+    if not layout.beam_files:
+        return centres
+    centres = np.array(centres)
+    # side by side the left image comes first
+    centres[..., 0, 0] -= layout.file_shape[2]
+    return centres
+
+
 def frame_positions(instrument, table, chain, names=None):
     """
     Return the position of every stage in each frame, from what the headers give.
@@ -311,7 +329,8 @@ def frame_positions(instrument, table, chain, names=None):
     instrument : Instrument
         That knows how stages follow the sky.
     table : `~astropy.table.QTable`
-        One row a frame with the angles of the headers.
+        One row a frame with the angles of the headers, and the state of a modulator, A or B, as
+        ``flc_state`` if the chain has one.
     chain : `~astropy.modeling.CompoundModel`
         From the sky to the detector.
     names : sequence of str, optional
@@ -325,7 +344,7 @@ def frame_positions(instrument, table, chain, names=None):
     Raises
     ------
     ObservationError
-        If an angle is missing; the message names the frame.
+        If an angle or a state is missing; the message names the frame.
 
     Examples
     --------
@@ -349,11 +368,13 @@ def frame_positions(instrument, table, chain, names=None):
         ):
             continue
         _check_angles(table, stage, names)
+    if "flc_state" in stages(chain):
+        _check_states(table, names)
     table["frame"], table["bin"] = np.arange(len(table)), np.zeros(len(table), dtype=int)
     table["wavelength"] = 1 * u.um
     # positions are read as those of observations are; the fluxes do not matter
     table["flux_right"] = table["flux_left"] = np.ones(len(table)) * u.adu
-    table.meta = {}
+    table.meta = {key: table.meta[key] for key in ("tracking",) if key in table.meta}
     observations = Observations.from_table(table, name=names[0])
     return dict(instrument.positions(observations, chain))
 
@@ -368,3 +389,14 @@ def _check_angles(table, stage, names):
     unknown = ~np.isfinite(values)
     if unknown.any():
         raise ObservationError(f"{names[int(np.argmax(unknown))]}: no angle {stage!r}")
+
+
+def _check_states(table, names):
+    """Refuse frames without the state of the modulator that the chain has."""
+    found = table["flc_state"] if "flc_state" in table.colnames else [""] * len(table)
+    for name, state in zip(names, np.ma.filled(np.ma.asarray(found).astype(str), ""), strict=True):
+        if not state.strip():
+            raise ObservationError(
+                f"{name}: no state of the modulator, flc_state, which the calibrated chain needs; "
+                "allowed are A and B"
+            )

@@ -13,6 +13,7 @@ from functools import lru_cache
 import astropy.units as u
 import numpy as np
 
+from astropolcal.correction._spline import resample, suits
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import angle_to_rad
 
@@ -157,10 +158,26 @@ def _resampled(image, matrix, offset, shape, order):
         order = 0
     image, offset = _cropped(image, matrix, offset, shape)
     flat = image.reshape(-1, *image.shape[-2:])
-    out = np.empty((len(flat), *shape))
-    for plane, result in zip(flat, out, strict=True):
-        result[:] = _plane(plane, matrix, offset, shape, order)
+    bad = ~np.isfinite(flat)
+    filled = np.where(bad, 0.0, flat) if bad.any() else flat
+    out = _interpolated(filled, matrix, offset, shape, order)
+    if bad.any():
+        # planes mostly lack the same pixels
+        bad = bad[:1] if (bad == bad[0]).all() else bad
+        share = _interpolated(bad.astype(float), matrix, offset, shape, min(order, 1))
+        out[np.broadcast_to(share > _EXACT, out.shape)] = np.nan
+    out[:, _outside(matrix, offset, shape, flat.shape[1:])] = np.nan
     return out.reshape(*image.shape[:-2], *shape)
+
+
+def _interpolated(planes, matrix, offset, shape, order):
+    """Return what a spline through finite planes gives at the places of the result."""
+    from scipy.ndimage import affine_transform
+
+    if suits(planes.shape, order):
+        return resample(planes, matrix, offset, shape, order)
+    settings = {"output_shape": shape, "mode": "mirror", "order": order}
+    return np.stack([affine_transform(plane, matrix, offset, **settings) for plane in planes])
 
 
 def _cropped(image, matrix, offset, shape):
@@ -181,20 +198,6 @@ def _on_pixels(matrix, offset):
     """Return whether pixels fall on pixels."""
     whole = np.abs(offset - np.rint(offset)) < 1e-9
     return bool(np.isin(matrix, (-1.0, 0.0, 1.0)).all() and whole.all())
-
-
-def _plane(plane, matrix, offset, shape, order):
-    from scipy.ndimage import affine_transform
-
-    bad = ~np.isfinite(plane)
-    settings = {"output_shape": shape, "mode": "mirror"}
-    filled = np.where(bad, 0.0, plane) if bad.any() else plane
-    result = affine_transform(filled, matrix, offset, order=order, **settings)
-    if bad.any():
-        share = affine_transform(bad.astype(float), matrix, offset, order=min(order, 1), **settings)
-        result[share > _EXACT] = np.nan
-    result[_outside(matrix, offset, shape, plane.shape)] = np.nan
-    return result
 
 
 def _outside(matrix, offset, shape, image_shape):

@@ -29,7 +29,9 @@ from astropolcal.units import length_to_um
 __all__ = ["RowModel", "check_optics", "measurement_rows", "sky_chain"]
 
 
-def sky_chain(calibration, dataset=None, *, optics_in=None, beam=None, label="the calibration"):
+def sky_chain(
+    calibration, dataset=None, *, optics_in=None, beam=None, label="the calibration", date=None
+):
     """
     Return the optics from the sky to the detector, with calibrated values.
 
@@ -50,6 +52,8 @@ def sky_chain(calibration, dataset=None, *, optics_in=None, beam=None, label="th
         `~astropolcal.instruments.Instrument.optics_of` tells them.
     label : str
         What messages call the calibration.
+    date : str, `~astropy.time.Time` or sequence of them, optional
+        Of the frames, for an instrument whose telescope changed.
 
     Returns
     -------
@@ -84,10 +88,13 @@ def sky_chain(calibration, dataset=None, *, optics_in=None, beam=None, label="th
         from astropolcal.exceptions import InstrumentError
 
         try:
-            return instruments.get(name).on_sky(chains[0])
+            instrument = instruments.get(name)
         except InstrumentError:
-            # an instrument without a telescope's chain
-            pass
+            instrument = None  # it need not be installed here
+        if instrument and type(instrument).on_sky is not instruments.Instrument.on_sky:
+            known = {"wavelength": getattr(calibration, "wavelength", None), "date": date}
+            options = {key: known[key] for key in instrument.sky_options}
+            return instrument.on_sky(chains[0], **options)
     return _from_stage(chains[0], [s for s in stages(chains[0]) if s not in COORDINATES])
 
 

@@ -179,6 +179,13 @@ class CubeFiles:
         That holds the cube; inverse variances may follow in ``extension + 1``.
     mirrored, order
         As for ``derotate``.
+    left_files : sequence of path-like, optional
+        Files of the left beam, where each beam has files of its own; centres are then those
+        in the image of each.
+    left_scale : array_like
+        By what the left beam is multiplied, one number or one a frame.
+    weights : {"inverse variance", "error"}
+        What follows the cube.
 
     Raises
     ------
@@ -195,7 +202,18 @@ class CubeFiles:
     """
 
     def __init__(
-        self, files, centres, size, *, position_angle=None, extension=1, mirrored=False, order=3
+        self,
+        files,
+        centres,
+        size,
+        *,
+        position_angle=None,
+        extension=1,
+        mirrored=False,
+        order=3,
+        left_files=None,
+        left_scale=1.0,
+        weights="inverse variance",
     ):
         self.files = [str(path) for path in files]
         if not self.files:
@@ -206,16 +224,21 @@ class CubeFiles:
         self._centres = np.broadcast_to(np.asarray(centres, dtype=float), (self.n_frames, 2, 2))
         self._angles = position_angle
         self.image_shape = (int(size), int(size))
-        self._places = [_places(path, extension) for path in self.files]
-        self._shape = self._places[0][0].shape
-        for path, (cube, *_) in zip(self.files, self._places, strict=True):
+        left = self.files if left_files is None else [str(path) for path in left_files]
+        self._beam_files = (self.files, left)
+        self._scale = np.broadcast_to(np.asarray(left_scale, dtype=float), (self.n_frames,))
+        self._weights = weights
+        found = {path: _places(path, extension) for path in dict.fromkeys([*self.files, *left])}
+        self._places = [[found[path] for path in files] for files in self._beam_files]
+        self._shape = self._places[0][0][0].shape
+        for path, (cube, *_) in found.items():
             if cube.shape != self._shape or len(cube.shape) != 3:
                 raise ObservationError(
                     f"{path}: a cube of shape {cube.shape}; {self.files[0]} has {self._shape}, and "
                     "three axes are needed"
                 )
         self.n_wavelengths = self._shape[0]
-        self.has_variances = all(len(places) > 1 for places in self._places)
+        self.has_variances = all(len(places) > 1 for places in found.values())
         self._check_window(self._shape[1:])
 
     def _check_window(self, shape):
@@ -236,17 +259,24 @@ class CubeFiles:
     def fluxes(self, beam, frames, wavelengths):
         """Return the fluxes of a beam in some frames and wavelengths, (n, m, size, size)."""
         numbers = range(self.n_frames)[frames]
-        return np.stack([self._cut(derotate, i, beam, self._read(i, wavelengths)) for i in numbers])
+        found = [self._read(beam, i, wavelengths) * self._factor(beam, i) for i in numbers]
+        cut = [self._cut(derotate, i, beam, cube) for i, cube in zip(numbers, found, strict=True)]
+        return np.stack(cut)
 
     def variances(self, beam, frames, wavelengths):
-        """Return their variances, NaN where the inverse variance is zero."""
+        """Return their variances, NaN where the weight or the error is zero."""
         found = []
         for i in range(self.n_frames)[frames]:
-            weight = self._read(i, wavelengths, 1)
-            with np.errstate(divide="ignore"):
-                variance = np.where(weight > 0, 1 / weight, np.nan)
+            known = self._read(beam, i, wavelengths, 1)
+            power = 2 if self._weights == "error" else -1
+            with np.errstate(divide="ignore", invalid="ignore"):
+                variance = np.where(known > 0, known**power, np.nan)
+            variance = variance * self._factor(beam, i) ** 2
             found.append(self._cut(derotate_variance, i, beam, variance))
         return np.stack(found)
+
+    def _factor(self, beam, i):
+        return self._scale[i] if beam == 1 else 1.0
 
     def _cut(self, resample, i, beam, cube):
         angle = 0 * u.deg if self._angles is None else self._angles[i]
@@ -259,15 +289,18 @@ class CubeFiles:
             order=self._order,
         )
 
-    def _read(self, i, wavelengths, offset=0):
-        place, path = self._places[i][offset], self.files[i]
+    def _read(self, beam, i, wavelengths, offset=0):
+        place, path = self._places[beam][i][offset], self._beam_files[beam][i]
         try:
             if place.start is not None:
                 # a thousand files would take long to open, wavelength by wavelength
                 cube = np.memmap(path, place.dtype, "r", place.start, place.shape)
                 return np.array(cube[wavelengths], dtype=float)
             with fits.open(path) as hdus:
-                return np.array(hdus[self._extension + offset].section[wavelengths], dtype=float)
+                section = hdus[self._extension + offset].section
+                if len(section.shape) == 2:
+                    return np.array(section[:, :], dtype=float)[None][wavelengths]
+                return np.array(section[wavelengths], dtype=float)
         except (OSError, IndexError, TypeError, ValueError) as error:
             raise ObservationError(
                 f"{path}: cannot be read: {' '.join(str(error).split())[:200]}"
@@ -308,4 +341,7 @@ def _place(hdu):
     plain &= info is not None and info["file"].compression is None and "BLANK" not in header
     bits = header.get("BITPIX", 8)
     dtype = f">{'f' if bits < 0 else 'i' if bits > 8 else 'u'}{abs(bits) // 8}"
-    return _Place(tuple(getattr(hdu, "shape", ())), dtype, info["datLoc"] if plain else None)
+    shape = tuple(getattr(hdu, "shape", ()))
+    # an image is a cube of one slice
+    shape = (1, *shape) if len(shape) == 2 else shape
+    return _Place(shape, dtype, info["datLoc"] if plain else None)

@@ -12,6 +12,7 @@ from importlib.metadata import entry_points
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.charis import CHARIS
+from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
 from astropolcal.instruments.vampires import VAMPIRES
@@ -21,6 +22,7 @@ __all__ = [
     "IRDIS",
     "VAMPIRES",
     "Instrument",
+    "SkyLaw",
     "add_nuisance",
     "get",
     "names",
@@ -95,7 +97,8 @@ def get(name):
     Raises
     ------
     InstrumentError
-        If it is unknown; the message names near matches.
+        If it is unknown; the message names near matches, and installed instruments that cannot
+        be loaded.
 
     Examples
     --------
@@ -106,13 +109,22 @@ def get(name):
     for cls in _REGISTRY.values():
         if cls().answers_to(str(name)):
             return cls()
+    broken = []
     for point in entry_points(group="astropolcal.instruments"):
-        instrument = register(point.load())()
+        try:
+            instrument = register(point.load())()
+        except InstrumentError:
+            raise
+        except Exception as error:  # whatever another package raises when it is imported
+            broken.append(f"; {point.name!r} cannot be loaded: {type(error).__name__}: {error}")
+            continue
         if instrument.answers_to(str(name)):
             return instrument
     near = difflib.get_close_matches(str(name).lower(), names(), n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise InstrumentError(f"unknown instrument {name!r}; known are {', '.join(names())}{hint}")
+    raise InstrumentError(
+        f"unknown instrument {name!r}; known are {', '.join(names())}{hint}{''.join(broken)}"
+    )
 
 
 register(CHARIS)

@@ -17,9 +17,15 @@ TEXTS = (
     "instrument",
     "filter",
     "pickoff",
+    "flc",
+    "flc_state",
+    "read_mode",
 )
 #: Beyond these, in degree, an angle in a header cannot be right.
 RANGES = dict.fromkeys(ANGLES, (-720.0, 720.0)) | {"altitude": (0.0, 90.0)}
+RANGES |= {"em_gain": (0.0, 1e5)}
+# numbers without a unit
+_PLAIN = ("camera", "em_gain")
 
 _MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
 
@@ -38,10 +44,15 @@ def look_up(headers, column, layout):
     return layout.keywords[column], None
 
 
+def unit_of(column, layout):
+    """Return the unit of a column's keyword."""
+    return u.Unit(layout.units.get(column, "" if column in _PLAIN else "deg"))
+
+
 def convert(column, value, layout, target):
     """Return a value as a number in a unit; TypeError or ValueError if it is none."""
     factor, offset = layout.transforms.get(column, (1.0, 0.0))
-    unit = u.Unit(layout.units.get(column, "deg"))
+    unit = unit_of(column, layout)
     return (factor * float(value) + offset) * unit.to(target)
 
 

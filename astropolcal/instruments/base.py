@@ -8,6 +8,7 @@ import astropy.units as u
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError
+from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.nuisance import add_nuisance
 from astropolcal.observations import (
     common_wavelengths,
@@ -42,6 +43,10 @@ class Instrument(ABC):
         How the instrument's FITS files look; None if they cannot be reduced here.
     references : tuple of str
         Where the values come from.
+    sky_law : SkyLaw
+        How half-wave plate and derotator follow the sky.
+    sky_options : tuple of str
+        Which of ``wavelength`` and ``date`` its `on_sky` takes.
 
     Examples
     --------
@@ -67,6 +72,7 @@ class Instrument(ABC):
     keywords = {}
     files = None
     references = ()
+    sky_options = ()
 
     @abstractmethod
     def chain(self, source="polarized", optics_in=(), *, wavelength=None, **options):
@@ -114,6 +120,47 @@ class Instrument(ABC):
         dict of str to bool
             Name of an optic to whether it was in the beam; what the header does not tell is
             absent.
+        """
+        return {}
+
+    def configured(self, header):
+        """
+        Return the instrument as a frame's mode has it, with the wavelengths and shape of its files.
+
+        Parameters
+        ----------
+        header : `~astropy.io.fits.Header` or mapping
+            Primary header.
+
+        Returns
+        -------
+        Instrument
+            Here the same: files of one kind only.
+
+        Raises
+        ------
+        InstrumentError
+            If the mode is not known.
+        """
+        return self
+
+    def mode_header(self, wavelength):
+        """
+        Return the keywords by which `configured` knows cubes of some wavelengths.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Of the slices.
+
+        Returns
+        -------
+        dict of str to str
+
+        Raises
+        ------
+        InstrumentError
+            If no mode of the instrument has these wavelengths.
         """
         return {}
 
@@ -236,6 +283,52 @@ class Instrument(ABC):
         """Site of the telescope, an `~astropy.coordinates.EarthLocation`, or None."""
         return None if self.files is None else location_of(self.files.site)
 
+    @property
+    def sky_law(self):
+        """How plate and derotator follow the sky; here that of Subaru, or of the file layout."""
+        return SkyLaw() if self.files is None else SkyLaw(plate=self.files.tracking)
+
+    def plate_law(self, observations):
+        """
+        Return the tracking law of the half-wave plate for a dataset.
+
+        Parameters
+        ----------
+        observations : Observations
+            Where the law depends on what the derotator keeps still, ``tracking`` in its meta
+            names that.
+
+        Returns
+        -------
+        (float, float)
+            Factors of parallactic angle and altitude.
+
+        Raises
+        ------
+        InstrumentError
+            If the table has neither the true angle of the plate, ``hwp_true``, nor says which law
+            it is.
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> from astropolcal.observations import Observations, example_table
+        >>> instruments.get("charis").plate_law(Observations.from_table(example_table()))
+        (0.5, 1.0)
+        """
+        law, stated = self.sky_law, observations.meta.get("tracking")
+        if not law.plate_depends_on_mode:
+            return law.plate_law()
+        if stated in law.modes:
+            return law.plate_law(stated)
+        if stated is None and "hwp_true" in observations.frames.colnames:
+            # the law then only tells how the plate moves within an exposure
+            return law.plate_law(law.modes[0])
+        raise InstrumentError(
+            f"{observations.name}: tracking is {stated!r} in the table's meta; without a column "
+            f"hwp_true it must be one of {', '.join(law.modes)}"
+        )
+
     def check(self, observations):
         """Raise InstrumentError if the table names another instrument."""
         stated = observations.instrument
@@ -252,8 +345,9 @@ class Instrument(ABC):
         """
         Return the position of every stage of the chain in each frame, in radian.
 
-        In a chain with stages "parallactic" or "altitude" the half-wave plate follows the sky,
-        see `~astropolcal.observations.sky_positions`; elsewhere the columns count.
+        In a chain with stages "parallactic" or "altitude" the half-wave plate follows the sky, by
+        the instrument's law or as the column ``hwp_true`` tells, see
+        `~astropolcal.observations.sky_positions`; elsewhere the columns count.
 
         Parameters
         ----------
@@ -277,8 +371,7 @@ class Instrument(ABC):
         """
         wanted, sky = stages(chain), {}
         if {"parallactic", "altitude"} & set(wanted):
-            if self.files is not None:
-                exposure = {"law": self.files.tracking} | exposure
+            exposure = {"law": self.plate_law(observations)} | exposure
             sky = sky_positions(observations, self.location, **exposure)
             # the table need not have the parallactic angle as a column
             steady = sky["parallactic"].reshape(-1, observations.n_frames).mean(axis=0)

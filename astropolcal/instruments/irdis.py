@@ -15,62 +15,35 @@ import re
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
-from astropy.table import QTable
-from astropy.time import Time
 
 from astropolcal import optics
 from astropolcal.chain import join, leaves, stages
-from astropolcal.exceptions import ChainError, InstrumentError, ObservationError
+from astropolcal.exceptions import ChainError, InstrumentError
+from astropolcal.instruments._irdis_headers import frame_table
+from astropolcal.instruments._irdis_optics import (
+    CENTRES,
+    FILTERS,
+    RECOATING,
+    calibration_polarizer,
+    check_all_filters,
+    choice,
+    coating_of,
+    coating_on,
+    derotator,
+    filters_at,
+    half_wave_plate,
+    polarizers,
+    stated_coating,
+    telescope,
+)
 from astropolcal.instruments.base import Instrument
+from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.nuisance import without_nuisance
 from astropolcal.instruments.telescope import star_source
 from astropolcal.observations import is_star
-from astropolcal.observations.pointing import location_of, pointing
+from astropolcal.observations.pointing import location_of
 
 __all__ = ["IRDIS"]
-
-# van Holstein et al. 2020, as distributed with their pipeline; one value a filter
-_FILTERS = ("Y", "J", "H", "Ks")
-_CENTRES = (1.043, 1.245, 1.625, 2.182) * u.um
-_HWP_RETARDANCE = (184.24489040687035, 177.52027378388257, 170.67214967707864, 177.61874393785442)
-_HWP_DIATTENUATION = (
-    -0.00021492286258857182, -0.00043278581895049085, -0.00029657803108325395,
-    -0.00041456866069250524)  # fmt: skip
-_DEROTATOR_RETARDANCE = (
-    126.11957538036766,
-    156.0584333408133,
-    99.32313652084311,
-    84.13439892002613,
-)
-_DEROTATOR_DIATTENUATION = (
-    -0.0009423930026144313, -0.008303978181252019, -0.002260131403393225,
-    0.0035517563420643166)  # fmt: skip
-# computed by them from the refractive index of aluminium, and held: UT and M4 alike
-_MIRROR_RETARDANCE = (171.891576898, 173.414169049, 174.998748608, 176.302288996)
-_UT_DIATTENUATION = {
-    "before": (0.023607413903534567, 0.016685701811847004, 0.012930082215499676,
-               0.010575041739439168),
-    "after": (0.01745394681183012, 0.01213513552053676, 0.009032205030412622,
-              0.0074593218421309315),
-}  # fmt: skip
-_M4_DIATTENUATION = {
-    "before": (0.018211735858186456, 0.012844478639635984, 0.009845229155837451,
-               0.007766430613637994),
-    "after": (0.018194769704367342, 0.013046513475544473, 0.009220985704954044,
-              0.008078285701524354),
-}  # fmt: skip
-_POLARIZER = (0.9801695109615369, 0.9894796343284551, 0.9955313968849352, 0.9841908773870153)
-_HWP_OFFSET, _DEROTATOR_OFFSET = -0.613158589269 * u.deg, 0.500072483779 * u.deg
-
-_RECOATING = "2017-04-16"
-_COATINGS = tuple(_UT_DIATTENUATION)
-# a wavelength within this share of a filter's centre stands for the filter
-_SAME_FILTER = 0.01
-
-# hwp_true = hwp + f * parallactic + g * altitude: what keeps the direction of polarization that
-# is measured fixed on the detector, with a derotator that follows the field, or the pupil
-_TRACKING = {"field": (-1.0, 1.0), "pupil": (-0.5, 1.0)}
 
 # longitude, latitude (deg) and height (m) of the telescope in the headers
 _SITE = (-70.4045, -24.6268, 2648.0)
@@ -94,7 +67,7 @@ class IRDIS(Instrument):
 
     name = "irdis"
     aliases = ("SPHERE/IRDIS", "VLT/SPHERE/IRDIS")
-    wavelength = _CENTRES
+    wavelength = CENTRES
     keywords = {
         "hwp_true": "ESO INS4 DROT3 BEGIN",
         "derotator": "ESO INS4 DROT2 BEGIN",
@@ -112,10 +85,16 @@ class IRDIS(Instrument):
         "polarized standard star",
         "star",
     )
+    sky_options = ("wavelength", "date")
     #: Names of the filters with coefficients, in the order of ``wavelength``.
-    filters = _FILTERS
+    filters = FILTERS
+    #: What keeps the direction of polarization that is measured fixed to the image.
+    sky_law = SkyLaw(
+        plate={"field": (-1.0, 1.0), "pupil": (-0.5, 1.0)},
+        derotator={"field": (-0.5, 0.5), "pupil": (0.0, 0.5)},
+    )
     #: Day from which the mirrors of the telescope have their new coating.
-    recoating = _RECOATING
+    recoating = RECOATING
 
     def chain(
         self,
@@ -170,19 +149,19 @@ class IRDIS(Instrument):
         >>> chain["derotator"].retardance.quantity.round(1)
         <Quantity 99.3 deg>
         """
-        _choice("source", source, self.sources)
+        choice("source", source, self.sources)
         if tuple(optics_in):
             raise InstrumentError(f"optics_in = {list(optics_in)}: no optic of irdis is optional")
         grid = self.wavelength if wavelength is None else np.atleast_1d(u.Quantity(wavelength))
-        index = _filters_at(grid)
-        common = [_half_wave_plate(index), _derotator(index), _polarizers(index)]
+        index = filters_at(grid)
+        common = [half_wave_plate(index), derotator(index), polarizers(index)]
         if source == "polarized":
-            return join([_calibration_polarizer(), *common])
+            return join([calibration_polarizer(), *common])
         if source == "unpolarized":
             zero = np.zeros(index.size)
             return join([optics.PolarizedSource(q=zero, u=zero, name="lamp"), *common])
         light = star_source(source, grid, star, target)
-        return join([light, *_telescope(index, coating), *common])
+        return join([light, *telescope(index, coating), *common])
 
     def published(self):
         """
@@ -204,7 +183,7 @@ class IRDIS(Instrument):
         """Return the meta of a table taken with the chain of `published`."""
         return {"instrument": "SPHERE/IRDIS", "source": "polarized"}
 
-    def on_sky(self, chain, *, wavelength=None, coating="after"):
+    def on_sky(self, chain, *, wavelength=None, coating=None, date=None):
         """
         Return the chain from the sky that has the optics of an internal chain.
 
@@ -214,8 +193,10 @@ class IRDIS(Instrument):
             A chain with a half-wave plate; one with the telescope already keeps it.
         wavelength : `~astropy.units.Quantity`, optional
             Filters of the chain by their central wavelengths; needed if it is not of all four.
-        coating : {"before", "after"}
+        coating : {"before", "after"}, optional
             Of the published telescope that is put in front: before or after 2017-04-16.
+        date : str, ``datetime.date``, `~astropy.time.Time` or sequence of them, optional
+            Of the frames, which tells the coating.
 
         Returns
         -------
@@ -225,12 +206,19 @@ class IRDIS(Instrument):
         ------
         ChainError
             If the chain has no half-wave plate, or does not tell its filters.
+        InstrumentError
+            If the coating is unknown, is not that of the date, or the dates are of both.
+
+        Warns
+        -----
+        AstropolcalWarning
+            If neither coating nor date is given: it is then that of after the recoating.
 
         Examples
         --------
         >>> from astropolcal import instruments
         >>> irdis = instruments.get("irdis")
-        >>> [optic.name for optic in irdis.on_sky(irdis.published(), coating="before")][:4]
+        >>> [optic.name for optic in irdis.on_sky(irdis.published(), date="2016-05-01")][:4]
         ['parallactic', 'ut', 'altitude', 'm4']
         """
         chain = without_nuisance(chain)
@@ -241,10 +229,10 @@ class IRDIS(Instrument):
         if start is None:
             raise ChainError("irdis: the chain has no optic 'hwp' to put the telescope before")
         if wavelength is None:
-            _check_all_filters(found[start:])
+            check_all_filters(found[start:])
             wavelength = self.wavelength
-        index = _filters_at(np.atleast_1d(wavelength))
-        return join([*_telescope(index, coating), *found[start:]])
+        index = filters_at(np.atleast_1d(wavelength))
+        return join([*telescope(index, coating_of(coating, date)), *found[start:]])
 
     def setup(self, observations):
         """
@@ -295,7 +283,7 @@ class IRDIS(Instrument):
         """
         if not is_star(observations.source):
             return {}
-        own = {"coating": _coating(observations)}
+        own = {"coating": stated_coating(observations)}
         target = str(observations.meta.get("object") or "")
         words = re.sub(r"\W+", "", target)
         return own | ({"star": f"star_{words}", "target": target} if words else {})
@@ -307,8 +295,8 @@ class IRDIS(Instrument):
 
         Parameters
         ----------
-        date : str or ``datetime.date``
-            ISO date of the observation.
+        date : str, ``datetime.date`` or `~astropy.time.Time`
+            Date of the observation, a text in ISO form.
 
         Returns
         -------
@@ -322,48 +310,15 @@ class IRDIS(Instrument):
         Examples
         --------
         >>> from astropolcal.instruments import IRDIS
-        >>> IRDIS.coating_on("2017-04-15"), IRDIS.coating_on("2017-04-16T03:00")
+        >>> coating_on("2017-04-15"), coating_on("2017-04-16T03:00")
         ('before', 'after')
         """
-        day = str(date)[:10]
-        if not re.fullmatch(r"\d{4}-[01]\d-[0-3]\d", day):
-            raise InstrumentError(f"date = {date!r}; an ISO date such as {_RECOATING} is needed")
-        return "before" if day < _RECOATING else "after"
+        return coating_on(date)
 
     @property
     def location(self):
         """Site of the telescope, an `~astropy.coordinates.EarthLocation`."""
         return location_of(_SITE)
-
-    def positions(self, observations, chain, **exposure):
-        """
-        Return the position of every stage of the chain in each frame, in radian.
-
-        The true angle of the half-wave plate is the column ``hwp_true``; where there is
-        none, it follows from ``hwp`` by the tracking law that ``tracking`` in the meta names,
-        ``field`` or ``pupil``.
-
-        Parameters
-        ----------
-        observations : Observations
-            The dataset.
-        chain : Optic or `~astropy.modeling.CompoundModel`
-            The chain.
-        **exposure
-            As for `Instrument.positions`.
-
-        Returns
-        -------
-        dict of str to `~numpy.ndarray`
-
-        Raises
-        ------
-        InstrumentError
-            If a star has neither.
-        """
-        if {"parallactic", "altitude"} & set(stages(chain)):
-            exposure = {"law": _law(observations)} | exposure
-        return super().positions(observations, chain, **exposure)
 
     def frame_table(self, headers):
         """
@@ -408,244 +363,12 @@ class IRDIS(Instrument):
         >>> table["derotator"].round(6), table.meta["filter"]
         (<Quantity [1.] deg>, 'H')
         """
-        table = _frame_table(list(headers), self.location)
+        table = frame_table(list(headers), self.location, dict(zip(FILTERS, CENTRES, strict=True)))
         days = {self.coating_on(time) for time in table["time"]}
         if len(days) > 1:
             raise InstrumentError(
-                f"the frames are from before and from after the recoating of {_RECOATING}; "
+                f"the frames are from before and from after the recoating of {RECOATING}; "
                 "make one table of each"
             )
         table.meta["instrument"] = "SPHERE/IRDIS"
         return table
-
-
-def _choice(what, value, allowed):
-    if value not in allowed:
-        raise InstrumentError(f"{what} = {value!r}; allowed are {', '.join(allowed)}")
-
-
-def _filters_at(wavelength):
-    """Return the index of the filter of every wavelength."""
-    centres, lam = _CENTRES.to_value(u.um), u.Quantity(wavelength).to_value(u.um)
-    index = np.abs(lam[:, None] / centres - 1).argmin(axis=1)
-    off = ~(np.abs(lam / centres[index] - 1) <= _SAME_FILTER)
-    if off.any():
-        known = ", ".join(f"{n} ({c:g} um)" for n, c in zip(_FILTERS, centres, strict=True))
-        raise InstrumentError(
-            f"wavelength = {lam[off][0]:.6g} um is that of no filter with coefficients; "
-            f"allowed are {known}"
-        )
-    return index
-
-
-def _check_all_filters(found):
-    sizes = {getattr(leaf, key).size for leaf in found for key in leaf.param_names}
-    if max(sizes) != len(_FILTERS):
-        raise ChainError(
-            f"irdis: the chain has {max(sizes)} values a parameter, and it is not known for which "
-            f"of the filters {', '.join(_FILTERS)}; give on_sky(chain, wavelength=...)"
-        )
-
-
-def _coating(observations):
-    stated = observations.meta.get("coating")
-    if stated is not None:
-        _choice(f"{observations.name}: coating", stated, _COATINGS)
-        return stated
-    if observations.meta.get("date") is None:
-        raise InstrumentError(
-            f"{observations.name}: neither date nor coating in the table's meta; were the "
-            f"telescope's mirrors those 'before' or 'after' {_RECOATING}?"
-        )
-    return IRDIS.coating_on(observations.meta["date"])
-
-
-def _law(observations):
-    stated = observations.meta.get("tracking")
-    if stated is None and "hwp_true" in observations.frames.colnames:
-        # the law then only tells how the plate moves within an exposure
-        return _TRACKING["field"]
-    if stated not in _TRACKING:
-        raise InstrumentError(
-            f"{observations.name}: tracking is {stated!r} in the table's meta; without a column "
-            f"hwp_true it must be one of {', '.join(_TRACKING)}"
-        )
-    return _TRACKING[stated]
-
-
-def _at(values, index):
-    return np.array(values)[index]
-
-
-def _near(about):
-    return {"fixed": {"theta": False}, "bounds": {"theta": (about - 5, about + 5)}}
-
-
-def _plate(retardance, diattenuation, index, theta, **settings):
-    held = _near(theta.value)
-    held["bounds"] |= {"diattenuation": (-0.1, 0.1), "retardance": (0, 360)}
-    return optics.DiattenuatorRetarder(
-        diattenuation=_at(diattenuation, index),
-        retardance=_at(retardance, index) * u.deg,
-        theta=theta,
-        **held,
-        **settings,
-    )
-
-
-def _half_wave_plate(index):
-    names = {"mount": "hwp", "name": "hwp"}
-    return _plate(_HWP_RETARDANCE, _HWP_DIATTENUATION, index, _HWP_OFFSET, **names)
-
-
-def _derotator(index):
-    names = {"mount": "derotator", "name": "derotator"}
-    derotator = _plate(
-        _DEROTATOR_RETARDANCE, _DEROTATOR_DIATTENUATION, index, _DEROTATOR_OFFSET, **names
-    )
-    # double differences see it in second order only
-    derotator.diattenuation.fixed = True
-    return derotator
-
-
-def _polarizers(index):
-    # the left beam passes +Q
-    return optics.WollastonPrism(
-        efficiency=_at(_POLARIZER, index), theta=90 * u.deg, name="wollaston"
-    )
-
-
-def _calibration_polarizer():
-    return optics.LinearPolarizer(name="calibration_polarizer", **_near(0))
-
-
-def _telescope(index, coating):
-    _choice("coating", coating, _COATINGS)
-    return [
-        optics.Rotator(mount="parallactic", name="parallactic"),
-        _mirror(_UT_DIATTENUATION[coating], index, "ut"),
-        optics.Rotator(mount="altitude", name="altitude"),
-        _mirror(_M4_DIATTENUATION[coating], index, "m4"),
-    ]
-
-
-def _mirror(diattenuation, index, name):
-    return optics.DiattenuatorRetarder(
-        diattenuation=_at(diattenuation, index),
-        retardance=_at(_MIRROR_RETARDANCE, index) * u.deg,
-        name=name,
-        fixed={"retardance": True},
-        bounds={"diattenuation": (-0.1, 0.1)},
-    )
-
-
-# ---- headers ---------------------------------------------------------------------------------
-
-_PLATE_ZERO, _PUPIL_OFFSET = 152.15, 135.99
-# seconds: of the read-out of every DIT, and of the start of an exposure
-_READ_OUT, _START = 0.938, 2.4
-_COMMANDED = {"Qplus": 0.0, "Qminus": 45.0, "Uplus": 22.5, "Uminus": 67.5}
-_STAGES = {"hwp_true": "ESO INS4 DROT3", "derotator": "ESO INS4 DROT2"}
-_ROTATION, _STOKES = "ESO INS4 COMB ROT", "ESO OCS DPI H2RT STOKES"
-_FILTER, _PARALLACTIC = "ESO INS1 FILT ID", "ESO TEL PARANG START"
-
-
-class _Header:
-    """The keywords of a frame, with an error that names both where one is missing."""
-
-    def __init__(self, number, header):
-        self.number, self.header = number, header
-
-    def __contains__(self, key):
-        return key in self.header
-
-    def text(self, key, allowed=None):
-        if key not in self.header:
-            raise ObservationError(f"frame {self.number}: no keyword {key} in its header")
-        value = str(self.header[key]).strip()
-        if allowed is not None and value not in allowed:
-            raise ObservationError(
-                f"frame {self.number}: {key} = {value!r}; allowed are {', '.join(allowed)}"
-            )
-        return value
-
-    def number_of(self, key, low=-np.inf):
-        text = self.text(key)
-        try:
-            value = float(text)
-        except ValueError:
-            value = np.nan
-        if not (np.isfinite(value) and value >= low):
-            limit = "" if np.isinf(low) else f" of at least {low:g}"
-            raise ObservationError(
-                f"frame {self.number}: {key} = {text!r}; a number{limit} is needed"
-            )
-        return value
-
-    def mean_angle(self, first, last):
-        ends = np.deg2rad([self.number_of(first), self.number_of(last)])
-        return float(np.rad2deg(np.angle(np.exp(1j * ends).sum())))
-
-
-def _frame_table(headers, location):
-    if not headers:
-        raise ObservationError("no headers were given, at least one is needed")
-    frames = [_Header(number, header) for number, header in enumerate(headers)]
-    stars = [_PARALLACTIC in frame for frame in frames]
-    if len(set(stars)) > 1:
-        raise ObservationError(f"frame {stars.index(False)}: no keyword {_PARALLACTIC}")
-    shared = {_filter(frame) for frame in frames}, {_tracking(frame, stars[0]) for frame in frames}
-    for what, found in zip(("filters", "kinds of tracking"), shared, strict=True):
-        if len(found) > 1:
-            raise ObservationError(
-                f"frames of several {what}: {', '.join(sorted(map(str, found)))}"
-            )
-    (band,), (tracking,) = shared
-    rows = [_row(frame, tracking, location if stars[0] else None) for frame in frames]
-    table = QTable({key: [row[key] for row in rows] for key in rows[0]})
-    table["wavelength"] = np.full(len(rows), _CENTRES[_FILTERS.index(band)].value) * u.um
-    table.meta = {"filter": band, "date": str(table["time"][0])[:10]}
-    table.meta |= {"tracking": tracking} if tracking else {}
-    return table
-
-
-def _filter(frame):
-    name = frame.text(_FILTER)
-    band = name.removeprefix("FILT_BBF_")
-    if band == name or band not in _FILTERS:
-        raise InstrumentError(
-            f"frame {frame.number}: {_FILTER} = {name!r} has no coefficients; allowed are "
-            f"{', '.join(f'FILT_BBF_{known}' for known in _FILTERS)}"
-        )
-    return band
-
-
-def _tracking(frame, star):
-    return frame.text(_ROTATION, ("FIELD", "PUPIL")).lower() if star else None
-
-
-def _row(frame, tracking, location):
-    angles = {
-        column: frame.mean_angle(f"{keyword} BEGIN", f"{keyword} END")
-        for column, keyword in _STAGES.items()
-    }
-    angles["hwp_true"] = (angles["hwp_true"] - _PLATE_ZERO) % 360
-    angles["derotator"] += 0.5 * _PUPIL_OFFSET if tracking == "pupil" else 0.0
-    dit, ndit = frame.number_of("EXPTIME", 0.0), frame.number_of("ESO DET NDIT", 1.0)
-    seconds = ndit * (dit + _READ_OUT) + _START
-    start = Time(frame.number_of("MJD-OBS", 0.0), format="mjd", scale="utc")
-    middle = start + 0.5 * seconds * u.s
-    if location is not None:
-        angles["parallactic"] = frame.mean_angle(_PARALLACTIC, "ESO TEL PARANG END")
-        angles["altitude"] = _altitude(frame, Time([start, middle]), location)
-    commanded = _COMMANDED[frame.text(_STOKES, _COMMANDED)] if _STOKES in frame else None
-    angles["hwp"] = angles["hwp_true"] if commanded is None else commanded
-    row = {"frame": frame.number} | {key: value * u.deg for key, value in angles.items()}
-    return row | {"exposure_time": dit * ndit * u.s, "time": middle.isot}
-
-
-def _altitude(frame, times, location):
-    """Return the altitude in the middle: that in the header and the change since the start."""
-    target = SkyCoord(frame.number_of("RA"), frame.number_of("DEC", -90.0), unit=u.deg)
-    start, middle = pointing(target, times, location)[0].to_value(u.deg)
-    return frame.number_of("ESO TEL ALT", 0.0) + float(middle - start)

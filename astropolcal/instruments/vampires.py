@@ -6,38 +6,50 @@ A ferroelectric liquid crystal switches between two states, A and B, from frame 
 polarizing beam splitter sends the two polarizations to two cameras. Each filter, and each field
 of the multiband imager, is one wavelength of a coarse grid.
 
+On sky, telescope and half-wave plate are those of CHARIS; the tertiary mirror is silver, as
+the law that is published for it was found in the infrared.
+
 Signs: as in CHARIS, which has the same half-wave plate, the retardance of the plate is negative.
 All retardances with the other sign, (H, 45, R) to (-H, -45, R), give the same data; the bounds of
 the half-wave plate exclude them, and those of the derotator exclude a further turn.
 """
 
+import re
+
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join
+from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import InstrumentError
+from astropolcal.instruments import _vampires_optics as _optics
 from astropolcal.instruments.base import Instrument
+from astropolcal.instruments.nuisance import without_nuisance
+from astropolcal.instruments.telescope import M3_MODELS, star_source, telescope
+from astropolcal.instruments.vampires_headers import (
+    KEYWORDS,
+    LAYOUT,
+    layout_of,
+    mode_header,
+    slices_of,
+)
 from astropolcal.observations import is_star, mask_saturated
-from astropolcal.observations.wavelengths import filter_wavelength
 
 __all__ = ["VAMPIRES"]
 
-_FILTERS = ("MBI 610", "625-50", "MBI 670", "675-50", "Open", "MBI 720", "725-50", "750-50",
-            "MBI 760", "775-50")  # fmt: skip
-
-# where fits start: wavelength in nm, and retardances in deg
-_START_AT = (610.0, 670.0, 725.0, 775.0)
-_HALF_WAVE_PLATE = (-158.0, -165.0, -171.0, -173.0)
-_DEROTATOR = (281.0, 245.0, 204.0, 176.0)
-
-_SOURCES = {"polarized": "polarized", "unpolarized": "unpolarized"}
-_SOURCES |= {f"{name} internal": name for name in ("polarized", "unpolarized")}
+_INTERNAL = ("polarized", "unpolarized")
+_STARS = ("unpolarized standard star", "polarized standard star", "star")
+# as tables may call them
+_SOURCES = {name: name for name in (*_INTERNAL, *_STARS)}
+_SOURCES |= {f"{name} internal": name for name in _INTERNAL}
 
 
 class VAMPIRES(Instrument):
     """
-    Subaru/SCExAO/VAMPIRES with its internal source.
+    Subaru/SCExAO/VAMPIRES, with its internal source or on sky.
+
+    Its wavelengths are the fields of the multiband imager; files and tables of single filters
+    have others, see `configured`.
 
     Examples
     --------
@@ -49,22 +61,15 @@ class VAMPIRES(Instrument):
 
     name = "vampires"
     aliases = ("SCExAO/VAMPIRES", "Subaru/SCExAO/VAMPIRES")
-    wavelength = u.Quantity([filter_wavelength("vampires", name) for name in _FILTERS])
-    keywords = {
-        "hwp": "RET-ANG1",
-        "hwp_true": "RET-POS1",
-        "derotator": "D_IMRANG",
-        "flc_state": "U_FLC",
-        "camera": "U_CAMERA",
-        "filter": "FILTER01",
-        "altitude": "ALTITUDE",
-        "parallactic": "PA",
-    }
+    wavelength = slices_of({"OBS-MOD": "MBI"})
+    keywords = KEYWORDS
+    files = LAYOUT
     references = (
         "Norris et al. 2015, MNRAS 447, 2894 (doi:10.1093/mnras/stu2529)",
+        "vampires_dpp, https://github.com/scexao-org/vampires_dpp (keywords and detectors)",
         "McIntosh et al. 2026, recalibration after the Nasmyth beam switcher, appendix on VAMPIRES",
     )
-    sources = ("polarized", "unpolarized")
+    sources = (*_INTERNAL, *_STARS)
 
     def chain(
         self,
@@ -74,30 +79,44 @@ class VAMPIRES(Instrument):
         wavelength=None,
         derotator="elliptical",
         bounds="physical",
+        m3="free",
+        star="star",
+        target=None,
     ):
         """
-        Return the chain of the internal source, ready to be calibrated.
+        Return the chain of the internal source or a star, ready to be calibrated.
 
         Free for all wavelengths are the orientations of polarizer, half-wave plate, derotator
         and liquid crystal and its switching angle; for each wavelength the retardances of all
         optics, the diattenuation of the relay optics, the efficiency of the beam splitter and
         the unequal gains of the cameras. Where the data cannot tell them apart, normal priors
-        hold the liquid crystal near half a wave and 43 deg, the cameras near equal gains, and
-        the derotator near a linear retarder.
+        hold the liquid crystal near half a wave and 43 deg, the cameras near equal gains, the
+        derotator near a linear retarder, the relay optics near no retardance, and the efficiency
+        near 0.95.
 
         Parameters
         ----------
         source : str
             ``"polarized"`` or ``"unpolarized"``: with or without the polarizer; without it the
             fold mirror's diattenuation is a free parameter for each wavelength.
+            ``"unpolarized standard star"``: a star of zero polarization, behind the telescope's
+            tertiary mirror. ``"polarized standard star"`` or ``"star"``: the star's q and u are
+            free parameters for each wavelength, in the frame of the sky.
         optics_in : sequence of str
             ``"flc"`` where the liquid crystal is in the beam.
         wavelength : `~astropy.units.Quantity`, optional
-            Grid, by default all filters.
+            Grid, by default the fields of the multiband imager.
         derotator : {"elliptical", "linear"}
             Kind of retarder.
         bounds : {"physical"}
             Half-wave plate from -180 to -90 deg, derotator within the turn from 0 deg on.
+        m3 : {"free", "power law", "metal"}
+            Tertiary mirror of a star's chain: a diattenuation a wavelength with the retardance of
+            silver, a law of the permittivity, or silver with a film.
+        star : str
+            Name of the source optic in a star's chain.
+        target : str, optional
+            Name of the star, for what the catalogue of standards knows of it.
 
         Returns
         -------
@@ -113,21 +132,142 @@ class VAMPIRES(Instrument):
         >>> from astropolcal import instruments
         >>> chain = instruments.get("vampires").chain(optics_in=(), derotator="linear")
         >>> chain["derotator"].retardance.shape
-        (10,)
+        (4,)
         """
         _choice("derotator", derotator, ("elliptical", "linear"))
         _choice("bounds", bounds, ("physical",))
         _choice("source", source, self.sources)
         for name in optics_in:
             _choice("optics_in", name, ("flc",))
-        grid = self.wavelength if wavelength is None else u.Quantity(wavelength)
-        train = [_polarizer() if source == "polarized" else _fold_mirror(grid.size)]
-        train += [_half_wave_plate(grid), _derotator(grid, derotator), _relay(grid.size)]
+        _choice("m3", m3, M3_MODELS)
+        grid = self.wavelength if wavelength is None else np.atleast_1d(u.Quantity(wavelength))
+        train = [_optics.polarizer() if source == "polarized" else _optics.fold_mirror(grid.size)]
+        if source in _STARS:
+            train = [star_source(source, grid, star, target), *telescope(_optics.mirror(m3, grid))]
+        train += [
+            _optics.half_wave_plate(grid),
+            _optics.derotator(grid, derotator),
+            _optics.relay(grid.size),
+        ]
         if "flc" in optics_in:
-            train.append(_liquid_crystal(grid.size))
-        train.append(optics.WollastonPrism(efficiency=np.full(grid.size, 0.95), name="wollaston"))
-        train.append(_cameras(grid.size))
+            train.append(_optics.liquid_crystal(grid.size))
+        train.append(_optics.splitter(grid.size))
+        train.append(_optics.cameras(grid.size))
         return join(train)
+
+    def on_sky(self, chain):
+        """
+        Return the chain of a star that has the optics of an internal chain.
+
+        The source and what belongs to it go; the tertiary mirror is bare silver.
+
+        Parameters
+        ----------
+        chain : `~astropy.modeling.CompoundModel`
+            A chain; one with the telescope already only loses the nuisance optics of its dataset.
+
+        Returns
+        -------
+        `~astropy.modeling.CompoundModel`
+
+        Raises
+        ------
+        InstrumentError
+            If it has no half-wave plate.
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> vampires = instruments.get("vampires")
+        >>> [optic.name for optic in vampires.on_sky(vampires.published())][:4]
+        ['parallactic', 'm3', 'altitude', 'hwp']
+        """
+        chain = without_nuisance(chain)
+        if "parallactic" in stages(chain):
+            return chain
+        found = leaves(chain)
+        start = next((i for i, leaf in enumerate(found) if leaf.name == "hwp"), None)
+        if start is None:
+            raise InstrumentError(
+                "vampires: the chain has no optic 'hwp' to put the telescope before"
+            )
+        return join([*telescope(_optics.silver("m3")), *found[start:]])
+
+    def particulars(self, observations):
+        """Return name of the source optic and target of a star: ``star_`` and the object's name."""
+        target = str(observations.meta.get("object") or "")
+        words = re.sub(r"\W+", "", target)
+        if not words or not is_star(observations.source):
+            return {}
+        return {"star": f"star_{words}", "target": target}
+
+    def published(self):
+        """
+        Return the chain of the polarized internal source with typical values, for simulations.
+
+        No values of all optics are published; these are where fits start, rounded from a fit to
+        the internal source in September 2023.
+
+        Returns
+        -------
+        `~astropy.modeling.CompoundModel`
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> instruments.get("vampires").published()["flc"].switching_angle.quantity
+        <Quantity 43. deg>
+        """
+        return self.chain("polarized")
+
+    def published_meta(self):
+        """Return the meta of a table taken with the chain of `published`."""
+        return {
+            "instrument": "SCExAO/VAMPIRES",
+            "mode": "IPOL_MBI",
+            "source": "polarized",
+            "flc": "in",
+            "pairing": "flc_state",
+        }
+
+    def configured(self, header):
+        """
+        Return the instrument with the wavelengths and the shape of a file.
+
+        Parameters
+        ----------
+        header : `~astropy.io.fits.Header` or mapping
+            Primary header, with mode, filter and size of the image.
+
+        Returns
+        -------
+        VAMPIRES
+
+        Raises
+        ------
+        InstrumentError
+            If the filter is not known, or the image not square.
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> instruments.get("vampires").configured({"FILTER01": "750-50"}).wavelength
+        <Quantity [750.] nm>
+        """
+        one = type(self)()
+        one.wavelength, one.files = slices_of(header), layout_of(header)
+        return one
+
+    def mode_header(self, wavelength):
+        """Return mode and filter in the headers of cubes of these wavelengths."""
+        return mode_header(wavelength)
+
+    def optics_of(self, header):
+        """Return whether the liquid crystal was in the beam, where the header tells."""
+        stated = str(header.get(KEYWORDS["flc"], "")).strip().upper()
+        known = {"IN": True, "OUT": False}
+        found = [present for word, present in known.items() if stated.startswith(word)]
+        return {"flc": found[0]} if found else {}
 
     def setup(self, observations):
         """
@@ -198,80 +338,3 @@ def _is_modulated(observations):
 def _choice(what, value, allowed):
     if value not in allowed:
         raise InstrumentError(f"vampires: {what} = {value!r}; allowed are {', '.join(allowed)}")
-
-
-def _misaligned(about, most=5):
-    return {"fixed": {"theta": False}, "bounds": {"theta": (about - most, about + most)}}
-
-
-def _normal(mean, std):
-    from scipy.stats import norm
-
-    return norm(mean, std)
-
-
-def _starts(grid, values):
-    return np.interp(grid.to_value(u.nm), _START_AT, values) * u.deg
-
-
-def _polarizer():
-    return optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer", **_misaligned(90))
-
-
-def _fold_mirror(size):
-    return optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror")
-
-
-def _half_wave_plate(grid):
-    settings = _misaligned(0)
-    settings["bounds"] |= {"retardance": (-180, -90)}
-    start = _starts(grid, _HALF_WAVE_PLATE)
-    return optics.LinearRetarder(retardance=start, mount="hwp", name="hwp", **settings)
-
-
-def _derotator(grid, kind):
-    settings, start = _misaligned(0), _starts(grid, _DEROTATOR)
-    main = "retardance" if kind == "linear" else "horizontal"
-    settings["bounds"] |= {main: (0, 360)}
-    settings |= {"mount": "derotator", "name": "derotator"}
-    if kind == "linear":
-        return optics.LinearRetarder(retardance=start, **settings)
-    settings["bounds"] |= {"diagonal": (-90, 90), "circular": (-90, 90)}
-    # off the point where the two small ones vanish
-    small = np.full(grid.size, 1.0) * u.deg
-    derotator = optics.EllipticalRetarder(
-        horizontal=start, diagonal=-small, circular=small, **settings
-    )
-    derotator.diagonal.prior = derotator.circular.prior = _normal(0, 10)
-    return derotator
-
-
-def _relay(size):
-    """Return what stands between derotator and liquid crystal, the dichroics included."""
-    return optics.DiattenuatorRetarder(
-        diattenuation=np.full(size, 0.01),
-        retardance=np.full(size, -30.0) * u.deg,
-        name="relay",
-        bounds={"diattenuation": (-0.6, 0.6)},
-    )
-
-
-def _liquid_crystal(size):
-    settings = _misaligned(0, most=20)
-    settings["bounds"] |= {"retardance": (90, 270), "switching_angle": (30, 60)}
-    crystal = optics.FerroelectricLiquidCrystal(
-        retardance=np.full(size, 180.0) * u.deg,
-        switching_angle=43 * u.deg,
-        mount="flc_state",
-        name="flc",
-        **settings,
-    )
-    crystal.retardance.prior, crystal.theta.prior = _normal(180, 15), _normal(0, 2)
-    crystal.switching_angle.prior = _normal(43, 2)
-    return crystal
-
-
-def _cameras(size):
-    cameras = optics.BeamGain(imbalance=np.zeros(size), name="cameras")
-    cameras.imbalance.prior = _normal(0, 0.1)
-    return cameras

@@ -158,9 +158,7 @@ class Dataset:
 
     def _frames_of_data(self):
         """Return the frames of each datum, shape (n_groups, frames_per_datum)."""
-        if self.observable.frames_per_datum == 2:
-            return np.asarray(self.observations.pairs())
-        return np.arange(self.observations.n_frames)[:, None]
+        return self.observations.groups(self.observable.frames_per_datum)
 
     def _observe(self, columns):
         obs = self.observations

@@ -4,9 +4,10 @@ What is compared with the model: differences of the two beams, with derivatives.
 
 Every observable is a small strategy object. Fluxes come as two arrays of shape
 ``(k, W, P)``: ``k`` frames a datum (index 0 the plus frame, index 1 the minus
-frame, whose half-wave plate is 45 degrees further), ``W`` wavelengths and
-``P`` data. The derivatives are analytic, because a fit evaluates them at every
-step. The names X and I follow Sec. 2.2 of the CHARIS recalibration paper.
+frame, whose half-wave plate is 45 degrees further; of four frames see
+`NormalizedTripleDifference`), ``W`` wavelengths and ``P`` data. The derivatives
+are analytic, because a fit evaluates them at every step. The names X and I
+follow Sec. 2.2 of the CHARIS recalibration paper.
 """
 
 import difflib
@@ -20,6 +21,7 @@ __all__ = [
     "OBSERVABLES",
     "NormalizedDoubleDifference",
     "NormalizedSingleDifference",
+    "NormalizedTripleDifference",
     "Observable",
     "PerFrameDoubleDifference",
     "RatioMethod",
@@ -129,7 +131,7 @@ def double_sum(right, left):
 
 class Observable(ABC):
     """
-    A quantity formed from the beam fluxes of one frame or one pair of frames.
+    A quantity formed from the beam fluxes of a frame, a pair of frames or two pairs.
 
     A subclass gives ``name``, ``description``, ``frames_per_datum``, `evaluate`
     and `derivative`; errors follow from the derivative.
@@ -141,7 +143,8 @@ class Observable(ABC):
     description : str
         One line for reports.
     frames_per_datum : int
-        1 for a quantity of single frames, 2 for one of pairs.
+        1 for a quantity of single frames, 2 for one of pairs, 4 for one of pairs in both
+        states of a modulator.
 
     Examples
     --------
@@ -428,6 +431,54 @@ class NormalizedSingleDifference(Observable):
         return left * scale, -right * scale
 
 
+class NormalizedTripleDifference(Observable):
+    r"""
+    Normalized triple difference: of beams, states of a modulator and half-wave-plate angles.
+
+    .. math:: x = \frac{(X_A^+ - X_B^+) - (X_A^- - X_B^-)}{I_A^+ + I_B^+ + I_A^- + I_B^-}
+
+    The four frames of a datum are :math:`A^+, B^+, A^-, B^-`: states A and B of the modulator,
+    and half-wave plates 45 deg apart.
+
+    Notes
+    -----
+    Norris et al. 2015, MNRAS 447, 2894 (doi:10.1093/mnras/stu2529), where the states of the
+    liquid crystal, the cameras and the half-wave plate are differenced in turn. What
+    differs between the beams drops out by the modulator, and what the modulator or the optics
+    behind the half-wave plate polarize drops out by the plate, as long as the flux does not change.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.observations import NormalizedTripleDifference
+    >>> right, left = np.array([3.0, 1.0, 1.0, 3.0]), np.array([1.0, 3.0, 3.0, 1.0])
+    >>> float(NormalizedTripleDifference().evaluate(right, left))
+    0.5
+    """
+
+    name = "normalized_triple_difference"
+    description = "normalized triple difference, (XA+ - XB+ - XA- + XB-) / (sum of all I)"
+    frames_per_datum = 4
+
+    @staticmethod
+    def _parts(right, left):
+        a_plus, b_plus, a_minus, b_minus = right - left
+        return (a_plus - b_plus) - (a_minus - b_minus), (right + left).sum(axis=0)
+
+    def evaluate(self, right, left):
+        """Return x, shape (W, P); see `Observable.evaluate`."""
+        difference, total = self._parts(right, left)
+        return difference / total
+
+    def derivative(self, right, left):
+        """Return dx/dR and dx/dL; see `Observable.derivative`."""
+        difference, total = self._parts(right, left)
+        inverse = 1.0 / total
+        x_inverse = difference * (inverse * inverse)
+        up, down = inverse - x_inverse, -inverse - x_inverse
+        return np.stack([up, down, down, up]), np.stack([down, up, up, down])
+
+
 OBSERVABLES = {
     observable.name: observable
     for observable in (
@@ -435,6 +486,7 @@ OBSERVABLES = {
         PerFrameDoubleDifference(),
         RatioMethod(),
         NormalizedSingleDifference(),
+        NormalizedTripleDifference(),
     )
 }
 """Every registered `Observable`, by name; the first one is the default."""

@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Pairs of frames whose half-wave plates stand 45 degrees apart, or whose modulators differ.
+Pairs of frames whose half-wave plates stand 45 degrees apart, or whose modulators differ, or both.
 
 Pairs are found from the angles, never from the order of the rows: the angles
 must differ by 45 degrees modulo 180, the derotator must stand still and the
@@ -15,7 +15,7 @@ import numpy as np
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.units import angle_to_rad
 
-__all__ = ["PAIRINGS", "pair_frames", "pair_states"]
+__all__ = ["PAIRINGS", "pair_frames", "pair_states", "quadruples"]
 
 #: By what frames may be paired: the half-wave plate, or the state of a modulator.
 PAIRINGS = ("hwp", "flc_state")
@@ -176,6 +176,62 @@ def pair_states(
             stacklevel=2,
         )
     return np.array(sorted(chosen), dtype=np.intp).reshape(-1, 2)
+
+
+def quadruples(
+    states, hwp, derotator, time=None, *, labels=None, rows=None, name="table", **limits
+):
+    """
+    Combine pairs of modulator states whose half-wave plates stand 45 degrees apart.
+
+    Parameters
+    ----------
+    states : `~numpy.ndarray` of int
+        Frame indices of each pair, first and second state, shape (P, 2), see `pair_states`.
+    hwp, derotator : `~astropy.units.Quantity`
+        Angles of every frame, shape (F,).
+    time : array_like of float, optional
+        Time of every frame in any unit; by default the index of the frame.
+    labels, rows, name
+        As for `pair_frames`, one a frame.
+    **limits
+        ``tolerance``, ``derotator_tolerance`` and ``share`` of `pair_frames`.
+
+    Returns
+    -------
+    `~numpy.ndarray` of int
+        Frame indices, shape (Q, 4): both states of the plus angle, both of the minus angle.
+
+    Raises
+    ------
+    ObservationError
+        If no pair stands 45 degrees from one of the angles.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If pairs are left over because their partners are missing or used.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal.observations.pairing import quadruples
+    >>> pairs = np.array([[0, 1], [2, 3]])
+    >>> quadruples(pairs, [0, 0, 45, 45] * u.deg, [90] * 4 * u.deg).tolist()
+    [[0, 1, 2, 3]]
+    """
+    first = np.asarray(states)[:, 0]
+    found = pair_frames(
+        hwp[first],
+        derotator[first],
+        time=first if time is None else np.asarray(time)[first],
+        labels=first.tolist() if labels is None else [labels[i] for i in first],
+        rows=None if rows is None else [rows[i] for i in first],
+        name=name,
+        **limits,
+    )
+    return np.asarray(states)[found].reshape(-1, 4)
 
 
 def _refuse_lonely(frame, state, angles, rows, name):

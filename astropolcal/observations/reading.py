@@ -9,7 +9,7 @@ and columns of Python objects are refused.
 """
 
 import io
-import re
+import textwrap
 import warnings
 from pathlib import Path
 
@@ -18,15 +18,14 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from astropolcal.exceptions import ObservationError
+from astropolcal.files import check_yaml, understood
 from astropolcal.observations.wavelengths import stated_wavelength
 
 __all__ = ["check_table", "complete_table", "first_bad_row", "numeric_column", "read_ecsv"]
 
 # real headers have 1 to 3 kB; the YAML loader needs seconds for a quarter of a megabyte
 _MAX_HEADER = 2**18
-# merge keys let a header of one kilobyte grow exponentially while it is loaded
 _SINGLE = ("single_difference", "single_sum")
-_MERGE_KEY = re.compile(r"<<|!!merge|2002:merge")
 
 
 def read_ecsv(path):
@@ -60,41 +59,43 @@ def read_ecsv(path):
         raise ObservationError(
             f"{path}: not an ECSV table; its first line must start with '# %ECSV'"
         )
-    _check_header(path, text)
-    try:
+    with understood(path, ObservationError, "not a readable ECSV table"):
+        _check_header(path, text)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # doubtful units and types are errors below
             return QTable.read(io.BytesIO(text.encode()), format="ascii.ecsv")
-    except Exception as error:  # the parsers below raise errors of every kind
-        reason = " ".join(str(error).split())[:300] or type(error).__name__
-        raise ObservationError(f"{path}: not a readable ECSV table: {reason}") from error
 
 
 def _read_text(path):
     try:
-        return Path(path).read_bytes().decode("utf-8")
-    except FileNotFoundError:
-        raise ObservationError(f"{path}: no such file") from None
-    except IsADirectoryError:
-        raise ObservationError(f"{path}: is a folder, an ECSV file is needed") from None
-    except UnicodeDecodeError:
-        raise ObservationError(f"{path}: not a text file, an ECSV table is needed") from None
-    except (OSError, TypeError, ValueError) as error:
-        raise ObservationError(f"{path}: cannot be read: {error}") from None
+        with understood(path, ObservationError, "cannot be read"):
+            return Path(path).read_bytes().decode("utf-8")
+    except ObservationError as error:
+        if Path(path).is_dir():
+            raise ObservationError(f"{path}: is a folder, an ECSV file is needed") from None
+        if isinstance(error.__cause__, UnicodeDecodeError):
+            raise ObservationError(f"{path}: not a text file, an ECSV table is needed") from None
+        raise
 
 
 def _check_header(path, text):
-    size = 0
-    for line in io.StringIO(text):
-        if not line.startswith("#"):
+    """Look at what astropy takes out of the comments at the start, and loads."""
+    lines, size = [], 0
+    for line in map(str.strip, text.split("\n")):
+        if line and not line.startswith("#"):
             break
         size += len(line)
         if size > _MAX_HEADER:
             raise ObservationError(
                 f"{path}: the header is longer than the {_MAX_HEADER} characters allowed"
             )
-        if _MERGE_KEY.search(line):
-            raise ObservationError(f"{path}: YAML merge keys ('<<') are not allowed in the header")
+        if len(line.splitlines()) > 1:
+            raise ObservationError(f"{path}: a line of the header has an end within it")
+        lines += [line[1:]] if line[1:] else []
+    try:
+        check_yaml(textwrap.dedent("\n".join(lines[1:])), ObservationError)
+    except ObservationError as error:
+        raise ObservationError(f"{path}: not a readable ECSV table: {error}") from None
 
 
 def check_table(table, label, required):

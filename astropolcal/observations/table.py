@@ -12,14 +12,14 @@ from astropy.table import Table
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import atomic_path
-from astropolcal.observations.coordinates import clock, frame_coordinate
+from astropolcal.observations.coordinates import frame_coordinate
 from astropolcal.observations.grid import build_grid
+from astropolcal.observations.groups import FrameGroups
 from astropolcal.observations.hashing import hash_columns
-from astropolcal.observations.pairing import PAIRINGS, pair_frames, pair_states
+from astropolcal.observations.pairing import PAIRINGS
 from astropolcal.observations.reading import complete_table, numeric_column, read_ecsv
 from astropolcal.observations.variances import beam_variances
 from astropolcal.optics import COORDINATES
-from astropolcal.units import angle_to_rad
 
 __all__ = ["Observations"]
 
@@ -77,7 +77,7 @@ class Observations:
         self.name = str(name)
         self.path = None if path is None else Path(path)
         self._variances = beam_variances(grid.flux_right, grid.flux_left, grid.errors)
-        self._pairs = {}
+        self._groups = FrameGroups(self, grid.rows.tolist(), self._label)
         self._hash = None
         self._mask = grid.reason > 0
         self._freeze()
@@ -437,46 +437,49 @@ class Observations:
         >>> obs.pairs().tolist()
         [[0, 2], [1, 3]]
         """
-        tolerances = (tolerance, derotator_tolerance)
-        key = (*(float(angle_to_rad(angle, "tolerance")) for angle in tolerances), bool(share))
-        if key not in self._pairs:
-            found = self._find_pairs(*(angle * u.rad for angle in key[:2]), key[2])
-            found.flags.writeable = False
-            self._pairs[key] = found
-        return self._pairs[key]
+        return self._groups.pairs(tolerance, derotator_tolerance, share)
 
-    def _find_pairs(self, tolerance, derotator_tolerance, share):
-        frames = self._grid.frames
-        if self.pairing == "flc_state":
-            return pair_states(
-                self.position("flc_state"),
-                self.position("hwp") * u.rad,
-                self.position("derotator") * u.rad,
-                clock(frames),
-                tolerance=tolerance,
-                derotator_tolerance=derotator_tolerance,
-                share=share,
-                rows=self._grid.rows.tolist(),
-                name=self._label,
-            )
-        pairs = pair_frames(
-            self.position("hwp") * u.rad,
-            self.position("derotator") * u.rad,
-            np.asarray(frames["flc_state"]) if "flc_state" in frames.colnames else None,
-            clock(frames),
-            tolerance=tolerance,
-            derotator_tolerance=derotator_tolerance,
-            share=share,
-            labels=np.asarray(frames["frame"]).tolist(),
-            rows=self._grid.rows.tolist(),
-            name=self._label,
-        )
-        if not len(pairs):
-            raise ObservationError(
-                f"{self._label}: none of its {_count(self.n_frames, 'frame')} can be paired; two "
-                "frames 45 deg of half-wave plate apart at the same derotator angle are needed"
-            )
-        return pairs
+    def groups(self, size):
+        """
+        Return the frames of each datum of an observable.
+
+        Parameters
+        ----------
+        size : {1, 2, 4}
+            Frames a datum: single frames, `pairs`, or pairs in both states of a modulator.
+
+        Returns
+        -------
+        `~numpy.ndarray` of int
+            Frame indices, shape (G, size). Four frames are state A and B at the plus angle of the
+            half-wave plate, then at the minus angle, which is 45 deg further.
+
+        Raises
+        ------
+        ObservationError
+            If a frame has no partner in the other state at its angles; the message names the
+            file, the row and the state. Or if nothing can be paired.
+
+        Warns
+        -----
+        AstropolcalWarning
+            If frames are left over.
+
+        Examples
+        --------
+        >>> from astropolcal.observations import Observations, example_table
+        >>> table = example_table(hwp=(0, 0, 45, 45), wavelength=(0.625,))
+        >>> table["flc_state"] = ["A", "B", "B", "A"]
+        >>> Observations.from_table(table).groups(4).tolist()
+        [[0, 1, 3, 2]]
+        """
+        if size == 4:
+            return self._groups.quadruples()
+        if size == 2:
+            return self.pairs()
+        if size != 1:
+            raise ObservationError(f"groups of {size!r} frames; allowed are 1, 2 and 4")
+        return np.arange(self.n_frames)[:, None]
 
     def with_mask(self, mask, reason):
         """

@@ -8,6 +8,7 @@ is imported when the first figure is drawn.
 """
 
 from astropolcal.plotting.accuracy import plot_accuracy
+from astropolcal.plotting.comparison import plot_comparison
 from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
 from astropolcal.plotting.efficiency import plot_polarimetric_efficiency
@@ -35,6 +36,7 @@ from astropolcal.plotting.targets import plot_target_accuracy
 
 __all__ = [
     "plot_accuracy",
+    "plot_comparison",
     "plot_corner",
     "plot_correlations",
     "plot_double_differences",

@@ -4,7 +4,7 @@
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration.efficiency import polarimetric_efficiency
+from astropolcal.calibration.efficiency import has_derotator, polarimetric_efficiency
 from astropolcal.chain import stages
 from astropolcal.plotting._style import canvas, looks, nanometres, style
 
@@ -14,6 +14,7 @@ _DEROTATOR = np.arange(0, 181, 2.5)
 _ALTITUDE = np.arange(20, 91, 5.0)
 _PARALLACTIC = np.arange(-180, 181, 10.0)
 _MOST_LINES = 6
+_LEAST_SPECTRUM = 8
 _LEVELS = (0.2, 0.4, 0.6, 0.8, 0.9)
 
 
@@ -25,6 +26,8 @@ def plot_polarimetric_efficiency(
     parallactic=0 * u.deg,
     derotator=90 * u.deg,
     shown=None,
+    instrument=None,
+    mode=None,
     title=None,
     figure=None,
 ):
@@ -43,6 +46,8 @@ def plot_polarimetric_efficiency(
         Derotator angle of the third panel.
     shown : `~astropy.units.Quantity`, optional
         Wavelengths of the lines, the nearest of the grid; by default six spread over it.
+    instrument, mode
+        Whose half-wave plate it is, see `~astropolcal.calibration.polarimetric_efficiency`.
     title : str, optional
         Title of the figure.
     figure : `~matplotlib.figure.Figure`, optional
@@ -53,7 +58,8 @@ def plot_polarimetric_efficiency(
     `~matplotlib.figure.Figure`
         Lines against the derotator angle; a map of derotator angle and wavelength; and, for a
         chain from the sky, a map of parallactic angle and altitude: the least efficiency over the
-        wavelengths.
+        wavelengths. Without a derotator there are lines against the parallactic angle, or
+        against the wavelength behind an internal source.
 
     Examples
     --------
@@ -64,58 +70,99 @@ def plot_polarimetric_efficiency(
     >>> len(figure.axes) >= 2
     True
     """
-    lam = nanometres(wavelength)
-    on_sky = "parallactic" in stages(chain)
-    pointing = {"altitude": altitude, "parallactic": parallactic} if on_sky else {}
-    values = polarimetric_efficiency(chain, wavelength, derotator=_DEROTATOR * u.deg, **pointing)
+    lam, moving = nanometres(wavelength), stages(chain)
+    at = {"altitude": altitude} if "altitude" in moving else {}
+    at |= {"parallactic": parallactic} if "parallactic" in moving else {}
+    asked = _Asked(chain, wavelength, {"instrument": instrument, "mode": mode})
+    turns, maps = has_derotator(chain), "altitude" in at
+    panels = (2 if turns else int(not maps)) + maps
     with style():
-        fig = canvas(figure, 16.5 if on_sky else 11.5, 5.2)
-        axes = fig.subplots(1, 3 if on_sky else 2)
-        _lines(axes[0], lam, values, shown)
-        where = f"altitude {_degree(altitude)}, parallactic angle {_degree(parallactic)}"
-        axes[0].set_title(where if on_sky else "behind the internal source")
-        _map_of_wavelengths(fig, axes[1], lam, values)
-        axes[1].set_title("as on the left, all wavelengths")
-        if on_sky:
-            _map_of_pointings(fig, axes[2], chain, wavelength, derotator)
+        fig = canvas(figure, 5.5 * panels + 0.5 * (panels < 2), 5.2)
+        axes = list(fig.subplots(1, panels, squeeze=False)[0])
+        if turns:
+            _with_derotator(fig, axes, lam, asked(derotator=_DEROTATOR * u.deg, **at), shown)
+            axes[0].set_title(_where(at))
+        elif not maps:
+            _without_derotator(axes[0], lam, asked, shown, "parallactic" in at)
+        if maps:
+            _map_of_pointings(fig, axes[-1], asked, derotator if turns else None)
         fig.suptitle(title or "Polarimetric efficiency")
     return fig
+
+
+class _Asked:
+    """The efficiency of one chain at angles."""
+
+    def __init__(self, chain, wavelength, settings):
+        self.chain, self.wavelength, self.settings = chain, wavelength, settings
+
+    def __call__(self, **angles):
+        return polarimetric_efficiency(self.chain, self.wavelength, **angles, **self.settings)
+
+
+def _where(at):
+    words = {"altitude": "altitude", "parallactic": "parallactic angle"}
+    if not at:
+        return "behind the internal source"
+    return ", ".join(f"{words[key]} {_degree(angle)}" for key, angle in at.items())
+
+
+def _with_derotator(fig, axes, lam, values, shown):
+    """Draw lines against the derotator angle, and a map of all wavelengths."""
+    _lines(axes[0], lam, _DEROTATOR, values, shown)
+    axes[0].set(xlabel="derotator angle (deg)", xlim=(0, 180), xticks=np.arange(0, 181, 45))
+    _map_of_wavelengths(fig, axes[1], lam, values)
+    axes[1].set_title("as on the left, all wavelengths")
+
+
+def _without_derotator(ax, lam, asked, shown, on_sky):
+    """Draw lines against the parallactic angle, or points at the wavelengths."""
+    if on_sky:
+        angles = np.arange(-180, 181, 5.0)
+        _lines(ax, lam, angles, asked(parallactic=angles * u.deg), shown)
+        ax.set(xlabel="parallactic angle (deg)", xlim=(-180, 180), xticks=np.arange(-180, 181, 90))
+        return
+    order = np.argsort(lam)
+    ax.plot(lam[order], np.atleast_2d(asked())[0][order], marker="o")
+    ax.set(xlabel="wavelength (nm)", ylabel="measured share of the polarization", ylim=(0, 1.02))
 
 
 def _degree(angle):
     return f"{u.Quantity(angle).to_value(u.deg):g}°"
 
 
-def _lines(ax, lam, values, shown):
+def _lines(ax, lam, angles, values, shown):
     if shown is None:
         rows = np.unique(np.linspace(0, lam.size - 1, min(_MOST_LINES, lam.size)).astype(int))
     else:
         rows = np.unique(np.abs(nanometres(shown)[:, None] - lam).argmin(axis=1))
     for (color, marker), row in zip(looks(len(rows)), rows, strict=True):
         ax.plot(
-            _DEROTATOR,
+            angles,
             values[:, row],
             color=color,
             marker=marker,
             markevery=6,
             label=f"{lam[row]:.0f} nm",
         )
-    ax.set(xlabel="derotator angle (deg)", ylabel="measured share of the polarization")
-    ax.set(xlim=(0, 180), ylim=(0, 1.02), xticks=np.arange(0, 181, 45))
+    ax.set(ylabel="measured share of the polarization", ylim=(0, 1.02))
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
 
 
 def _map_of_wavelengths(fig, ax, lam, values):
     order = np.argsort(lam)
-    mesh = _mesh(ax, _DEROTATOR, lam[order], values.T[order])
+    # between a few filters there is nothing to interpolate
+    filters = lam.size < _LEAST_SPECTRUM
+    y = np.arange(lam.size) if filters else lam[order]
+    mesh = _mesh(ax, _DEROTATOR, y, values.T[order], contours=not filters)
+    if filters:
+        ax.set_yticks(y, [f"{value:.0f}" for value in lam[order]])
     ax.set(xlabel="derotator angle (deg)", ylabel="wavelength (nm)", xticks=np.arange(0, 181, 45))
     fig.colorbar(mesh, ax=ax, label="measured share of the polarization")
 
 
-def _map_of_pointings(fig, ax, chain, wavelength, derotator):
-    values = polarimetric_efficiency(
-        chain,
-        wavelength,
+def _map_of_pointings(fig, ax, asked, derotator):
+    values = asked(
         derotator=derotator,
         altitude=_ALTITUDE[:, None] * u.deg,
         parallactic=_PARALLACTIC * u.deg,
@@ -123,13 +170,14 @@ def _map_of_pointings(fig, ax, chain, wavelength, derotator):
     mesh = ax.pcolormesh(_PARALLACTIC, _ALTITUDE, values, cmap="cividis", shading="nearest")
     ax.set(xlabel="parallactic angle (deg)", ylabel="altitude (deg)")
     ax.set(xticks=np.arange(-180, 181, 90))
-    ax.set_title(f"derotator at {_degree(derotator)}, worst wavelength")
+    turned = "" if derotator is None else f"derotator at {_degree(derotator)}, "
+    ax.set_title(f"{turned}worst wavelength")
     fig.colorbar(mesh, ax=ax, label="measured share of the polarization")
 
 
-def _mesh(ax, x, y, values):
+def _mesh(ax, x, y, values, contours):
     mesh = ax.pcolormesh(x, y, values, cmap="cividis", vmin=0, vmax=1, shading="nearest")
-    for levels, color in ((_LEVELS[:3], "white"), (_LEVELS[3:], "black")):
+    for levels, color in ((_LEVELS[:3], "white"), (_LEVELS[3:], "black")) * contours:
         # a level that no value reaches is no fault
         inside = [level for level in levels if values.min() < level < values.max()]
         if inside:

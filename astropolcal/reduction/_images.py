@@ -117,14 +117,22 @@ class Detector:
     background: np.ndarray
     saturation: float
     noise: bool
+    excess_noise: float = 1.0
 
     def expose(self, light, response, rng):
         """Return the image in adu, and the inverse of its variance."""
         electrons = self.gain * response * (light + self.background)
-        variance = (electrons + self.read_noise**2) / self.gain**2
+        variance = (self.excess_noise**2 * electrons + self.read_noise**2) / self.gain**2
         if self.noise:
-            electrons = rng.poisson(electrons) + self.read_noise * rng.standard_normal(light.shape)
+            electrons = self._multiplied(rng.poisson(electrons), rng)
+            electrons = electrons + self.read_noise * rng.standard_normal(light.shape)
         image = np.minimum(electrons / self.gain, self.saturation)
         with np.errstate(divide="ignore"):
             weight = np.where(variance > 0, 1 / variance, 0.0)
         return image.astype(np.float32), weight.astype(np.float32)
+
+    def _multiplied(self, electrons, rng):
+        """Return electrons with the scatter of a multiplication, over its gain."""
+        extra = self.excess_noise**2 - 1
+        # each electron becomes an exponentially distributed number of them
+        return extra * rng.gamma(electrons / extra) if extra > 0 else electrons

@@ -148,10 +148,12 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
         total, area, kept = _weighted(cut, known, weights)
         scale = area / np.where(kept > 0, kept, 1.0)
         result.flux[beam] = total * scale - level * area
-        photons = np.maximum(total - level * kept, 0.0) / detector.gain * scale**2
-        result.variance[beam] = flux_variance(photons, area * scale, spread, number)
+        own = detector.of(beam)
+        photons = own.photon_noise(np.maximum(total - level * kept, 0.0)) * scale**2
+        pixel = np.maximum(spread, own.read_noise**2)
+        result.variance[beam] = flux_variance(photons, area * scale, pixel, number)
         result.flag(kept < (1 - max_masked) * area, f"{BEAMS[beam]} aperture masked")
-        result.flag(_peak(cut, known, weights) >= detector.saturation, "saturated")
+        result.flag(_peak(cut, known, weights) >= own.saturation, "saturated")
         areas.append(area)
     if background == "outside":
         result.covariance[:] = shared_background(*areas, spread, number)

@@ -8,13 +8,11 @@ field; both are seen through the field stop, of which the beam splitter makes
 two images.
 """
 
-import re
 import warnings
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
 from tqdm import tqdm
@@ -26,16 +24,15 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
-from astropolcal.files import atomic_path
 from astropolcal.observations import Observations, tracked
+from astropolcal.reduction._cube_files import file_names, header_of, write_cube
 from astropolcal.reduction._images import Detector, Scene
 from astropolcal.simulation import _expected, _scale, simulate
 from astropolcal.units import angle_to_rad
 
-__all__ = ["simulate_cubes", "true_observations"]
+__all__ = ["both_states", "simulate_cubes", "true_observations"]
 
 _SOURCES, _PROFILES = ("internal", "star"), ("moffat", "gaussian")
-_TEXT_COLUMNS = ("object", "instrument", "filter", "date", "time", "right_ascension", "declination")
 
 
 def simulate_cubes(
@@ -94,7 +91,8 @@ def simulate_cubes(
         One row a frame: ``hwp`` as commanded, ``derotator`` and whatever else
         the chain needs; for a star ``parallactic`` and ``altitude``. A column
         ``hwp_true`` replaces the tracking law, ``time`` and ``exposure_time`` the
-        arguments below. All columns that the layout has a keyword for are written.
+        arguments below; ``em_gain`` and ``read_mode`` of the first row tell how the detector is
+        read out. All columns that the layout has a keyword for are written.
     wavelength : `~astropy.units.Quantity`, optional
         Of the slices; by default the instrument's.
     source : {"internal", "star"}
@@ -129,7 +127,7 @@ def simulate_cubes(
     background : float or array_like
         In adu per pixel, scalar or one value a wavelength.
     gain, read_noise : float, optional
-        Electrons per adu, and electrons per pixel; by default the layout's.
+        Electrons per adu, and electrons per pixel; by default as the layout's ``read_out`` says.
     noise : bool
         Whether to draw noise; the variances are given either way.
     saturate : bool
@@ -192,11 +190,12 @@ def simulate_cubes(
     ...     fits.getdata(paths[0], 1).shape
     (22, 201, 201)
     """
+    instrument, wavelength, more = _of_mode(instrument, wavelength)
+    more |= headers or {}
     layout = _layout(instrument)
     _choice("source", source, _SOURCES)
     _choice("psf", psf, _PROFILES)
     frames = _with_headers(frames, layout, source, exposure_time, start)
-    wavelength = instrument.wavelength if wavelength is None else np.atleast_1d(wavelength)
     n_wavelengths, n_frames = _count(layout, wavelength), len(frames)
     beams = _beam_fluxes(chain, wavelength, frames, source, flux=flux, lamp=lamp, stokes=stokes)
     scene = Scene(
@@ -209,11 +208,13 @@ def simulate_cubes(
         halo_fwhm=_pixels("halo_fwhm", halo_fwhm, layout, n_wavelengths),
         margin=_number("margin", margin),
     )
+    how = _read_out(frames, layout)
     detector = Detector(
-        gain=_number("gain", layout.gain if gain is None else gain, above=0.0),
-        read_noise=_number("read_noise", layout.read_noise if read_noise is None else read_noise),
+        gain=_number("gain", how.gain if gain is None else gain, above=0.0),
+        read_noise=_number("read_noise", how.read_noise if read_noise is None else read_noise),
+        excess_noise=how.excess_noise,
         background=_per_wavelength("background", background, n_wavelengths)[:, None, None],
-        saturation=layout.saturation if saturate else np.inf,
+        saturation=how.saturation if saturate else np.inf,
         noise=noise,
     )
     seeds = np.random.SeedSequence(seed).spawn(n_frames + 2)
@@ -225,16 +226,17 @@ def simulate_cubes(
         n_frames,
     )
     response, bad = _defects(np.random.default_rng(seeds[-2]), layout, flat_error, bad_pixels)
-    names = _names(Path(directory), layout, prefix, first, n_frames, raw, overwrite)
+    raw = raw and bool(layout.raw_columns or not layout.beam_files)
+    names = file_names(Path(directory), layout, prefix, first, n_frames, raw, overwrite)
     brightest = 0.0
     for i in tqdm(range(n_frames), desc="cubes", disable=None if progress else True):
         light = scene.light(beams[:, i], centres[i], widths[i])
         brightest = max(brightest, float((light + detector.background).max()))
         image, weight = detector.expose(light, response, np.random.default_rng(seeds[i]))
         image[bad], weight[bad] = np.nan, 0.0
-        _write(*names[i], image, weight, _header(frames[i], layout) | (headers or {}), layout)
-    if brightest > layout.saturation and not saturate:
-        _warn_of_saturation(brightest, layout)
+        write_cube(*names[i], image, weight, header_of(frames[i], layout) | more, layout)
+    if brightest > how.saturation and not saturate:
+        _warn_of_saturation(brightest, how)
     return [cube for cube, _ in names]
 
 
@@ -365,6 +367,46 @@ def _pixels(name, value, layout, n_wavelengths, least=0.5):
 # --- what is true ----------------------------------------------------------------
 
 
+def both_states(frames):
+    """
+    Return each frame in both states of a modulator.
+
+    Parameters
+    ----------
+    frames : `~astropy.table.QTable`
+        One row a frame.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Each row twice, with 0 (state A) and 1 (B) in the column ``flc_state``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.reduction.cubes import both_states
+    >>> from astropolcal.simulation import half_wave_plate_cycles
+    >>> both_states(half_wave_plate_cycles(hwp=[0, 45] * u.deg))["flc_state"].tolist()
+    [0.0, 1.0, 0.0, 1.0]
+    """
+    twice = QTable(frames)[np.repeat(np.arange(len(frames)), 2)]
+    twice["flc_state"] = np.tile([0.0, 1.0], len(frames))
+    return twice
+
+
+def _of_mode(instrument, wavelength):
+    """Return the instrument in the mode of the wavelengths, these, and keywords of the mode."""
+    wavelength = instrument.wavelength if wavelength is None else np.atleast_1d(wavelength)
+    header = dict(instrument.mode_header(wavelength))
+    return instrument.configured(header), wavelength, header
+
+
+def _read_out(frames, layout):
+    """Return how the detector is read out in the first frame, and so in all."""
+    first = frames[0]
+    return layout.read_out({c: first[c] for c in ("em_gain", "read_mode") if c in frames.colnames})
+
+
 def _with_headers(frames, layout, source, exposure_time, start):
     """Return the frames with the true angle of the half-wave plate and the times."""
     frames = QTable(frames, copy=True)
@@ -419,78 +461,10 @@ def _defects(rng, layout, flat_error, bad_pixels):
     return response, rng.random(layout.shape) < share
 
 
-# --- files -----------------------------------------------------------------------
-
-
-def _names(directory, layout, prefix, first, n_frames, raw, overwrite):
-    """Return the paths of cube and raw header of every frame."""
-    if not directory.parent.is_dir():
-        raise ObservationError(f"{directory}: there is no folder {directory.parent}")
-    if directory.exists() and not directory.is_dir():
-        raise ObservationError(f"{directory}: is a file, not a folder")
-    prefix = layout.prefix if prefix is None else prefix
-    numbers = [f"{prefix}{first + i:08d}" for i in range(n_frames)]
-    if first < 0 or re.search(layout.frame_pattern, f"{numbers[-1]}_cube.fits") is None:
-        raise ParameterError(
-            f"{numbers[-1]}: the number of the frame must match {layout.frame_pattern}"
-        )
-    names = [
-        (directory / f"{n}_cube.fits", directory / "raw" / f"{n}.fits" if raw else None)
-        for n in numbers
-    ]
-    present = [path for pair in names for path in pair if path is not None and path.exists()]
-    if present and not overwrite:
-        raise ObservationError(f"{present[0]}: exists; overwriting it was not asked for")
-    (directory / "raw" if raw else directory).mkdir(exist_ok=True, parents=True)
-    return names
-
-
-def _write(cube, raw_header, image, weight, header, layout):
-    in_raw = {layout.keywords[c] for c in layout.raw_columns if c in layout.keywords}
-    in_cube = {k: v for k, v in header.items() if raw_header is None or k not in in_raw}
-    hdus = [fits.PrimaryHDU(header=fits.Header(list(in_cube.items())))]
-    # the cube's extension need not be the first
-    hdus += [fits.ImageHDU() for _ in range(layout.cube_extension - 1)]
-    for name, values, unit in (("IMAGE", image, "adu"), ("IVAR", weight, "adu-2")):
-        hdus.append(fits.ImageHDU(values, header=fits.Header({"BUNIT": unit}), name=name))
-    _save(fits.HDUList(hdus), cube)
-    if raw_header is not None:
-        _save(fits.HDUList([fits.PrimaryHDU(header=fits.Header(list(header.items())))]), raw_header)
-
-
-def _warn_of_saturation(brightest, layout):
+def _warn_of_saturation(brightest, how):
     warnings.warn(
         f"the brightest pixel has {brightest:.3g} adu, above the saturation of "
-        f"{layout.saturation:g} adu: lower the flux, or cut off with saturate",
+        f"{how.saturation:g} adu: lower the flux, or cut off with saturate",
         AstropolcalWarning,
         stacklevel=3,
     )
-
-
-def _save(hdus, path):
-    with atomic_path(path, ObservationError) as temporary:
-        hdus.writeto(temporary, overwrite=True)
-
-
-def _header(frame, layout):
-    """Return keyword and value of every column that the layout has a keyword for."""
-    header = {}
-    time = Time(frame["time"])
-    date, clock = time.isot.split("T")
-    known = {"date": date, "time": clock, "mjd": time.mjd * u.day}
-    if layout.identities:
-        known["instrument"] = layout.identities[0]
-    known |= {c: frame[c] for c in frame.colnames if c != "time"}
-    for column, keyword in layout.keywords.items():
-        if column in known:
-            header[keyword] = _value(column, known[column], layout)
-    return header
-
-
-def _value(column, value, layout):
-    """Return what a header says: the inverse of how the layout reads it."""
-    if column in _TEXT_COLUMNS and not isinstance(value, u.Quantity):
-        return str(value)
-    number = u.Quantity(value).to_value(layout.units.get(column, "deg"))
-    factor, offset = layout.transforms.get(column, (1.0, 0.0))
-    return float((number - offset) / factor)

@@ -3,7 +3,7 @@
 Errors of aperture fluxes: photons, read noise, background, and what they share.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import astropy.units as u
 import numpy as np
@@ -31,6 +31,10 @@ class Detector:
         Standard deviation of a pixel in the unit of the data.
     saturation : float
         In the unit of the data.
+    excess_noise : float
+        By what factor electron multiplication raises the photon noise.
+    left : Detector or None
+        That of the left beam, if it is another one.
 
     Examples
     --------
@@ -44,13 +48,34 @@ class Detector:
     gain: float
     read_noise: float
     saturation: float
+    excess_noise: float = 1.0
+    left: "Detector | None" = None
 
     def variance(self, pixels):
         """Return the variance of pixels: photon noise of what is above zero, and read noise."""
-        return np.maximum(pixels, 0.0) / self.gain + self.read_noise**2
+        return self.photon_noise(np.maximum(pixels, 0.0)) + self.read_noise**2
+
+    def photon_noise(self, signal):
+        """Return the variance that the photons of a signal have, in squared units of the data."""
+        return self.excess_noise**2 * signal / self.gain
+
+    def of(self, beam):
+        """Return the detector of the right (0) or left (1) beam."""
+        return self.left if beam == 1 and self.left is not None else self
+
+    def in_units_of(self, other):
+        """Return the same detector where its electrons count as another one's do."""
+        factor = self.gain / other.gain
+        return replace(
+            self,
+            unit=other.unit,
+            gain=other.gain,
+            read_noise=self.read_noise * factor,
+            saturation=self.saturation * factor,
+        )
 
 
-def detector_of(layout, unit=None, exposure_time=None):
+def detector_of(layout, unit=None, exposure_time=None, values=None):
     """
     Return the detector of a layout in the unit that a header gives.
 
@@ -62,6 +87,8 @@ def detector_of(layout, unit=None, exposure_time=None):
         ``BUNIT``; adu where it is absent.
     exposure_time : float, optional
         Seconds, needed for a rate.
+    values : dict, optional
+        Of the header, by which the layout knows how the detector was read out.
 
     Returns
     -------
@@ -70,8 +97,8 @@ def detector_of(layout, unit=None, exposure_time=None):
     Raises
     ------
     ObservationError
-        If the unit is neither adu nor electrons, nor a rate of them; or the
-        exposure time of a rate is unknown.
+        If the unit is neither adu nor electrons, nor a rate of them; the exposure time of a rate
+        is unknown; or the read-out is.
 
     Examples
     --------
@@ -85,12 +112,14 @@ def detector_of(layout, unit=None, exposure_time=None):
     if rate and exposure_time is None:
         raise ObservationError(f"BUNIT = {unit!r} is a rate, and the exposure time is unknown")
     counts = 1 * own * (exposure_time * u.s if rate else 1)
+    how = layout.read_out(values or {})
     if counts.unit.is_equivalent(u.adu):
-        electrons = float(layout.gain * counts.to_value(u.adu))
+        electrons = float(how.gain * counts.to_value(u.adu))
     else:
         electrons = float(counts.to_value(u.electron))
-    full = layout.saturation * layout.gain
-    return Detector(own, electrons, layout.read_noise / electrons, full / electrons)
+    full = how.saturation * how.gain
+    noise = how.read_noise / electrons
+    return Detector(own, electrons, noise, full / electrons, how.excess_noise)
 
 
 def _unit(text):

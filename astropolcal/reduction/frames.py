@@ -12,6 +12,7 @@ from astropy.io import fits
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.reduction.apertures import evenly_lit, measure_internal
+from astropolcal.reduction.beams import match_beams
 from astropolcal.reduction.errors import detector_of
 from astropolcal.reduction.headers import observation_time, pointing, read_header, tracking_error
 from astropolcal.reduction.photometry import Photometry
@@ -136,7 +137,9 @@ def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
             frame.errors, frame.doubts = known.errors, known.doubts
             _check_header(frame, layout, source)
             unit = header.get("BUNIT", primary.get("BUNIT"))
-            detector = detector_of(layout, unit, frame.values.get("exposure_time"))
+            detector = detector_of(layout, unit, frame.values.get("exposure_time"), frame.values)
+            if layout.beam_files:
+                detector, cube = match_beams(frame, layout, cube, detector)
             frame.unit = detector.unit.to_string()
             measure = measure_stars if source == "star" else measure_internal
             frame.photometry = measure(cube, good, detector, layout, **(options or {}))
@@ -213,24 +216,45 @@ def open_cube(path, layout):
 
 
 def _read(path, hdus, layout):
+    primary, header, cube, good = _read_beams(path, hdus, layout)
+    left = layout.left_file(path)
+    if left is None:
+        return primary, header, cube, good
+    if not left.is_file():
+        raise ObservationError(f"{path}: no file {left.name} of the left beam beside it")
+    # what is joined is in memory, so that this file need not stay open
+    with fits.open(left, memmap=False) as others:
+        _, _, other, known = _read_beams(left, others, layout)
+    joined = np.concatenate([other, cube], axis=-1)
+    if good is not None or known is not None:
+        parts = [
+            np.ones(c.shape, bool) if g is None else g for c, g in ((other, known), (cube, good))
+        ]
+        good = np.concatenate(parts, axis=-1)
+    return primary, header, joined, good
+
+
+def _read_beams(path, hdus, layout):
     number = layout.cube_extension
     if len(hdus) <= number:
         raise ObservationError(
             f"{path}: no extension {number}, where the cube should be; it has {len(hdus)} HDUs"
         )
     data = hdus[number].data
-    if data is None or data.shape != tuple(layout.shape):
+    wanted = layout.file_shape
+    if data is not None and data.ndim == 2 and wanted[0] == 1:
+        data = data[None]
+    if data is None or data.shape != wanted:
         shape = "no data" if data is None else f"shape {data.shape}"
-        raise ObservationError(
-            f"{path}: {shape} in extension {number}, {tuple(layout.shape)} is needed"
-        )
+        raise ObservationError(f"{path}: {shape} in extension {number}, {wanted} is needed")
     if data.dtype.kind not in "fiu":
         raise ObservationError(f"{path}: pixels of type {data.dtype}, numbers are needed")
     native = data.dtype.newbyteorder("=") if data.dtype.kind == "f" else float
     cube = np.asarray(data, dtype=native)
     good = np.isfinite(cube)
     weight = hdus[number + 1].data if len(hdus) > number + 1 else None
-    if weight is not None and weight.shape == cube.shape:
+    if weight is not None and weight.size == cube.size:
+        weight = weight.reshape(cube.shape)
         good &= np.asarray(weight) > 0
     if not good.any():
         raise ObservationError(f"{path}: no pixel has a value")

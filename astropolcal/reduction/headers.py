@@ -18,7 +18,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.instruments._keywords import ANGLES, RANGES, TEXTS, convert, look_up
+from astropolcal.instruments._keywords import ANGLES, RANGES, TEXTS, convert, look_up, unit_of
 
 __all__ = [
     "FrameHeader",
@@ -222,10 +222,13 @@ def _raw_header(frame, raw):
 
 def _convert(frame, column, keyword, value, layout):
     """Store a value in the unit of its column, or say why it cannot be right."""
+    if column == "flc_state":
+        _add_state(frame, keyword, value, layout)
+        return
     if column in TEXTS:
         frame.values[column] = str(value).strip()
         return
-    unit = u.Unit(layout.units.get(column, "deg"))
+    unit = unit_of(column, layout)
     target = u.deg if column in ANGLES else u.Unit({"exposure_time": "s"}.get(column, unit))
     try:
         number = convert(column, value, layout, target)
@@ -241,9 +244,20 @@ def _convert(frame, column, keyword, value, layout):
     frame.values[column] = number
 
 
+def _add_state(frame, keyword, value, layout):
+    """Store the state of a modulator, A or B."""
+    known = {"A": "A", "B": "B"} | layout.states
+    # a whole number may be written as 1.0
+    word = f"{value:g}" if isinstance(value, float) else str(value).strip()
+    if word not in known:
+        frame.errors.append(f"{keyword} = {value!r}, allowed are {', '.join(known)}")
+    elif known[word]:
+        frame.values["flc_state"] = known[word]
+
+
 def _allowed(low, high, unit):
     if np.isfinite(high):
-        return f"{low:g} to {high:g} {unit}"
+        return f"{low:g} to {high:g} {unit}".strip()
     return "finite numbers" if np.isinf(low) else "numbers above zero"
 
 

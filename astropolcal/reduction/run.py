@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from multiprocessing import get_all_start_methods, get_context
 
 import numpy as np
+from astropy.io import fits
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
 from astropolcal.observations import Observations, is_star
@@ -231,11 +232,12 @@ def reduce_run(
     ...
     astropolcal.exceptions.ObservationError: no files to reduce
     """
-    instrument = _instrument(instrument)
-    photometry = _photometry(source, instrument)
     files = [str(path) for path in files]
+    instrument = _instrument(instrument, files)
+    photometry = _photometry(source, instrument)
     if not files:
         raise ObservationError("no files to reduce")
+    files = instrument.files.frame_files(files)
     task = {
         "layout": instrument.files,
         "source": photometry,
@@ -244,7 +246,7 @@ def reduce_run(
     }
     frames = _measure_all(files, task, workers, resume, progress)
     reduction = Reduction(instrument, photometry, options=options)
-    frames = set_aside(frames, reduction)
+    frames = _with_state(set_aside(frames, reduction), reduction)
     replace_angles(frames, hwp_sequence)
     frames = consistent(frames, reduction, instrument.files, hwp_sequence is None)
     if photometry == "internal" and not keep_repeats:
@@ -258,10 +260,13 @@ def reduce_run(
     return reduction
 
 
-def _instrument(instrument):
+def _instrument(instrument, files=()):
     from astropolcal import instruments
 
     instrument = instruments.get(instrument) if isinstance(instrument, str) else instrument
+    header = _first_header(files)
+    if header is not None:
+        instrument = instrument.configured(header)
     if instrument.files is None:
         raise InstrumentError(
             f"{instrument.name}: nothing is known of its files; its class needs an attribute files"
@@ -272,6 +277,30 @@ def _instrument(instrument):
             f"{instrument.files.shape[0]} slices"
         )
     return instrument
+
+
+def _first_header(files):
+    """Return the primary header of the first file that has one, None without."""
+    for path in files:
+        try:
+            return fits.getheader(path, 0)
+        except Exception:  # damaged files raise errors of every kind, and are reported later
+            continue
+    return None
+
+
+def _with_state(frames, reduction):
+    """Leave out frames without the state of a modulator that others have."""
+    states = [frame.values.get("flc_state") for frame in frames]
+    if not any(states):
+        return frames
+    keyword = reduction.instrument.files.keywords.get("flc_state", "flc_state")
+    for frame, state in zip(frames, states, strict=True):
+        if state is None:
+            reduction.problems[frame.path] = [
+                f"no state of the modulator, A or B, in its header ({keyword}), which others have"
+            ]
+    return [frame for frame, state in zip(frames, states, strict=True) if state is not None]
 
 
 def _photometry(source, instrument):
@@ -372,6 +401,9 @@ def _meta(frames, instrument, source, given):
     if "date" in meta:
         meta["date"] = meta["date"][:10]
     meta |= _optics(values, instrument.files)
+    if any(v.get("flc_state") for v in values):
+        # the states alternate within an exposure, so that their difference is the better one
+        meta["pairing"] = "flc_state"
     if source != "internal":
         meta["source"] = source
     elif "source" not in given and (seen := _seen_source(frames)):

@@ -20,6 +20,7 @@ from astropolcal.reduction.errors import flux_variance, shared_pixels
 from astropolcal.reduction.finding import find_pair
 from astropolcal.reduction.gaussians import fit_gaussians
 from astropolcal.reduction.photometry import BEAMS, Photometry
+from astropolcal.reduction.wings import wing_shares
 
 __all__ = ["choose_radius", "curve_of_growth", "measure_stars"]
 
@@ -73,9 +74,11 @@ def measure_stars(
         For a radius that follows the image.
     annulus : float
         Width of the ring in pixels.
-    aperture_correction : bool
-        Whether fluxes are scaled to those within ``max_radius``, by the same factor
-        in both beams, smooth over wavelength; its error is in variance and covariance.
+    aperture_correction : bool or "growth"
+        Whether fluxes are scaled to all of the star's light, by a profile of its wings
+        (`~astropolcal.reduction.wings.wing_shares`); or to what circles of
+        ``max_radius`` have. By the same factor in both beams, smooth over wavelength;
+        its error is in variance and covariance.
     companion : float
         A second star brighter than this fraction of the first spoils a frame.
     max_masked : float
@@ -110,6 +113,10 @@ def measure_stars(
     [1.0]
     """
     _check(radius, factor, max_radius, annulus, companion, max_masked)
+    if aperture_correction not in (False, True, "growth"):
+        raise ParameterError(
+            f"aperture_correction = {aperture_correction!r}; allowed are False, True and 'growth'"
+        )
     result = Photometry.empty(len(cube))
     good = np.isfinite(cube) if good is None else good
     empty = ~good.any(axis=(1, 2))
@@ -126,13 +133,16 @@ def measure_stars(
     _judge(result, fits, origin, pair)
     result.radius[:] = _radii(result.fwhm, radius, factor, max_radius, mean, known, pair)
     run = _Cube(cube, good, fits, origin, detector, layout.edge, annulus, max_masked)
-    _measure(result, run)
+    level_variance = _measure(result, run)
     usable = ~result.failed
     distance = np.hypot(*(np.diff(axis[:, usable], axis=0)[0] for axis in (result.x, result.y)))
     pixel = detector.variance(result.background[:, usable].mean(axis=0))
     result.covariance[usable] = shared_pixels(distance, result.radius[0, usable], pixel)
-    if aperture_correction:
-        _correct(result, run, max_radius)
+    if aperture_correction == "growth":
+        _correct(result, *_growth_shares(result, run, max_radius))
+    elif aperture_correction:
+        found = wing_shares(cube, good, result, level_variance, detector, layout, reach=max_radius)
+        _correct(result, *_spread_out(found, usable))
     return result
 
 
@@ -256,17 +266,20 @@ class _Cube:
 
 
 def _measure(result, cube):
-    """Sum the apertures of all slices that have not failed."""
+    """Sum the apertures of all slices that have not failed; return the levels' variances."""
+    level_variance = np.zeros_like(result.flux)
     for k in np.flatnonzero(~result.failed):
         found = _both(result, cube, k, result.radius[0, k])
         if isinstance(found, str):
             result.flag(np.arange(len(result.reasons)) == k, found)
-        else:
-            result.flux[:, k], result.variance[:, k], result.background[:, k] = found
+            continue
+        result.flux[:, k], result.variance[:, k], result.background[:, k] = found[:3]
+        level_variance[:, k] = found[3]
+    return level_variance
 
 
 def _both(result, cube, k, radius):
-    """Return flux, variance and background of both beams in a slice, or why there are none."""
+    """Return flux, variance, background and its share in the variance, or why there are none."""
     places = np.stack([result.x[:, k], result.y[:, k]], axis=1)
     found = []
     for beam in range(2):
@@ -278,10 +291,10 @@ def _both(result, cube, k, radius):
 
 
 def _aperture(cube, k, beam, places, radius):
-    """Return flux, variance and background of one aperture, or why it cannot be used."""
+    """Return what `_flux` does of one aperture, or why it cannot be used."""
     from photutils.aperture import CircularAperture
 
-    place, image, detector = places[beam], cube.cube[k], cube.detector
+    place, image, detector = places[beam], cube.cube[k], cube.detector.of(beam)
     if _beyond_edge(place, radius, image.shape, cube.edge):
         return "edge"
     mask = CircularAperture(place, radius).to_mask(method="exact")
@@ -308,7 +321,7 @@ def _ring(shape, places, beam, radius, annulus):
 
 
 def _flux(inside, weights, ring, detector):
-    """Return flux, variance and background from the pixels of an aperture and its ring."""
+    """Return flux, its variance, background, and what the latter's noise adds to the variance."""
     level = float(np.median(ring))
     area = weights.sum()
     flux = float((weights * inside).sum() - level * area)
@@ -317,8 +330,10 @@ def _flux(inside, weights, ring, detector):
     spread = 1.4826 * np.median(np.abs(ring - level))
     # what the ring shows, but never less than the detector's own noise
     pixel = max(spread**2, float(detector.variance(level)))
-    photons = float((weights**2 * np.maximum(inside - level, 0.0)).sum()) / detector.gain
-    return flux, float(flux_variance(photons, area, pixel, ring.size)), level
+    photons = detector.photon_noise(float((weights**2 * np.maximum(inside - level, 0.0)).sum()))
+    without = flux_variance(photons, area, pixel)
+    variance = flux_variance(photons, area, pixel, ring.size)
+    return flux, float(variance), level, float(variance - without)
 
 
 def _beyond_edge(place, radius, shape, edge):
@@ -347,8 +362,8 @@ def _filled(image, known, gauss, corner):
     return np.where(known, image, model + nearby)
 
 
-def _correct(result, cube, reach):
-    """Scale fluxes to a larger radius by what both beams together have beyond their own."""
+def _growth_shares(result, cube, reach):
+    """Return which part of the flux in wider circles both beams together have, and its noise."""
     share, spread = np.full((2, len(result.reasons)), np.nan)
     for k in np.flatnonzero(~result.failed):
         wide = _both(result, cube, k, reach)
@@ -359,11 +374,22 @@ def _correct(result, cube, reach):
         beyond = max((wide[1] - result.variance[:, k]).sum(), 1e-12 * wide[1].sum())
         spread[k] = share[k] * np.sqrt(beyond) / total
     known = np.isfinite(share)
-    if known.sum() < _CORRECTION_DEGREE + 1:
+    return share[known], np.diag(spread[known] ** 2), known
+
+
+def _spread_out(found, usable):
+    if found is None:
+        return np.empty(0), np.empty((0, 0)), np.zeros_like(usable)
+    return found.values, found.covariance, usable
+
+
+def _correct(result, share, covariance, known):
+    """Divide fluxes by the part of the light that they are."""
+    if not known.any():
         result.flag(True, "no aperture correction")
         return
-    # smooth over wavelength: the noise of the wide apertures must not enter the fluxes
-    smooth, error = _smooth(share, spread, known)
+    # smooth over wavelength: the noise of the wings must not enter the fluxes
+    smooth, error = _smooth(share, covariance, known)
     result.flag(smooth <= 0.0, "no aperture correction")
     result.scale[:] = 1 / np.where(smooth > 0, smooth, 1.0)
     result.scale_err[:] = error * result.scale**2
@@ -374,18 +400,19 @@ def _correct(result, cube, reach):
     result.covariance[:] = result.covariance * result.scale**2 + both
 
 
-def _smooth(values, errors, known):
+def _smooth(values, covariance, known):
     """Return a polynomial over the slices through what is known, and its standard deviation."""
-    terms = legvander(np.linspace(-1, 1, len(values)), _CORRECTION_DEGREE)
-    weighted = terms[known] / errors[known, None]
-    inverse = np.linalg.pinv(weighted)
-    coefficients = inverse @ (values[known] / errors[known])
-    residuals = values[known] / errors[known] - weighted @ coefficients
+    degree = min(_CORRECTION_DEGREE, known.sum() - 1)
+    terms = legvander(np.linspace(-1, 1, len(known)), degree)
+    errors = np.sqrt(np.diag(covariance))
+    weighted = terms[known] / errors[:, None]
+    inverse = np.linalg.pinv(weighted) / errors
+    residuals = (values - terms[known] @ (inverse @ values)) / errors
     freedom = known.sum() - terms.shape[1]
     # a curve that is no polynomial makes errors larger, chance does not make them smaller
     excess = max(1.0, (residuals**2).sum() / freedom) if freedom else 1.0
-    covariance = inverse @ inverse.T * excess
-    return terms @ coefficients, np.sqrt(np.einsum("ki,ij,kj->k", terms, covariance, terms))
+    spread = inverse @ covariance @ inverse.T * excess
+    return terms @ inverse @ values, np.sqrt(np.einsum("ki,ij,kj->k", terms, spread, terms))
 
 
 def curve_of_growth(image, place, radii):

@@ -95,6 +95,9 @@ def _frame_columns(frames, instrument):
         if frames and None not in values:
             column = "time" if name == "mjd" else name
             table[column] = np.repeat(np.array(values, dtype=float), n) * unit
+    states = [frame.values.get("flc_state") for frame in frames]
+    if frames and None not in states:
+        table["flc_state"] = np.repeat(states, n)
     return table
 
 

@@ -17,7 +17,7 @@ examples:
   astropolcal calibrate run.ecsv --fix hwp.theta=0 --fix derotator.theta=0
   astropolcal calibrate run.ecsv --standard other.ecsv --groups cycle
   astropolcal calibrate run.ecsv --target 5,30   for 5 % at 30 deg
-  astropolcal calibrate polarized.ecsv unpolarized.ecsv star.ecsv --strategy sequential
+  astropolcal calibrate polarized.ecsv star.ecsv --strategy sequential
 """
 
 
@@ -28,7 +28,7 @@ def add_parser(commands):
     parser = commands.add_parser(
         "calibrate",
         help="fit an instrument's chain of optics to observation tables",
-        description="Fit an instrument's chain of optics to observation tables. Without files, "
+        description="Fit an instrument's chain of optics to observation tables. Without files,\n"
         "the packaged example is calibrated.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,

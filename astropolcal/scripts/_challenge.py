@@ -5,7 +5,7 @@ import argparse
 from contextlib import nullcontext
 
 from astropolcal.exceptions import AstropolcalError
-from astropolcal.scripts._common import check_outputs, write_json
+from astropolcal.scripts._common import check_outputs, wrapped, write_json
 
 _EPILOG = """\
 examples:
@@ -13,7 +13,8 @@ examples:
   astropolcal challenge -n 1000 --snr 8:300 --workers 8 --checkpoint run.jsonl
   astropolcal challenge -n 50 --kinds none,absorbed --json alarms.json
 
-A run that was interrupted goes on if it is started again with the same checkpoint.
+A run that was interrupted goes on if it is started again with the same
+checkpoint.
 """
 
 
@@ -125,5 +126,6 @@ def _report(result):
         said = " + ".join("/".join(group) for group in record["causes"])
         strength = f" (SNR {min(record['snr']):.0f})" if record["snr"] else ""
         answer = f"{record['verdict']} {said}".strip()
-        lines.append(f"  no. {record['index']}, {record['kind']}: {truth}{strength} -> {answer}")
+        line = f"  no. {record['index']}, {record['kind']}: {truth}{strength} -> {answer}"
+        lines.append(wrapped(line, indent=6))
     return "\n".join(lines)

@@ -26,6 +26,7 @@ def read_night(files, instrument, raw=None):
     layout = instrument.files
     if layout is None:
         raise AstropolcalError(f"{instrument.name}: it is not known how its files look")
+    layout = configured(instrument, files).files
     dates, modes, headers = [], {}, []
     for file in files:
         frame = read_header(file, layout, raw=raw)
@@ -43,6 +44,17 @@ def read_night(files, instrument, raw=None):
     dates.sort()
     ends = list(dict.fromkeys((dates[0], dates[-1]))) if dates else []
     return Night(ends, next(iter(modes), None), told_beam(headers, instrument, files))
+
+
+def configured(instrument, files):
+    """Return the instrument as the first file's header says; as it is if that cannot be read."""
+    from astropy.io import fits
+
+    try:
+        header = fits.getheader(files[0])
+    except (OSError, ValueError, IndexError):
+        return instrument
+    return instrument.configured(header)
 
 
 def choose_calibration(arguments, files, raw=None):
@@ -66,7 +78,13 @@ def choose_calibration(arguments, files, raw=None):
         calibration, path = entry.calibration, entry.path
     else:
         _check_validity(calibration, path, arguments, night)
-    chain = sky_chain(calibration, optics_in=arguments.optics_in, beam=beam, label=str(path))
+    chain = sky_chain(
+        calibration,
+        optics_in=arguments.optics_in,
+        beam=beam,
+        label=str(path),
+        date=night.dates or None,
+    )
     return (
         calibration,
         chain,

@@ -4,6 +4,7 @@
 import json
 import re
 import sys
+import textwrap
 from pathlib import Path
 
 import astropy.units as u
@@ -12,6 +13,8 @@ import numpy as np
 from astropolcal.chain import find_optic, leaves, remove_optic
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import atomic_path
+
+_COLUMNS = 80
 
 
 def check_outputs(*paths):
@@ -24,6 +27,17 @@ def check_outputs(*paths):
             raise AstropolcalError(f"{path}: there is no folder {path.parent}")
         if path.is_dir():
             raise AstropolcalError(f"{path}: is a folder, not a file")
+
+
+def wrapped(line, indent=0):
+    """Break a line at 80 columns, the further ones indented; words stay whole."""
+    return textwrap.fill(
+        line,
+        _COLUMNS,
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def write_json(content, path):

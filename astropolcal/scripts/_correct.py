@@ -8,8 +8,8 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
-from astropolcal.scripts._choosing import choose_calibration
-from astropolcal.scripts._common import check_outputs, write_json
+from astropolcal.scripts._choosing import choose_calibration, configured
+from astropolcal.scripts._common import check_outputs, wrapped, write_json
 
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 
@@ -168,7 +168,9 @@ def run(arguments):
     files = _files(arguments.cubes)
     calibration, chain, provenance = choose_calibration(arguments, files)
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
-    table, centres, scale = _headers(files, instrument, arguments)
+    instrument = configured(instrument, files)
+    files = instrument.files.frame_files(files)
+    table, centres, scale, left_scale = _headers(files, instrument, arguments)
     frames = ScienceFrames.from_files(
         files,
         instrument,
@@ -179,6 +181,7 @@ def run(arguments):
         position_angle=_position_angles(table, arguments),
         mirrored=arguments.mirrored,
         scale=scale,
+        left_scale=left_scale,
     )
     if arguments.brightness == "measured":
         rows = measurement_rows(
@@ -229,9 +232,10 @@ def _files(cubes):
 
 
 def _headers(files, instrument, arguments):
-    """Return the angles of all frames, the places of the star, and the relative exposures."""
+    """Return angles of all frames, places of the star, exposures, and scales of the left beam."""
     from astropy.table import QTable
 
+    from astropolcal.reduction.beams import beam_scale
     from astropolcal.reduction.headers import raw_frames
 
     layout = instrument.files
@@ -242,6 +246,9 @@ def _headers(files, instrument, arguments):
         values = [frame.values.get(name, np.nan) for frame in found]
         if np.isfinite(values).any():
             table[name] = values * u.deg
+    states = [frame.values.get("flc_state", "") for frame in found]
+    if any(states):
+        table["flc_state"] = states
     if "hwp_true" in table.colnames and not np.isfinite(table["hwp_true"]).all():
         # an angle that some headers lack follows from the tracking law in all
         table.remove_column("hwp_true")
@@ -254,7 +261,8 @@ def _headers(files, instrument, arguments):
             raise ObservationError(f"{bad}: the star was not found; give its place with --centre")
     exposure = np.array([frame.values.get("exposure_time", np.nan) for frame in found])
     differ = np.isfinite(exposure).all() and np.ptp(exposure) > 1e-6 * exposure.max()
-    return table, centres, exposure / np.median(exposure) if differ else None
+    left = [beam_scale(file, layout, f.values) for file, f in zip(files, found, strict=True)]
+    return table, centres, exposure / np.median(exposure) if differ else None, left
 
 
 def _frame(file, layout, raw, centre):
@@ -347,7 +355,8 @@ def _report(summary):
     if condition:
         print(f"  condition: {min(condition):.3g} to {max(condition):.3g}")
     for i, words in summary["poorly_determined"].items():
-        print(f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}")
+        line = f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}"
+        print(wrapped(line, indent=4))
     for name, words in (("s_p", "degree"), ("s_chi", "angle, deg")):
         for kind in ("statistical", "systematic"):
             values = [v for v in summary["aperture"][f"{name}_{kind}"] if v is not None]

@@ -7,15 +7,21 @@ from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.scripts._calibrate import _stated
-from astropolcal.scripts._common import check_outputs, edit_chains, read_datasets, write_json
+from astropolcal.scripts._common import (
+    check_outputs,
+    edit_chains,
+    read_datasets,
+    wrapped,
+    write_json,
+)
 
 _EPILOG = """\
 examples:
   astropolcal diagnose polarized.ecsv unpolarized.ecsv --report gap.html
-  astropolcal diagnose cal.asdf polarized.ecsv         the model of a calibration
-  astropolcal diagnose run.ecsv --derotator linear     a simpler model
+  astropolcal diagnose cal.asdf polarized.ecsv      the model of a calibration
+  astropolcal diagnose run.ecsv --derotator linear  a simpler model
   astropolcal diagnose run.ecsv --effects beam_gain,hwp_tilt
-  astropolcal diagnose run.ecsv --save improved.asdf   calibrate with what is found
+  astropolcal diagnose run.ecsv --save better.asdf  calibrate with what is found
 
 Several tables are used together. The effects are listed by --effects help.
 """
@@ -127,7 +133,8 @@ def _list_of_effects():
     from astropolcal.gap import EFFECTS
 
     width = max(map(len, EFFECTS)) + 2
-    return "\n".join(f"{name:<{width}}{effect.title}" for name, effect in EFFECTS.items())
+    lines = (f"{name:<{width}}{effect.title}" for name, effect in EFFECTS.items())
+    return "\n".join(wrapped(line, indent=width) for line in lines)
 
 
 # ---- the nominal model ------------------------------------------------------------------------

@@ -4,15 +4,18 @@
 import astropy.units as u
 import numpy as np
 
+from astropolcal import instruments
+from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.scripts._common import check_outputs, write_json
 
 _EPILOG = """\
 examples:
-  astropolcal efficiency                                published values of CHARIS
-  astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o efficiency.png
+  astropolcal efficiency                         published values of CHARIS
+  astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o plot.png
   astropolcal efficiency cal.asdf --derotator 45 70 90 --wavelength 1.2 1.6 2.2
-  astropolcal efficiency cal.asdf --target 75.2,28.3 --night 2025-11-03T08:00/2025-11-03T12:00
+  astropolcal efficiency cal.asdf --target 75.2,28.3 \\
+      --night 2025-11-03T08:00/2025-11-03T12:00
 """
 
 
@@ -23,9 +26,10 @@ def add_parser(commands):
     parser = commands.add_parser(
         "efficiency",
         help="polarimetric efficiency over wavelength, derotator angle and pointing",
-        description="Share of the linear polarization that an observation measures, over "
-        "wavelength, derotator angle, altitude and parallactic angle; and the derotator offset "
-        "that loses least of it. Without a calibration the published values are taken.",
+        description="Share of the linear polarization that an observation measures, over\n"
+        "wavelength, derotator angle, altitude and parallactic angle; and the derotator\n"
+        "offset that loses least of it. Without a calibration the published values are\n"
+        "taken.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -54,7 +58,12 @@ def add_parser(commands):
     )
     parser.add_argument("--night", metavar="START/END", help="times in UTC, with --target")
     parser.add_argument(
-        "--law", choices=("pupil", "field"), default="pupil", help="what the derotator keeps still"
+        "--law",
+        metavar="MODE",
+        help="what the derotator keeps still, such as field (default: pupil)",
+    )
+    parser.add_argument(
+        "--date", metavar="DATE", help="of the telescope's mirrors, where that matters"
     )
     parser.add_argument("-o", "--output", metavar="FILE", help="save the figure (PNG, PDF, SVG)")
     parser.add_argument("--json", metavar="FILE", help="summary for machines (- for stdout)")
@@ -82,41 +91,74 @@ def run(arguments):
 
 def _chain(arguments):
     """Return instrument, chain from the sky and wavelengths."""
-    from astropolcal import Calibration, instruments
+    from astropolcal import Calibration
 
     if arguments.file is None:
         instrument = instruments.get(arguments.instrument or "charis")
-        return instrument, instrument.on_sky(instrument.published()), instrument.wavelength
+        grid = instrument.wavelength
+        return instrument, _on_sky(instrument, instrument.published(), grid, arguments), grid
     calibration = Calibration.read(arguments.file)
     name = arguments.instrument or calibration.instrument
     if name is None:
         raise InstrumentError(f"{arguments.file}: names no instrument; give --instrument NAME")
     instrument = instruments.get(name)
     # a chain that has the telescope already is better than the published one
-    chains = sorted(calibration.chains, key=lambda chain: "m3" not in chain.submodel_names)
-    return instrument, instrument.on_sky(chains[0]), calibration.wavelength
+    chains = sorted(calibration.chains, key=lambda chain: "parallactic" not in stages(chain))
+    grid = calibration.wavelength
+    return instrument, _on_sky(instrument, chains[0], grid, arguments), grid
+
+
+def _on_sky(instrument, chain, grid, arguments):
+    """Return the chain behind the telescope; as it is where no telescope is known."""
+    if type(instrument).on_sky is instruments.Instrument.on_sky or "parallactic" in stages(chain):
+        return chain
+    known = {"wavelength": grid, "date": arguments.date}
+    if arguments.date is not None and "date" not in instrument.sky_options:
+        raise ParameterError(f"--date: the telescope of {instrument.name} is that of any date")
+    return instrument.on_sky(chain, **{key: known[key] for key in instrument.sky_options})
 
 
 def _table(arguments, instrument, chain, grid):
-    from astropolcal.calibration import polarimetric_efficiency
+    from astropolcal.calibration.efficiency import has_derotator, polarimetric_efficiency
 
+    turns = has_derotator(chain)
+    if arguments.derotator and not turns:
+        raise ParameterError(f"--derotator: {instrument.name} has none in this chain")
     derotator = np.array(arguments.derotator or np.arange(0, 91, 15), dtype=float)
     rows = _rows(arguments.wavelength, grid)
     values = polarimetric_efficiency(
         chain,
         grid,
-        derotator=derotator * u.deg,
-        altitude=arguments.altitude * u.deg,
-        parallactic=arguments.parallactic * u.deg,
+        derotator=derotator * u.deg if turns else None,
+        instrument=instrument,
+        mode=_mode(arguments, instrument),
+        **_pointing(arguments, chain),
     )
-    return {
-        "instrument": instrument.name,
-        "altitude_deg": arguments.altitude,
-        "parallactic_deg": arguments.parallactic,
-        "derotator_deg": derotator.tolist(),
+    content = {"instrument": instrument.name}
+    content |= {f"{key}_deg": a.value for key, a in _pointing(arguments, chain).items()}
+    content |= {"derotator_deg": derotator.tolist()} if turns else {}
+    return content | {
         "wavelength_nm": grid.to_value(u.nm)[rows].tolist(),
-        "efficiency": values[:, rows].tolist(),
+        "efficiency": np.atleast_2d(values)[:, rows].tolist(),
     }
+
+
+def _pointing(arguments, chain):
+    """Return the angles of the telescope, where the chain has one."""
+    on_sky = {"altitude", "parallactic"} & set(stages(chain))
+    keys = ("altitude", "parallactic") if on_sky else ()
+    return {key: getattr(arguments, key) * u.deg for key in keys}
+
+
+def _mode(arguments, instrument):
+    """Return what the derotator keeps still; the pupil, if it can and nothing is said."""
+    modes = instrument.sky_law.modes
+    if arguments.law is not None and modes and arguments.law not in modes:
+        raise ParameterError(
+            f"--law {arguments.law}: allowed of {instrument.name} are {', '.join(modes)}"
+        )
+    usual = "pupil" if "pupil" in modes else next(iter(modes), None)
+    return arguments.law or usual
 
 
 def _rows(wanted, grid):
@@ -137,7 +179,8 @@ def _best(arguments, instrument, chain, grid):
     from astropolcal.calibration import best_derotator
 
     altitude, parallactic = _track(arguments, instrument)
-    best = best_derotator(chain, grid, altitude, parallactic, law=arguments.law)
+    mode = _mode(arguments, instrument)
+    best = best_derotator(chain, grid, altitude, parallactic, law=mode, instrument=instrument)
     row = int(np.argmax(best.table["least"]))
     return {
         "law": best.law,
@@ -184,21 +227,33 @@ def _draw(arguments, instrument, chain, grid):
         parallactic=arguments.parallactic * u.deg,
         derotator=(arguments.derotator or [90.0])[-1] * u.deg,
         shown=None if arguments.wavelength is None else arguments.wavelength * u.um,
+        instrument=instrument,
+        mode=_mode(arguments, instrument),
         title=f"Polarimetric efficiency of {instrument.name}",
     )
     with atomic_path(arguments.output) as temporary:
         figure.savefig(temporary, dpi=150)
 
 
+def _where(content):
+    if "altitude_deg" not in content:
+        return "behind the internal source"
+    return (
+        f"at altitude {content['altitude_deg']:g} deg, parallactic angle "
+        f"{content['parallactic_deg']:g} deg"
+    )
+
+
 def _text(content):
+    turns = "derotator_deg" in content
     lines = [
-        f"Polarimetric efficiency of {content['instrument']} at altitude "
-        f"{content['altitude_deg']:g} deg, parallactic angle {content['parallactic_deg']:g} deg",
+        f"Polarimetric efficiency of {content['instrument']} {_where(content)}",
         "",
-        "derotator" + "".join(f"{lam:8.0f}" for lam in content["wavelength_nm"]) + " nm",
+        "derotator" * turns + "".join(f"{lam:8.0f}" for lam in content["wavelength_nm"]) + " nm",
     ]
-    for angle, row in zip(content["derotator_deg"], content["efficiency"], strict=True):
-        lines.append(f"{angle:8.2f} " + "".join(f"{value:8.3f}" for value in row))
+    for i, row in enumerate(content["efficiency"]):
+        angle = f"{content['derotator_deg'][i]:8.2f} " if turns else ""
+        lines.append(angle + "".join(f"{value:8.3f}" for value in row))
     best = content.get("best_derotator")
     if best:
         (low, high), (east, west) = best["altitude_deg"], best["parallactic_deg"]

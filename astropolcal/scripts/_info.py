@@ -3,7 +3,7 @@
 
 from pathlib import Path
 
-from astropolcal.scripts._common import write_json
+from astropolcal.scripts._common import wrapped, write_json
 
 
 def add_parser(commands):
@@ -76,12 +76,13 @@ def _calibration(path):
         f"{path}: calibration made {made.get('created', 'at an unknown time')} "
         f"with astropolcal {made.get('astropolcal', '?')}",
         f"  valid for {held}",
-        f"  content sha256 {digest}",
+        f"  sha256 {digest}",
     ]
     for record in calibration.datasets:
         optics = ", ".join(f"{k}: {v}" for k, v in record.meta.items() if k not in _DULL)
         lines.append(f"  {record.name}: {optics}, sha256 {record.content_hash[:12]}")
     content = calibration.to_dict() | {"validity": held.to_dict(), "content_hash": digest}
+    lines = [wrapped(line, indent=4) for line in lines]
     return "\n".join([*lines, "", calibration.summary()]), content
 
 
@@ -104,11 +105,13 @@ def _library(folder):
         ]
         files.append(_plain(row) | {"validity": entry.validity.to_dict()})
     problems = {path.name: reason for path, reason in library.problems.items()}
-    lines += [f"{name}\n  UNREADABLE: {reason}" for name, reason in problems.items()]
+    for name, reason in problems.items():
+        lines += [name, f"  UNREADABLE: {reason}"]
     overlaps = library.overlaps()
     lines += [f"OVERLAP: {words}" for words in overlaps]
     content = {"folder": str(folder), "calibrations": files}
-    return "\n".join(lines), content | {"unreadable": problems, "overlaps": overlaps}
+    text = "\n".join(wrapped(line, indent=4) for line in lines)
+    return text, content | {"unreadable": problems, "overlaps": overlaps}
 
 
 def _plain(row):
@@ -148,4 +151,5 @@ def _observations(path):
         "wavelength_nm": [float(w) for w in observations.wavelength.to_value(u.nm)],
         "content_hash": observations.content_hash,
     }
-    return observations.summary(), content
+    lines = observations.summary().splitlines()
+    return "\n".join(wrapped(line, indent=2) for line in lines), content

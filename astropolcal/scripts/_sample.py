@@ -6,13 +6,13 @@ import sys
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
-from astropolcal.scripts._common import check_outputs, read_datasets, write_json
+from astropolcal.scripts._common import check_outputs, read_datasets, wrapped, write_json
 
 _EPILOG = """\
 examples:
   astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
   astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2
-  astropolcal sample cal.asdf run.ecsv --checkpoint run.h5 --resume -o sampled.asdf
+  astropolcal sample cal.asdf run.ecsv --checkpoint run.h5 --resume -o out.asdf
 
 The files are the tables that the calibration was made from, all of them. Which
 parameters vary, their bounds and their priors are those of the calibration.
@@ -148,7 +148,8 @@ def _words(posterior):
     common = {name: entry for name, entry in parameters.items() if not name.endswith("]")}
     shown = common or parameters
     width = max(map(len, shown)) + 2
-    lines = [posterior.words(), "", "".join(f"{text:>13}" for text in _COLUMNS).rjust(width + 52)]
+    lines = [wrapped(line, indent=2) for line in posterior.words().splitlines()]
+    lines += ["", "".join(f"{text:>13}" for text in _COLUMNS).rjust(width + 52)]
     for name, entry in shown.items():
         numbers = "".join(f"{entry[key]:13.5f}" for key in _COLUMNS)
         lines.append(f"{name:<{width}}{numbers} {entry['unit']}".rstrip())

@@ -153,7 +153,7 @@ def run(arguments):
     check_outputs(arguments.output, arguments.json)
     chain, wavelength, meta = _truth(arguments)
     (chain,) = edit_chains([chain], without=arguments.without, fix=arguments.fix)
-    frames = _frames(arguments)
+    frames = _frames(arguments, chain)
     observations = _table(arguments, chain, wavelength, frames, _meta(meta, arguments))
     written = []
     if arguments.cubes:
@@ -169,11 +169,13 @@ def run(arguments):
         print(f"Written: {', '.join(written)}")
 
 
-def _frames(arguments):
-    """Return the half-wave-plate cycles, for a star with the pointing of each frame."""
+def _frames(arguments, chain):
+    """Return half-wave-plate cycles in all states, for a star with the pointing of each frame."""
     import astropy.units as u
     import numpy as np
 
+    from astropolcal.chain import stages
+    from astropolcal.reduction.cubes import both_states
     from astropolcal.simulation import half_wave_plate_cycles
 
     star = arguments.source == "star"
@@ -189,7 +191,7 @@ def _frames(arguments):
             raise AstropolcalError(f"--{name}: is for --source star")
         if star:
             frames[name] = np.linspace(ends[0], ends[-1], len(frames)) * u.deg
-    return frames
+    return both_states(frames) if "flc_state" in stages(chain) else frames
 
 
 def _table(arguments, chain, wavelength, frames, meta):

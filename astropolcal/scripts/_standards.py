@@ -4,7 +4,7 @@
 import math
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.scripts._common import check_outputs, write_json
+from astropolcal.scripts._common import check_outputs, wrapped, write_json
 
 # more stars than this make a figure unreadable
 _DRAWN = 5
@@ -99,13 +99,13 @@ def _describe(star):
     lines = [f"{star.name}: {star.kind} standard star"]
     lines.append(f"  position    {place} (ICRS, +-{star.position_error.value:g} arcsec)")
     if star.aliases:
-        lines.append(f"  also        {', '.join(star.aliases)}")
+        lines.append(wrapped(f"  also        {', '.join(star.aliases)}", indent=14))
     bright = "  ".join(f"{b} {m.value:g}" for b, m in star.magnitudes.items())
     lines.append(f"  magnitudes  {bright or 'not known'}")
     if star.spectral_type:
         lines.append(f"  type        {star.spectral_type}")
     if star.note:
-        lines.append(f"  note        {star.note}")
+        lines.append(wrapped(f"  note        {star.note}", indent=14))
     lines += _law_lines(star)
     if len(star.polarization):
         lines += ["", "  band      um     p (%)         theta (deg)   source"]

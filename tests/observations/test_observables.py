@@ -83,6 +83,32 @@ def test_per_frame_observables_ignore_the_flux(right, left, plus, minus):
         np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-12)
 
 
+@given(arrays(float, (4, N_BINS, N_DATA), elements=st.floats(1.0, 1e6)), gains)
+def test_triple_difference_is_made_of_differences_of_states(fluxes, gain):
+    right, left = fluxes, fluxes[::-1] * gain
+    x, total = single_difference(right, left), single_sum(right, left)
+    plus, minus = x[0] - x[1], x[2] - x[3]
+    value = get_observable("normalized_triple_difference").evaluate(right, left)
+    np.testing.assert_allclose(value, (plus - minus) / total.sum(axis=0), rtol=1e-12, atol=1e-15)
+
+
+@given(st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
+def test_triple_difference_is_blind_to_what_only_plate_or_only_state_changes(p, plate, state):
+    hwp, flc = np.array([1, 1, -1, -1]), np.array([1, -1, 1, -1])
+    x = (p * hwp * flc + plate * hwp + state * flc).reshape(4, 1, 1)
+    value = get_observable("normalized_triple_difference").evaluate(1 + x, 1 - x)
+    assert value[0, 0] == pytest.approx(p, abs=1e-12)
+
+
+def test_covariance_of_triple_differences_that_share_a_pair_of_states():
+    """Both have the same frames A and B at the minus angle: half of the noise is common."""
+    flux = np.full((4, 1, 2), 100.0)
+    frames = np.array([[0, 1, 2, 3], [4, 5, 2, 3]])
+    x = get_observable("normalized_triple_difference")
+    found = x.frame_covariance(flux, flux, flux, flux, 0.0, frames)[0]
+    np.testing.assert_allclose(found, [[1 / 800, 1 / 1600], [1 / 1600, 1 / 800]])
+
+
 def test_default_observable_does_not_ignore_the_flux():
     # the invariance above must be able to fail
     right, left = random_beams(2)
@@ -96,8 +122,11 @@ def test_all_double_differences_agree_for_a_steady_source_and_equal_beams(p, flu
     right = flux * np.array([1 + p, 1 - p]).reshape(2, 1, 1)
     left = flux * np.array([1 - p, 1 + p]).reshape(2, 1, 1)
     for observable in OBSERVABLES.values():
-        k = observable.frames_per_datum
-        assert observable.evaluate(right[:k], left[:k])[0, 0] == pytest.approx(p, abs=1e-12)
+        # the state of a modulator exchanges the beams as the half-wave plate does
+        frames = [0, 1, 1, 0] if observable.frames_per_datum == 4 else [0, 1]
+        frames = frames[: observable.frames_per_datum]
+        value = observable.evaluate(right[frames], left[frames])
+        assert value[0, 0] == pytest.approx(p, abs=1e-12)
 
 
 @EVERY
@@ -240,7 +269,7 @@ def test_covariance_refuses_frames_of_the_wrong_shape():
 def test_every_observable_is_described(observable):
     assert isinstance(observable, Observable)
     assert OBSERVABLES[observable.name] is observable
-    assert observable.frames_per_datum in (1, 2)
+    assert observable.frames_per_datum in (1, 2, 4)
     assert observable.description in repr(observable)
 
 

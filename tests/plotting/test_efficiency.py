@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from astropolcal import instruments
+from astropolcal import instruments, optics
 from astropolcal.calibration import polarimetric_efficiency
+from astropolcal.chain import remove_optic
+from astropolcal.instruments import SkyLaw
 from astropolcal.plotting import plot_polarimetric_efficiency
 
 CHARIS = instruments.get("charis")
@@ -56,3 +58,30 @@ def test_internal_chain_has_no_map_of_pointings():
     # two panels and a colour bar
     assert len(figure.axes) == 3
     assert figure.axes[0].get_title() == "behind the internal source"
+
+
+def test_few_filters_are_rows_of_their_own():
+    irdis = instruments.get("irdis")
+    figure = plot_polarimetric_efficiency(irdis.published(), irdis.wavelength, instrument=irdis)
+    labels = [text.get_text() for text in figure.axes[1].get_yticklabels()]
+    assert labels == ["1043", "1245", "1625", "2182"]
+
+
+def test_without_a_derotator_the_sky_turns():
+    chain = (
+        optics.Rotator(mount="parallactic", name="sky")
+        | optics.LinearRetarder(retardance=[60, 90] * u.deg, name="relay")
+        | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+        | optics.WollastonPrism(name="wollaston")
+    )
+
+    class Fixed:
+        sky_law = SkyLaw(plate=(0, 0), derotator={})
+
+    (ax,) = plot_polarimetric_efficiency(chain, [1.2, 1.6] * u.um, instrument=Fixed()).axes
+    assert ax.get_xlabel() == "parallactic angle (deg)"
+    assert len(ax.get_lines()) == 2
+    assert ax.get_lines()[1].get_ydata().min() < 0.05
+    inside = remove_optic(chain, "sky")
+    (ax,) = plot_polarimetric_efficiency(inside, [1.2, 1.6] * u.um).axes
+    assert ax.get_xlabel() == "wavelength (nm)"

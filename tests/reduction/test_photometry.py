@@ -181,7 +181,7 @@ def test_radius_by_growth_and_aperture_correction(star_cube):
     fixed = measure_stars(star_cube, None, DETECTOR, LAYOUT, radius=3.0)
     whole = measure_stars(star_cube, None, DETECTOR, LAYOUT, radius="growth", max_radius=25.0)
     corrected = measure_stars(
-        star_cube, None, DETECTOR, LAYOUT, radius=3.0, aperture_correction=True, max_radius=25.0
+        star_cube, None, DETECTOR, LAYOUT, radius=3.0, aperture_correction="growth", max_radius=25.0
     )
     sigma = 5.0 / 2.354820045
     share = 1 - np.exp(-(3.0**2) / (2 * sigma**2))
@@ -194,12 +194,13 @@ def test_radius_by_growth_and_aperture_correction(star_cube):
     )
 
 
-def test_aperture_correction_has_the_error_of_its_factor():
+@pytest.mark.parametrize("kind", [True, "growth"])
+def test_aperture_correction_has_the_error_of_its_factor(kind):
     # light, noise and aperture such that the error of the factor is most of all
     errors, offsets, both = [], [], []
     for seed in range(40):
         cube = expose(star_image(pair(LAYOUT), flux=4e5), LAYOUT, seed=seed)
-        result = measure_stars(cube, None, DETECTOR, LAYOUT, aperture_correction=True)
+        result = measure_stars(cube, None, DETECTOR, LAYOUT, aperture_correction=kind)
         total = result.flux.sum(axis=0)
         errors.append(np.sqrt(result.variance.sum(axis=0) + 2 * result.covariance))
         offsets.append(total - 8e5)
@@ -221,7 +222,7 @@ def test_aperture_correction_is_not_misled_by_the_other_beam():
         image += 2e5 * 2 / (np.pi * core**2) * (1 + squares / core**2) ** -3.0
     cube = np.repeat(image[None], 4, axis=0)
     plain = measure_stars(cube, None, DETECTOR, LAYOUT)
-    corrected = measure_stars(cube, None, DETECTOR, LAYOUT, aperture_correction=True)
+    corrected = measure_stars(cube, None, DETECTOR, LAYOUT, aperture_correction="growth")
     np.testing.assert_allclose(plain.flux, 2e5, rtol=0.02)
     assert (plain.flux < 0.99 * 2e5).all()
     np.testing.assert_allclose(corrected.flux, 2e5, rtol=1e-3)
@@ -306,7 +307,8 @@ def test_flag_no_background(star_cube):
 def test_flag_no_aperture_correction():
     image = star_image(pair(LAYOUT, 40.0, 85.0))
     assert set(flags_of(image)) == {""}
-    assert set(flags_of(image, aperture_correction=True)) == {"no aperture correction"}
+    for kind in (True, "growth"):
+        assert set(flags_of(image, aperture_correction=kind)) == {"no aperture correction"}
 
 
 def test_star_options_are_checked(star_cube):
@@ -317,6 +319,7 @@ def test_star_options_are_checked(star_cube):
         {"annulus": 0.0},
         {"companion": 1.5},
         {"max_masked": -0.1},
+        {"aperture_correction": "wings"},
     ):
         with pytest.raises(ParameterError, match=next(iter(options))):
             measure_stars(star_cube, None, DETECTOR, LAYOUT, **options)

@@ -72,6 +72,9 @@ def test_figure_is_written(tmp_path):
         (["--target", "1,2", "--night", "yesterday"], ParameterError, "START/END"),
         (["--wavelength", "5"], ParameterError, r"--wavelength 5: allowed are 1.160 to 2.369 um"),
         (["--altitude", "95"], AstropolcalError, "altitude = 95 deg"),
+        (["--law", "sky"], ParameterError, "--law sky: allowed of charis are pupil, field"),
+        (["--date", "2020-01-01"], ParameterError, "--date: the telescope of charis"),
+        (["--instrument", "irdis", "--date", "spring"], InstrumentError, "an ISO date"),
         (["--instrument", "nothing"], InstrumentError, "unknown instrument 'nothing'"),
         (["-o", "/nowhere/x.png"], AstropolcalError, "there is no folder"),
         (["missing.asdf"], AstropolcalError, "missing.asdf"),
@@ -80,3 +83,15 @@ def test_figure_is_written(tmp_path):
 def test_bad_input_is_one_error(argv, error, words):
     with pytest.raises(error, match=words):
         run(*argv)
+
+
+def test_law_and_coating_are_those_of_the_instrument(tmp_path):
+    found = []
+    for options in (["--law", "field"], ["--law", "pupil"], ["--date", "2016-01-01"]):
+        out = tmp_path / "out.json"
+        dated = options if "--date" in options else [*options, "--date", "2018-01-01"]
+        run("--instrument", "irdis", *dated, "--parallactic", 30, "--json", out, "-q")
+        found.append(np.array(json.loads(out.read_text())["efficiency"]))
+    assert found[0].shape == (7, 4)
+    assert np.abs(found[0] - found[1]).max() > 1e-5
+    assert np.abs(found[1] - found[2]).max() > 1e-5

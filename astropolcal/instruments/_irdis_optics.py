@@ -1,0 +1,173 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Optics of SPHERE/IRDIS with their published values, one a filter, and the coatings."""
+
+import re
+import warnings
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+from astropy.time import Time
+
+from astropolcal import optics
+from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError
+
+# van Holstein et al. 2020, as distributed with their pipeline; one row a filter
+_DATA = QTable.read(Path(__file__).parents[1] / "data" / "irdis.ecsv", format="ascii.ecsv")
+
+#: Filters with coefficients, and the wavelengths that stand for them.
+FILTERS = tuple(str(name) for name in _DATA["filter"])
+CENTRES = _DATA["wavelength"]
+#: Day from which the telescope's mirrors have their new coating, and the names of both.
+RECOATING = _DATA.meta["recoating"]
+COATINGS = ("before", "after")
+
+# a wavelength within this share of a filter's centre stands for the filter
+_SAME_FILTER = 0.01
+
+
+def choice(what, value, allowed):
+    """Raise if a value is not one of those allowed."""
+    if value not in allowed:
+        raise InstrumentError(f"{what} = {value!r}; allowed are {', '.join(allowed)}")
+
+
+def filters_at(wavelength):
+    """Return the index of the filter of every wavelength."""
+    centres, lam = CENTRES.to_value(u.um), u.Quantity(wavelength).to_value(u.um)
+    index = np.abs(lam[:, None] / centres - 1).argmin(axis=1)
+    off = ~(np.abs(lam / centres[index] - 1) <= _SAME_FILTER)
+    if off.any():
+        known = ", ".join(f"{n} ({c:g} um)" for n, c in zip(FILTERS, centres, strict=True))
+        raise InstrumentError(
+            f"wavelength = {lam[off][0]:.6g} um is that of no filter with coefficients; "
+            f"allowed are {known}"
+        )
+    return index
+
+
+def check_all_filters(found):
+    """Raise if the optics have another number of values than there are filters."""
+    sizes = {getattr(leaf, key).size for leaf in found for key in leaf.param_names}
+    if max(sizes) != len(FILTERS):
+        raise ChainError(
+            f"irdis: the chain has {max(sizes)} values a parameter, and it is not known for which "
+            f"of the filters {', '.join(FILTERS)}; give on_sky(chain, wavelength=...)"
+        )
+
+
+def coating_on(date):
+    """Return "before" or "after", the coating on a date."""
+    day = date.utc.isot[:10] if isinstance(date, Time) and date.isscalar else str(date)[:10]
+    if not re.fullmatch(r"\d{4}-[01]\d-[0-3]\d", day):
+        raise InstrumentError(f"date = {date!r}; an ISO date such as {RECOATING} is needed")
+    return "before" if day < RECOATING else "after"
+
+
+def stated_coating(observations):
+    """Return the coating that the meta of a table tell."""
+    stated = observations.meta.get("coating")
+    if stated is not None:
+        choice(f"{observations.name}: coating", stated, COATINGS)
+        return stated
+    if observations.meta.get("date") is None:
+        raise InstrumentError(
+            f"{observations.name}: neither date nor coating in the table's meta; were the "
+            f"telescope's mirrors those 'before' or 'after' {RECOATING}?"
+        )
+    return coating_on(observations.meta["date"])
+
+
+def coating_of(coating, date):
+    """Return the coating of a telescope that is put before a chain, by name or date."""
+    if coating is not None:
+        choice("coating", coating, COATINGS)
+    if date is None:
+        if coating is None:
+            warnings.warn(
+                "irdis: neither date nor coating of the telescope was given; it is the one from "
+                f"{RECOATING} on; give the date of the frames, or coating='before' for older ones",
+                AstropolcalWarning,
+                stacklevel=3,
+            )
+        return coating or "after"
+    several = np.ndim(date) > 0
+    found = sorted({coating_on(day) for day in (date if several else [date])})
+    if len(found) != 1:
+        words = f"of before and of after the recoating of {RECOATING}" if found else "none"
+        raise InstrumentError(f"the dates are {words}; those of one coating are needed")
+    if coating not in (None, *found):
+        raise InstrumentError(
+            f"coating = {coating!r}, but the date {date} is {found[0]} {RECOATING}"
+        )
+    return found[0]
+
+
+def _column(name, index):
+    return _DATA[name][index]
+
+
+def _near(about):
+    return {"fixed": {"theta": False}, "bounds": {"theta": (about - 5, about + 5)}}
+
+
+def half_wave_plate(index):
+    """Return the half-wave plate."""
+    return _retarder(index, "hwp")
+
+
+def _retarder(index, name):
+    theta = _DATA.meta[f"{name}_theta_deg"]
+    held = _near(theta)
+    held["bounds"] |= {"diattenuation": (-0.1, 0.1), "retardance": (0, 360)}
+    return optics.DiattenuatorRetarder(
+        diattenuation=_column(f"{name}_diattenuation", index),
+        retardance=_column(f"{name}_retardance", index),
+        theta=theta * u.deg,
+        mount=name,
+        name=name,
+        **held,
+    )
+
+
+def derotator(index):
+    """Return the derotator."""
+    turning = _retarder(index, "derotator")
+    # double differences see it in second order only
+    turning.diattenuation.fixed = True
+    return turning
+
+
+def polarizers(index):
+    """Return the pair of polarizers before the halves of the detector."""
+    # the left beam passes +Q
+    return optics.WollastonPrism(
+        efficiency=_column("polarizer_efficiency", index), theta=90 * u.deg, name="wollaston"
+    )
+
+
+def calibration_polarizer():
+    """Return the polarizer of the internal source."""
+    return optics.LinearPolarizer(name="calibration_polarizer", **_near(0))
+
+
+def telescope(index, coating):
+    """Return the optics from the sky to the half-wave plate."""
+    choice("coating", coating, COATINGS)
+    return [
+        optics.Rotator(mount="parallactic", name="parallactic"),
+        _mirror("ut", coating, index),
+        optics.Rotator(mount="altitude", name="altitude"),
+        _mirror("m4", coating, index),
+    ]
+
+
+def _mirror(name, coating, index):
+    return optics.DiattenuatorRetarder(
+        diattenuation=_column(f"{name}_diattenuation_{coating}", index),
+        retardance=_column("mirror_retardance", index),
+        name=name,
+        fixed={"retardance": True},
+        bounds={"diattenuation": (-0.1, 0.1)},
+    )

@@ -1,0 +1,105 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Files of simulated cubes: their names, headers and extensions."""
+
+import re
+
+import astropy.units as u
+import numpy as np
+from astropy.io import fits
+from astropy.time import Time
+
+from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.files import atomic_path
+from astropolcal.instruments._keywords import TEXTS, unit_of
+
+
+def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):
+    """Return the paths of cube and raw header of every frame."""
+    if not directory.parent.is_dir():
+        raise ObservationError(f"{directory}: there is no folder {directory.parent}")
+    if directory.exists() and not directory.is_dir():
+        raise ObservationError(f"{directory}: is a file, not a folder")
+    prefix = layout.prefix if prefix is None else prefix
+    numbers = [f"{prefix}{first + i:08d}" for i in range(n_frames)]
+    if first < 0 or re.search(layout.frame_pattern, f"{numbers[-1]}_cube.fits") is None:
+        raise ParameterError(
+            f"{numbers[-1]}: the number of the frame must match {layout.frame_pattern}"
+        )
+    mark = layout.beam_files[0] if layout.beam_files else "cube"
+    names = [
+        (directory / f"{n}_{mark}.fits", directory / "raw" / f"{n}.fits" if raw else None)
+        for n in numbers
+    ]
+    every = [(cube, layout.left_file(cube), header) for cube, header in names]
+    present = [path for group in every for path in group if path is not None and path.exists()]
+    if present and not overwrite:
+        raise ObservationError(f"{present[0]}: exists; overwriting it was not asked for")
+    (directory / "raw" if raw else directory).mkdir(exist_ok=True, parents=True)
+    return names
+
+
+def write_cube(cube, raw_header, image, weight, header, layout):
+    in_raw = {layout.keywords[c] for c in layout.raw_columns if c in layout.keywords}
+    in_cube = {k: v for k, v in header.items() if raw_header is None or k not in in_raw}
+    left, camera = layout.left_file(cube), layout.keywords.get("camera")
+    if left is None:
+        _save(_hdus(in_cube, image, weight, layout), cube)
+    else:
+        # the left image is the first half
+        parts = [np.split(array, 2, axis=-1) for array in (image, weight)]
+        for number, (path, side) in enumerate([(cube, 1), (left, 0)], start=1):
+            own = in_cube | ({} if camera is None else {camera: number})
+            _save(_hdus(own, *(part[side] for part in parts), layout), path)
+    if raw_header is not None:
+        _save(fits.HDUList([fits.PrimaryHDU(header=fits.Header(list(header.items())))]), raw_header)
+
+
+def _hdus(header, image, weight, layout):
+    header, second = fits.Header(list(header.items())), ("IVAR", "adu-2")
+    if layout.weights == "error":
+        with np.errstate(divide="ignore"):
+            # where nothing is known the weight is 0, and so is this
+            weight = np.where(weight > 0, 1 / np.sqrt(weight), 0.0).astype(np.float32)
+        second = ("ERR", "adu")
+    if layout.cube_extension == 0:
+        header["BUNIT"] = "adu"
+        hdus = [fits.PrimaryHDU(image, header=header)]
+    else:
+        # the cube's extension need not be the first
+        hdus = [fits.PrimaryHDU(header=header)]
+        hdus += [fits.ImageHDU() for _ in range(layout.cube_extension - 1)]
+        hdus.append(fits.ImageHDU(image, header=fits.Header({"BUNIT": "adu"}), name="IMAGE"))
+    name, unit = second
+    hdus.append(fits.ImageHDU(weight, header=fits.Header({"BUNIT": unit}), name=name))
+    return fits.HDUList(hdus)
+
+
+def _save(hdus, path):
+    with atomic_path(path, ObservationError) as temporary:
+        hdus.writeto(temporary, overwrite=True)
+
+
+def header_of(frame, layout):
+    """Return keyword and value of every column that the layout has a keyword for."""
+    header = {}
+    time = Time(frame["time"])
+    date, clock = time.isot.split("T")
+    known = {"date": date, "time": clock, "mjd": time.mjd * u.day}
+    if layout.identities:
+        known["instrument"] = layout.identities[0]
+    known |= {c: frame[c] for c in frame.colnames if c != "time"}
+    for column, keyword in layout.keywords.items():
+        if column in known:
+            header[keyword] = _value(column, known[column], layout)
+    return header
+
+
+def _value(column, value, layout):
+    """Return what a header says: the inverse of how the layout reads it."""
+    if column == "flc_state":
+        return "AB"[int(value)]
+    if column in TEXTS and not isinstance(value, u.Quantity):
+        return str(value)
+    number = u.Quantity(value).to_value(unit_of(column, layout))
+    factor, offset = layout.transforms.get(column, (1.0, 0.0))
+    return float((number - offset) / factor)
