@@ -133,6 +133,9 @@ class Propagator:
             ]
             for beam in ("right", "left")
         ]
+        first, other = (arm[0] for arm in self._arms)
+        same = np.array_equal(first.stage_angle, other.stage_angle)
+        self._same_entrance = same and not first.leaf.rotates_frame
 
     def values(self):
         """
@@ -253,10 +256,14 @@ class Sweep:
         self._propagator = propagator
         self._common, state = _run(propagator._common, values, (propagator.source, 0.0))
         self._arms, fluxes = [], []
+        # in front of the splitter the light of both beams is the same
+        turned = {} if propagator._same_entrance else None
         for nodes in propagator._arms:
-            steps, (light, _) = _run(nodes, values, state)
+            steps, (light, _) = _run(nodes, values, state, turned)
             self._arms.append(steps)
-            fluxes.append(np.broadcast_to(light[:, 0, :], propagator.shape))
+            flux = light[:, 0]
+            whole = flux.shape == propagator.shape
+            fluxes.append(flux if whole else np.broadcast_to(flux, propagator.shape))
         #: Fluxes of the right and the left beam, (n_wavelengths, n_columns) each.
         self.fluxes = tuple(fluxes)
 
@@ -290,8 +297,12 @@ class Sweep:
         return {key: np.broadcast_to(value, shape) for key, value in result.items()}
 
 
-def _run(nodes, values, state):
-    """Carry light through ``nodes``; return the steps and the state behind them."""
+def _run(nodes, values, state, turned=None):
+    """
+    Carry light through ``nodes``; return the steps and the state behind them.
+
+    ``turned`` keeps the light as the first node sees it, for other nodes behind the same light.
+    """
     light, frame = state
     steps = []
     for node in nodes:
@@ -303,7 +314,10 @@ def _run(nodes, values, state):
             steps.append(_Step(node, own, None, light, None, light))
             continue
         turn = angle - frame
-        light = _rotate(light, turn)
+        known = turned.get("light") if turned is not None else None
+        light = _rotate(light, turn) if known is None else known
+        if turned is not None:
+            turned["light"], turned = light, None
         matrix = node.matrix(own)
         out = _act(matrix, light)
         steps.append(_Step(node, own, turn, light, matrix, out))
@@ -355,18 +369,34 @@ def _cross(a, s):
 
 def _rotate(light, angle):
     """Return T(angle) applied to the light; ``angle`` broadcasts against (wavelength, column)."""
-    if np.ndim(angle) == 0 and angle == 0:
+    dimensions = np.ndim(angle)
+    if dimensions == 0 and angle == 0:
         return light
-    cosine, sine = np.cos(2 * angle), np.sin(2 * angle)
-    q, u = light[..., 1, :], light[..., 2, :]
-    rows, columns = np.broadcast_shapes(q.shape, cosine.shape)
-    out = np.empty((rows, 4, columns))
-    out[..., 0, :], out[..., 3, :] = light[..., 0, :], light[..., 3, :]
-    out[..., 1, :] = cosine * q + sine * u
-    out[..., 2, :] = cosine * u - sine * q
+    double = 2 * angle
+    cosine, sine = np.cos(double), np.sin(double)
+    rows, _, columns = light.shape
+    if dimensions:
+        # the shape of the product, without asking numpy for it
+        columns = max(columns, angle.shape[-1])
+        rows = max(rows, angle.shape[0]) if dimensions == 2 else rows
+    out = _blank(rows, columns)
+    q, u, new_q, new_u = light[:, 1], light[:, 2], out[:, 1], out[:, 2]
+    out[:, ::3] = light[:, ::3]
+    np.multiply(cosine, q, out=new_q)
+    new_q += sine * u
+    np.multiply(cosine, u, out=new_u)
+    new_u -= sine * q
     return out
 
 
 def _act(matrix, light):
     """Return matrix times light; the matrix may have a last axis of columns."""
-    return matrix @ light if matrix.ndim == 3 else (matrix * light[:, None]).sum(axis=2)
+    if matrix.ndim == 3:
+        out = _blank(max(len(matrix), len(light)), light.shape[2])
+        return np.matmul(matrix, light, out=out)
+    return (matrix * light[:, None]).sum(axis=2)
+
+
+def _blank(rows, columns):
+    """Return light, (rows, 4, columns), where the values of each Stokes parameter lie together."""
+    return np.empty((4, rows, columns)).swapaxes(0, 1)

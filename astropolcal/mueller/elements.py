@@ -79,7 +79,14 @@ def _rotate(matrix, theta):
 
 def _linear_retarder(retardance):
     """Return a linear retarder for floats in radian."""
-    return _diattenuator_retarder(0.0, retardance)
+    retardance = np.asarray(retardance, dtype=float)
+    # elements by their number in the matrix, row by row: few assignments with plain strides
+    matrix = np.zeros((*retardance.shape, 16))
+    matrix[..., 0:6:5] = 1.0
+    matrix[..., 10:16:5] = np.cos(retardance)[..., None]
+    matrix[..., 11] = np.sin(retardance)
+    matrix[..., 14] = -matrix[..., 11]
+    return matrix.reshape(*retardance.shape, 4, 4)
 
 
 def _diattenuator(diattenuation):
@@ -89,34 +96,35 @@ def _diattenuator(diattenuation):
 
 def _diattenuator_retarder(diattenuation, retardance):
     """Return a linear diattenuator-retarder for floats, radian."""
-    diattenuation, retardance = np.broadcast_arrays(diattenuation, retardance)
+    diattenuation = np.asarray(diattenuation, dtype=float)
     transverse = np.sqrt((1 - diattenuation) * (1 + diattenuation))
-    matrix = np.zeros((*retardance.shape, 4, 4))
-    matrix[..., 0, 0] = matrix[..., 1, 1] = 1.0
-    matrix[..., 0, 1] = matrix[..., 1, 0] = diattenuation
-    matrix[..., 2, 2] = matrix[..., 3, 3] = transverse * np.cos(retardance)
-    matrix[..., 2, 3] = transverse * np.sin(retardance)
-    matrix[..., 3, 2] = -matrix[..., 2, 3]
-    return matrix
+    cosine = transverse * np.cos(retardance)
+    matrix = np.zeros((*np.shape(cosine), 16))
+    matrix[..., 0:6:5] = 1.0
+    matrix[..., 1:5:3] = diattenuation[..., None]
+    matrix[..., 10:16:5] = cosine[..., None]
+    matrix[..., 11] = transverse * np.sin(retardance)
+    matrix[..., 14] = -matrix[..., 11]
+    return matrix.reshape(*np.shape(cosine), 4, 4)
 
 
 def _elliptical_retarder(horizontal, diagonal, circular):
     """Return an elliptical retarder for floats in radian."""
-    axis = np.stack(np.broadcast_arrays(horizontal, diagonal, circular), axis=-1).astype(float)
-    total = np.sqrt(np.sum(axis**2, axis=-1))
+    vector = h, d, c = [np.asarray(x, dtype=float) for x in (horizontal, diagonal, circular)]
+    squares = [x * x for x in vector]
+    total = np.sqrt(sum(squares))
     # S / Delta and T / Delta^2 of the paper, which are smooth through zero
-    sine = np.sinc(total / np.pi)
+    sine, cosine = np.sinc(total / np.pi), np.cos(total)
     versine = 0.5 * np.sinc(total / (2 * np.pi)) ** 2
-    matrix = np.zeros((*total.shape, 4, 4))
-    matrix[..., 0, 0] = 1.0
-    block = matrix[..., 1:, 1:]
-    block[...] = versine[..., None, None] * axis[..., :, None] * axis[..., None, :]
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        block[..., i, i] += np.cos(total)
-        block[..., j, k] += sine * axis[..., i]
-        block[..., k, j] -= sine * axis[..., i]
-    return matrix
+    matrix = np.zeros((*np.shape(total), 16))
+    matrix[..., 0] = 1.0
+    for i, square in zip((5, 10, 15), squares, strict=True):
+        matrix[..., i] = cosine + versine * square
+    for i, j, first, second, axis in ((6, 9, h, d, c), (11, 14, d, c, h), (13, 7, c, h, d)):
+        both, own = versine * first * second, sine * axis
+        matrix[..., i] = both + own
+        matrix[..., j] = both - own
+    return matrix.reshape(*np.shape(total), 4, 4)
 
 
 def rotation_matrix(angle):

@@ -6,7 +6,15 @@ import sys
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
-from astropolcal.scripts._common import check_outputs, write_json
+from astropolcal.scripts._common import (
+    add_json,
+    add_quiet,
+    angles,
+    check_outputs,
+    cube_files,
+    number_or,
+    write_json,
+)
 
 _MAX_LISTED = 20
 
@@ -23,6 +31,20 @@ def add_parser(commands):
         "cubes", metavar="CUBES", nargs="+", help="cubes, or folders of them (*.fits)"
     )
     parser.add_argument("-o", "--output", metavar="OBS.ecsv", required=True, help="the table")
+    _add_meta(parser)
+    _add_photometry(parser)
+    parser.add_argument("--workers", metavar="N", type=int, help="number of processes")
+    parser.add_argument(
+        "--resume", metavar="FILE", help="journal of what is done, to go on after a stop"
+    )
+    parser.add_argument("--quicklook", metavar="DIR", help="write figures to this folder")
+    add_json(parser)
+    add_quiet(parser, "no progress bar")
+    parser.set_defaults(run=run)
+
+
+def _add_meta(parser):
+    """Add what says what the cubes are of, beside or in the place of their headers."""
     parser.add_argument("--instrument", metavar="NAME", default="charis", help="default: charis")
     parser.add_argument(
         "--raw", metavar="DIR", help="folder of raw frames, for keywords that the cubes lack"
@@ -45,20 +67,9 @@ def add_parser(commands):
     parser.add_argument(
         "--hwp-sequence",
         metavar="DEG,DEG,...",
-        type=_angles,
+        type=angles,
         help="commanded angles that replace wrong ones of the headers, in turn",
     )
-    _add_photometry(parser)
-    parser.add_argument("--workers", metavar="N", type=int, help="number of processes")
-    parser.add_argument(
-        "--resume", metavar="FILE", help="journal of what is done, to go on after a stop"
-    )
-    parser.add_argument("--quicklook", metavar="DIR", help="write figures to this folder")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
-    )
-    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
-    parser.set_defaults(run=run)
 
 
 def _add_photometry(parser):
@@ -70,7 +81,7 @@ def _add_photometry(parser):
     parser.add_argument(
         "--radius",
         metavar="PIXELS",
-        type=_radius,
+        type=number_or("fwhm", "growth"),
         help="stars: radius of the aperture; fwhm (default, 3 full widths), growth (99 %% of the "
         "light) or pixels",
     )
@@ -78,7 +89,7 @@ def _add_photometry(parser):
         "--aperture-correction",
         action="store_true",
         default=None,
-        help="stars: scale the fluxes to an aperture of 45 pixels",
+        help="stars: scale the fluxes to all of the star's light, by a profile of its wings",
     )
 
 
@@ -89,22 +100,6 @@ def _pair(text):
     return key.strip(), value.strip()
 
 
-def _angles(text):
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of angles in degree") from None
-
-
-def _radius(text):
-    if text in ("fwhm", "growth"):
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not fwhm, growth or a number") from None
-
-
 def run(arguments):
     """Reduce the cubes and write the table."""
     from tqdm import tqdm
@@ -113,7 +108,7 @@ def run(arguments):
     from astropolcal.reduction import reduce_run
 
     check_outputs(arguments.output, arguments.json, arguments.resume)
-    files = _files(arguments.cubes)
+    files = cube_files(arguments.cubes)
     instrument = instruments.get(arguments.instrument)
     with tqdm(
         total=len(files), desc="reducing", unit="cube", disable=True if arguments.quiet else None
@@ -136,17 +131,6 @@ def run(arguments):
         summary = {"output": str(arguments.output)} | reduction.summary()
         write_json(summary | {"figures": [str(path) for path in figures]}, arguments.json)
     _report(reduction, arguments, figures)
-
-
-def _files(cubes):
-    """Return the files, and those in the folders, that are named."""
-    found = []
-    for path in map(Path, cubes):
-        inside = sorted(path.glob("*.fits*")) if path.is_dir() else [path]
-        if not inside:
-            raise AstropolcalError(f"{path}: no FITS file in this folder")
-        found += inside
-    return found
 
 
 def _options(arguments):

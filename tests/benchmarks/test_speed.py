@@ -2,9 +2,7 @@
 """
 Speed, by comparison with something that does the same on the same machine.
 
-Not part of the normal run: ``pytest tests/benchmarks``. Both sides of a ratio
-run in turns in one process, and medians are compared, so that a busy machine
-slows both.
+Not part of the normal run: ``pytest tests/benchmarks``. How times are compared, `timing` says.
 """
 
 import statistics
@@ -19,6 +17,7 @@ import pytest
 from astropy.modeling.fitting import TRFLSQFitter
 from scipy.linalg import svd
 from scipy.optimize import least_squares
+from timing import interleaved, report
 
 from astropolcal import calibrate, instruments
 from astropolcal.calibration import BinProblem, search_branches
@@ -27,20 +26,6 @@ from astropolcal.measurement import Measurement
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
-REPEATS = 25
-
-
-def interleaved(*functions, repeats=REPEATS):
-    """Return the median time (s) of each function, run in turns."""
-    times = [[] for _ in functions]
-    for function in functions:
-        function()
-    for _ in range(repeats):
-        for kept, function in zip(times, functions, strict=True):
-            started = time.perf_counter()
-            function()
-            kept.append(time.perf_counter() - started)
-    return [statistics.median(kept) for kept in times]
 
 
 def truth():
@@ -70,11 +55,6 @@ def measurement(observations):
 def forget(measurement):
     """Undo the memory of the last sweep, so that each call does its work."""
     measurement._last = (None, None)
-
-
-def report(capsys, text):
-    with capsys.disabled():
-        print(f"\n  {text}")
 
 
 # --- absolute, with pytest-benchmark ------------------------------------------------------
@@ -231,9 +211,9 @@ def _seconds(code, repeats=7):
 def test_import_over_astropy_modeling(capsys):
     """What the package adds where astropy.modeling is imported, lazy names resolved."""
     extra = _seconds(
-        "import time, astropy.modeling.fitting; t = time.perf_counter(); "
+        "import time, astropy.modeling.fitting; t = time.process_time(); "
         "from astropolcal import Observations, calibrate, instruments, optics; "
-        "print(time.perf_counter() - t)"
+        "print(time.process_time() - t)"
     )
     report(capsys, f"import astropolcal adds {extra * 1e3:.0f} ms to astropy.modeling")
     assert extra <= 0.15

@@ -1,0 +1,49 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Times of functions that do the same, taken in turns in one process.
+
+A busy machine slows both sides of a ratio. The least time of many is that of a turn in which
+nothing else ran; where a function takes longer than such a turn, the time of the processor does
+not count the waiting.
+"""
+
+import statistics
+import time
+
+# seconds that a process mostly gets without a pause
+_TURN = 2e-3
+
+
+def interleaved(*functions, repeats=25, clock=time.perf_counter):
+    """Return the median time (s) of each function, run in turns."""
+    return [statistics.median(kept) for kept in _times(functions, repeats, clock)]
+
+
+def fastest(*functions, repeats=25, clock=None):
+    """
+    Return the least time (s) of each function, run in turns.
+
+    The clock is that of the wall if all functions are short, else that of the processor.
+    """
+    if clock is None:
+        long = any(kept[0] > _TURN for kept in _times(functions, 1, time.process_time))
+        clock = time.process_time if long else time.perf_counter
+    return [min(kept) for kept in _times(functions, repeats, clock)]
+
+
+def _times(functions, repeats, clock):
+    times = [[] for _ in functions]
+    for function in functions:
+        function()
+    for _ in range(repeats):
+        for kept, function in zip(times, functions, strict=True):
+            started = clock()
+            function()
+            kept.append(clock() - started)
+    return times
+
+
+def report(capsys, text):
+    """Print a line past pytest's capture."""
+    with capsys.disabled():
+        print(f"\n  {text}")
