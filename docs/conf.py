@@ -7,7 +7,9 @@ resolved only where ``READTHEDOCS`` or ``ASTROPOLCAL_DOCS_ONLINE`` is set.
 """
 
 import os
+import sys
 from datetime import UTC, datetime
+from pathlib import Path
 
 from sphinx_astropy.conf.v3 import *  # noqa: F403
 from sphinx_astropy.conf.v3 import (
@@ -19,6 +21,9 @@ from sphinx_astropy.conf.v3 import (
 
 from astropolcal.version import version as release
 
+# the gallery of models is a package beside this file
+sys.path.insert(0, str(Path(__file__).parent))
+
 # -- Project --------------------------------------------------------------------
 
 project = "astropolcal"
@@ -28,8 +33,28 @@ version = release.split("+")[0]
 
 # -- Sources --------------------------------------------------------------------
 
-exclude_patterns += ["changes/*", "_templates", "**/conftest.py"]
+exclude_patterns += ["changes/*", "_templates", "gallery", "tutorials", "**/conftest.py"]
 numpydoc_xref_ignore |= {"shape", "array"}
+
+# -- Pages that are written by a build ----------------------------------------------
+
+# pages of optics and effects from the registries, and tutorials from scripts; what has not
+# changed is not drawn or run again
+extensions += ["gallery.build", "sphinx_gallery.gen_gallery"]
+
+sphinx_gallery_conf = {
+    "examples_dirs": "tutorials",
+    "gallery_dirs": "generated/tutorials",
+    "filename_pattern": r"/plot_",
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "capture_repr": (),
+    "remove_config_comments": True,
+    "show_signature": False,
+    "write_computation_times": False,
+    "inspect_global_variables": False,
+}
 
 # -- Links to other packages ------------------------------------------------------
 
@@ -80,6 +105,10 @@ if not ONLINE:
 
 html_title = f"astropolcal {version}"
 html_static_path = []
+# one picture of each plot; the default makes three
+plot_formats = [("png", 110)]
+plot_html_show_formats = False
+
 modindex_common_prefix = ["astropolcal."]
 
 # the class page lists attributes and methods already

@@ -5,6 +5,9 @@ import os
 
 import pytest
 
+# scripts of the gallery, which other tests run, and what a build has written
+collect_ignore_glob = ["gallery/*", "generated/*", "tutorials/*"]
+
 # examples that draw need no window system
 os.environ.setdefault("MPLBACKEND", "agg")
 

@@ -1,0 +1,126 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+3. Read a diagnosis
+===================
+
+A calibrated model leaves residuals. Are they noise? If not, what does the model lack? This run
+has an error in it that the model does not know, and the diagnosis is to find it.
+"""
+
+# %%
+# An instrument with a secret
+# ---------------------------
+#
+# The true instrument has beams of unequal gain and a half-wave plate that absorbs one polarization
+# more than the other. The model has neither. With a folder of tables, the real internal source is
+# diagnosed instead, and nobody knows the answer.
+
+import os
+from pathlib import Path
+
+import astropy.units as u
+import matplotlib.pyplot as plt
+import numpy as np
+
+from astropolcal import Observations, instruments, optics
+from astropolcal.chain import insert_optic
+from astropolcal.gap import diagnose
+from astropolcal.gap.report import causes_table, summary
+from astropolcal.plotting import plot_effect_scores, plot_gap_maps, plot_gap_spectrum, plot_where
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+charis = instruments.get("charis")
+wavelength = charis.wavelength[[2, 6, 10, 14, 18, 20]]
+frames = half_wave_plate_cycles(np.arange(0, 180, 11.25) * u.deg, [45, 62.5, 80, 100] * u.deg)
+
+
+def simulated():
+    """Return chains of the model, and observations with what it lacks."""
+    chains, data = [], []
+    for i, source in enumerate(("polarized", "unpolarized")):
+        chain = charis.chain(source, derotator="linear", wavelength=wavelength)
+        plate = optics.Diattenuator(diattenuation=0.004, mount="hwp", name="plate_absorbs")
+        truth = insert_optic(chain, plate, after="hwp")
+        truth = truth | optics.BeamGain(imbalance=0.012, name="gain")
+        data.append(
+            simulate(truth, wavelength, frames, seed=i, meta={"source": source}, name=source)
+        )
+        chains.append(chain)
+    return chains, data
+
+
+folder = os.environ.get("ASTROPOLCAL_DATA")
+if folder:
+    paths = [next(Path(folder).rglob("dataset3_polarized*.ecsv"))]
+    data = [Observations.read(path) for path in paths]
+    chains = charis.chains_for(data)
+else:
+    chains, data = simulated()
+
+# %%
+# Ask
+# ---
+#
+# Left alone, ``diagnose`` tries the whole library. A few are enough here, so that the page builds
+# quickly.
+
+effects = [
+    "beam_gain",
+    "hwp_diattenuation",
+    "hwp_tilt",
+    "hwp_beam_wander",
+    "derotator_diattenuation",
+    "hwp_encoder_eccentricity",
+    "static_diattenuator",
+]
+diagnosis = diagnose(chains, data, effects=effects)
+print(summary(diagnosis))
+
+# %%
+# How to read it
+# --------------
+#
+# The first sentence is the size of the gap, on frames that were left out of the fit, beside the
+# noise. The second names causes, in the order in which they were found. The third says what is
+# left.
+
+causes = causes_table(diagnosis)
+print(causes[causes.colnames[:4]])
+
+# %%
+# The gap against wavelength, before and after the effects are in the model. Where the second line
+# meets the noise, nothing is missing that these data could show.
+
+figure = plt.figure(figsize=(10, 8.2))
+plot_gap_spectrum(diagnosis, figure=figure)
+
+# %%
+# Maps of the residuals: wavelength against frame. Unequal gains are a constant, in all frames; what
+# turns with the half-wave plate makes stripes.
+
+figure = plt.figure(figsize=(12, 7.9))
+plot_gap_maps(diagnosis, figure=figure)
+
+# %%
+# The score is what each effect alone would explain. One that is not a cause may still score,
+# because it looks in part like one that is: read the causes, not the scores.
+
+figure = plt.figure(figsize=(10, 5))
+plot_effect_scores(diagnosis, figure=figure)
+
+# %%
+# Where the gap lies, by harmonic, angle, wavelength and time. This is what there is to go by when
+# the verdict is *unexplained*.
+
+figure = plt.figure(figsize=(10.5, 7))
+plot_where(diagnosis, figure=figure)
+
+# %%
+# And then
+# --------
+#
+# The improved chains are ordinary chains. They calibrate, go into files and correct science data;
+# the page :doc:`/diagnosis` says how, and what the limits of such a search are.
+
+for chain in diagnosis.chains:
+    print(" | ".join(optic.name for optic in chain))
