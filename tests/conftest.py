@@ -5,12 +5,18 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, is_hypothesis_test, settings
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+FEW_EXAMPLES = 5
 
 # no window system is needed to test a figure
 os.environ.setdefault("MPLBACKEND", "agg")
+
+# small matrices gain nothing from threads, and those of parallel tests (-n) take the
+# cores from each other; processes started from here on, the workers too, obey this
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
 
 # the same examples every time, however slow the machine
 settings.register_profile(
@@ -36,6 +42,21 @@ def pytest_configure(config):
     from astropolcal.version import version
 
     TESTED_VERSIONS["astropolcal"] = version
+
+
+def pytest_collection_modifyitems(config, items):
+    """Try few examples of each law where slow tests are left out."""
+    if config.option.markexpr == "not slow":
+        for item in items:
+            _few_examples(getattr(item, "obj", None))
+
+
+def _few_examples(test):
+    if is_hypothesis_test(test):
+        # what @settings sets; there is no public way to lower it from outside
+        known = getattr(test, "_hypothesis_internal_use_settings", None) or settings.default
+        few = settings(known, max_examples=min(known.max_examples, FEW_EXAMPLES))
+        test._hypothesis_internal_use_settings = few
 
 
 @pytest.fixture(scope="session")

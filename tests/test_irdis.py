@@ -22,7 +22,8 @@ from astropolcal.exceptions import (
     InstrumentError,
     ObservationError,
 )
-from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, base, check_effect, get_effect
+from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, check_effect, get_effect
+from astropolcal.gap.effects import roles as roles_module
 from astropolcal.instruments import IRDIS
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
@@ -545,9 +546,9 @@ def minimal(plate=True):
 @pytest.fixture
 def diattenuating_plates(monkeypatch):
     """Plates and derotators that also attenuate count as such."""
-    retards = base._retards
+    retards = roles_module._retards
     monkeypatch.setattr(
-        base, "_retards", lambda o: retards(o) or isinstance(o, optics.DiattenuatorRetarder)
+        roles_module, "_retards", lambda o: retards(o) or isinstance(o, optics.DiattenuatorRetarder)
     )
 
 

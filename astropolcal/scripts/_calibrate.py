@@ -6,8 +6,19 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
-from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
-from astropolcal.scripts._common import check_outputs, edit_chains, read_datasets, write_json
+from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.scripts._common import (
+    add_edits,
+    add_json,
+    add_quiet,
+    check_outputs,
+    edit_chains,
+    instrument_of,
+    printer,
+    read_datasets,
+    say_written,
+    write_calibration,
+)
 
 _EPILOG = """\
 examples:
@@ -39,10 +50,8 @@ def add_parser(commands):
     _add_model_options(parser)
     _add_accuracy_options(parser)
     parser.add_argument("--plots", metavar="DIR", help="save the figures in this folder")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
-    )
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    add_json(parser)
+    add_quiet(parser)
     parser.set_defaults(run=run)
 
 
@@ -114,32 +123,13 @@ def _add_fit_options(parser):
 
 def _add_parameter_options(parser):
     """Add what says which parameters are free."""
-    parser.add_argument(
-        "--fix",
-        action="append",
-        default=[],
-        metavar="NAME[=VALUE]",
-        help="hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg",
-    )
-    parser.add_argument(
-        "--free",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="free a parameter, such as wollaston.theta",
-    )
+    add_edits(parser, "fix", "free")
     parser.add_argument(
         "--start",
         metavar="OLD.asdf",
         help="start from this calibration, hold it, and refit only what --free names",
     )
-    parser.add_argument(
-        "--prior",
-        action="append",
-        default=[],
-        metavar="NAME=MEAN+-STD",
-        help="normal prior on a parameter, such as hwp.theta=0+-0.1deg",
-    )
+    add_edits(parser, "prior")
     parser.add_argument(
         "--gauge",
         choices=("minimal", "none"),
@@ -147,13 +137,7 @@ def _add_parameter_options(parser):
         help="where the data leave a choice: the least misalignments (default), or where the "
         "fit ends",
     )
-    parser.add_argument(
-        "--without",
-        action="append",
-        default=[],
-        metavar="OPTIC",
-        help="take an optic out of the model",
-    )
+    add_edits(parser, "without")
 
 
 def _add_accuracy_options(parser):
@@ -183,14 +167,13 @@ def _add_accuracy_options(parser):
 
 def run(arguments):
     """Calibrate, print the summary and write what was asked for."""
-    from astropolcal import instruments
-    from astropolcal.calibration import summary
+    from astropolcal.calibration import summary, to_dict
     from astropolcal.calibration.standards import add_standard
     from astropolcal.calibration.star_check import add_star_check
     from astropolcal.calibration.target_accuracy import TARGETS
     from astropolcal.observations import get_observable
 
-    say = _silent if arguments.quiet or arguments.json == "-" else print
+    say = printer(arguments)
     check_outputs(arguments.output, arguments.json)
     _check_start(arguments)
     get_observable(arguments.observable)
@@ -199,7 +182,7 @@ def run(arguments):
     datasets, standards = read_datasets(files), read_datasets(arguments.standard)
     _check_standards(arguments.standard, standards, files, datasets)
     n = len(datasets)
-    instrument = instruments.get(arguments.instrument or _stated(datasets))
+    instrument = instrument_of(arguments, datasets)
     if not arguments.keep_all:
         datasets = [instrument.prepare(table) for table in datasets]
         standards = [instrument.prepare(table) for table in standards]
@@ -223,10 +206,9 @@ def run(arguments):
         if _is_known(item[1]):
             add_star_check(calibration, *item)
     # written first: whoever reads the summary may go away
-    written = _write(calibration, arguments, targets)
+    written = write_calibration(calibration, arguments, lambda: to_dict(calibration, targets))
     say(summary(calibration, targets))
-    if written:
-        say("\nWritten: " + "\n         ".join(written))
+    say_written(say, written)
 
 
 def _is_known(observations):
@@ -328,10 +310,6 @@ def _quantity(text, part, unit, low, high):
     return value
 
 
-def _silent(*_):
-    pass
-
-
 def _example(say):
     """Return the path of the packaged example, and say that it is used."""
     import astropolcal
@@ -342,31 +320,3 @@ def _example(say):
         "(22 wavelengths, 8 derotator angles x 8 half-wave-plate angles).\n"
     )
     return path
-
-
-def _stated(datasets):
-    """Return the instrument that the first table names."""
-    stated = datasets[0].instrument
-    if stated is None:
-        raise InstrumentError(
-            f"{datasets[0].name}: the table names no instrument; give --instrument NAME"
-        )
-    return stated
-
-
-def _write(calibration, arguments, targets):
-    written = []
-    if arguments.output:
-        calibration.write(arguments.output, overwrite=True)
-        written.append(arguments.output)
-    if arguments.plots:
-        from astropolcal.plotting import save_all
-
-        written += [str(path) for path in save_all(calibration, arguments.plots)]
-    if arguments.json:
-        from astropolcal.calibration import to_dict
-
-        write_json(to_dict(calibration, targets), arguments.json)
-        if arguments.json != "-":
-            written.append(arguments.json)
-    return written

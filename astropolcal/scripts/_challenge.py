@@ -5,7 +5,14 @@ import argparse
 from contextlib import nullcontext
 
 from astropolcal.exceptions import AstropolcalError
-from astropolcal.scripts._common import check_outputs, wrapped, write_json
+from astropolcal.scripts._common import (
+    add_json,
+    add_quiet,
+    check_outputs,
+    is_quiet,
+    wrapped,
+    write_json,
+)
 
 _EPILOG = """\
 examples:
@@ -52,10 +59,8 @@ def add_parser(commands):
     )
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default: 1")
     parser.add_argument("--figure", metavar="FILE", help="draw the outcome (PNG, PDF or SVG)")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
-    )
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    add_json(parser)
+    add_quiet(parser)
     parser.set_defaults(run=run)
 
 
@@ -73,7 +78,6 @@ def run(arguments):
     from astropolcal.gap.challenge import KINDS, Setup, run_challenge
 
     check_outputs(arguments.json, arguments.figure, arguments.checkpoint)
-    quiet = arguments.quiet or arguments.json == "-"
     with _workers(arguments.workers) as client:
         result = run_challenge(
             arguments.n,
@@ -90,8 +94,10 @@ def run(arguments):
     if arguments.json:
         write_json(result.to_dict(), arguments.json)
     if arguments.figure:
-        _save(result, arguments.figure)
-    if not quiet:
+        from astropolcal.plotting._style import save
+
+        save(result.plot(), arguments.figure)
+    if not is_quiet(arguments):
         print(_report(result))
 
 
@@ -106,16 +112,6 @@ def _workers(count):
 
     # what is forked from a process with threads may hang
     return ProcessPoolExecutor(count, mp_context=get_context("spawn"))
-
-
-def _save(result, path):
-    from astropolcal.files import atomic_path
-
-    try:
-        with atomic_path(path) as temporary:
-            result.plot().savefig(temporary)
-    except ValueError as problem:
-        raise AstropolcalError(f"{path}: {problem}") from None
 
 
 def _report(result):

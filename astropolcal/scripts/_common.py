@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What the subcommands share: outputs, datasets, edits of the chains."""
+"""What the subcommands share: options, outputs, datasets, edits of the chains."""
 
+import argparse
 import json
 import re
 import sys
@@ -11,10 +12,77 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.chain import find_optic, leaves, remove_optic
-from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
 from astropolcal.files import atomic_path
 
 _COLUMNS = 80
+
+# options that edit the model, for edit_chains
+_EDITS = {
+    "fix": ("NAME[=VALUE]", "hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg"),
+    "free": ("NAME", "free a parameter, such as wollaston.theta"),
+    "prior": (
+        "NAME=MEAN+-STD",
+        "normal prior on a parameter, such as hwp.theta=0+-0.1deg",
+    ),
+    "without": ("OPTIC", "take an optic out of the model"),
+}
+
+
+# ---- options --------------------------------------------------------------------------------
+
+
+def add_json(parser, what="write a summary"):
+    """Add ``--json``."""
+    parser.add_argument("--json", metavar="FILE", help=f"{what} for machines (- for stdout)")
+
+
+def add_quiet(parser, meaning="print nothing but errors"):
+    """Add ``--quiet``."""
+    parser.add_argument("-q", "--quiet", action="store_true", help=meaning)
+
+
+def add_edits(parser, *names):
+    """Add options that edit the model and may be given several times."""
+    for name in names:
+        form, meaning = _EDITS[name]
+        parser.add_argument(f"--{name}", action="append", default=[], metavar=form, help=meaning)
+
+
+def angles(text):
+    """Return the angles of a comma-separated list, in degree."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of angles in degree") from None
+
+
+def number_or(*words):
+    """Return the type of an option that takes one of some words or a number."""
+
+    def convert(text):
+        if text in words:
+            return text
+        try:
+            return float(text)
+        except ValueError:
+            allowed = f"{', '.join(words)} or a number"
+            raise argparse.ArgumentTypeError(f"{text!r} is not {allowed}") from None
+
+    return convert
+
+
+# ---- outputs --------------------------------------------------------------------------------
+
+
+def is_quiet(arguments):
+    """Return whether nothing is printed: as asked for, or because the JSON goes to stdout."""
+    return arguments.quiet or arguments.json == "-"
+
+
+def printer(arguments):
+    """Return what prints, or does nothing if that is asked for."""
+    return (lambda *_: None) if is_quiet(arguments) else print
 
 
 def check_outputs(*paths):
@@ -50,6 +118,54 @@ def write_json(content, path):
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_calibration(calibration, arguments, content):
+    """Write calibration, figures and what ``content()`` returns as asked for; return the files."""
+    written = []
+    if arguments.output:
+        calibration.write(arguments.output, overwrite=True)
+        written.append(arguments.output)
+    if arguments.plots:
+        from astropolcal.plotting import save_all
+
+        written += [str(path) for path in save_all(calibration, arguments.plots)]
+    if arguments.json:
+        write_json(content(), arguments.json)
+        written += [arguments.json] if arguments.json != "-" else []
+    return written
+
+
+def say_written(say, written):
+    """Say which files were written, a line each."""
+    if written:
+        say("\nWritten: " + "\n         ".join(written))
+
+
+# ---- inputs ---------------------------------------------------------------------------------
+
+
+def cube_files(paths):
+    """Return the files, and those in the folders, that are named."""
+    found = []
+    for path in map(Path, paths):
+        inside = sorted(path.glob("*.fits*")) if path.is_dir() else [path]
+        if not inside:
+            raise AstropolcalError(f"{path}: no FITS file in this folder")
+        found += inside
+    return found
+
+
+def instrument_of(arguments, datasets):
+    """Return the instrument that is asked for, or the one that the first table names."""
+    from astropolcal import instruments
+
+    name = arguments.instrument or datasets[0].instrument
+    if name is None:
+        raise InstrumentError(
+            f"{datasets[0].name}: the table names no instrument; give --instrument NAME"
+        )
+    return instruments.get(name)
+
+
 def read_datasets(paths):
     """Read observation tables; refuse one that is given twice."""
     from astropolcal.observations import Observations
@@ -62,6 +178,9 @@ def read_datasets(paths):
                 raise AstropolcalError(f"{path}: holds the same frames as {other}")
         datasets.append(dataset)
     return datasets
+
+
+# ---- the model ------------------------------------------------------------------------------
 
 
 def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):

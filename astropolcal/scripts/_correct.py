@@ -2,14 +2,21 @@
 """``astropolcal correct``: from science cubes to Stokes parameters."""
 
 import argparse
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.exceptions import ObservationError
 from astropolcal.scripts._choosing import choose_calibration, configured
-from astropolcal.scripts._common import check_outputs, wrapped, write_json
+from astropolcal.scripts._common import (
+    add_json,
+    add_quiet,
+    check_outputs,
+    cube_files,
+    number_or,
+    wrapped,
+    write_json,
+)
 
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 
@@ -32,6 +39,24 @@ def add_parser(commands):
         help="a calibration file, or a library, from which the one that holds is taken",
     )
     parser.add_argument("-o", "--output", metavar="OUT.fits", required=True, help="the product")
+    _add_solution(parser)
+    _add_instrument(parser)
+    _add_images(parser)
+    _add_errors(parser)
+    parser.add_argument("--spectrum", metavar="OUT.ecsv", help="table of the star in an aperture")
+    parser.add_argument(
+        "--radius", metavar="PIXELS", type=float, default=10.0, help="of the aperture, default: 10"
+    )
+    parser.add_argument("--plot", metavar="FILE", help="figure of the result")
+    parser.add_argument("--workers", metavar="N", type=int, help="threads of dask")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of dask.distributed")
+    add_json(parser)
+    add_quiet(parser, "no progress bar")
+    parser.set_defaults(run=run)
+
+
+def _add_solution(parser):
+    """Add what says what is solved for, and from what."""
     parser.add_argument(
         "--mode",
         choices=("stokes", "ip"),
@@ -47,8 +72,6 @@ def add_parser(commands):
     parser.add_argument(
         "--components", choices=("IQU", "IQUV"), default="IQU", help="default: IQU, V is zero"
     )
-    _add_instrument(parser)
-    _add_images(parser)
     parser.add_argument(
         "--weights", choices=("equal", "variance"), default="equal", help="of the fluxes"
     )
@@ -62,10 +85,14 @@ def add_parser(commands):
     parser.add_argument(
         "--max-condition", metavar="X", type=float, default=30.0, help="default: 30"
     )
+
+
+def _add_errors(parser):
+    """Add what says how the calibration's errors are propagated."""
     parser.add_argument(
         "--open-directions",
         metavar="SIGMA",
-        type=_sigma,
+        type=number_or("infinite", "ignore"),
         default="infinite",
         help="systematic errors along what the calibration leaves open: infinite (default), "
         "ignore, or a standard deviation in degrees, micrometres and percent",
@@ -74,18 +101,6 @@ def add_parser(commands):
         "--samples", metavar="N", type=int, default=0, help="sample the systematic errors"
     )
     parser.add_argument("--seed", metavar="N", type=int, help="of the samples")
-    parser.add_argument("--spectrum", metavar="OUT.ecsv", help="table of the star in an aperture")
-    parser.add_argument(
-        "--radius", metavar="PIXELS", type=float, default=10.0, help="of the aperture, default: 10"
-    )
-    parser.add_argument("--plot", metavar="FILE", help="figure of the result")
-    parser.add_argument("--workers", metavar="N", type=int, help="threads of dask")
-    parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of dask.distributed")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
-    )
-    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
-    parser.set_defaults(run=run)
 
 
 def _add_instrument(parser):
@@ -150,22 +165,13 @@ def _point(text):
     return x, y
 
 
-def _sigma(text):
-    if text in ("infinite", "ignore"):
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not infinite, ignore or a number") from None
-
-
 def run(arguments):
     """Correct the cubes and write the product."""
     from astropolcal import instruments
-    from astropolcal.correction import ScienceFrames, correct, measurement_rows
+    from astropolcal.correction import ScienceFrames
 
     check_outputs(arguments.output, arguments.json, arguments.spectrum, arguments.plot)
-    files = _files(arguments.cubes)
+    files = cube_files(arguments.cubes)
     calibration, chain, provenance = choose_calibration(arguments, files)
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
@@ -183,33 +189,7 @@ def run(arguments):
         scale=scale,
         left_scale=left_scale,
     )
-    if arguments.brightness == "measured":
-        rows = measurement_rows(
-            calibration,
-            frames.positions,
-            frames.wavelength,
-            chain=chain,
-            interpolate=arguments.interpolate,
-        )
-        frames = frames.with_brightness(rows)
-    result = correct(
-        calibration,
-        frames,
-        mode=arguments.mode,
-        observable=arguments.observable,
-        components=arguments.components,
-        weights="variance" if arguments.weights == "variance" else None,
-        max_condition=arguments.max_condition,
-        chain=chain,
-        interpolate=arguments.interpolate,
-        open_directions=arguments.open_directions,
-        n_samples=arguments.samples,
-        seed=arguments.seed,
-        workers=arguments.workers,
-        cluster=arguments.cluster,
-        progress=not arguments.quiet,
-        provenance=provenance,
-    )
+    result = _corrected(calibration, frames, chain, arguments, provenance)
     result.write(arguments.output, overwrite=True)
     star = result.aperture(arguments.radius)
     _write_others(result, star, arguments)
@@ -220,15 +200,31 @@ def run(arguments):
         _report(summary)
 
 
-def _files(cubes):
-    """Return the files, and those in the folders, that are named."""
-    found = []
-    for path in map(Path, cubes):
-        inside = sorted(path.glob("*.fits*")) if path.is_dir() else [path]
-        if not inside:
-            raise AstropolcalError(f"{path}: no FITS file in this folder")
-        found += inside
-    return found
+def _corrected(calibration, frames, chain, arguments, provenance):
+    """Return the solution, after the brightness of the frames if that is measured."""
+    from astropolcal.correction import correct, measurement_rows
+
+    how = {"chain": chain, "interpolate": arguments.interpolate}
+    if arguments.brightness == "measured":
+        rows = measurement_rows(calibration, frames.positions, frames.wavelength, **how)
+        frames = frames.with_brightness(rows)
+    return correct(
+        calibration,
+        frames,
+        mode=arguments.mode,
+        observable=arguments.observable,
+        components=arguments.components,
+        weights="variance" if arguments.weights == "variance" else None,
+        max_condition=arguments.max_condition,
+        open_directions=arguments.open_directions,
+        n_samples=arguments.samples,
+        seed=arguments.seed,
+        workers=arguments.workers,
+        cluster=arguments.cluster,
+        progress=not arguments.quiet,
+        provenance=provenance,
+        **how,
+    )
 
 
 def _headers(files, instrument, arguments):

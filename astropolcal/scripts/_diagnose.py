@@ -6,11 +6,17 @@ import sys
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
-from astropolcal.scripts._calibrate import _stated
 from astropolcal.scripts._common import (
+    add_edits,
+    add_json,
+    add_quiet,
     check_outputs,
     edit_chains,
+    instrument_of,
+    is_quiet,
+    printer,
     read_datasets,
+    say_written,
     wrapped,
     write_json,
 )
@@ -63,12 +69,7 @@ def _add_model_options(parser):
         metavar="MODEL",
         help="elliptical (default) or linear retarder; not with a calibration",
     )
-    for option, form, words in (
-        ("--without", "OPTIC", "take an optic out of the model"),
-        ("--free", "NAME", "free a parameter, such as wollaston.theta"),
-        ("--fix", "NAME[=VALUE]", "hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg"),
-    ):
-        parser.add_argument(option, action="append", default=[], metavar=form, help=words)
+    add_edits(parser, "without", "free", "fix")
 
 
 def _add_output_options(parser):
@@ -81,10 +82,8 @@ def _add_output_options(parser):
         metavar="CAL.asdf",
         help="calibrate with the effects that were found, and write the calibration",
     )
-    parser.add_argument(
-        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
-    )
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    add_json(parser)
+    add_quiet(parser)
 
 
 def run(arguments):
@@ -95,18 +94,16 @@ def run(arguments):
     if arguments.effects == "help":
         print(_list_of_effects())
         return
-    quiet = arguments.quiet or arguments.json == "-"
-    say = (lambda *_: None) if quiet else print
+    say, progress = printer(arguments), None if is_quiet(arguments) else _progress
     check_outputs(arguments.report, arguments.save, arguments.json)
     effects = _effects(arguments.effects)
     nominal, datasets, instrument = _nominal(arguments)
-    diagnosis = diagnose(nominal, datasets, effects=effects, progress=None if quiet else _progress)
+    diagnosis = diagnose(nominal, datasets, effects=effects, progress=progress)
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
     written = _write(diagnosis, content, arguments, instrument)
     say(summary(diagnosis, content))
-    if written:
-        say("\nWritten: " + "\n         ".join(written))
+    say_written(say, written)
 
 
 def _progress(line):
@@ -142,8 +139,6 @@ def _list_of_effects():
 
 def _nominal(arguments):
     """Return the nominal calibration or chains, the datasets, and the instrument's name."""
-    from astropolcal import instruments
-
     first, *rest = arguments.files or [""]
     known = first if Path(first).suffix == ".asdf" else None
     files = rest if known else arguments.files
@@ -153,7 +148,7 @@ def _nominal(arguments):
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix")}
     if known:
         return _of_calibration(known, files, datasets, edits, arguments)
-    instrument = instruments.get(arguments.instrument or _stated(datasets))
+    instrument = instrument_of(arguments, datasets)
     options = {"derotator": arguments.derotator} if arguments.derotator else {}
     chains = instrument.chains_for(datasets, **options)
     return edit_chains(chains, **edits), datasets, instrument.name

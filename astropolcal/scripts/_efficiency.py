@@ -7,7 +7,14 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError, ParameterError
-from astropolcal.scripts._common import check_outputs, write_json
+from astropolcal.scripts._common import (
+    add_json,
+    add_quiet,
+    check_outputs,
+    is_quiet,
+    say_written,
+    write_json,
+)
 
 _EPILOG = """\
 examples:
@@ -35,6 +42,15 @@ def add_parser(commands):
     )
     parser.add_argument("file", nargs="?", metavar="CAL.asdf", help="calibration")
     parser.add_argument("--instrument", metavar="NAME", help="default: that of the file, or charis")
+    _add_observation(parser)
+    parser.add_argument("-o", "--output", metavar="FILE", help="save the figure (PNG, PDF, SVG)")
+    add_json(parser)
+    add_quiet(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_observation(parser):
+    """Add what says of which observations the efficiency is."""
     parser.add_argument("--altitude", type=float, default=60.0, metavar="DEG", help="default: 60")
     parser.add_argument("--parallactic", type=float, default=0.0, metavar="DEG", help="default: 0")
     parser.add_argument(
@@ -65,10 +81,6 @@ def add_parser(commands):
     parser.add_argument(
         "--date", metavar="DATE", help="of the telescope's mirrors, where that matters"
     )
-    parser.add_argument("-o", "--output", metavar="FILE", help="save the figure (PNG, PDF, SVG)")
-    parser.add_argument("--json", metavar="FILE", help="summary for machines (- for stdout)")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
-    parser.set_defaults(run=run)
 
 
 def run(arguments):
@@ -82,11 +94,9 @@ def run(arguments):
         _draw(arguments, instrument, chain, grid)
     if arguments.json:
         write_json(content, arguments.json)
-    if not arguments.quiet and arguments.json != "-":
+    if not is_quiet(arguments):
         print(_text(content))
-        written = [path for path in (arguments.output, arguments.json) if path]
-        if written:
-            print("\nWritten: " + "\n         ".join(written))
+        say_written(print, [path for path in (arguments.output, arguments.json) if path])
 
 
 def _chain(arguments):
@@ -217,7 +227,7 @@ def _track(arguments, instrument):
 
 
 def _draw(arguments, instrument, chain, grid):
-    from astropolcal.files import atomic_path
+    from astropolcal.plotting._style import save
     from astropolcal.plotting.efficiency import plot_polarimetric_efficiency
 
     figure = plot_polarimetric_efficiency(
@@ -231,8 +241,7 @@ def _draw(arguments, instrument, chain, grid):
         mode=_mode(arguments, instrument),
         title=f"Polarimetric efficiency of {instrument.name}",
     )
-    with atomic_path(arguments.output) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save(figure, arguments.output)
 
 
 def _where(content):

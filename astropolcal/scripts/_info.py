@@ -3,7 +3,7 @@
 
 from pathlib import Path
 
-from astropolcal.scripts._common import wrapped, write_json
+from astropolcal.scripts._common import add_json, wrapped, write_json
 
 
 def add_parser(commands):
@@ -22,7 +22,7 @@ def add_parser(commands):
         help="ASDF calibration, folder of calibrations, or ECSV table",
     )
     parser.add_argument("--instruments", action="store_true", help="list the instruments only")
-    parser.add_argument("--json", metavar="FILE", help="write it for machines (- for stdout)")
+    add_json(parser, "write it")
     parser.set_defaults(run=run)
 
 

@@ -6,7 +6,16 @@ import sys
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
-from astropolcal.scripts._common import check_outputs, read_datasets, wrapped, write_json
+from astropolcal.scripts._common import (
+    add_json,
+    add_quiet,
+    check_outputs,
+    printer,
+    read_datasets,
+    say_written,
+    wrapped,
+    write_calibration,
+)
 
 _EPILOG = """\
 examples:
@@ -39,10 +48,8 @@ def add_parser(commands):
     )
     _add_run_options(parser)
     parser.add_argument("--plots", metavar="DIR", help="save the figures in this folder")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
-    )
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    add_json(parser)
+    add_quiet(parser)
     parser.set_defaults(run=run)
 
 
@@ -90,18 +97,16 @@ def run(arguments):
     """Sample, print what came out and write what was asked for."""
     from astropolcal.calibration import Calibration
 
-    quiet = arguments.quiet or arguments.json == "-"
-    say = (lambda *_: None) if quiet else print
+    say = printer(arguments)
     check_outputs(arguments.output, arguments.json, arguments.checkpoint)
     _check_options(arguments)
     calibration = Calibration.read(arguments.calibration)
     calibration = calibration.with_observations(read_datasets(arguments.files))
     calibration.posterior = _sample(calibration, arguments)
     # first the files: a reader of our words may have gone in the meantime
-    written = _write(calibration, arguments)
+    written = write_calibration(calibration, arguments, calibration.to_dict)
     say(_words(calibration.posterior))
-    if written:
-        say("\nWritten: " + "\n         ".join(written))
+    say_written(say, written)
 
 
 def _check_options(arguments):
@@ -158,20 +163,3 @@ def _words(posterior):
     if rest:
         lines.append(f"{rest} values given per wavelength are in the file and in the JSON")
     return "\n".join(lines)
-
-
-def _write(calibration, arguments):
-    """Write what was asked for; return the names of the files."""
-    written = []
-    if arguments.output:
-        calibration.write(arguments.output, overwrite=True)
-        written.append(arguments.output)
-    if arguments.plots:
-        from astropolcal.plotting import save_all
-
-        written += [str(path) for path in save_all(calibration, arguments.plots)]
-    if arguments.json:
-        write_json(calibration.to_dict(), arguments.json)
-        if arguments.json != "-":
-            written.append(arguments.json)
-    return written

@@ -2,7 +2,13 @@
 """``astropolcal simulate``: beam fluxes or image cubes of an instrument, with noise."""
 
 from astropolcal.exceptions import AstropolcalError
-from astropolcal.scripts._common import check_outputs, edit_chains, write_json
+from astropolcal.scripts._common import (
+    add_json,
+    angles,
+    check_outputs,
+    edit_chains,
+    write_json,
+)
 
 #: What the packaged example was made with.
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
@@ -37,22 +43,46 @@ def add_parser(commands):
     )
     parser.add_argument("--instrument", metavar="NAME", default="charis", help="default: charis")
     parser.add_argument("--calibration", metavar="CAL.asdf", help="take the chain from this file")
+    _add_angles(parser)
+    _add_star(parser)
+    _add_cubes(parser)
+    _add_noise(parser)
+    parser.add_argument(
+        "--fix",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="set a parameter of the true chain",
+    )
+    parser.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        metavar="OPTIC",
+        help="take an optic out of the true chain",
+    )
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_angles(parser):
     parser.add_argument(
         "--hwp",
         metavar="DEG,DEG,...",
-        type=_angles,
+        type=angles,
         default=None,
         help="half-wave-plate angles (default: 0 to 78.75 by 11.25)",
     )
     parser.add_argument(
         "--derotator",
         metavar="DEG,DEG,...",
-        type=_angles,
+        type=angles,
         default=None,
         help="derotator angles (default: 45 to 132.5 by 12.5)",
     )
-    _add_star(parser)
-    _add_cubes(parser)
+
+
+def _add_noise(parser):
     parser.add_argument(
         "--flux",
         type=float,
@@ -76,24 +106,6 @@ def add_parser(commands):
     )
     parser.add_argument("--no-noise", action="store_true", help="leave the noise out")
     parser.add_argument("--seed", type=int, default=EXAMPLE["seed"], help="default: %(default)s")
-    parser.add_argument(
-        "--fix",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="set a parameter of the true chain",
-    )
-    parser.add_argument(
-        "--without",
-        action="append",
-        default=[],
-        metavar="OPTIC",
-        help="take an optic out of the true chain",
-    )
-    parser.add_argument(
-        "--json", metavar="FILE", help="write a summary for machines (- for stdout)"
-    )
-    parser.set_defaults(run=run)
 
 
 def _add_star(parser):
@@ -107,7 +119,7 @@ def _add_star(parser):
         parser.add_argument(
             f"--{name}",
             metavar="DEG[,DEG]",
-            type=_angles,
+            type=angles,
             help=f"{name} angle of a star in all frames, or in the first and last",
         )
 
@@ -134,16 +146,6 @@ def _add_cubes(parser):
     group.add_argument(
         "--saturate", action="store_true", help="cut pixels off at the instrument's saturation"
     )
-
-
-def _angles(text):
-    """Return the angles of a comma-separated list, in degree."""
-    import argparse
-
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of angles in degree") from None
 
 
 def run(arguments):

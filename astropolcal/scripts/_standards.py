@@ -4,7 +4,7 @@
 import math
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.scripts._common import check_outputs, wrapped, write_json
+from astropolcal.scripts._common import add_json, check_outputs, wrapped, write_json
 
 # more stars than this make a figure unreadable
 _DRAWN = 5
@@ -35,7 +35,7 @@ def add_parser(commands):
         default=30.0,
         help="lowest altitude (default: 30)",
     )
-    add("--json", metavar="FILE", help="write it for machines (- for stdout)")
+    add_json(parser, "write it")
     add("--plot", metavar="FILE", help="draw altitude and parallactic angle over the night")
     parser.set_defaults(run=run)
 
@@ -344,13 +344,7 @@ def _site(text):
 
 
 def _plot(seen, path):
-    from astropolcal.exceptions import AstropolcalError
-    from astropolcal.files import atomic_path
+    from astropolcal.plotting._style import save
     from astropolcal.plotting.standards import plot_observability
 
-    figure = plot_observability(seen)
-    with atomic_path(path) as temporary:
-        try:
-            figure.savefig(temporary, dpi=150)
-        except ValueError as error:
-            raise AstropolcalError(f"{path}: {error}") from None
+    save(plot_observability(seen), path)

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from astropolcal import instruments
+from astropolcal.calibration import calibrate
+from astropolcal.measurement import FreeParameters
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 # star_data.py, which several folders use
@@ -58,8 +60,53 @@ def make():
     from types import SimpleNamespace
 
     return SimpleNamespace(
-        charis=CHARIS, chain=charis_chain, truth=charis_truth, frames=charis_frames, observe=observe
+        charis=CHARIS,
+        chain=charis_chain,
+        truth=charis_truth,
+        frames=charis_frames,
+        observe=observe,
+        fits=fits,
+        pulls_of=pulls_of,
     )
+
+
+def fits(kind, fixed, seeds):
+    """Truth and calibration of simulated datasets, which differ by their noise."""
+    truth = charis_truth(charis_chain(kind, fixed=fixed))
+    for seed in seeds:
+        # the branch search has its own tests, and costs more than the fit
+        cal = calibrate(
+            truth, observe(truth, seed=seed), weights="errors", search=False, cross_validate=False
+        )
+        assert cal.converged
+        assert not cal.at_bound
+        assert cal.identifiability.rank == {"linear": 49 - 2 * fixed, "elliptical": 91}[kind]
+        yield truth, cal
+
+
+def pulls_of(truth, cal):
+    """(fitted - true) / error of every free parameter."""
+    free = FreeParameters([truth], 22)
+    error = (cal.measurement.vector() - free.start()) / free.factors()
+    return error / cal.covariance.stds
+
+
+@pytest.fixture(scope="session")
+def pulls():
+    """
+    Pulls of simulated calibrations, of shape (n, n_free).
+
+    ``pulls(kind, fixed, n)``: kind of derotator, gauge angles fixed or free, how
+    many. What has been fitted once is kept, as it serves several files.
+    """
+    known = {}
+
+    def ensemble(kind, fixed, n):
+        rows = known.setdefault((kind, fixed), [])
+        rows += [pulls_of(*both) for both in fits(kind, fixed, range(len(rows), n))]
+        return np.array(rows[:n])
+
+    return ensemble
 
 
 @pytest.fixture(scope="session")

@@ -13,35 +13,19 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from astropolcal.calibration import calibrate, derived_data, derived_retardance
-from astropolcal.measurement import FreeParameters, Measurement
+from astropolcal.calibration import derived_data, derived_retardance
+from astropolcal.measurement import Measurement
 
+pytestmark = pytest.mark.slow
 N = 200
 ONE_SIGMA, TWO_SIGMA = (norm.cdf(k) - norm.cdf(-k) for k in (1, 2))
 LAM = [1.25, 1.65, 2.15] * u.um
 
 
-def fits(make, fixed, n):
-    """Truth and calibrations of n simulated datasets, which differ by their noise."""
-    truth = make.truth(make.chain("elliptical", fixed=fixed))
-    options = {"weights": "errors", "search": False, "cross_validate": False, "gauge": None}
-    for seed in range(n):
-        cal = calibrate(truth, make.observe(truth, seed=seed), **options)
-        assert cal.converged
-        assert cal.identifiability.rank == 91
-        yield truth, cal
-
-
-def pulls_of(truth, cal):
-    free = FreeParameters([truth], 22)
-    error = (cal.measurement.vector() - free.start()) / free.factors()
-    return error / cal.covariance.stds
-
-
 @pytest.fixture(scope="module")
-def fixed(make):
+def fixed(pulls):
     """Pulls of all parameters with the gauge angles fixed, shape (N, 91)."""
-    return np.array([pulls_of(truth, cal) for truth, cal in fits(make, True, N)])
+    return pulls("elliptical", True, N)
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +35,8 @@ def free(make):
     law = truth["hwp"].retardance(LAM)
     clean = Measurement(truth, make.observe(truth, noise=False)).observed
     found = {"parameters": [], "law": [], "data": []}
-    for true, cal in fits(make, False, N // 2):
-        found["parameters"].append(pulls_of(true, cal))
+    for _, cal in make.fits("elliptical", False, range(N // 2)):
+        found["parameters"].append(make.pulls_of(truth, cal))
         made = derived_retardance(cal, "hwp", LAM)
         found["law"].append(((made.value - law) / made.std).value)
         made = derived_data(cal)

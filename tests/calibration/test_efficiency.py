@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from star_data import CHARIS
 
-from astropolcal import optics
+from astropolcal import instruments, optics
 from astropolcal.calibration import best_derotator, polarimetric_efficiency
-from astropolcal.calibration.efficiency import DEROTATOR_LAWS, sky_path
-from astropolcal.chain import leaves
-from astropolcal.exceptions import ChainError, ObservationError, ParameterError
+from astropolcal.calibration.efficiency import DEROTATOR_LAWS, has_derotator, sky_path
+from astropolcal.chain import join, leaves, replace_optic
+from astropolcal.exceptions import ChainError, InstrumentError, ObservationError, ParameterError
+from astropolcal.instruments import Instrument, SkyLaw
 
 LAM = [1.6] * u.um
 
@@ -118,6 +119,113 @@ def test_impossible_requests_are_errors(sky):
     chain = optics.LinearRetarder(mount="other", name="x") | bench(90)
     with pytest.raises(ChainError, match="no position of the stages other"):
         polarimetric_efficiency(chain, LAM, derotator=0 * u.deg)
+
+
+# --- other instruments ------------------------------------------------------------------------
+
+
+def cassegrain(retardance=180.0):
+    """Sky, a mirror and an ideal splitter, with a plate that stays where it is put."""
+    return (
+        optics.Rotator(mount="parallactic", name="sky")
+        | optics.LinearRetarder(retardance=60 * u.deg, name="relay")
+        | optics.LinearRetarder(retardance=retardance * u.deg, mount="hwp", name="hwp")
+        | optics.WollastonPrism(name="wollaston")
+    )
+
+
+class Cassegrain(Instrument):
+    name = "cassegrain"
+    sky_law = SkyLaw(plate=(0, 0), derotator={})
+
+    def chain(self, source="star", optics_in=(), *, wavelength=None):
+        return cassegrain()
+
+    def setup(self, observations):
+        return "star", ()
+
+
+def test_instrument_without_a_derotator_and_with_a_plate_that_stands():
+    """The sky turns in front of a retarder: sqrt(cos^2 2x + sin^2 2x cos^2 delta)."""
+    p = np.arange(0, 180, 10)
+    found = polarimetric_efficiency(
+        cassegrain(), LAM, parallactic=p * u.deg, aolp=30 * u.deg, instrument=Cassegrain()
+    )
+    x = np.deg2rad(2 * (30 - p))
+    np.testing.assert_allclose(
+        found[:, 0], np.hypot(np.cos(x), np.sin(x) * np.cos(np.deg2rad(60))), atol=1e-12
+    )
+    assert not has_derotator(cassegrain())
+    with pytest.raises(ChainError, match="no derotator whose offset"):
+        best_derotator(cassegrain(), LAM, [60] * u.deg, [0] * u.deg, instrument=Cassegrain())
+    # another law turns the plate
+    with pytest.raises(ParameterError, match="needs altitude= and parallactic="):
+        polarimetric_efficiency(cassegrain(), LAM, parallactic=p * u.deg)
+    with pytest.raises(ParameterError, match="needs parallactic="):
+        polarimetric_efficiency(cassegrain(), LAM, instrument=Cassegrain())
+
+
+def test_law_of_the_instrument_counts():
+    """A plate that is no half-wave plate measures more or less, as it follows the sky."""
+    chain, p = cassegrain(150), np.arange(0, 180, 10) * u.deg
+    options = {"parallactic": p, "altitude": 50 * u.deg, "aolp": 10 * u.deg}
+    own = polarimetric_efficiency(chain, LAM, instrument=Cassegrain(), **options)
+    stated = polarimetric_efficiency(chain, LAM, law=(0, 0), **options)
+    other = polarimetric_efficiency(chain, LAM, law=(0.5, 1), **options)
+    np.testing.assert_array_equal(own, stated)
+    assert np.abs(own - other).max() > 0.02
+
+
+def test_derotator_may_have_another_name():
+    chain = bench(120)
+    moved = leaves(bench(120))[2].copy()
+    moved.mount = "rotator"
+    named = replace_optic(chain, "derotator", moved)
+    angles = [10, 40, 80] * u.deg
+    np.testing.assert_array_equal(
+        polarimetric_efficiency(named, LAM, derotator=angles),
+        polarimetric_efficiency(chain, LAM, derotator=angles),
+    )
+    with pytest.raises(ParameterError, match="on the stage rotator: derotator= is needed"):
+        polarimetric_efficiency(named, LAM)
+
+
+@pytest.mark.parametrize("mode", ["field", "pupil"])
+def test_offset_of_irdis_keeps_the_derotator_off_45_deg(mode):
+    irdis = instruments.get("irdis")
+    sky = irdis.on_sky(irdis.published(), coating="after")
+    altitude, parallactic = [60, 63, 66] * u.deg, [-40, -30, -20] * u.deg
+    best = best_derotator(
+        sky, irdis.wavelength, altitude, parallactic, law=mode, instrument="irdis"
+    )
+    f, g = irdis.sky_law.derotator_law(mode)
+    derotator = np.mod((best.offset + f * parallactic + g * altitude).to_value(u.deg), 90)
+    assert np.all(np.minimum(derotator, 90 - derotator) < 12)
+    with pytest.raises(InstrumentError, match="mode = None; allowed are field, pupil"):
+        polarimetric_efficiency(
+            sky,
+            irdis.wavelength,
+            derotator=0 * u.deg,
+            altitude=60 * u.deg,
+            parallactic=0 * u.deg,
+            instrument=irdis,
+        )
+
+
+def test_both_states_of_a_liquid_crystal_are_one_measurement():
+    crystal = optics.FerroelectricLiquidCrystal(
+        retardance=180 * u.deg, switching_angle=45 * u.deg, mount="flc_state", name="flc"
+    )
+    whole = join([*leaves(bench(120))[:3], crystal, *leaves(bench(120))[3:]])
+    angles = [0, 20, 45] * u.deg
+    np.testing.assert_allclose(
+        polarimetric_efficiency(whole, LAM, derotator=angles),
+        polarimetric_efficiency(bench(120), LAM, derotator=angles),
+    )
+    crystal.switching_angle = 40 * u.deg
+    whole = join([*leaves(bench(120))[:3], crystal, *leaves(bench(120))[3:]])
+    less = polarimetric_efficiency(whole, LAM, derotator=0 * u.deg, aolp=90 * u.deg)
+    assert less[0] == pytest.approx((1 + np.cos(np.deg2rad(20))) / 2, abs=0.01)
 
 
 # --- planning ---------------------------------------------------------------------------------

@@ -787,7 +787,8 @@ def test_other_versions(path, content):
         (b"mount: hwp", b"mount: !<tag:example.org:thing-1.0.0> {}", "unknown kind"),
         (b"mount: hwp", b"mount: [unclosed", "damaged"),
         (b"mount: hwp", b"mount: *missing", "damaged"),
-        (b"calibration:", b"calibration: &loop {a: *loop}\nold:", "not an astropolcal calibration"),
+        (b"calibration:", b"calibration: &loop {a: *loop}\nold:", "refers to itself"),
+        (b"calibration:", b"calibration: &loop {}\nold:", "not an astropolcal calibration"),
     ],
 )
 def test_changed_file(path, content, old, new, message):
@@ -834,6 +835,7 @@ def refusal(path, content, expected):
     return None
 
 
+@pytest.mark.slow
 def test_mutated_file_is_refused_or_the_same(calibration, path, content):
     rng = np.random.default_rng(11)
     expected = calibration.to_dict()
@@ -852,6 +854,7 @@ def test_mutated_file_is_refused_or_the_same(calibration, path, content):
     assert not any("\n" in reason for reason in reasons)
 
 
+@pytest.mark.slow
 def test_cut_and_doubled_pieces_are_refused_or_the_same(calibration, path, content):
     rng = np.random.default_rng(12)
     expected = calibration.to_dict()

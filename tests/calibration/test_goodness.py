@@ -57,6 +57,7 @@ def uniform(p):
 # --- known noise --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weighted", [True, False])
 def test_probabilities_are_uniform_for_a_true_model(measurement, weighted):
     """Monte Carlo, 300 runs; a fit with equal weights is not the best one and yet calibrated."""
@@ -165,6 +166,7 @@ def test_overestimated_noise_is_told(measurement):
 # --- estimated noise ----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_f_test_with_the_null_channel_is_calibrated(make, chain):
     """Monte Carlo, 100 runs of faintly polarized light, whose noise is the same in all data."""
     source = optics.Diattenuator(diattenuation=0.2, fixed={"diattenuation": True}, name="source")
@@ -181,6 +183,7 @@ def test_f_test_with_the_null_channel_is_calibrated(make, chain):
     assert uniform(single) > 0.01
 
 
+@pytest.mark.slow
 def test_f_test_with_replicates_is_calibrated(make, chain):
     """Monte Carlo, 200 runs: the classical test of lack of fit against pure error."""
     twice = np.repeat([45, 70, 95, 120], 2) * u.deg
@@ -232,6 +235,7 @@ def fit_with_priors(measurement, vector, weights, level, steps=5):
     return vector
 
 
+@pytest.mark.slow
 def test_probabilities_are_uniform_with_priors_that_are_true(chain, measurement):
     """Monte Carlo, 200 runs: truths drawn from the priors, which are as narrow as the data."""
     data = measurement.datasets[0].observations

@@ -258,6 +258,7 @@ def write_two(base, folder, number, barrier):
     Library(folder).add(base, valid_from="2010-01-01", mode=f"of {number}")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_concurrent_writers(tmp_path):
     """Two of three write the same at the same time; each file is whole, and there once."""

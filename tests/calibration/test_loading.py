@@ -158,6 +158,7 @@ def test_covariance_is_that_of_the_parameters(calibration, loaded):
         np.testing.assert_allclose(found.covariance[i], block, rtol=1e-4, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_covariance_agrees_with_samples(calibration, loaded):
     rng = np.random.default_rng(3)
     found = loaded.system_mueller(HEADER)
@@ -395,6 +396,7 @@ print(repr(float(mueller.value[0, 0, 0, 1])))
 """
 
 
+@pytest.mark.slow
 def test_nothing_else_is_needed(tmp_path):
     command = [sys.executable, "-c", _BLOCKED, str(OLD), str(tmp_path / "m.fits")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -72,6 +72,7 @@ def test_fit_of_a_long_table_ends_where_one_without_the_short_cut_does(long, wei
     assert residuals[0] == pytest.approx(residuals[1], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_time_is_linear_in_the_number_of_frames():
     def seconds(n_frames):
         chain, data = lamp(n_frames)

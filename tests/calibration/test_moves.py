@@ -62,6 +62,7 @@ def run(target, moves, n_steps, n_walkers=None, start=1.0, seed=1):
     return sampler.get_chain(discard=n_steps // 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 10, 60])
 def test_default_moves_keep_a_normal_distribution(n):
     target = Normal(n)
@@ -69,6 +70,7 @@ def test_default_moves_keep_a_normal_distribution(n):
     assert target.whitened(chain).std() == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistaken", [0.5, 2.0])
 def test_default_moves_find_the_distribution_though_the_fit_is_wrong(mistaken):
     """The steps around the fit then hardly help, but do no harm."""
@@ -83,12 +85,14 @@ def test_default_moves_widen_a_start_that_is_too_narrow():
     assert target.whitened(chain).std() == pytest.approx(1, abs=0.04)
 
 
+@pytest.mark.slow
 def test_each_default_move_alone_keeps_a_normal_distribution():
     target = Normal(12)
     for move, _ in default_moves(emcee, Laplace(target)):
         assert target.whitened(run(target, move, 3000)).std() == pytest.approx(1, abs=0.03)
 
 
+@pytest.mark.slow
 def test_steps_around_the_fit_are_worth_it_in_many_dimensions():
     target = Normal(60)
     moves = default_moves(emcee, Laplace(target))
@@ -100,6 +104,7 @@ def test_steps_around_the_fit_are_worth_it_in_many_dimensions():
     assert alone > 4 * around
 
 
+@pytest.mark.slow
 def test_half_of_a_normal_distribution_at_a_bound():
     """One parameter at its bound: mean and width of half a normal distribution."""
     target = Normal(12)

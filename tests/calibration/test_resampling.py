@@ -60,6 +60,7 @@ def test_white_noise_gives_the_errors_of_the_covariance(white, block):
     assert ratio.max() < 1.7
 
 
+@pytest.mark.slow
 def test_errors_in_blocks_are_noticed(make):
     """An angle wrong for a whole cycle: pairs are not independent, and cycles say so."""
     cal = shifted(make)
@@ -229,6 +230,7 @@ def test_calibration_from_a_file_has_no_data(white, tmp_path):
 # --- real data ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_errors_of_the_real_fit_are_too_small(charis_data, make):
     """Dataset 3: the residuals are no white noise, and cycles tell by how much."""
     data = charis_data("dataset3_")

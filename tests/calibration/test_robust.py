@@ -235,6 +235,7 @@ def test_calibration_from_a_file_has_no_data(few, tmp_path):
 # --- real measurements -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_errors_of_dataset_3_are_those_of_the_bootstrap(charis_data, make):
     """Measured: 1.7 times the covariance's, 0.9 times the bootstrap's, in the median."""
     data = charis_data("dataset3_")

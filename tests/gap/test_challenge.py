@@ -175,6 +175,7 @@ def test_the_figure_shows_each_kind_that_was_run(result):
 # ---- how a run goes on ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_was_killed(tmp_path, result, monkeypatch):
     path = tmp_path / "run.jsonl"
     run_challenge(2, 5, checkpoint=path, **RUN)
@@ -243,6 +244,7 @@ def test_a_run_that_makes_no_sense_is_refused(options, words):
         run_challenge(**options)
 
 
+@pytest.mark.slow
 def test_a_cluster_of_dask_gives_the_same_answers():
     distributed = pytest.importorskip("distributed")
     small = Setup(n_wavelengths=5, n_derotator=4)

@@ -31,6 +31,7 @@ def test_score_predicts_what_the_full_fit_gains():
     assert score.statistic == pytest.approx(model.fit.chi2 - better.fit.chi2, rel=0.02)
 
 
+@pytest.mark.slow
 def test_scores_of_noise_are_chi_square():
     """The p-values of many seeds are uniform."""
     effects = [EFFECTS["hwp_diattenuation"], EFFECTS["derotator_encoder"]]
@@ -168,6 +169,7 @@ def test_fit_that_did_not_converge_is_refused(monkeypatch):
 # ---- the cases with a key ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["case000", "case004", "case009", "case015", "case026"])
 def test_case_with_a_key(shared_data, case):
     folder = shared_data / "gap-cases"

@@ -15,6 +15,7 @@ from astropolcal.gap.alternatives import thinned
 from astropolcal.gap.remainder import outlying_frames
 from astropolcal.observations import Observations
 
+pytestmark = pytest.mark.slow
 CHARIS = instruments.get("charis")
 PARITY = {"mirror_flip", "mirror_flip_before_plate", "beams_swapped"}
 DEROTATOR = {

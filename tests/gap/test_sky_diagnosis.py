@@ -77,6 +77,7 @@ def test_wrong_sign(name):
     assert name in names(found)
 
 
+@pytest.mark.slow
 def test_real_star_misses_flat_field_and_mirror(shared_data):
     charis, folder = instruments.get("charis"), shared_data / "data" / "charis"
     lamp = Observations.read(folder / "dataset3_polarized_2025-10-05.ecsv")

@@ -110,6 +110,7 @@ def test_several_standards_and_optics_of_their_own(tables, tmp_path, capsys):
     assert np.median(wrong["s_standard_percent"]) > 5 * np.median(right["s_standard_percent"])
 
 
+@pytest.mark.slow
 def test_summary_file_and_info_know_the_standard(tables, tmp_path, capsys):
     cal = tmp_path / "cal.asdf"
     arguments = [tables["first"], "--standard", tables["second"], "-o", cal, "--plots", tmp_path]
@@ -188,6 +189,7 @@ def test_choices_are_those_of_the_function(capsys):
 # ---- targets ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_targets_by_default_and_by_choice(tables, tmp_path, capsys):
     usual = run(tmp_path, tables["first"], tables["dark"])["targets"]
     assert [(t["dolp_percent"], t["aolp_deg"]) for t in usual] == [(1.0, None), (30.0, None)]

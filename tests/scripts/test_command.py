@@ -133,6 +133,7 @@ def test_output_and_info_tell_the_same(small, tmp_path, capsys):
     assert Calibration.read(path).chain["hwp"].w_sio2.unit == u.mm
 
 
+@pytest.mark.slow
 def test_plots_are_saved(small, tmp_path, capsys):
     assert main(["calibrate", str(small), "--plots", str(tmp_path / "figures")]) == 0
     assert "Written: " in capsys.readouterr().out

@@ -85,6 +85,7 @@ def test_cubes_to_product(night, tmp_path, capsys):
     assert (tmp_path / "out.png").stat().st_size > 1e4
 
 
+@pytest.mark.slow
 def test_modes_differ(night, tmp_path):
     words = [night / "cubes", "--calibration", night / "charis.asdf", "-q", "--size", 21]
     for mode in ("stokes", "ip"):

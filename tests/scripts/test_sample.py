@@ -25,7 +25,10 @@ WHAT = ["--parameters", *NAMES, "--walkers", "12", "--seed", "3"]
 LONG, RUN = ([*WHAT, "--steps", steps] for steps in ("2400", "60"))
 
 # as for a user: warnings are printed
-pytestmark = pytest.mark.filterwarnings("default::astropolcal.exceptions.AstropolcalWarning")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("default::astropolcal.exceptions.AstropolcalWarning"),
+]
 
 
 def make_table(path, seed, **options):
