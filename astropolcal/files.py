@@ -170,7 +170,7 @@ def understood(path, error, words):
 
 
 def one_line(problem, longest=_LONGEST_REASON):
-    """
+    r"""
     Return what an error or a text says, in one line that is not too long.
 
     Parameters
@@ -187,7 +187,7 @@ def one_line(problem, longest=_LONGEST_REASON):
     Examples
     --------
     >>> from astropolcal.files import one_line
-    >>> one_line(ValueError("could not\\n   parse it"))
+    >>> one_line(ValueError("could not\n   parse it"))
     'could not parse it'
     >>> one_line(KeyError("names"))
     "KeyError: 'names'"

@@ -180,9 +180,15 @@ def angle_of_linear_polarization(stokes, axis=-1):
     """
     _, q, u_, _ = _bright_stokes(stokes, axis)
     _require((q != 0) | (u_ != 0), q, "Q = U", "different from zero for an angle to exist")
-    angle = np.rad2deg(np.arctan2(u_, q) / 2) % 180
+    return _angle(q, u_) * u.deg
+
+
+def _angle(q, u_):
+    """Return the angle in degrees, at least 0 and below 180; NaN where q or u is."""
+    with np.errstate(invalid="ignore"):
+        angle = np.rad2deg(np.arctan2(u_, q) / 2) % 180
     # the remainder of a tiny negative angle rounds to the excluded end
-    return np.where(angle >= 180, 0.0, angle) * u.deg
+    return np.where(angle >= 180, 0.0, angle)
 
 
 def stokes_from_dolp_aolp(dolp, aolp, circular=0.0, intensity=1.0):

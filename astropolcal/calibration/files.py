@@ -8,18 +8,21 @@ file gives back exactly what was written, or one line that says why not.
 """
 
 import io
+import math
 import re
+import struct
 import warnings
 from contextlib import contextmanager
 from pathlib import Path
 
 import asdf
 import asdf.util
+from asdf.constants import YAML_END_MARKER_REGEX
 from asdf.exceptions import AsdfConversionWarning, AsdfWarning, ValidationError
 
 from astropolcal.converters.calibration import CALIBRATION_TAG, CALIBRATION_TAGS
 from astropolcal.exceptions import CalibrationFileError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, check_yaml, one_line, understood
 from astropolcal.version import version as our_version
 
 __all__ = ["read_calibration", "write_calibration"]
@@ -36,7 +39,10 @@ _ALLOWED_TAGS = re.compile(
 # arrays of more numbers go into binary blocks, the others are readable
 _INLINE = 64
 _BEGIN, _END = b"#ASDF", b"\n...\n"
-_LONGEST_REASON = 240
+_NUMBERS = re.compile(r"bool8|u?int(8|16|32|64)|float(16|32|64)")
+# bytes that a compressed block may always have
+_MOST_UNPACKED = 2**26
+_BLOCK, _BLOCK_HEAD = b"\xd3BLK", struct.Struct(">4sHI4sQQQ")
 
 
 def write_calibration(calibration, path, overwrite=False):
@@ -80,7 +86,7 @@ def write_calibration(calibration, path, overwrite=False):
         raise CalibrationFileError(f"{path}: exists already; overwrite=True replaces it")
     if not path.parent.is_dir():
         raise CalibrationFileError(f"{path}: cannot be written: no folder {path.parent}")
-    with _speaking_of(path, "cannot be written: "):
+    with _speaking_of(path, "cannot be written", "cannot be written: "):
         content = _to_bytes(calibration)
     with atomic_path(path, error=CalibrationFileError) as temporary:
         temporary.write_bytes(content)
@@ -124,7 +130,7 @@ def read_calibration(path):
     if not path.is_file():
         what = "is a folder, not a file" if path.is_dir() else "no such file"
         raise CalibrationFileError(f"{path}: {what}")
-    with _speaking_of(path, ""):
+    with _speaking_of(path, "damaged"):
         content = path.read_bytes()
         _check_ends(content)
         _check_tree(content)
@@ -193,12 +199,31 @@ def _check_ends(content):
 
 
 def _check_tree(content):
-    """Check the tags before any object is made, so that nothing unknown is."""
+    """Check text and tags before any object is made, so that nothing unknown is."""
+    end = re.search(YAML_END_MARKER_REGEX, content)
+    with _speaking_of("damaged", "its YAML"):
+        check_yaml(content[: end.end()], CalibrationFileError)
+    _check_blocks(content, end.end())
     tree = asdf.util.load_yaml(io.BytesIO(content), tagged=True)
     if not isinstance(tree, dict) or _KEY not in tree:
         raise CalibrationFileError(f"not an astropolcal calibration: it has no {_KEY!r}")
     _check_version(getattr(tree[_KEY], "_tag", None) or "no tag")
-    _check_nodes(tree)
+    _check_nodes(tree, len(content))
+
+
+def _check_blocks(content, start):
+    """Refuse blocks that are not all there, or claim to hold much more than the file."""
+    while content[start : start + 4] == _BLOCK:
+        head = content[start : start + 6 + 48]
+        if len(head) < 6 + 48:
+            raise CalibrationFileError("truncated: a binary block has no end")
+        _, size, _, packing, room, used, data = _BLOCK_HEAD.unpack_from(head)
+        start += 6 + size
+        if data > (used if packing == b"\0\0\0\0" else max(_MOST_UNPACKED, 20 * used)):
+            raise CalibrationFileError(f"a binary block claims to hold {data} bytes")
+        if not used <= room <= len(content) - start:
+            raise CalibrationFileError("a binary block claims more than the file holds")
+        start += room
 
 
 def _check_version(tag):
@@ -224,8 +249,8 @@ def _newer(version, known):
     return first > second
 
 
-def _check_nodes(tree):
-    """Refuse unknown tags and links out of the file."""
+def _check_nodes(tree, size):
+    """Refuse unknown tags, links out of the file, and arrays that cannot be in it."""
     waiting, seen = [tree], set()
     while waiting:
         node = waiting.pop()
@@ -238,42 +263,42 @@ def _check_nodes(tree):
         if isinstance(node, dict):
             if "$ref" in node or ("ndarray" in (tag or "") and isinstance(node.get("source"), str)):
                 raise CalibrationFileError("refers to another file")
+            if "ndarray" in (tag or ""):
+                _check_array(node, size)
             waiting.extend(node.values())
         elif isinstance(node, list):
             waiting.extend(node)
+
+
+def _check_array(node, size):
+    """Refuse arrays that are no plain numbers, or more than the bytes of the file."""
+    kind, shape = node.get("datatype"), node.get("shape", [])
+    if not (isinstance(kind, str) and _NUMBERS.fullmatch(kind)):
+        raise CalibrationFileError(f"an array of {one_line(kind)}, plain numbers are allowed")
+    plain = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
+    if not plain or math.prod(shape) > size:
+        raise CalibrationFileError(f"an array of shape {one_line(shape)}, which cannot be in it")
+    for key in ("strides", "mask"):
+        if key in node:
+            raise CalibrationFileError(f"an array with {key}, plain ones are allowed")
 
 
 # ---- errors ------------------------------------------------------------------------
 
 
 @contextmanager
-def _speaking_of(path, prefix):
+def _speaking_of(path, words, prefix=""):
     """Turn whatever goes wrong into one line that names the file."""
-    try:
-        yield
-    except CalibrationFileError as error:
-        raise CalibrationFileError(f"{path}: {prefix}{error}") from error
-    except OSError as error:
-        reason = error.strerror or _one_line(error)
-        raise CalibrationFileError(f"{path}: {prefix}{reason}") from error
-    except ValidationError as error:
-        raise CalibrationFileError(f"{path}: {prefix}{_where(error)}") from error
-    # a damaged file can make ASDF, YAML and numpy raise anything
-    except Exception as error:
-        label = prefix or "damaged: "
-        raise CalibrationFileError(f"{path}: {label}{_one_line(error)}") from error
+    with understood(path, CalibrationFileError, words):
+        try:
+            yield
+        except CalibrationFileError as error:
+            raise CalibrationFileError(f"{path}: {prefix}{one_line(error, 500)}") from error
+        except ValidationError as error:
+            raise CalibrationFileError(f"{path}: {prefix}{_where(error)}") from error
 
 
 def _where(error):
     """Return what a schema objects to, and at which place of the file."""
     place = ".".join(str(part) for part in error.absolute_path)
-    return f"invalid at {place}: {_shortened(error.message)}"
-
-
-def _one_line(error):
-    return _shortened(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
-
-
-def _shortened(text):
-    text = " ".join(text.split())
-    return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
+    return f"invalid at {one_line(place)}: {one_line(error.message)}"

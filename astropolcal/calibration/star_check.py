@@ -14,6 +14,7 @@ from astropolcal.exceptions import (
     ObservationError,
     WavelengthRangeError,
 )
+from astropolcal.stokes import _angle
 
 __all__ = ["add_star_check", "star_check"]
 
@@ -128,8 +129,7 @@ def _add_known(table, q, stokes_u, covariance):
     length = np.hypot(q, stokes_u)
     table["q_known"], table["u_known"] = q * percent, stokes_u * percent
     table["dolp_known"] = length * percent
-    angle = np.mod(np.rad2deg(0.5 * np.arctan2(stokes_u, q)), 180)
-    table["aolp_known"] = np.where(length > 0, angle, np.nan) * u.deg
+    table["aolp_known"] = np.where(length > 0, _angle(q, stokes_u), np.nan) * u.deg
     along, across = np.full((2, length.size), np.nan)
     if covariance is not None:
         c, s = (np.divide(x, length, out=np.ones_like(x), where=length > 0) for x in (q, stokes_u))

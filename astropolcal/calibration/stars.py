@@ -126,7 +126,7 @@ def _table(wavelength, found):
     dolp = np.hypot(*mean)
     table["dolp"] = stokes.debias_dolp(dolp, spread) * percent
     table["dolp_err"] = spread * percent
-    table["aolp"] = np.rad2deg(np.mod(0.5 * np.arctan2(mean[1], mean[0]), np.pi)) * u.deg
+    table["aolp"] = stokes._angle(*mean) * u.deg
     with np.errstate(divide="ignore", invalid="ignore"):
         table["aolp_err"] = np.rad2deg(0.5 * spread / dolp) * u.deg
     table["n_cycles"] = count

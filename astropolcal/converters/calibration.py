@@ -330,7 +330,7 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
         datasets=[_dataset(entry) for entry in node["datasets"]],
         settings=plain(node["settings"]),
         fit=plain(node["fit"]),
-        ties={entry["target"]: _tie(entry) for entry in node["ties"]},
+        ties={name: _tie(entry) for name, entry in _by_name(node["ties"], "target").items()},
         stages=[_stage(entry) for entry in node["stages"]],
         provenance=plain(node["provenance"]),
         posterior=posterior_from_node(node["posterior"]) if "posterior" in node else None,
@@ -395,12 +395,22 @@ def _identifiability(node):
     )
 
 
+def _by_name(entries, key="name"):
+    """Return entries by name; of two of one name only one would be left."""
+    found = {entry[key]: entry for entry in entries}
+    if len(found) < len(entries):
+        names = [entry[key] for entry in entries]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise CalibrationFileError(f"{twice!r} is given twice in a list of parameters")
+    return found
+
+
 def _direction(node):
     from astropolcal.converters.nodes import plain
 
     return {
         "words": node["words"],
-        "parameters": {entry["name"]: entry["value"] for entry in node["parameters"]},
+        "parameters": {k: entry["value"] for k, entry in _by_name(node["parameters"]).items()},
         **({"sky": plain(node["sky"])} if "sky" in node else {}),
     }
 
@@ -428,8 +438,9 @@ def _tie(node):
 def _stage(node):
     from astropolcal.converters.nodes import value_from_node
 
+    parameters = node["parameters"]
     return {
         "title": node["title"],
-        "parameters": {entry["name"]: value_from_node(entry) for entry in node["parameters"]},
+        "parameters": {k: value_from_node(entry) for k, entry in _by_name(parameters).items()},
         "residual_rms": node["residual_rms"],
     }

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Whether the parts of a calibration belong together."""
 
+import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
@@ -57,6 +58,7 @@ def check_calibration(calibration):
     _check_shared(calibration.chains, free)
     _check_covariance(calibration.covariance, free)
     _check_identifiability(calibration.identifiability, free.names)
+    _check_fit(calibration.fit)
     _check_words(calibration, free.names)
 
 
@@ -102,6 +104,21 @@ def _check_identifiability(finding, names):
             raise CalibrationFileError(f"{key} have shape {found}, expected {shape}")
 
 
+def _check_fit(fit):
+    """Check what a schema does not: the pairs of frames at odds with the fit."""
+    masked = fit.get("masked") or []
+    if not isinstance(masked, list) or not all(isinstance(one, dict) for one in masked):
+        raise CalibrationFileError("fit.masked is no list of reasons, one entry a dataset")
+    numbers = ("residual_percent", "sigma", "brightness")
+    outliers = fit.get("outliers") or []
+    if not isinstance(outliers, list):
+        raise CalibrationFileError(f"fit.outliers is a {type(outliers).__name__}, not a list")
+    for one in outliers:
+        good = isinstance(one, dict) and {"frames", "dataset", *numbers} <= set(one)
+        if not good or not all(isinstance(one[key], int | float) for key in numbers):
+            raise CalibrationFileError("fit.outliers lacks what a pair of frames is told by")
+
+
 def _check_words(calibration, names):
     unknown = sorted(set(calibration.at_bound) - set(names))
     if unknown:
@@ -112,4 +129,21 @@ def _check_words(calibration, names):
         if missing:
             raise CalibrationFileError(
                 f"the accuracy of {record.name} has no column {', '.join(missing)}"
+            )
+        _check_accuracy(record)
+
+
+def _check_accuracy(record):
+    """Check that the columns of accuracies are numbers, one of each at every wavelength."""
+    for name in _ACCURACY if record.accuracy is not None else ():
+        column = record.accuracy[name]
+        if column.dtype.kind not in "iuf" or column.ndim != 1:
+            raise CalibrationFileError(
+                f"the accuracy of {record.name}: {name} is no list of numbers"
+            )
+    if record.accuracy is not None:
+        length = u.Quantity(record.accuracy["wavelength"])
+        if not length.unit.is_equivalent(u.um) or not np.all(length.value > 0):
+            raise CalibrationFileError(
+                f"the accuracy of {record.name}: wavelength = {length} must be positive lengths"
             )

@@ -90,6 +90,9 @@ def value_from_node(node):
     >>> value_from_node({"value": 1.5, "unit": "deg"})
     <Quantity 1.5 deg>
     """
+    unknown = sorted(set(node) - {"name", "unit", "value"})
+    if unknown:
+        raise CalibrationFileError(f"a value with {unknown[0]!r}, which means nothing here")
     value = np.array(node["value"])
     return value * unit_from_text(node["unit"]) if "unit" in node else value
 
@@ -123,7 +126,10 @@ def table_from_node(node):
     """
     if node is None:
         return None
-    return QTable({column["name"]: value_from_node(column) for column in node})
+    columns = {column["name"]: value_from_node(column) for column in node}
+    if len(columns) < len(node):
+        raise CalibrationFileError("two columns of a table have the same name")
+    return QTable(columns)
 
 
 def plain(value, where="value"):

@@ -152,8 +152,11 @@ def restore_priors(chains, nodes):
     """
     from astropolcal.measurement import parameter_table
 
-    table = parameter_table(chains)
+    table, seen = parameter_table(chains), set()
     for node in nodes:
+        if node["parameter"] in seen:
+            raise CalibrationFileError(f"prior of {node['parameter']!r} is given twice")
+        seen.add(node["parameter"])
         if node["parameter"] not in table:
             raise CalibrationFileError(f"prior of {node['parameter']!r}, which no chain has")
         for parameter in table[node["parameter"]]:

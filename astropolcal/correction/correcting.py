@@ -113,11 +113,7 @@ def correct(
     >>> float(star.q[0].round(9)), float(star.u[0].round(9))
     (0.02, -0.01)
     """
-    if mode not in MODES:
-        raise ParameterError(f"mode = {mode!r}; allowed are {', '.join(MODES)}")
-    by_variance = isinstance(weights, str)
-    if by_variance and weights != "variance":
-        raise ParameterError(f'weights = {weights!r}; allowed are arrays and "variance"')
+    by_variance = _check_choices(mode, weights)
     model = RowModel(
         calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
     )
@@ -162,6 +158,16 @@ def correct(
         frames.pixel_scale,
         _provenance(calibration, frames, systematic, provenance),
     )
+
+
+def _check_choices(mode, weights):
+    """Return whether the variances of the fluxes weight them; refuse what is not known."""
+    if mode not in MODES:
+        raise ParameterError(f"mode = {mode!r}; allowed are {', '.join(MODES)}")
+    by_variance = isinstance(weights, str)
+    if by_variance and weights != "variance":
+        raise ParameterError(f'weights = {weights!r}; allowed are arrays and "variance"')
+    return by_variance
 
 
 def _rows(model, frames, mode):

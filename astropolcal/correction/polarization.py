@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from astropolcal.stokes import aolp_error, debias_dolp, dolp_error, transverse_error
+from astropolcal.stokes import _angle, aolp_error, debias_dolp, dolp_error, transverse_error
 
 __all__ = ["fractions", "polarization"]
 
@@ -89,13 +89,10 @@ def polarization(q, u, errors, method="mas"):
     (array([0.001]), array([1.432]))
     """
     dolp = np.hypot(q, u)
-    with np.errstate(invalid="ignore"):
-        angle = np.rad2deg(np.arctan2(u, q) / 2) % 180
     result = {
         "dolp": dolp,
         "dolp_debiased": np.full(dolp.shape, np.nan),
-        # the remainder of a tiny negative angle rounds to the excluded end
-        "aolp": np.where(dolp > 0, np.where(angle >= 180, 0.0, angle), np.nan),
+        "aolp": np.where(dolp > 0, _angle(q, u), np.nan),
     }
     for kind, error in errors.items():
         s_p, s_chi, across = _errors(q, u, dolp, error)

@@ -18,7 +18,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join, leaves, stages
+from astropolcal.chain import join, stages
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments._keywords import frame_time
 from astropolcal.instruments.base import Instrument
@@ -26,13 +26,14 @@ from astropolcal.instruments.layout import FileLayout
 from astropolcal.instruments.nuisance import without_nuisance
 from astropolcal.instruments.telescope import (
     M3_MODELS,
+    _behind_telescope,
+    _star_of,
     k_mirror,
     published_mirror,
     star_source,
     telescope,
     tertiary_mirror,
 )
-from astropolcal.observations import is_star
 
 __all__ = ["CHARIS"]
 
@@ -244,6 +245,11 @@ class CHARIS(Instrument):
         -------
         `~astropy.modeling.CompoundModel`
 
+        Raises
+        ------
+        ChainError
+            If it has no half-wave plate.
+
         Examples
         --------
         >>> from astropolcal import instruments
@@ -252,19 +258,13 @@ class CHARIS(Instrument):
         ['parallactic', 'm3', 'altitude', 'hwp']
         """
         chain = without_nuisance(chain)
-        found = leaves(chain)
         if "parallactic" in stages(chain):
             return chain
-        start = next(i for i, leaf in enumerate(found) if leaf.name == "hwp")
-        return join([*telescope(published_mirror()), *found[start:]])
+        return join([*telescope(published_mirror()), *_behind_telescope(chain, self.name)])
 
     def particulars(self, observations):
         """Return name of the source optic and target of a star: ``star_`` and the object's name."""
-        target = str(observations.meta.get("object") or "")
-        words = re.sub(r"\W+", "", target)
-        if not words or not is_star(observations.source):
-            return {}
-        return {"star": f"star_{words}", "target": target}
+        return _star_of(observations)
 
     def published(self):
         """

@@ -11,14 +11,12 @@ Beams have the names of the halves of the detector. The left one passes +Q, so s
 differences here, right minus left, have the opposite sign of the published ones.
 """
 
-import re
-
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join, leaves, stages
-from astropolcal.exceptions import ChainError, InstrumentError
+from astropolcal.chain import join, stages
+from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments._irdis_headers import frame_table
 from astropolcal.instruments._irdis_optics import (
     CENTRES,
@@ -39,7 +37,7 @@ from astropolcal.instruments._irdis_optics import (
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.nuisance import without_nuisance
-from astropolcal.instruments.telescope import star_source
+from astropolcal.instruments.telescope import _behind_telescope, _star_of, star_source
 from astropolcal.observations import is_star
 from astropolcal.observations.pointing import location_of
 
@@ -222,17 +220,14 @@ class IRDIS(Instrument):
         ['parallactic', 'ut', 'altitude', 'm4']
         """
         chain = without_nuisance(chain)
-        found = leaves(chain)
         if "parallactic" in stages(chain):
             return chain
-        start = next((i for i, leaf in enumerate(found) if leaf.name == "hwp"), None)
-        if start is None:
-            raise ChainError("irdis: the chain has no optic 'hwp' to put the telescope before")
+        behind = _behind_telescope(chain, self.name)
         if wavelength is None:
-            check_all_filters(found[start:])
+            check_all_filters(behind)
             wavelength = self.wavelength
         index = filters_at(np.atleast_1d(wavelength))
-        return join([*telescope(index, coating_of(coating, date)), *found[start:]])
+        return join([*telescope(index, coating_of(coating, date)), *behind])
 
     def setup(self, observations):
         """
@@ -283,10 +278,7 @@ class IRDIS(Instrument):
         """
         if not is_star(observations.source):
             return {}
-        own = {"coating": stated_coating(observations)}
-        target = str(observations.meta.get("object") or "")
-        words = re.sub(r"\W+", "", target)
-        return own | ({"star": f"star_{words}", "target": target} if words else {})
+        return {"coating": stated_coating(observations)} | _star_of(observations)
 
     @staticmethod
     def coating_on(date):

@@ -1,13 +1,21 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What stands before the half-wave plate on sky: a star, and the telescope's tertiary mirror."""
 
+import re
 import warnings
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics, standards
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, InstrumentError
+from astropolcal.chain import leaves
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    ChainError,
+    InstrumentError,
+)
+from astropolcal.observations import is_star
 
 __all__ = [
     "M3_MODELS",
@@ -262,3 +270,21 @@ def _catalogued(target, wavelength):
         return standards.get(target).stokes(wavelength)
     except AstropolcalError:
         return None
+
+
+def _behind_telescope(chain, name, error=ChainError):
+    """Return the optics of an instrument's chain from the half-wave plate on."""
+    found = leaves(chain)
+    start = next((i for i, leaf in enumerate(found) if leaf.name == "hwp"), None)
+    if start is None:
+        raise error(f"{name}: the chain has no optic 'hwp' to put the telescope before")
+    return found[start:]
+
+
+def _star_of(observations):
+    """Return the options of a chain that name its star: ``star_`` and the object's name."""
+    target = str(observations.meta.get("object") or "")
+    words = re.sub(r"\W+", "", target)
+    if not words or not is_star(observations.source):
+        return {}
+    return {"star": f"star_{words}", "target": target}

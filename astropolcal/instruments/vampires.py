@@ -14,18 +14,22 @@ All retardances with the other sign, (H, 45, R) to (-H, -45, R), give the same d
 the half-wave plate exclude them, and those of the derotator exclude a further turn.
 """
 
-import re
-
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join, leaves, stages
+from astropolcal.chain import join, stages
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments import _vampires_optics as _optics
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.nuisance import without_nuisance
-from astropolcal.instruments.telescope import M3_MODELS, star_source, telescope
+from astropolcal.instruments.telescope import (
+    M3_MODELS,
+    _behind_telescope,
+    _star_of,
+    star_source,
+    telescope,
+)
 from astropolcal.instruments.vampires_headers import (
     KEYWORDS,
     LAYOUT,
@@ -185,21 +189,12 @@ class VAMPIRES(Instrument):
         chain = without_nuisance(chain)
         if "parallactic" in stages(chain):
             return chain
-        found = leaves(chain)
-        start = next((i for i, leaf in enumerate(found) if leaf.name == "hwp"), None)
-        if start is None:
-            raise InstrumentError(
-                "vampires: the chain has no optic 'hwp' to put the telescope before"
-            )
-        return join([*telescope(_optics.silver("m3")), *found[start:]])
+        behind = _behind_telescope(chain, self.name, InstrumentError)
+        return join([*telescope(_optics.silver("m3")), *behind])
 
     def particulars(self, observations):
         """Return name of the source optic and target of a star: ``star_`` and the object's name."""
-        target = str(observations.meta.get("object") or "")
-        words = re.sub(r"\W+", "", target)
-        if not words or not is_star(observations.source):
-            return {}
-        return {"star": f"star_{words}", "target": target}
+        return _star_of(observations)
 
     def published(self):
         """

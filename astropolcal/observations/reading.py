@@ -18,7 +18,7 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import check_yaml, understood
+from astropolcal.files import check_yaml, one_line, understood
 from astropolcal.observations.wavelengths import stated_wavelength
 
 __all__ = ["check_table", "complete_table", "first_bad_row", "numeric_column", "read_ecsv"]
@@ -71,7 +71,7 @@ def _read_text(path):
         with understood(path, ObservationError, "cannot be read"):
             return Path(path).read_bytes().decode("utf-8")
     except ObservationError as error:
-        if Path(path).is_dir():
+        if str(error).endswith("is a folder, not a file"):
             raise ObservationError(f"{path}: is a folder, an ECSV file is needed") from None
         if isinstance(error.__cause__, UnicodeDecodeError):
             raise ObservationError(f"{path}: not a text file, an ECSV table is needed") from None
@@ -222,10 +222,10 @@ def _beams(table, label):
     check_table(table, label, _SINGLE)
     unit = getattr(table[_SINGLE[0]], "unit", None) or u.dimensionless_unscaled
     difference, total = (numeric_column(table, name, label, unit) for name in _SINGLE)
-    return {
-        "flux_right": 0.5 * (total + difference) * unit,
-        "flux_left": 0.5 * (total - difference) * unit,
-    }
+    # what is beyond all numbers becomes infinite, and is masked like that
+    with np.errstate(over="ignore", invalid="ignore"):
+        right, left = 0.5 * (total + difference), 0.5 * (total - difference)
+    return {"flux_right": right * unit, "flux_left": left * unit}
 
 
 def numeric_column(table, name, label, unit=None):
@@ -287,7 +287,7 @@ def _convert(values, own, unit, name, label):
         factor = u.Unit(own).to(unit)
     except (u.UnitsError, TypeError, ValueError, AttributeError):
         raise ObservationError(
-            f"{label}: column {name} has unit {own}, a unit {example} is needed"
+            f"{label}: column {name} has unit {one_line(own, 60)}, a unit {example} is needed"
         ) from None
     with np.errstate(over="ignore", under="ignore"):
         return values if factor == 1.0 else values * factor

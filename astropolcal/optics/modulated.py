@@ -14,7 +14,11 @@ import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller.elements import _elliptical_retarder, _linear_retarder
+from astropolcal.mueller.elements import (
+    _elliptical_retarder,
+    _linear_retarder,
+    _rotation_matrix,
+)
 from astropolcal.optics.beamsplitters import BEAMS, _BeamOptic
 from astropolcal.optics.core import Optic, blank
 from astropolcal.optics.retarders import EllipticalRetarder, _linear_slope
@@ -136,7 +140,7 @@ class HarmonicRotator(_Harmonic):
     sine = Parameter(default=0.0, unit=u.deg, bounds=(-30, 30), description="sine amplitude")
 
     def _matrix(self, coordinate, cosine, sine):
-        return _turned(self._sum(coordinate, cosine, sine))
+        return _rotation_matrix(self._sum(coordinate, cosine, sine))
 
     def _derivatives(self, coordinate, cosine, sine):
         slope = _turned_slope(self._sum(coordinate, cosine, sine))
@@ -170,7 +174,7 @@ class DriftRotator(FrameOptic):
     rate = Parameter(default=0.0, unit=u.deg, bounds=(-30, 30), description="angle over the run")
 
     def _matrix(self, coordinate, rate):
-        return _turned(rate * np.asarray(coordinate))
+        return _rotation_matrix(rate * np.asarray(coordinate))
 
     def _derivatives(self, coordinate, rate):
         return (_times(coordinate, _turned_slope(rate * np.asarray(coordinate))),)
@@ -543,16 +547,6 @@ def _scaled(gain):
 
 def _times(factor, matrix):
     return np.asarray(factor)[..., None, None] * matrix
-
-
-def _turned(angle):
-    """Return T(angle)."""
-    out = blank(angle)
-    out[..., 0, 0] = out[..., 3, 3] = 1.0
-    out[..., 1, 1] = out[..., 2, 2] = np.cos(2 * angle)
-    out[..., 1, 2] = np.sin(2 * angle)
-    out[..., 2, 1] = -out[..., 1, 2]
-    return out
 
 
 def _turned_slope(angle):

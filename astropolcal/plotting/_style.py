@@ -2,11 +2,13 @@
 """Colours, markers, sizes, and what else all figures have in common."""
 
 from itertools import cycle, islice
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.files import atomic_path
 
 # Okabe & Ito (2008), distinct for all kinds of colour vision; yellow is too pale for lines
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
@@ -19,6 +21,7 @@ GREY = "0.45"
 MINUS, SIGMA = "\N{MINUS SIGN}", "\N{GREEK SMALL LETTER SIGMA}"
 # more names than this do not fit into a title
 _MAX_NAMES = 2
+_DPI = 150
 
 _SETTINGS = {
     "font.size": 11,
@@ -66,8 +69,23 @@ def looks(count):
     return list(islice(zip(cycle(COLORS), cycle(MARKERS), strict=False), count))
 
 
-def heading(figure, calibration, what, names):
+def save(figure, path, error=AstropolcalError):
+    """Write a figure, atomically; raise ``error`` if the suffix is that of no known format."""
+    path = Path(path)
+    if path.suffix.removeprefix(".").lower() not in figure.canvas.get_supported_filetypes():
+        raise error(f"{path}: no format of this suffix is known")
+    with atomic_path(path, error) as temporary:
+        figure.savefig(temporary, dpi=_DPI)
+    return path
+
+
+def heading(figure, calibration, what, names=None):
     """Title a figure with what it shows, of what, and whether the fit is to be trusted."""
+    if names is None:
+        if not hasattr(calibration, "datasets"):
+            figure.suptitle(what)
+            return
+        names = [record.name for record in calibration.datasets]
     state = "" if calibration.converged else "  (FIT NOT CONVERGED)"
     of = ", ".join(names) if len(names) <= _MAX_NAMES else f"{len(names)} datasets"
     instrument = f"{calibration.instrument}: " if calibration.instrument else ""
@@ -90,6 +108,13 @@ def nanometres(wavelength):
 def wavelength_label(axes):
     """Label the wavelength axis."""
     axes.set_xlabel("wavelength (nm)")
+
+
+def draw_line(axes, lam, values, **look):
+    """Draw values over the wavelength, which need not be in order; return the line."""
+    order = np.argsort(lam)
+    (line,) = axes.plot(np.asarray(lam)[order], np.asarray(values)[order], **look)
+    return line
 
 
 def clusters(values, gap):

@@ -14,6 +14,7 @@ from astropolcal.plotting._style import (
     PURPLE,
     VERMILION,
     canvas,
+    draw_line,
     heading,
     legend_outside,
     nanometres,
@@ -144,14 +145,8 @@ def _draw_record(axes, record, calibration):
         if not np.isfinite(values).any():
             label = f"{name}: not known (too few data or groups)"
         lam = nanometres(record.accuracy["wavelength"])
-        drawn[name] = _line(axes, lam, values, color=color, marker=marker, label=label)
+        drawn[name] = draw_line(axes, lam, values, color=color, marker=marker, label=label)
     return drawn
-
-
-def _line(axes, lam, values, **look):
-    order = np.argsort(lam)
-    (line,) = axes.plot(np.asarray(lam)[order], np.asarray(values)[order], **look)
-    return line
 
 
 def _standard_looks(standards):
@@ -175,7 +170,7 @@ def _placed(panels, records, standards, others):
 
 def _draw_standard(axes, entry, look):
     label = f"s_standard: rms error when predicting {entry['name']}, which was not fitted"
-    line = _line(
+    line = draw_line(
         axes, entry["wavelength_nm"], entry["s_standard_percent"], color=PURPLE, label=label, **look
     )
     return {entry["content_hash"]: line}
@@ -184,7 +179,7 @@ def _draw_standard(axes, entry, look):
 def _draw_standard_s_cv(axes, entry):
     """Draw what a standard of another source is compared with."""
     label = "s_cv of the data that were fitted, for comparison"
-    line = _line(
+    line = draw_line(
         axes, entry["wavelength_nm"], entry["s_cv_percent"], color=GREEN, alpha=0.6, label=label
     )
     return {"s_cv for comparison": line}

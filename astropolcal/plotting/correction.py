@@ -1,12 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Corrected science: images of the Stokes parameters, spectra, how well they are determined."""
 
-from pathlib import Path
-
 import numpy as np
 
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.files import atomic_path
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
@@ -17,13 +14,13 @@ from astropolcal.plotting._style import (
     canvas,
     legend_outside,
     nanometres,
+    save,
     style,
     wavelength_label,
 )
 
 __all__ = ["plot_corrected", "plot_images", "plot_spectrum", "save_figure"]
 
-_DPI = 150
 # of the brightest pixels, those beyond this quantile may saturate the colours
 _QUANTILE = 0.995
 _COLORS = {"q": BLUE, "u": VERMILION, "v": GREEN}
@@ -364,8 +361,4 @@ def save_figure(figure, path):
     ...
     astropolcal.exceptions.ObservationError: figure.xyz: no format of this suffix is known
     """
-    path = Path(path)
-    if path.suffix.removeprefix(".").lower() not in figure.canvas.get_supported_filetypes():
-        raise ObservationError(f"{path}: no format of this suffix is known")
-    with atomic_path(path, ObservationError) as temporary:
-        figure.savefig(temporary, dpi=_DPI)
+    save(figure, path, ObservationError)

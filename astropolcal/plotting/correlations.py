@@ -72,11 +72,7 @@ def plot_correlations(calibration, *, figure=None):
             _write(axes, edges, matrix)
         figure.colorbar(image, ax=axes, shrink=0.7, pad=0.02, label="correlation")
         _explain(figure, matrix)
-        if hasattr(calibration, "datasets"):
-            names = [record.name for record in calibration.datasets]
-            heading(figure, calibration, "Correlations of the parameters", names)
-        else:
-            figure.suptitle("Correlations of the parameters")
+        heading(figure, calibration, "Correlations of the parameters")
     return figure
 
 

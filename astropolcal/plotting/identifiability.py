@@ -108,11 +108,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
         _draw_conditions(figure.add_subplot(grid[0, 1]), finding, angles)
         _draw_loadings(figure, figure.add_subplot(grid[1, :]), finding, rows)
         _write_words(figure.add_subplot(grid[2, :]), words)
-        if hasattr(calibration, "datasets"):
-            names = [record.name for record in calibration.datasets]
-            heading(figure, calibration, "What the data determine", names)
-        else:
-            figure.suptitle("What the data determine")
+        heading(figure, calibration, "What the data determine")
     return figure
 
 

@@ -103,7 +103,7 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
             last = column[len(shown) - 1]
             last.tick_params(labelbottom=True)
             wavelength_label(last)
-        heading(figure, calibration, "Mirrors", [record.name for record in calibration.datasets])
+        heading(figure, calibration, "Mirrors")
         _legend(figure, panels)
     return figure
 

@@ -270,5 +270,5 @@ def _grid(figure, count):
 
 
 def _finish(figure, axes, calibration, what):
-    heading(figure, calibration, what, [record.name for record in calibration.datasets])
+    heading(figure, calibration, what)
     legend_of(figure, axes, calibration)

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.files import atomic_path
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
@@ -15,6 +14,7 @@ from astropolcal.plotting._style import (
     VERMILION,
     canvas,
     legend_outside,
+    save,
     style,
 )
 from astropolcal.reduction.frames import open_cube
@@ -22,7 +22,6 @@ from astropolcal.reduction.photometry import BEAMS
 
 __all__ = ["plot_apertures", "plot_run", "save_quicklook"]
 
-_DPI = 130
 _COLORS = {"right": VERMILION, "left": BLUE}
 _LINES = {"right": "-", "left": "--"}
 _MARKERS = {"right": "o", "left": "s"}
@@ -65,10 +64,7 @@ def plot_apertures(reduction, *, frames=None, wavelength=None, figure=None):
     astropolcal.exceptions.ParameterError: the reduction has no frames
     """
     chosen = _chosen(reduction, frames)
-    grid = reduction.instrument.wavelength
-    k = len(grid) // 2 if wavelength is None else int(wavelength)
-    if not 0 <= k < len(grid):
-        raise ParameterError(f"wavelength = {k}; allowed are 0 to {len(grid) - 1}")
+    k, at = _slice(reduction, wavelength)
     columns = min(4, len(chosen))
     rows = -(-len(chosen) // columns)
     with style():
@@ -84,7 +80,7 @@ def plot_apertures(reduction, *, frames=None, wavelength=None, figure=None):
         for panel in axes[::columns]:
             panel.set_ylabel("y (pixel)")
         figure.suptitle(
-            f"Apertures at {grid[k].to_value('nm'):.0f} nm "
+            f"Apertures at {at} "
             f"({len(chosen)} of {len(reduction.frames)} frames; square-root scale)"
         )
         legend_outside(figure, _handles(reduction.source, gaps), columns=4)
@@ -101,6 +97,15 @@ def _chosen(reduction, frames):
     if chosen.size == 0 or chosen.min() < 0 or chosen.max() >= count:
         raise ParameterError(f"frames = {chosen.tolist()}; allowed are 0 to {count - 1}")
     return chosen
+
+
+def _slice(reduction, wavelength):
+    """Return the index of a slice, by default the middle one, and its wavelength in words."""
+    grid = reduction.instrument.wavelength
+    k = len(grid) // 2 if wavelength is None else int(wavelength)
+    if not 0 <= k < len(grid):
+        raise ParameterError(f"wavelength = {k}; allowed are 0 to {len(grid) - 1}")
+    return k, f"{grid[k].to_value('nm'):.0f} nm"
 
 
 def _handles(source, gaps):
@@ -216,10 +221,7 @@ def plot_run(reduction, *, wavelength=None, figure=None):
     astropolcal.exceptions.ParameterError: the reduction has no frames
     """
     _chosen(reduction, None)
-    grid = reduction.instrument.wavelength
-    k = len(grid) // 2 if wavelength is None else int(wavelength)
-    if not 0 <= k < len(grid):
-        raise ParameterError(f"wavelength = {k}; allowed are 0 to {len(grid) - 1}")
+    k, at = _slice(reduction, wavelength)
     star = reduction.source == "star"
     clock, label = _clock(reduction.frames)
     with style():
@@ -229,7 +231,7 @@ def plot_run(reduction, *, wavelength=None, figure=None):
         if star:
             _draw_places(axes[2:], reduction, clock, k)
         axes[-1].set_xlabel(label)
-        figure.suptitle(f"The run at {grid[k].to_value('nm'):.0f} nm")
+        figure.suptitle(f"The run at {at}")
         figure.align_ylabels()
         legend_outside(figure, _run_handles(reduction, k), columns=4)
     return figure
@@ -337,7 +339,5 @@ def save_quicklook(reduction, folder):
         raise ObservationError(f"{folder}: cannot be made: {error.strerror}") from None
     written = []
     for name, plot in (("apertures.png", plot_apertures), ("run.png", plot_run)):
-        with atomic_path(folder / name, ObservationError) as temporary:
-            plot(reduction).savefig(temporary, dpi=_DPI)
-        written.append(folder / name)
+        written.append(save(plot(reduction), folder / name, ObservationError))
     return written

@@ -13,7 +13,7 @@ from astropolcal.exceptions import (
     ChainError,
     ObservationError,
 )
-from astropolcal.files import atomic_path
+from astropolcal.plotting._style import save
 from astropolcal.plotting.accuracy import plot_accuracy
 from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
@@ -31,8 +31,6 @@ from astropolcal.plotting.star_check import plot_star_check
 from astropolcal.plotting.targets import plot_target_accuracy
 
 __all__ = ["save_all"]
-
-_DPI = 150
 
 
 def save_all(calibration, folder):
@@ -103,7 +101,7 @@ def save_all(calibration, folder):
             figure = draw()
         except (ChainError, CalibrationFileError, ObservationError):
             continue
-        paths.append(_save(figure, folder / f"{name}.png"))
+        paths.append(save(figure, folder / f"{name}.png"))
     if calibration.posterior is not None:
         paths += _save_posterior(calibration.posterior, folder)
     return paths
@@ -121,7 +119,7 @@ def _save_posterior(posterior, folder):
         except AstropolcalError as error:
             warnings.warn(f"{path} is not drawn: {error}", AstropolcalWarning, stacklevel=3)
             continue
-        paths.append(_save(figure, path))
+        paths.append(save(figure, path))
     return paths
 
 
@@ -155,9 +153,3 @@ def _figures(calibration):
     yield "efficiency", lambda: plot_efficiency(calibration)
     yield "correlations", lambda: plot_correlations(calibration)
     yield "other_parameters", lambda: plot_parameters(calibration, other_parameters(calibration))
-
-
-def _save(figure, path):
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=_DPI)
-    return path

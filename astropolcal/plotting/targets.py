@@ -9,6 +9,7 @@ from astropolcal.calibration.target_accuracy import TARGETS
 from astropolcal.exceptions import ObservationError
 from astropolcal.plotting._style import (
     canvas,
+    draw_line,
     heading,
     legend_outside,
     looks,
@@ -85,8 +86,7 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
         panels[1].set_title("Degree of polarization of a target")
         panels[2].set_title("Angle of polarization of a target")
         wavelength_label(panels[2])
-        names = [record.name for record in calibration.datasets]
-        heading(figure, calibration, "Accuracy for targets", names)
+        heading(figure, calibration, "Accuracy for targets")
         legend_outside(figure, [*handles, *lines])
     return figure
 
@@ -100,8 +100,7 @@ def _draw_parts(axes, table):
         if not np.isfinite(value).any():
             label = f"{key}: not known, no such dataset"
         # what is exactly zero stands for a calibration that is missing
-        order = np.argsort(lam)
-        handles += axes.plot(lam[order], value[order], color=color, marker=marker, label=label)
+        handles.append(draw_line(axes, lam, value, color=color, marker=marker, label=label))
         values.append(value)
     scale_axis(axes, np.concatenate(values))
     return handles
@@ -112,9 +111,8 @@ def _draw_targets(axes, tables, key):
     # apart from the looks of the parts, which share the legend
     for table, (color, marker) in zip(tables, looks(len(tables) + 4)[4:], strict=True):
         lam, value = nanometres(table["wavelength"]), table[key].value
-        order = np.argsort(lam)
         label = f"target of {_words(table)}"
-        lines += axes.plot(lam[order], value[order], color=color, marker=marker, label=label)
+        lines.append(draw_line(axes, lam, value, color=color, marker=marker, label=label))
         values.append(value)
     scale_axis(axes, np.concatenate(values))
     return lines

@@ -25,11 +25,10 @@ from astropolcal.gap.effects.base import (
     Effect,
     EffectParameter,
     Insertion,
-    Roles,
-    adapted,
     tracking_laws,
 )
 from astropolcal.gap.effects.check import check_against, check_declared
+from astropolcal.gap.effects.roles import Roles, adapted
 
 __all__ = [
     "EFFECTS",

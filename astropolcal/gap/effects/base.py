@@ -16,13 +16,13 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 
-from astropolcal import instruments, optics
-from astropolcal.chain import insert_optic, leaves
+from astropolcal import instruments
+from astropolcal.chain import insert_optic
 from astropolcal.exceptions import InstrumentError
+from astropolcal.gap.effects.roles import SEVERAL, Roles
 from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointing import TRACKING
-from astropolcal.optics import COORDINATES
 
 __all__ = [
     "KINDS",
@@ -31,8 +31,6 @@ __all__ = [
     "Effect",
     "EffectParameter",
     "Insertion",
-    "Roles",
-    "adapted",
     "tracking_laws",
 ]
 
@@ -176,156 +174,6 @@ def _tracking_law(observations):
         return instruments.get(observations.instrument).plate_law(observations)
     except InstrumentError:
         return TRACKING
-
-
-class Roles:
-    """
-    The optics of a chain by what they are for.
-
-    There may be several of a kind. The plates are the retarders on the stage ``hwp``, and those
-    on a stage in front of it; the derotators are retarders on a stage behind the plate, whatever
-    it is called; the telescope's mirrors stand between the rotation by the parallactic angle and
-    the plate.
-
-    Parameters
-    ----------
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        The chain.
-    **chosen
-        Role to the name of the optic that has it, where that is not the first of its kind.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.effects import Roles
-    >>> roles = Roles(instruments.get("charis").chain())
-    >>> roles.plate.name, roles.derotator.name, roles.splitter.name
-    ('hwp', 'derotator', 'wollaston')
-    >>> irdis = Roles(instruments.get("irdis").chain("star"))
-    >>> [mirror.name for mirror in irdis.all("telescope_mirror")]
-    ['ut', 'm4']
-    """
-
-    def __init__(self, chain, **chosen):
-        self.leaves = leaves(chain)
-        # what an effect has added stands for nothing else
-        self._own = [o for o in self.leaves if o.name and not o.name.startswith("gap_")]
-        self._kinds = {
-            "polarizer": [o for o in self._own if isinstance(o, optics.LinearPolarizer)],
-            "mirror": self._source_mirrors(),
-            **self._turning(),
-        }
-        self._kinds["telescope_mirror"] = self._telescope_mirrors()
-        for role, found in self._kinds.items():
-            name = chosen.get(role)
-            own = (o for o in found if name in (None, o.name))
-            setattr(self, role, next(own, None))
-        self.splitter = next((o for o in self._own if isinstance(o, optics.WollastonPrism)), None)
-        #: What static optics of the relay stand behind.
-        self.relay = self.derotator or self.plate
-        #: The plate, where the model has nothing in front of it that could polarize.
-        self.entrance = self.plate if self._is_entrance() else None
-
-    def all(self, role):
-        """Return all optics of a role, in the order in which light meets them."""
-        return self._kinds.get(role, [])
-
-    def _source_mirrors(self):
-        """Return what stands in the place of the polarizer for unpolarized light."""
-        first = self.leaves[0]
-        kinds = (optics.Diattenuator, optics.DiattenuatorRetarder)
-        return [first] if isinstance(first, kinds) and first.stage is None else []
-
-    def _turning(self):
-        """Return plates and derotators."""
-        found = [o for o in self._own if _retards(o) and o.stage not in (None, *_NO_STAGES)]
-        names = [o.stage for o in found]
-        middle = names.index("hwp") if "hwp" in names else -1
-        plates = [o for o in found if o.stage == "hwp"]
-        plates += found[: max(middle, 0)]
-        behind = [o for o in found if not any(o is plate for plate in plates)]
-        return {"plate": plates, "derotator": sorted(behind, key=lambda o: o.stage != "derotator")}
-
-    def _in_front(self):
-        """Return what stands between the rotation by the parallactic angle and the plate."""
-        names = [o.stage for o in self._own]
-        start = names.index("parallactic") + 1 if "parallactic" in names else len(names)
-        plate = self._kinds["plate"]
-        end = next((i for i, o in enumerate(self._own) if plate and o is plate[0]), start)
-        return [o for o in self._own[start:end] if not isinstance(o, optics.Rotator)]
-
-    def _telescope_mirrors(self):
-        return [o for o in self._in_front() if hasattr(o, "diattenuation")]
-
-    def _is_entrance(self):
-        if self.plate is None:
-            return False
-        if self._own[0] is self.plate:
-            return True
-        on = {o.stage for o in self._own}
-        if "parallactic" not in on or "altitude" in on:
-            return False
-        # the sky turns, and the instrument with the telescope
-        return all(getattr(o, key).fixed for o in self._in_front() for key in o.param_names)
-
-
-# positions that are not those of a stage which carries a retarder
-_NO_STAGES = ("parallactic", "altitude", *COORDINATES)
-
-
-def _retards(optic):
-    kinds = (
-        optics.LinearRetarder,
-        optics.EllipticalRetarder,
-        optics.TwoLayerWaveplate,
-        optics.DiattenuatorRetarder,
-        optics.KMirror,
-    )
-    return isinstance(optic, kinds)
-
-
-def adapted(effects, chains):
-    """
-    Return the effects of a library that chains have a place for, one for each optic of a kind.
-
-    Parameters
-    ----------
-    effects : sequence of Effect
-        The library.
-    chains : sequence
-        One a dataset.
-
-    Returns
-    -------
-    list of Effect
-        An effect that acts on one kind of optic comes once for each such optic: under its own name
-        for the first, as ``"name:optic"`` for the others. Where there is no derotator, the words
-        of what stands behind it name the half-wave plate.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.effects import EFFECTS, adapted
-    >>> chain = instruments.get("irdis").chain("star")
-    >>> chain["ut"].diattenuation.fixed = chain["m4"].diattenuation.fixed = True
-    >>> [effect.name for effect in adapted([EFFECTS["m3_diattenuation"]], [chain])]
-    ['m3_diattenuation', 'm3_diattenuation:m4']
-    """
-    chains = list(chains)
-    found = [one for effect in effects for one in effect.per_optic(chains)]
-    found = [one for one in found if one.applies(chains)]
-    if any(Roles(chain).derotator is not None for chain in chains):
-        return found
-    return [_reworded(one) for one in found]
-
-
-def _reworded(effect):
-    words = {"title": effect.title, "place": effect.place}
-    new = {key: text.replace(_BEHIND, _BEHIND_PLATE) for key, text in words.items()}
-    return effect if new == words else effect.changed(**new)
-
-
-_BEHIND, _BEHIND_PLATE = "behind the derotator", "behind the half-wave plate"
 
 
 class Effect(ABC):
@@ -476,10 +324,6 @@ class Effect(ABC):
         return f"<Effect {self.name}: {self.title}>"
 
 
-# roles of which a chain may have several optics
-_SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
-
-
 def label_of(name):
     """Return the name of an optic that an effect adds."""
     return "gap_" + re.sub(r"\W", "_", name)
@@ -518,7 +362,7 @@ class Insertion(Effect):
     @property
     def acts_on(self):
         """Role of the optic that it acts on, where there may be several of a kind."""
-        return self.anchor if self.anchor in _SEVERAL else None
+        return self.anchor if self.anchor in SEVERAL else None
 
     @property
     def label(self):

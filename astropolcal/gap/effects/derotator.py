@@ -6,8 +6,8 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import insert_optic, replace_optic
-from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion, label_of
-from astropolcal.gap.effects.plate import _Around
+from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, label_of
+from astropolcal.gap.effects.plate import PlateDiattenuation, PlateEccentricity, _Around
 from astropolcal.gap.effects.relay import _BandAverage
 from astropolcal.measurement import Tie
 
@@ -179,7 +179,7 @@ class DerotatorBandAverage(_BandAverage):
         return roles.derotator
 
 
-class DerotatorDiattenuation(Insertion):
+class DerotatorDiattenuation(PlateDiattenuation):
     """
     Diattenuation of the derotator.
 
@@ -194,17 +194,11 @@ class DerotatorDiattenuation(Insertion):
     title = "diattenuation of the derotator"
     shows = "harmonic 2 of the derotator angle, constant with the plate"
     reference = "van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
-    anchor, follows = "derotator", True
+    anchor, side = "derotator", "after"
     free = {"diattenuation": (0.005, 0.2)}
 
-    def build(self, size, anchor, context):
-        """Return a diattenuator that turns with the derotator."""
-        return optics.Diattenuator(
-            diattenuation=np.zeros(size), mount=anchor.mount, name=self.label
-        )
 
-
-class DerotatorEccentricity(_Around):
+class DerotatorEccentricity(PlateEccentricity):
     """
     Scale of the derotator's encoder that is not centred.
 
@@ -219,12 +213,7 @@ class DerotatorEccentricity(_Around):
     title = "angle of the derotator wrong once a turn (eccentric encoder)"
     shows = "rotation of Q and U with the derotator angle, the same at all wavelengths"
     reference = "geometry of an eccentric scale; compare van Holstein et al. 2020"
-    anchor, side, degree, harmonic = "derotator", "before", None, 1
-    free = {"cosine": (0.1 * u.deg, 5 * u.deg), "sine": (0.1 * u.deg, 5 * u.deg)}
-
-    def build(self, size, anchor, context):
-        """Return a rotator by an angle that varies with the derotator angle."""
-        return optics.HarmonicRotator(harmonic=self.harmonic, mount=anchor.mount, name=self.label)
+    anchor = "derotator"
 
 
 class DerotatorTwoLobes(DerotatorEccentricity):

@@ -65,6 +65,8 @@ class _BothBeams(Insertion):
     """A gain of both beams that depends on their own fluxes, with one coefficient."""
 
     anchor, degree, power, stage = "splitter", 0, 1, "flux"
+    #: Whether the stage gives a ratio of fluxes, which needs no flux to refer to.
+    is_ratio = False
 
     def build(self, size, anchor, context):
         """Return a gain that depends on the flux."""
@@ -72,7 +74,7 @@ class _BothBeams(Insertion):
             right=np.zeros(size),
             left=np.zeros(size),
             power=self.power,
-            reference=context.flux,
+            reference=1.0 if self.is_ratio else context.flux,
             mount=self.stage,
             name=self.label,
         )
@@ -117,16 +119,5 @@ class Persistence(_BothBeams):
     title = "light of the frame before that is still in the detector"
     shows = "differences that follow those of the frame before"
     reference = "Smith et al. 2008, doi:10.1117/12.789372"
-    stage = "previous_flux"
+    power, stage, is_ratio = -1, "previous_flux", True
     free = {"right": (0.003, 0.1), "left": (0.003, 0.1)}
-
-    def build(self, size, anchor, context):
-        """Return a gain by the ratio of the frame before to this one."""
-        return optics.FluxGain(
-            right=np.zeros(size),
-            left=np.zeros(size),
-            power=-1,
-            reference=1.0,
-            mount=self.stage,
-            name=self.label,
-        )

@@ -108,20 +108,15 @@ class PlateSign(_Discrete):
     name, place = "hwp_sign", "stage of the half-wave plate"
     title = "angle of the half-wave plate with the wrong sign"
     shows = "everywhere: the polarization turns the other way"
-    role = "plate"
-
-    @property
-    def acts_on(self):
-        """Role of the optic whose angle it is."""
-        return self.role
+    acts_on = "plate"
 
     def applies_to(self, roles):
         """Return whether there is an optic on the stage."""
-        return getattr(roles, self.role) is not None
+        return getattr(roles, self.acts_on) is not None
 
     def change(self, chain, roles):
         """Return the chain with the sign of the stage turned."""
-        leaf = next(o for o in leaves(chain) if o.name == getattr(roles, self.role).name)
+        leaf = next(o for o in leaves(chain) if o.name == getattr(roles, self.acts_on).name)
         leaf.mount = leaf.stage if leaf.stage_sign < 0 else f"-{leaf.stage}"
         return chain
 
@@ -133,11 +128,11 @@ class DerotatorSign(PlateSign):
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("derotator_sign").role
+    >>> get_effect("derotator_sign").acts_on
     'derotator'
     """
 
-    name, place, role = "derotator_sign", "stage of the derotator", "derotator"
+    name, place, acts_on = "derotator_sign", "stage of the derotator", "derotator"
     title = "angle of the derotator with the wrong sign"
     shows = "everywhere that depends on the derotator angle"
 
@@ -186,7 +181,7 @@ class PlateOffset(PlateSign):
 
     def change(self, chain, roles):
         """Return the chain with the optic turned, and the bounds of its angle with it."""
-        name, offset = getattr(roles, self.role).name, self.offset.to_value(u.deg)
+        name, offset = getattr(roles, self.acts_on).name, self.offset.to_value(u.deg)
         leaf = next(o for o in leaves(chain) if o.name == name)
         bounds = [None if b is None else b + offset for b in leaf.theta.bounds]
         leaf.theta = (leaf.theta.value + offset) * u.deg
@@ -201,10 +196,10 @@ class DerotatorOffset(PlateOffset):
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("derotator_offset").role
+    >>> get_effect("derotator_offset").acts_on
     'derotator'
     """
 
-    name, place, role = "derotator_offset", "stage of the derotator", "derotator"
+    name, place, acts_on = "derotator_offset", "stage of the derotator", "derotator"
     title = "angle of the derotator from another zero or keyword, off by 45 deg"
     shows = "everywhere that depends on the derotator angle"

@@ -27,12 +27,7 @@ class _Freed(Effect):
     """Parameters of one optic that become free, within their bounds or wider ones."""
 
     kind = "parameter"
-    role = "plate"
-
-    @property
-    def acts_on(self):
-        """Role of the optic."""
-        return self.role
+    acts_on = "plate"
 
     #: Parameter to (size to expect, largest change that is physical).
     free = {"theta": (0.5 * u.deg, 5 * u.deg)}
@@ -43,7 +38,7 @@ class _Freed(Effect):
 
     def applies_to(self, roles):
         """Return whether one of the parameters is held."""
-        optic = getattr(roles, self.role)
+        optic = getattr(roles, self.acts_on)
         return optic is not None and any(
             self.is_open(getattr(optic, key), limit) for key, (_, limit) in self._own(optic)
         )
@@ -55,7 +50,7 @@ class _Freed(Effect):
         """Return the chains with the parameters free; see `Effect.edit`."""
         edited, added = [], {}
         for chain in chains:
-            optic = getattr(self.roles(chain), self.role)
+            optic = getattr(self.roles(chain), self.acts_on)
             if optic is not None:
                 fresh = optic.copy()
                 added |= self._release(fresh)
@@ -100,7 +95,7 @@ class PlateMisalignment(_Freed):
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("hwp_misalignment").role
+    >>> get_effect("hwp_misalignment").acts_on
     'plate'
     """
 
@@ -117,11 +112,11 @@ class DerotatorMisalignment(PlateMisalignment):
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("derotator_misalignment").role
+    >>> get_effect("derotator_misalignment").acts_on
     'derotator'
     """
 
-    name, place, role = "derotator_misalignment", "derotator", "derotator"
+    name, place, acts_on = "derotator_misalignment", "derotator", "derotator"
     title = "orientation of the derotator, which the model holds fixed"
     shows = "pattern in derotator angle of a turned derotator, with its retardance"
 
@@ -133,11 +128,11 @@ class PolarizerMisalignment(PlateMisalignment):
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("polarizer_misalignment").role
+    >>> get_effect("polarizer_misalignment").acts_on
     'polarizer'
     """
 
-    name, place, role = "polarizer_misalignment", "calibration polarizer", "polarizer"
+    name, place, acts_on = "polarizer_misalignment", "calibration polarizer", "polarizer"
     title = "orientation of the calibration polarizer, which the model holds fixed"
     shows = "phase of harmonic 4 of the plate angle, polarized data alone"
 
@@ -149,11 +144,11 @@ class MirrorMisalignment(PlateMisalignment):
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("mirror_misalignment").role
+    >>> get_effect("mirror_misalignment").acts_on
     'mirror'
     """
 
-    name, place, role = "mirror_misalignment", "mirror in front of the half-wave plate", "mirror"
+    name, place, acts_on = "mirror_misalignment", "mirror in front of the half-wave plate", "mirror"
     title = "orientation of the mirror in front of the half-wave plate, held fixed by the model"
     shows = "phase of harmonic 4 of the plate angle, unpolarized data alone"
     free = {"theta": (1 * u.deg, 45 * u.deg)}
@@ -201,7 +196,7 @@ class DerotatorAngleBound(PlateAngleBound):
     'bound'
     """
 
-    name, place, role = "derotator_angle_bound", "derotator", "derotator"
+    name, place, acts_on = "derotator_angle_bound", "derotator", "derotator"
     title = "orientation of the derotator beyond its bound"
 
 
@@ -216,7 +211,7 @@ class PolarizerAngleBound(PlateAngleBound):
     'bound'
     """
 
-    name, place, role = "polarizer_angle_bound", "calibration polarizer", "polarizer"
+    name, place, acts_on = "polarizer_angle_bound", "calibration polarizer", "polarizer"
     title = "orientation of the calibration polarizer beyond its bound"
 
 
@@ -243,11 +238,11 @@ class DerotatorRetardanceBound(_Lifted):
     Examples
     --------
     >>> from astropolcal.gap.effects import get_effect
-    >>> get_effect("derotator_retardance_bound").role
+    >>> get_effect("derotator_retardance_bound").acts_on
     'derotator'
     """
 
-    name, place, role = "derotator_retardance_bound", "derotator", "derotator"
+    name, place, acts_on = "derotator_retardance_bound", "derotator", "derotator"
     title = "retardance of the derotator beyond its bound"
     free = {
         key: (5 * u.deg, 180 * u.deg)

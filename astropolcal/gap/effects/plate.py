@@ -126,7 +126,7 @@ class PlateDiattenuation(Insertion):
     free = {"diattenuation": (0.003, 0.1)}
 
     def build(self, size, anchor, context):
-        """Return a diattenuator that turns with the plate."""
+        """Return a diattenuator that turns with the optic it stands next to."""
         return optics.Diattenuator(
             diattenuation=np.zeros(size), mount=anchor.mount, name=self.label
         )
@@ -288,7 +288,7 @@ class PlateEccentricity(_Around):
     free = {"cosine": (0.1 * u.deg, 5 * u.deg), "sine": (0.1 * u.deg, 5 * u.deg)}
 
     def build(self, size, anchor, context):
-        """Return a rotator by an angle that varies with the plate angle."""
+        """Return a rotator by an angle that varies with that of the stage."""
         return optics.HarmonicRotator(harmonic=self.harmonic, mount=anchor.mount, name=self.label)
 
 

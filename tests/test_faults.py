@@ -1,0 +1,435 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Full disks, killed processes, unwritable folders, and several writers at once."""
+
+import errno
+import json
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from astropolcal import Calibration, Observations
+from astropolcal.calibration import Library, _checkpoint, load, mueller_table, write_mueller
+from astropolcal.exceptions import AstropolcalError, CalibrationFileError, FitError, GapError
+from astropolcal.files import atomic_path
+from astropolcal.gap.challenge import _append, _journal
+from astropolcal.reduction.frames import Frame
+from astropolcal.reduction.journal import Journal
+from astropolcal.scripts._common import write_json
+from tests.fuzz.readers import READERS, Checkpoint, calibration, lab
+
+FORK = multiprocessing.get_context("fork")
+
+
+def product():
+    """Return a Stokes product that was read back."""
+    import tempfile
+
+    reader = READERS["product"]()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "good.fits"
+        path.write_bytes(reader.seeds()["image"])
+        return reader.read(path)
+
+
+def mueller():
+    positions = {name: [10.0, 20.0] * u.deg for name in ("hwp", "derotator")}
+    return mueller_table(load(calibration()), positions=positions, light="internal")
+
+
+WRITERS = {
+    "calibration": (".asdf", lambda: calibration().write),
+    "observations": (".ecsv", lambda: lab()[1].write),
+    "product": (".fits", lambda: product().write),
+    "mueller_ecsv": (".ecsv", lambda: lambda p, overwrite: write_mueller(mueller(), p, overwrite)),
+    "mueller_fits": (".fits", lambda: lambda p, overwrite: write_mueller(mueller(), p, overwrite)),
+    "json": (".json", lambda: lambda p, overwrite: write_json({"a": [1.5] * 3000}, p)),
+}
+
+
+@pytest.fixture(params=WRITERS)
+def writer(request):
+    """Suffix, and a function that writes a file of more than 4 kB."""
+    suffix, make = WRITERS[request.param]
+    return suffix, make()
+
+
+@contextmanager
+def files_up_to(size):
+    """Let no file grow beyond a size, as on a disk that is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    old = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, old)
+
+
+def assert_says(caught, path, *words):
+    text = str(caught.value)
+    assert str(path) in text
+    assert "\n" not in text
+    for word in words:
+        assert word in text
+
+
+# ---- full disk ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [0, 1, 3000])
+def test_full_disk_keeps_the_old_file(writer, tmp_path, size):
+    suffix, write = writer
+    path = tmp_path / f"out{suffix}"
+    path.write_bytes(b"what was there")
+    with files_up_to(size), pytest.raises(AstropolcalError, match="cannot be written") as caught:
+        write(path, overwrite=True)
+    assert_says(caught, path)
+    assert path.read_bytes() == b"what was there"
+    assert list(tmp_path.iterdir()) == [path]
+    write(path, overwrite=True)
+    assert path.stat().st_size > 4000
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO])
+def test_disk_that_is_full_when_it_is_synced(tmp_path, monkeypatch, number):
+    path = tmp_path / "cal.asdf"
+
+    def refuse(stream):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(CalibrationFileError, match=os.strerror(number)) as caught:
+        calibration().write(path)
+    advice = () if number == errno.EIO else ("free some space",)
+    assert_says(caught, path, *advice)
+    assert list(tmp_path.iterdir()) == []
+
+
+def no_room(*arguments):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def closed_badly(*arguments):
+    raise RuntimeError("Can't decrement id ref count (file write failed: time = now\n, errno = 28)")
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "what", "words"),
+    [
+        (os, "posix_fallocate", no_room, "free some space"),
+        (_checkpoint, "_allocate", closed_badly, "file write failed"),
+    ],
+)
+def test_full_disk_while_a_checkpoint_is_made(tmp_path, monkeypatch, place, name, what, words):
+    path = tmp_path / "chain.h5"
+    monkeypatch.setattr(place, name, what)
+    with pytest.raises(FitError, match="cannot be written") as caught:
+        Checkpoint()._run(path, 4)
+    assert_says(caught, path, words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_checkpoint_has_the_room_it_needs_from_the_start(tmp_path):
+    path = tmp_path / "chain.h5"
+    Checkpoint()._run(path, 1)
+    state = path.stat()
+    assert 512 * state.st_blocks >= state.st_size
+
+
+def test_failed_write_of_a_checkpoint_loses_one_interval(tmp_path, monkeypatch):
+    path, sync, calls = tmp_path / "chain.h5", _checkpoint.Chain._sync, []
+
+    def full(self):
+        calls.append(self.count)
+        if len(calls) > 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        sync(self)
+
+    monkeypatch.setattr(_checkpoint.Chain, "_sync", full)
+    with pytest.raises(FitError, match="2 steps are safe") as caught:
+        Checkpoint()._run(path, 8)
+    assert_says(caught, path, "No space left")
+    monkeypatch.setattr(_checkpoint.Chain, "_sync", sync)
+    reader = Checkpoint()
+    reader.check(reader.read(path), path)
+
+
+def test_write_that_fails_once_spoils_no_checkpoint(tmp_path, monkeypatch):
+    path, sync, calls = tmp_path / "chain.h5", _checkpoint.Chain._sync, []
+
+    def flaky(self):
+        calls.append(self.count)
+        if len(calls) == 4:
+            raise OSError(errno.EIO, "Input/output error")
+        sync(self)
+
+    # the steps that were not written go out when the file is closed
+    monkeypatch.setattr(_checkpoint.Chain, "_sync", flaky)
+    with pytest.raises(FitError, match="Input/output error"):
+        Checkpoint()._run(path, 8)
+    reader = Checkpoint()
+    reader.check(reader.read(path), path)
+
+
+def test_full_disk_while_a_challenge_is_appended(tmp_path):
+    path, settings = tmp_path / "run.jsonl", {"seed": 1}
+    _journal(path, settings)
+    _append(path, {"index": 0, "kind": "single"})
+    size = path.stat().st_size
+    with files_up_to(size + 10), pytest.raises(GapError, match="cannot be written") as caught:
+        _append(path, {"index": 1, "words": "x" * 4000})
+    assert_says(caught, path)
+    assert list(_journal(path, settings)) == [0]
+    _append(path, {"index": 1})
+    assert list(_journal(path, settings)) == [0, 1]
+
+
+# ---- folders -----------------------------------------------------------------------
+
+
+def test_folder_that_is_not_there(writer, tmp_path):
+    suffix, write = writer
+    path = tmp_path / "no" / f"out{suffix}"
+    with pytest.raises(AstropolcalError, match="no folder") as caught:
+        write(path, overwrite=True)
+    assert_says(caught, path)
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no folder /proc")
+def test_folder_in_which_nobody_can_write():
+    path = Path("/proc/self/out.asdf")
+    with pytest.raises(CalibrationFileError, match="cannot be written") as caught:
+        calibration().write(path)
+    assert_says(caught, path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write all")
+def test_folder_without_permission(writer, tmp_path):
+    suffix, write = writer
+    tmp_path.chmod(0o500)
+    with pytest.raises(AstropolcalError, match="name a folder that you may write to"):
+        write(tmp_path / f"out{suffix}", overwrite=True)
+    tmp_path.chmod(0o700)
+
+
+@pytest.mark.parametrize("name", ["", ".", "a\0b"])
+def test_what_is_no_name_of_a_file(name):
+    with pytest.raises(AstropolcalError, match="no name of a file"), atomic_path(name):
+        pass
+
+
+def test_long_names_can_be_written(tmp_path):
+    path = tmp_path / ("n" * 240 + ".txt")
+    with atomic_path(path) as temporary:
+        temporary.write_text("x")
+    assert path.read_text() == "x"
+
+
+# ---- killed processes --------------------------------------------------------------
+
+
+def killed(task, *arguments, after):
+    """Run a function in a process that is killed in the middle of it."""
+    process = FORK.Process(target=task, args=arguments)
+    process.start()
+    time.sleep(after)
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+
+
+def write_for_ever(path):
+    content = [b"a" * 300_000, b"b" * 300_000]
+    for i in range(10**9):
+        with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+            for start in range(0, 300_000, 3000):
+                stream.write(content[i % 2][start : start + 3000])
+
+
+def test_killed_writer_leaves_a_whole_file(tmp_path):
+    path = tmp_path / "out.bin"
+    path.write_bytes(b"a" * 300_000)
+    rng = np.random.default_rng(4)
+    for _ in range(12):
+        killed(write_for_ever, path, after=rng.uniform(0.02, 0.12))
+        assert path.read_bytes() in (b"a" * 300_000, b"b" * 300_000)
+    left = [p for p in tmp_path.iterdir() if p != path]
+    # hidden, so that no search for files of a kind finds them
+    assert all(p.name.startswith(".out.") for p in left)
+    for p in left:
+        os.utime(p, (0, 0))
+    other = tmp_path / ".out.bin.backup"
+    other.touch()
+    os.utime(other, (0, 0))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(b"new")
+    assert path.read_bytes() == b"new"
+    assert sorted(tmp_path.iterdir()) == sorted([path, other])
+
+
+def test_remains_of_a_process_of_the_same_number_do_not_disturb(writer, tmp_path):
+    suffix, write = writer
+    (tmp_path / f".out.{os.getpid()}.tmp{suffix}").write_bytes(b"remains")
+    write(tmp_path / f"out{suffix}", overwrite=False)
+    assert (tmp_path / f"out{suffix}").stat().st_size > 4000
+
+
+def write_calibrations(path):
+    cal = calibration()
+    while True:
+        cal.write(path, overwrite=True)
+
+
+def test_killed_calibrate_leaves_a_calibration_or_nothing(tmp_path):
+    path, digest = tmp_path / "cal.asdf", None
+    rng = np.random.default_rng(5)
+    for _ in range(4):
+        killed(write_calibrations, path, after=rng.uniform(0.1, 0.5))
+        if path.exists():
+            found = Calibration.read(path).to_dict()
+            assert digest in (None, found)
+            digest = found
+    # whatever was left is no part of a library
+    assert not Library(tmp_path).problems
+
+
+def append_challenges(path):
+    records = _journal(path, {"seed": 1})
+    for i in range(len(records), 10**9):
+        _append(path, {"index": i, "words": "x" * 500})
+
+
+def test_killed_challenges_go_on(tmp_path):
+    path, before = tmp_path / "run.jsonl", 0
+    rng = np.random.default_rng(6)
+    for _ in range(8):
+        killed(append_challenges, path, after=rng.uniform(0.03, 0.15))
+        if path.exists():
+            records = _journal(path, {"seed": 1})
+            assert sorted(records) == list(range(len(records)))
+            assert len(records) >= before
+            before = len(records)
+    assert before > 0
+
+
+def add_frames(path, folder):
+    journal = Journal(path, {})
+    for i in range(10**9):
+        journal.add(Frame(str(folder / f"{i % 5}.fits"), number=i, errors=["x" * 300]))
+
+
+def test_killed_reduction_goes_on(tmp_path):
+    for i in range(5):
+        (tmp_path / f"{i}.fits").write_bytes(b"x")
+    path, rng = tmp_path / "journal", np.random.default_rng(7)
+    for _ in range(6):
+        killed(add_frames, path, tmp_path, after=rng.uniform(0.03, 0.15))
+        assert Journal(path, {}).done(tmp_path / "0.fits").errors == ["x" * 300]
+    # a line that was cut off in the middle costs one frame
+    path.write_bytes(path.read_bytes()[:-100])
+    journal = Journal(path, {})
+    journal.add(Frame(str(tmp_path / "4.fits"), number=99))
+    journal.close()
+    assert Journal(path, {}).done(tmp_path / "4.fits").number == 99
+
+
+def sample_for_ever(path):
+    reader = Checkpoint()
+    type(reader).shape = (4000, 4, 2)
+    while True:
+        reader._run(path, 4000, resume=True)
+        path.unlink()
+
+
+def test_killed_sampler_goes_on(tmp_path, monkeypatch):
+    path, rng = tmp_path / "chain.h5", np.random.default_rng(8)
+    monkeypatch.setattr(Checkpoint, "shape", (4000, 4, 2))
+    for _ in range(6):
+        killed(sample_for_ever, path, after=rng.uniform(0.05, 0.3))
+        if path.exists():
+            chain = Checkpoint()._run(path, 10)
+            steps = np.arange(1.0, chain.count + 1)
+            assert np.array_equal(chain.coords[: chain.count, 0, 0], steps)
+
+
+# ---- several writers ---------------------------------------------------------------
+
+
+def add_to_library(folder, number, same, out):
+    library = Library(folder)
+    try:
+        for i in range(2):
+            year = 2025 if same else 2001 + 2 * number + i
+            library.add(
+                calibration(), valid_from=f"{year}-01-01", valid_until=f"{year}-12-31T23:00:00"
+            )
+        out.put((number, ""))
+    except Exception as error:
+        out.put((number, repr(error)))
+
+
+@pytest.mark.parametrize("same", [False, True])
+def test_several_processes_add_to_one_library(tmp_path, same):
+    calibration()
+    out = FORK.Queue()
+    processes = [
+        FORK.Process(target=add_to_library, args=(tmp_path, i, same, out)) for i in range(3)
+    ]
+    for process in processes:
+        process.start()
+    told = [out.get(timeout=120) for _ in processes]
+    for process in processes:
+        process.join()
+    assert [words for _, words in sorted(told)] == [""] * 3
+    library = Library(tmp_path)
+    assert not library.problems
+    assert not library.overlaps()
+    assert len(library) == (1 if same else 6)
+    left = {p.name for p in tmp_path.iterdir()} - {e.name for e in library.entries}
+    assert left == {".lock"}
+
+
+def test_killed_writer_does_not_lock_a_library(tmp_path):
+    killed(add_to_library, tmp_path, 0, False, FORK.Queue(), after=0.3)
+    Library(tmp_path).add(calibration(), valid_from="1999-01-01", valid_until="1999-06-01")
+    assert not Library(tmp_path).problems
+
+
+def write_tables(path, number):
+    data = lab()[1]
+    for _ in range(15):
+        data.write(path, overwrite=True)
+
+
+def test_several_processes_write_one_file(tmp_path):
+    path, digest = tmp_path / "night.ecsv", lab()[1].content_hash
+    processes = [FORK.Process(target=write_tables, args=(path, i)) for i in range(3)]
+    for process in processes:
+        process.start()
+    while any(process.is_alive() for process in processes):
+        if path.exists():
+            assert Observations.read(path).content_hash == digest
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_json_is_written_whole(tmp_path):
+    path = tmp_path / "out.json"
+    write_json({"a": 1}, path)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json({"a": float("nan")}, path)
+    assert json.loads(path.read_text()) == {"a": 1}
