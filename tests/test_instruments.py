@@ -11,7 +11,7 @@ from astropy.table import Table
 
 from astropolcal import instruments, optics
 from astropolcal.chain import join, leaves, stages
-from astropolcal.exceptions import AstropolcalError, InstrumentError
+from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError
 from astropolcal.instruments import CHARIS, Instrument
 from astropolcal.measurement import FreeParameters, Measurement
 from astropolcal.observations import Observations
@@ -399,3 +399,10 @@ def test_published_chain_of_the_instrument_agrees_with_the_table(published):
     assert chain["hwp"].w_sio2.value == pytest.approx(given["w_sio2_mm"])
     assert chain["hwp"].w_mgf2.value == pytest.approx(given["w_mgf2_mm"])
     assert chain["calibration_polarizer"].theta.value == pytest.approx(90 + given["offset_cal_deg"])
+
+
+@pytest.mark.parametrize("name", ["charis", "irdis", "vampires"])
+def test_on_sky_needs_a_half_wave_plate(name):
+    chain = optics.LinearPolarizer(name="polarizer") | optics.WollastonPrism(name="wollaston")
+    with pytest.raises((ChainError, InstrumentError), match="hwp"):
+        instruments.get(name).on_sky(chain)

@@ -64,6 +64,12 @@ def test_figure_is_written(tmp_path):
     assert (tmp_path / "efficiency.png").stat().st_size > 10_000
 
 
+def test_unknown_format_of_the_figure_is_refused(tmp_path):
+    with pytest.raises(AstropolcalError, match="xyz"):
+        run("-o", tmp_path / "efficiency.xyz", "-q")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("argv", "error", "words"),
     [
