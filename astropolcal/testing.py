@@ -424,9 +424,13 @@ class _Probe:
 
     def _observe(self, chain, source, grid=None, *, shift=0.0, noise=True):
         """Return simulated frames of a source, with everything that stands on a stage."""
-        frames = self._frames(chain, shift)
         meta = {"instrument": self.instrument.name, "date": "2020-01-01"}
         meta |= self.instrument.published_meta() | {"source": source}
+        frames = self._frames(chain, shift)
+        if "flc_state" in (*stages(chain), meta.get("pairing")):
+            # both states of a modulator at every position
+            frames = frames[np.repeat(np.arange(len(frames)), 2)]
+            frames["flc_state"] = np.tile([0, 1], len(frames) // 2)
         return simulate(
             chain,
             self.few if grid is None else grid,

@@ -19,7 +19,7 @@ from astropolcal.units import canonical_factor
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
-_ROUNDS = 3
+_ROUNDS, _MORE = 3, 3
 # a fit whose residuals are less probable than this may sit in a wrong minimum
 _NOISE = 1e-3
 # directions in which a size at its limit does less than this to the data, in units of the
@@ -330,6 +330,9 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
     for _ in range(_ROUNDS - 1 if like is None else 0):
         problem.settle_noise(found.coefficients)
         found = problem.fit(found.coefficients)
+    for _ in range(_MORE):
+        # along the flat valleys of a model that lacks much, a fit takes its time
+        found = found if found.converged else problem.fit(found.coefficients)
     if not (found.converged and np.isfinite(found.chi2)):
         raise _no_convergence()
     return Model(problem, found)
