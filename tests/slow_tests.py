@@ -12,7 +12,7 @@ from collections import defaultdict
 from pathlib import Path
 
 #: The longest case, and all cases of a test together, in seconds.
-ONE, ALL = 0.25, 1.0
+ONE, ALL = 0.1, 0.4
 LIST = Path(__file__).with_name("slow_tests.txt")
 
 
