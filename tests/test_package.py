@@ -20,8 +20,8 @@ def test_no_more_names_than_a_user_keeps_in_mind():
 
 
 def test_unknown_name():
-    with pytest.raises(AttributeError, match="'astropolcal' has no attribute 'callibrate'"):
-        _ = astropolcal.callibrate
+    with pytest.raises(AttributeError, match="'astropolcal' has no attribute 'no_such_name'"):
+        _ = astropolcal.no_such_name
 
 
 def test_import_loads_none_of_the_heavy_packages():
