@@ -119,7 +119,7 @@ class Chain:
         """Write a file with room for all steps; it takes its name when it is complete."""
         with atomic_path(path, error=FitError) as temporary, _as_os_errors():
             with h5py.File(temporary, "w", libver="earliest") as file:
-                file.attrs["format"] = _FORMAT
+                file.attrs["format"] = np.bytes_(_FORMAT)
                 text = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
                 file["description"] = text
                 for key, array in arrays.items():
@@ -243,8 +243,7 @@ def _read(h5py, path, names=()):
     if not path.exists():
         return None
     with _opened(h5py, path, "r") as file, _intact(path):
-        stated = file.attrs.get("format")
-        if not isinstance(stated, str) or stated != _FORMAT:
+        if _format_of(h5py, file) != _FORMAT.encode():
             raise FitError(f"{path}: is an HDF5 file but no checkpoint of this version")
         # looked up, not listed: a damaged list may claim any length
         fixed = file.get("fixed") if _is_own(h5py, file, "fixed") else None
@@ -260,6 +259,15 @@ def _read(h5py, path, names=()):
         if not 0 <= found["count"] <= capacity or len(steps["log_prob"]) != capacity:
             raise ValueError(f"it counts {found['count']} steps, and has room for {capacity}")
     return found
+
+
+def _format_of(h5py, file):
+    """Return what the file says it is; text of any length is in a heap, which may be damaged."""
+    if not h5py.h5a.exists(file.id, b"format"):
+        return None
+    attribute = h5py.h5a.open(file.id, b"format")
+    short = attribute.dtype.kind == "S" and attribute.dtype.itemsize < 100 and not attribute.shape
+    return bytes(file.attrs["format"]) if short else None
 
 
 def _is_own(h5py, file, name):

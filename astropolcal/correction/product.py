@@ -6,6 +6,7 @@ The primary array has the axes x, y, wavelength and Stokes (FITS order; spectra 
 two). The wavelengths, which need not be evenly spaced, stand in the table ``WAVELENGTH``.
 """
 
+import io
 import warnings
 from pathlib import Path
 
@@ -223,6 +224,7 @@ def read_product(path):
         with open(path, "rb") as stream, warnings.catch_warnings():
             # a wrong checksum is found when the data are read, and only warned of
             warnings.simplefilter("error", AstropyUserWarning)
+            _check_sizes(path, stream)
             with fits.open(stream, checksum=True, memmap=False) as hdus:
                 return _read(path, hdus)
     except FileNotFoundError:
@@ -253,6 +255,7 @@ def _read(path, hdus):
         key: header[keyword] for key, (keyword, _) in _KEYWORDS.items() if keyword in header
     }
     provenance["frames"] = [str(name) for name in Table.read(hdus["FRAMES"])["frame"]]
+    _check(path, hdus, stokes, codes, table)
     return Corrected(
         "".join(StokesCoord(codes).symbol),
         np.asarray(table["wavelength"], dtype=float) * u.Unit(table["wavelength"].unit),
@@ -271,6 +274,41 @@ def _read(path, hdus):
         header.get("PIXSCALE"),
         provenance,
     )
+
+
+def _check_sizes(path, stream):
+    """Refuse headers that claim more data than the file has, before anything is read."""
+    size = Path(path).stat().st_size
+    with fits.open(io.BytesIO(stream.read()), memmap=False) as hdus:
+        for hdu in hdus:
+            info = hdu.fileinfo()
+            if info["file"].compression is None and info["datLoc"] + info["datSpan"] > size:
+                raise ObservationError(f"{path}: truncated: {hdu.name or 'the image'} is not whole")
+    stream.seek(0)
+
+
+def _check(path, hdus, stokes, codes, table):
+    """Refuse parts that do not belong together."""
+    n, w = stokes.shape[:2] if stokes.ndim in (2, 4) else (0, 0)
+    pairs = n * (n + 1) // 2
+    needed = {"COVSTAT": (pairs, *stokes.shape[1:]), "SYSOPEN": (w, n, n)}
+    if "SYSFACT" in hdus:
+        needed["SYSFACT"] = (len(hdus["SYSFACT"].data), w, n, n)
+    wrong = [name for name, shape in needed.items() if name in hdus and hdus[name].shape != shape]
+    if tuple(codes) not in ((1, 2, 3), (1, 2, 3, 4)) or len(table) != w or wrong:
+        raise ObservationError(
+            f"{path}: not a readable product: Stokes parameters of shape {stokes.shape} do not fit "
+            f"{', '.join(wrong) or f'{len(table)} wavelengths and the codes {codes.tolist()}'}"
+        )
+    values = np.asarray(table["wavelength"], dtype=float)
+    if not np.all(np.isfinite(values) & (values > 0)) or not u.Unit(
+        table["wavelength"].unit
+    ).is_equivalent(u.um):
+        raise ObservationError(f"{path}: not a readable product: its wavelengths are no lengths")
+    if "COVSTAT" in hdus and n:
+        diagonal = [i for i, (a, b) in enumerate(covariance_index(n)) if a == b]
+        if np.any(hdus["COVSTAT"].data[diagonal] < 0):
+            raise ObservationError(f"{path}: not a readable product: negative variances")
 
 
 def _native(values):

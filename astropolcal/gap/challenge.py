@@ -303,8 +303,11 @@ def _journal(path, settings):
     whole = text[: text.rfind(b"\n") + 1]
     try:
         first, *others = [json.loads(line) for line in whole.splitlines()]
-        known, records = first["settings"], {record["index"]: record for record in others}
-    except (ValueError, KeyError, TypeError):
+        known, records = first["settings"], {_index(record): record for record in others}
+        # whatever is asked of the records must have an answer
+        result = ChallengeResult(list(records.values()), known)
+        repr(result), result.summary(), result.table
+    except Exception:  # a damaged line may hold anything
         raise GapError(f"{path}: is no checkpoint of challenges") from None
     wrong = [key for key in settings if known.get(key) != settings[key]]
     if wrong:
@@ -312,6 +315,18 @@ def _journal(path, settings):
     # a run that was killed may have left half a line
     os.truncate(path, len(whole))
     return records
+
+
+def _index(record):
+    """Return the number of a record that has what a record has, or raise."""
+    numbers = [record.get(key, []) for key in ("snr", "gap_percent", "pulls")]
+    plain = all(isinstance(x, int | float) for part in numbers for x in part)
+    texts = all(isinstance(record[key], str) for key in ("kind", "verdict"))
+    if type(record["index"]) is not int or not (plain and texts):
+        raise TypeError("no record of a challenge")
+    if "right" in record and not isinstance(record["right"], bool):
+        raise TypeError("right or wrong")
+    return record["index"]
 
 
 def _append(path, content):

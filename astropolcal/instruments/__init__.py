@@ -113,12 +113,11 @@ def get(name):
     for point in entry_points(group="astropolcal.instruments"):
         try:
             instrument = register(point.load())()
-        except InstrumentError:
-            raise
+            asked = instrument.answers_to(str(name))
         except Exception as error:  # whatever another package raises when it is imported
             broken.append(f"; {point.name!r} cannot be loaded: {type(error).__name__}: {error}")
             continue
-        if instrument.answers_to(str(name)):
+        if asked:
             return instrument
     near = difflib.get_close_matches(str(name).lower(), names(), n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""

@@ -2,6 +2,7 @@
 """Values of header keywords in the units of a file layout."""
 
 import astropy.units as u
+from astropy.io.fits import VerifyError
 from astropy.io.fits.card import Undefined
 from astropy.time import Time
 
@@ -36,7 +37,7 @@ def look_up(headers, column, layout):
         return None, None
     for header in headers:
         for keyword in (layout.keywords[column], *layout.alternatives.get(column, ())):
-            value = header.get(keyword)
+            value = _read(header, keyword)
             if value is None or isinstance(value, Undefined):
                 continue
             if str(value).strip().lower() not in _MISSING:
@@ -47,6 +48,14 @@ def look_up(headers, column, layout):
 def unit_of(column, layout):
     """Return the unit of a column's keyword."""
     return u.Unit(layout.units.get(column, "" if column in _PLAIN else "deg"))
+
+
+def _read(header, keyword):
+    try:
+        return header.get(keyword)
+    except VerifyError:
+        # no number, and no text that anything answers to
+        return "an unreadable card"
 
 
 def convert(column, value, layout, target):

@@ -16,8 +16,10 @@ import numpy as np
 from astropy.coordinates import FK5, SkyCoord
 from astropy.io import fits
 from astropy.time import Time
+from erfa import ErfaError
 
 from astropolcal.exceptions import ObservationError
+from astropolcal.files import understood
 from astropolcal.instruments._keywords import ANGLES, RANGES, TEXTS, convert, look_up, unit_of
 
 __all__ = [
@@ -195,12 +197,9 @@ def read_header(path, layout, *, header=None, raw=None):
 
 
 def _primary(path):
-    try:
-        return fits.getheader(path, 0)
-    except FileNotFoundError:
-        raise ObservationError(f"{path}: no such file") from None
-    except Exception as error:  # astropy raises errors of many kinds for damaged files
-        raise ObservationError(f"{path}: not a readable FITS file: {_short(error)}") from error
+    # astropy does not close a file that it cannot read
+    with understood(path, ObservationError, "not a readable FITS file"), open(path, "rb") as stream:
+        return fits.getheader(stream, 0)
 
 
 def _short(error):
@@ -226,7 +225,7 @@ def _convert(frame, column, keyword, value, layout):
         _add_state(frame, keyword, value, layout)
         return
     if column in TEXTS:
-        frame.values[column] = str(value).strip()
+        frame.values[column] = " ".join(str(value).split())
         return
     unit = unit_of(column, layout)
     target = u.deg if column in ANGLES else u.Unit({"exposure_time": "s"}.get(column, unit))
@@ -334,7 +333,7 @@ def observation_time(values):
         return Time(date if "T" in date else f"{date[:10]}T{values['time']}", scale="utc")
     except KeyError as error:
         raise ObservationError(f"no {error.args[0]} to compute the time from") from None
-    except ValueError as error:
+    except (ValueError, ErfaError) as error:
         raise ObservationError(f"time: {_short(error)}") from None
 
 

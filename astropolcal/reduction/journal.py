@@ -12,6 +12,22 @@ from astropolcal.reduction.frames import Frame
 
 __all__ = ["Journal"]
 
+# what a line raises that was cut off, or is no frame
+_DAMAGE = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError)
+_DAMAGE += (RecursionError,)
+
+
+def _frame(content):
+    """Return a frame that has what a frame has, or raise."""
+    frame = Frame.from_dict(content)
+    if not isinstance(frame.path, str) or not isinstance(frame.values, dict):
+        raise TypeError("a frame has a path, and values by name")
+    for texts in (frame.errors, frame.doubts):
+        if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+            raise TypeError("errors and doubts are lists of texts")
+    frame.to_dict()
+    return frame
+
 
 class Journal:
     """
@@ -56,9 +72,9 @@ class Journal:
         known = {}
         for line in lines:
             # a line may have been cut off when a run was stopped
-            with suppress(ValueError, KeyError, TypeError):
+            with suppress(*_DAMAGE):
                 entry = json.loads(line)
-                known[entry["key"]] = Frame.from_dict(entry["frame"])
+                known[str(entry["key"])] = _frame(entry["frame"])
         if lines and not known:
             raise ObservationError(f"{self.path}: not a journal of a reduction; take another name")
         return known

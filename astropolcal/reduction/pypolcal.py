@@ -17,6 +17,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.exceptions import ObservationError
+from astropolcal.files import one_line
 from astropolcal.observations import Observations
 
 __all__ = ["read_pypolcal"]
@@ -124,7 +125,7 @@ def _numbers(rows, column):
             values[k] = float(row[column])
         except (TypeError, ValueError):
             raise ObservationError(
-                f"{path}, line {i}: {column} = {row[column]!r}, a number is needed"
+                f"{path}, line {i}: {column} = {one_line(row[column], 40)!r}, a number is needed"
             ) from None
     return values
 
@@ -137,6 +138,8 @@ def _frame_numbers(rows, bins):
         cube = row["filepath"].strip()
         numbers.setdefault(cube, len(numbers))
         if (cube, b) in seen:
-            raise ObservationError(f"{path}, line {i}: {cube} is given already in {seen[cube, b]}")
+            raise ObservationError(
+                f"{path}, line {i}: {one_line(cube, 80)} is given already in {seen[cube, b]}"
+            )
         seen[cube, b] = f"{path}, line {i}"
     return np.array([numbers[row["filepath"].strip()] for _, _, row in rows])

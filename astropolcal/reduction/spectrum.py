@@ -244,7 +244,10 @@ def _checked(table):
     _check_wavelength(table["wavelength"])
     mask = np.zeros(len(table), dtype=bool)
     if "mask" in table.colnames:
-        mask = np.array(table["mask"], dtype=bool)
+        try:
+            mask = np.array(table["mask"], dtype=bool)
+        except (TypeError, ValueError):
+            raise ObservationError("target: mask must be true or false in each row") from None
     for name in names:
         unit = u.Quantity(table[name]).unit if name == "intensity" else u.one
         columns = [name, f"{name}_err", f"{name}_{_SYSTEMATIC}"]

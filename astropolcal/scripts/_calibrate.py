@@ -11,6 +11,7 @@ from astropolcal.scripts._common import (
     add_edits,
     add_json,
     add_quiet,
+    check_folders,
     check_outputs,
     edit_chains,
     instrument_of,
@@ -175,6 +176,7 @@ def run(arguments):
 
     say = printer(arguments)
     check_outputs(arguments.output, arguments.json)
+    check_folders(arguments.plots)
     _check_start(arguments)
     get_observable(arguments.observable)
     targets = [_target(text) for text in arguments.target] or TARGETS

@@ -116,7 +116,7 @@ def _workers(count):
 
 def _report(result):
     """Return the rates, and the wrong answers one by one."""
-    lines = [result.words()]
+    lines = [result.words(), "(in brackets: interval of each rate at 68 %; number it is from)"]
     for record in result.failures:
         truth = " + ".join(record["effects"]) or "nothing"
         said = " + ".join("/".join(group) for group in record["causes"])

@@ -3,6 +3,7 @@
 
 import argparse
 import json
+import os
 import re
 import sys
 import textwrap
@@ -37,7 +38,7 @@ def add_json(parser, what="write a summary"):
     parser.add_argument("--json", metavar="FILE", help=f"{what} for machines (- for stdout)")
 
 
-def add_quiet(parser, meaning="print nothing but errors"):
+def add_quiet(parser, meaning="print nothing but warnings and errors"):
     """Add ``--quiet``."""
     parser.add_argument("-q", "--quiet", action="store_true", help=meaning)
 
@@ -86,7 +87,7 @@ def printer(arguments):
 
 
 def check_outputs(*paths):
-    """Raise before any work is done if an output's folder is missing or is a file."""
+    """Raise before any work is done if a file cannot be written there."""
     for path in paths:
         if path is None or str(path) == "-":
             continue
@@ -95,6 +96,25 @@ def check_outputs(*paths):
             raise AstropolcalError(f"{path}: there is no folder {path.parent}")
         if path.is_dir():
             raise AstropolcalError(f"{path}: is a folder, not a file")
+        _check_writable(path, path.parent)
+
+
+def check_folders(*paths):
+    """Raise before any work is done if a folder is a file, or cannot be made or written to."""
+    for path in paths:
+        if path is None:
+            continue
+        there = next(p for p in [Path(path), *Path(path).absolute().parents] if p.exists())
+        if not there.is_dir():
+            raise AstropolcalError(f"{there}: is a file, not a folder")
+        _check_writable(path, there)
+
+
+def _check_writable(path, folder):
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise AstropolcalError(
+            f"{path}: no permission to write to {folder}; name a folder that you may write to"
+        )
 
 
 def wrapped(line, indent=0):
@@ -244,7 +264,8 @@ def _parameters(chains, name):
     found = []
     for leaf in carriers:
         if key and key not in leaf.param_names:
-            raise ParameterError(f"{optic} has no parameter {key!r}; it has {leaf.param_names}")
+            known = ", ".join(leaf.param_names)
+            raise ParameterError(f"{optic} has no parameter {key!r}; it has {known}")
         found += [getattr(leaf, each) for each in ([key] if key else leaf.param_names)]
     return found
 

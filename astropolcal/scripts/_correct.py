@@ -18,6 +18,14 @@ from astropolcal.scripts._common import (
     write_json,
 )
 
+_EPILOG = """\
+examples:
+  astropolcal correct --calibration cal.asdf cubes/ --raw raw/ -o stokes.fits
+  astropolcal correct --calibration library/ cubes/ -o out.fits --plot fig.png
+  astropolcal correct --calibration cal.asdf cubes/ -o disk.fits \\
+      --rotation pupil --camera-angle 113 --open-directions ignore
+"""
+
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 
 
@@ -26,8 +34,10 @@ def add_parser(commands):
     parser = commands.add_parser(
         "correct",
         help="correct science cubes with a calibration and write Stokes parameters",
-        description="Solve for the Stokes parameters of the light that entered the telescope, by "
+        description="Solve for the Stokes parameters of the light that entered the telescope, by\n"
         "least squares over all frames, and write them with their errors.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "cubes", metavar="CUBES", nargs="+", help="cubes, or folders of them (*.fits)"
@@ -36,7 +46,8 @@ def add_parser(commands):
         "--calibration",
         metavar="LIB_OR_FILE",
         required=True,
-        help="a calibration file, or a library, from which the one that holds is taken",
+        help="a calibration file, or a folder of them, from which the one that holds for the "
+        "frames is taken",
     )
     parser.add_argument("-o", "--output", metavar="OUT.fits", required=True, help="the product")
     _add_solution(parser)
@@ -45,7 +56,7 @@ def add_parser(commands):
     _add_errors(parser)
     parser.add_argument("--spectrum", metavar="OUT.ecsv", help="table of the star in an aperture")
     parser.add_argument(
-        "--radius", metavar="PIXELS", type=float, default=10.0, help="of the aperture, default: 10"
+        "--radius", metavar="PIXELS", type=float, default=10.0, help="of the aperture (default: 10)"
     )
     parser.add_argument("--plot", metavar="FILE", help="figure of the result")
     parser.add_argument("--workers", metavar="N", type=int, help="threads of dask")
@@ -73,7 +84,10 @@ def _add_solution(parser):
         "--components", choices=("IQU", "IQUV"), default="IQU", help="default: IQU, V is zero"
     )
     parser.add_argument(
-        "--weights", choices=("equal", "variance"), default="equal", help="of the fluxes"
+        "--weights",
+        choices=("equal", "variance"),
+        default="equal",
+        help="of the fluxes: equal (default), or one over their variances",
     )
     parser.add_argument(
         "--brightness",
@@ -83,7 +97,12 @@ def _add_solution(parser):
         "light in the images, for clouds",
     )
     parser.add_argument(
-        "--max-condition", metavar="X", type=float, default=30.0, help="default: 30"
+        "--max-condition",
+        metavar="X",
+        type=float,
+        default=30.0,
+        help="condition number from which on Stokes parameters count as poorly determined "
+        "and are left out (default: 30)",
     )
 
 
@@ -98,9 +117,13 @@ def _add_errors(parser):
         "ignore, or a standard deviation in degrees, micrometres and percent",
     )
     parser.add_argument(
-        "--samples", metavar="N", type=int, default=0, help="sample the systematic errors"
+        "--samples",
+        metavar="N",
+        type=int,
+        default=0,
+        help="systematic errors from N samples of the calibration (default: linearized)",
     )
-    parser.add_argument("--seed", metavar="N", type=int, help="of the samples")
+    parser.add_argument("--seed", metavar="N", type=int, help="of the random numbers of --samples")
 
 
 def _add_instrument(parser):
@@ -139,7 +162,13 @@ def _add_images(parser):
         type=_point,
         help="place of the star in the left beam, 0-based; by default it is found",
     )
-    parser.add_argument("--size", metavar="PIXELS", type=int, default=51, help="default: 51")
+    parser.add_argument(
+        "--size",
+        metavar="PIXELS",
+        type=int,
+        default=51,
+        help="width of the images of the product (default: 51)",
+    )
     parser.add_argument(
         "--rotation",
         choices=("none", "fixed", "pupil"),
@@ -353,8 +382,25 @@ def _report(summary):
     for i, words in summary["poorly_determined"].items():
         line = f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}"
         print(wrapped(line, indent=4))
-    for name, words in (("s_p", "degree"), ("s_chi", "angle, deg")):
+    aperture = summary["aperture"]
+    print(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
+    for name, unit, error, words in (
+        ("dolp", "", "s_p", "degree of linear polarization"),
+        ("aolp", " deg", "s_chi", "angle of linear polarization"),
+    ):
+        value = _middle(aperture[name], ".4f" if name == "dolp" else ".1f", unit, name == "aolp")
+        print(f"    {words}: {value}")
         for kind in ("statistical", "systematic"):
-            values = [v for v in summary["aperture"][f"{name}_{kind}"] if v is not None]
-            text = f"{np.median(values):.2g}" if values else "not known"
-            print(f"  {kind} error of the star's {words}: {text}")
+            print(f"      {kind} error: {_middle(aperture[f'{error}_{kind}'], '.2g', unit)}")
+
+
+def _middle(values, form, unit, turns=False):
+    """Return the median of what is known, as text; angles near 0 and 180 deg are neighbours."""
+    known = np.array([value for value in values if value is not None])
+    if known.size == 0:
+        return "not known"
+    if turns:
+        centre = np.degrees(np.angle(np.exp(2j * np.radians(known)).sum())) / 2
+        known = centre + (known - centre + 90) % 180 - 90
+        return f"{np.median(known) % 180:{form}}{unit}"
+    return f"{np.median(known):{form}}{unit}"

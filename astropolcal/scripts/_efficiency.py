@@ -270,9 +270,10 @@ def _text(content):
             "",
             f"Target at altitude {low:.1f} to {high:.1f} deg, parallactic angle {east:.1f} to "
             f"{west:.1f} deg",
-            f"Best derotator offset, {best['law']} still: {best['offset_deg']:g} deg; at the worst "
-            f"moment,",
-            f"wavelength and angle of polarization {best['least']:.3f} are measured (mean "
-            f"{best['mean']:.3f}, worst offset {best['least_of_any_offset']:.3f})",
+            f"Best derotator offset, {best['law']} still: {best['offset_deg']:g} deg",
+            f"  efficiency over times, wavelengths and angles of polarization: least "
+            f"{best['least']:.3f},",
+            f"  mean {best['mean']:.3f}; with the worst offset the least is "
+            f"{best['least_of_any_offset']:.3f}",
         ]
     return "\n".join(lines)

@@ -10,6 +10,7 @@ from astropolcal.scripts._common import (
     add_json,
     add_quiet,
     angles,
+    check_folders,
     check_outputs,
     cube_files,
     number_or,
@@ -18,14 +19,23 @@ from astropolcal.scripts._common import (
 
 _MAX_LISTED = 20
 
+_EPILOG = """\
+examples:
+  astropolcal reduce cubes/ --raw raw/ --source polarized -o run.ecsv
+  astropolcal reduce cubes/ --raw raw/ --source star -o star.ecsv
+  astropolcal reduce cubes/ -o run.ecsv --quicklook look --background outside
+"""
+
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
     parser = commands.add_parser(
         "reduce",
         help="measure both beams in FITS cubes and write an observation table",
-        description="Measure the fluxes of both beams in extracted cubes. A file that cannot be "
+        description="Measure the fluxes of both beams in extracted cubes. A file that cannot be\n"
         "used is left out and listed with the reason.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "cubes", metavar="CUBES", nargs="+", help="cubes, or folders of them (*.fits)"
@@ -108,6 +118,7 @@ def run(arguments):
     from astropolcal.reduction import reduce_run
 
     check_outputs(arguments.output, arguments.json, arguments.resume)
+    check_folders(arguments.quicklook)
     files = cube_files(arguments.cubes)
     instrument = instruments.get(arguments.instrument)
     with tqdm(

@@ -9,6 +9,7 @@ from astropolcal.exceptions import AstropolcalError
 from astropolcal.scripts._common import (
     add_json,
     add_quiet,
+    check_folders,
     check_outputs,
     printer,
     read_datasets,
@@ -111,8 +112,7 @@ def run(arguments):
 
 def _check_options(arguments):
     """Raise before the long work is done."""
-    if arguments.plots and Path(arguments.plots).is_file():
-        raise AstropolcalError(f"{arguments.plots}: is a file, not a folder")
+    check_folders(arguments.plots)
     if arguments.resume and not arguments.checkpoint:
         raise AstropolcalError("--resume needs --checkpoint FILE.h5")
     if arguments.seed is not None and arguments.seed < 0:

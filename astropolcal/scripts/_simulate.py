@@ -1,10 +1,13 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal simulate``: beam fluxes or image cubes of an instrument, with noise."""
 
+import argparse
+
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.scripts._common import (
     add_json,
     angles,
+    check_folders,
     check_outputs,
     edit_chains,
     write_json,
@@ -14,6 +17,15 @@ from astropolcal.scripts._common import (
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 
 _STAR_CYCLE = [0, 45, 22.5, 67.5]
+
+_EPILOG = """\
+examples:
+  astropolcal simulate -o run.ecsv                      the packaged example
+  astropolcal simulate -o run.ecsv --derotator 45,70,95 --fix hwp.w_sio2=1.66mm
+  astropolcal simulate -o true.ecsv --cubes lamp        image cubes, raw headers
+  astropolcal simulate --cubes star --source star --altitude 67,64 \\
+      --parallactic 24,30 --derotator 97 --fix star.q=0.01
+"""
 
 #: Options of ``--cubes`` that are numbers: default, unit and meaning.
 _IMAGES = {
@@ -32,8 +44,10 @@ def add_parser(commands):
     parser = commands.add_parser(
         "simulate",
         help="simulate an observation table or image cubes, with photon and read noise",
-        description="Simulate the beam fluxes of an instrument's chain: the published values, "
+        description="Simulate the beam fluxes of an instrument's chain: the published values,\n"
         "or those of a calibration file. With --cubes, simulate its image cubes.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "-o",
@@ -153,6 +167,7 @@ def run(arguments):
     if not (arguments.output or arguments.cubes):
         raise AstropolcalError("nothing to write: give -o OBS.ecsv, --cubes DIR or both")
     check_outputs(arguments.output, arguments.json)
+    check_folders(arguments.cubes)
     chain, wavelength, meta = _truth(arguments)
     (chain,) = edit_chains([chain], without=arguments.without, fix=arguments.fix)
     frames = _frames(arguments, chain)

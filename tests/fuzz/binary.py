@@ -227,9 +227,9 @@ def _hdf5_step(rng, h5py, file, name):
         file.attrs["format"] = some(rng, (3.0, b"x", "astropolcal", np.arange(4)))
         return
     if kind == "text":
-        text = (
-            mutate_json(rng, file["description"][...].tobytes()) if "description" in file else b""
-        )
+        text = file.get("description")
+        small = isinstance(text, h5py.Dataset) and text.size < 10**6
+        text = mutate_json(rng, text[...].tobytes() if small else b"{}")
         name, old = "description", np.frombuffer(text, dtype=np.uint8)
     if name in file:
         del file[name]

@@ -30,7 +30,18 @@ FAILED = {
     "checkpoint": {0: (58, 137, 168, 184), 1: (222, 274, 306, 387)},
 }
 #: Readers that never fail; the others are for offline runs.
-DOORS = ("calibration", "forged", "observations", "exported", "spectra", "checkpoint")
+DOORS = (
+    "calibration",
+    "forged",
+    "observations",
+    "exported",
+    "spectra",
+    "checkpoint",
+    "journal",
+    "challenge",
+    "csv",
+    "product",
+)
 #: Slow ones take a part of that.
 SHARE = {"calibration": 2, "forged": 2, "cube": 4, "observations": 2, "spectra": 2}
 NEEDS = {"checkpoint": "h5py", "spectra": "specutils", "loaded": "asdf"}
