@@ -134,7 +134,10 @@ def check_instrument(instrument, *, skip=(), seed=0, raises=True):
     unknown = sorted(set(skip) - set(RULES))
     if unknown:
         raise InstrumentError(f"no rules {unknown}; there are {', '.join(RULES)}")
-    if inspect.isclass(instrument) and not inspect.isabstract(instrument):
+    if inspect.isabstract(instrument):
+        lacking = ", ".join(sorted(instrument.__abstractmethods__))
+        raise InstrumentError(f"class: {instrument.__name__} lacks the methods {lacking}")
+    if inspect.isclass(instrument):
         instrument = instrument()
     if not isinstance(instrument, Instrument):
         raise InstrumentError(f"class: {instrument!r} is not an Instrument, nor a class of one")

@@ -235,7 +235,7 @@ def test_instrument_without_keywords_has_no_headers_to_check():
 
 @pytest.mark.parametrize("thing", [int, "sound", Instrument, None])
 def test_what_is_no_instrument_is_refused(thing):
-    with pytest.raises(InstrumentError, match="is not an Instrument"):
+    with pytest.raises(InstrumentError, match="is not an Instrument|lacks the methods"):
         check_instrument(thing)
 
 
@@ -278,6 +278,16 @@ def test_instrument_of_an_installed_package_is_found_and_conforms(tmp_path, monk
     monkeypatch.setattr(instruments, "_REGISTRY", dict(instruments._REGISTRY))
     assert "outside" in instruments.names()
     assert check_instrument(instruments.get("outside"))
+
+
+def test_missing_methods_are_named():
+    class Half(Instrument):
+        """Without a chain."""
+
+        name = "half"
+
+    with pytest.raises(InstrumentError, match=r"Half lacks the methods chain"):
+        check_instrument(Half)
 
 
 @pytest.mark.parametrize("name", instruments.names())

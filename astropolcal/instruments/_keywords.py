@@ -26,7 +26,8 @@ TEXTS = (
 RANGES = dict.fromkeys(ANGLES, (-720.0, 720.0)) | {"altitude": (0.0, 90.0)}
 RANGES |= {"em_gain": (0.0, 1e5)}
 # numbers without a unit
-_PLAIN = ("camera", "em_gain")
+# what a layout means that gives no unit; everything else is in degree
+_UNITS = {"camera": "", "em_gain": "", "exposure_time": "s"}
 
 _MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
 
@@ -47,7 +48,7 @@ def look_up(headers, column, layout):
 
 def unit_of(column, layout):
     """Return the unit of a column's keyword."""
-    return u.Unit(layout.units.get(column, "" if column in _PLAIN else "deg"))
+    return u.Unit(layout.units.get(column, _UNITS.get(column, "deg")))
 
 
 def _read(header, keyword):
