@@ -235,7 +235,7 @@ def test_instrument_without_keywords_has_no_headers_to_check():
 
 @pytest.mark.parametrize("thing", [int, "sound", Instrument, None])
 def test_what_is_no_instrument_is_refused(thing):
-    with pytest.raises(InstrumentError, match="is not an Instrument|lacks the methods"):
+    with pytest.raises(InstrumentError, match=r"is not an Instrument|lacks the methods"):
         check_instrument(thing)
 
 
