@@ -67,7 +67,7 @@ def _add_model_options(parser):
     parser.add_argument(
         "--derotator",
         metavar="MODEL",
-        help="elliptical (default) or linear retarder; not with a calibration",
+        help="elliptical (default) or linear retarder, or kmirror; not with a calibration",
     )
     add_edits(parser, "without", "free", "fix")
 
