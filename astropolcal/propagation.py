@@ -8,11 +8,15 @@ towards the source. The derivative to any parameter is then a product of the
 two at its optic, so that all derivatives together cost about as much as a
 few evaluations. Everything is on canonical floats.
 
-Arrays of light have shape (n_wavelengths, 4, n_columns); a column is a frame,
-and an axis has length 1 as long as nothing has depended on it. The matrix of an
-optic has shape (n_wavelengths, 4, 4), or (n_wavelengths, 4, 4, n_columns) where it
-changes from frame to frame.
+Light has shape (n_wavelengths, n_columns, 4); a column is a frame, and an axis has
+length 1 as long as nothing has depended on it. Q and U of a column lie side by side, so
+that they are also the complex number Q + iU, which a rotation of the frame by an angle
+multiplies by exp(-2i angle). Light is kept in the frame of the optic that it enters. The
+matrix of an optic has shape (n_wavelengths, 4, 4), or (n_wavelengths, n_columns, 4, 4)
+where it changes from frame to frame.
 """
+
+import cmath
 
 import numpy as np
 
@@ -26,7 +30,7 @@ __all__ = ["Propagator"]
 class _Node:
     """An optic of the chain, with what does not change in a fit."""
 
-    __slots__ = ("dispersion", "index", "leaf", "per_frame", "stage_angle")
+    __slots__ = ("dispersion", "index", "leaf", "per_frame", "phase", "stage_angle")
 
     def __init__(self, index, leaf, wavelength, positions):
         self.index = index
@@ -37,6 +41,24 @@ class _Node:
             self.dispersion, self.stage_angle = leaf._moved(0.0, 0.0, np.atleast_2d(shift))
         else:
             self.dispersion, self.stage_angle = leaf._dispersion(wavelength), shift
+        self.phase = None
+
+    def follow(self, frame):
+        """
+        Take up the stage angle of the frame in front of the optic; return the one behind it.
+
+        The stages stay where they are in a fit, so that their cosines are worked out once.
+        """
+        if self.leaf.rotates_frame:
+            return frame - self.stage_angle
+        turn = self.stage_angle - frame
+        self.phase = np.exp(-2j * turn) if np.any(turn) else None
+        return self.stage_angle
+
+    @property
+    def moves(self):
+        """Whether the optic turns against the one in front of it from frame to frame."""
+        return np.ndim(self.phase) > 0
 
     def matrix(self, values):
         return self._shaped(self.leaf._matrix(self.dispersion, *self._along(values)))
@@ -50,10 +72,7 @@ class _Node:
         return [v[:, None] if np.ndim(v) else v for v in values] if self.per_frame else values
 
     def _shaped(self, matrix):
-        """Return a matrix with its axis of wavelengths first and that of columns last."""
-        if self.per_frame:
-            return np.ascontiguousarray(np.moveaxis(matrix, 1, -1))
-        return matrix if matrix.ndim == 3 else matrix.reshape(-1, 4, 4)
+        return matrix if self.per_frame or matrix.ndim == 3 else matrix.reshape(-1, 4, 4)
 
 
 def _for_beam(leaf, beam):
@@ -72,13 +91,13 @@ def _of_beam(leaf, positions):
 
 
 class _Step:
-    """What the forward sweep leaves at one optic for the backward sweep."""
+    """An optic at given values, and the light that entered it in the forward sweep."""
 
-    __slots__ = ("light", "matrix", "node", "out", "turn", "values")
+    __slots__ = ("light", "matrix", "node", "phase", "values")
 
-    def __init__(self, node, values, turn, light, matrix, out):
-        self.node, self.values, self.turn = node, values, turn
-        self.light, self.matrix, self.out = light, matrix, out
+    def __init__(self, node, values, phase=None, matrix=None):
+        self.node, self.values, self.phase, self.matrix = node, values, phase, matrix
+        self.light = None
 
 
 class Propagator:
@@ -122,7 +141,7 @@ class Propagator:
         _check(self.leaves, positions, len(wavelength))
         self.wavelength = wavelength
         self.shape = (len(wavelength), _column_count(positions))
-        self.source = np.asarray(source, dtype=float).reshape(1, 4, 1)
+        self.source = np.asarray(source, dtype=float).reshape(1, 1, 4)
         split = next(i for i, leaf in enumerate(self.leaves) if leaf.depends_on_beam)
         make = [_Node(i, leaf, wavelength, positions) for i, leaf in enumerate(self.leaves)]
         self._common = make[:split]
@@ -133,9 +152,13 @@ class Propagator:
             ]
             for beam in ("right", "left")
         ]
+        frame = _follow(self._common, 0.0)
+        for arm in self._arms:
+            _follow(arm, frame)
         first, other = (arm[0] for arm in self._arms)
         same = np.array_equal(first.stage_angle, other.stage_angle)
         self._same_entrance = same and not first.leaf.rotates_frame
+        self._meeting = _meeting(self._common, self._arms) if self._same_entrance else None
 
     def values(self):
         """
@@ -179,7 +202,17 @@ class Propagator:
         >>> [float(flux[0, 0]) for flux in Propagator(optics.WollastonPrism(), [1.6], {}).fluxes()]
         [0.5, 0.5]
         """
-        return self.forward(values).fluxes
+        values = self._own_values() if values is None else values
+        if self._meeting is None:
+            return Sweep(self, values).fluxes
+        common, frame = _at(self._common, values, 0.0)
+        arms = [_inward(_at(arm, values, frame)[0]) for arm in self._arms]
+        (right, phase), (left, _) = arms
+        # what stands still meets the light of all frames as two rows a wavelength
+        rows, phase = _inward(common[self._meeting :], np.concatenate([right, left], axis=1), phase)
+        light, fresh = _behind(common[: self._meeting], self.source, keep=False)
+        fluxes = _turned(light, phase, fresh) @ np.ascontiguousarray(rows.swapaxes(1, 2))
+        return tuple(_whole(fluxes[..., beam], self.shape) for beam in (0, 1))
 
     def forward(self, values=None):
         """
@@ -249,21 +282,39 @@ def _column_count(positions):
     return several.pop() if several else 1
 
 
+def _meeting(common, arms):
+    """
+    Return the index of the first optic behind which no optic moves from frame to frame.
+
+    It is the splitter where one in front of it moves against it, and None where one behind does.
+    """
+    if any(node.per_frame or node.moves for arm in arms for node in arm[1:]) or any(
+        arm[0].per_frame for arm in arms
+    ):
+        return None
+    place, moves = len(common), arms[0][0].moves
+    while place and not moves and not common[place - 1].per_frame:
+        place -= 1
+        moves = common[place].moves
+    return place
+
+
 class Sweep:
     """A forward sweep: the fluxes of both beams, ready to be differentiated."""
 
     def __init__(self, propagator, values):
         self._propagator = propagator
-        self._common, state = _run(propagator._common, values, (propagator.source, 0.0))
-        self._arms, fluxes = [], []
-        # in front of the splitter the light of both beams is the same
-        turned = {} if propagator._same_entrance else None
-        for nodes in propagator._arms:
-            steps, (light, _) = _run(nodes, values, state, turned)
-            self._arms.append(steps)
-            flux = light[:, 0]
-            whole = flux.shape == propagator.shape
-            fluxes.append(flux if whole else np.broadcast_to(flux, propagator.shape))
+        self._common, frame = _at(propagator._common, values, 0.0)
+        self._arms = [_at(arm, values, frame)[0] for arm in propagator._arms]
+        light, fresh = _behind(self._common, propagator.source)
+        same = propagator._same_entrance
+        if same:
+            # in front of the splitter the light of both beams is the same
+            light = _turned(light, self._arms[0][0].phase, fresh)
+        fluxes = []
+        for arm in self._arms:
+            last, seen = _enter(arm, light, entered=same)
+            fluxes.append(_flux(last, seen, propagator.shape))
         #: Fluxes of the right and the left beam, (n_wavelengths, n_columns) each.
         self.fluxes = tuple(fluxes)
 
@@ -287,116 +338,196 @@ class Sweep:
         by_optic = {}
         for optic, parameter in wanted:
             by_optic.setdefault(optic, []).append(parameter)
-        adjoint = 0.0
+        adjoint, behind = 0.0, []
         for steps, weight in zip(self._arms, weights, strict=True):
-            row = np.zeros((weight.shape[0], 4, weight.shape[1]))
-            row[:, 0, :] = weight
-            adjoint = adjoint + _back(steps, row, by_optic, result)
-        _back(self._common, adjoint, by_optic, result)
+            row = np.zeros((*weight.shape, 4))
+            row[..., 0] = weight
+            inward, pairs = _back(steps, row, [], by_optic, result)
+            adjoint, behind = adjoint + inward, behind + pairs
+        _back(self._common, adjoint, behind, by_optic, result)
         shape = self._propagator.shape
         return {key: np.broadcast_to(value, shape) for key, value in result.items()}
 
 
-def _run(nodes, values, state, turned=None):
-    """
-    Carry light through ``nodes``; return the steps and the state behind them.
+def _follow(nodes, frame):
+    """Tell every node the stage angle of the frame in front of it; return the last one's."""
+    for node in nodes:
+        frame = node.follow(frame)
+    return frame
 
-    ``turned`` keeps the light as the first node sees it, for other nodes behind the same light.
+
+def _at(nodes, values, frame):
     """
-    light, frame = state
+    Return the optics of nodes at given values, as steps, and theta of the frame behind them.
+
+    ``frame`` is theta of the frame in front of them.
+    """
     steps = []
     for node in nodes:
         theta, *own = values[node.index]
-        # one value a wavelength goes along the first axis, positions along the last
-        angle = node.stage_angle + (theta[:, None] if np.ndim(theta) else theta)
         if node.leaf.rotates_frame:
-            frame = frame - angle
-            steps.append(_Step(node, own, None, light, None, light))
+            frame = frame - theta
+            steps.append(_Step(node, own))
+        else:
+            phase = _phase(node.phase, theta - frame)
+            steps.append(_Step(node, own, phase, node.matrix(own)))
+            frame = theta
+    return steps, frame
+
+
+def _enter(steps, light, *, entered=False, keep=True):
+    """
+    Carry light to the last optic with a matrix; return it, or None, and the light it sees.
+
+    Light that has ``entered`` is in the frame of the first optic already. Where steps do not
+    keep the light that they see, the memory of one product serves the next, in the cache.
+    """
+    last = None
+    for step in steps:
+        if step.matrix is None:
             continue
-        turn = angle - frame
-        known = turned.get("light") if turned is not None else None
-        light = _rotate(light, turn) if known is None else known
-        if turned is not None:
-            turned["light"], turned = light, None
-        matrix = node.matrix(own)
-        out = _act(matrix, light)
-        steps.append(_Step(node, own, turn, light, matrix, out))
-        light, frame = out, angle
-    return steps, (light, frame)
+        if last is not None:
+            # what comes out of a product belongs to nobody else
+            light = _turned(_act(last.matrix, light), step.phase, in_place=True)
+        elif not entered:
+            light = _turned(light, step.phase)
+        if keep:
+            step.light = light
+        last = step
+    return last, light
 
 
-def _back(steps, adjoint, by_optic, result):
-    """Carry the adjoint back through ``steps``, adding derivatives to ``result``."""
+def _behind(steps, light, keep=True):
+    """Return the light behind all optics, and whether it may be overwritten."""
+    last, light = _enter(steps, light, keep=keep)
+    return (light, False) if last is None else (_act(last.matrix, light), True)
+
+
+def _inward(steps, rows=None, phase=None):
+    """
+    Carry analyser rows, (w, n, 4), to the first optic with a matrix; return them and its phase.
+
+    They come from behind all steps, where light is turned by ``phase``, or from the detector.
+    """
+    for step in reversed(steps):
+        if step.matrix is not None:
+            if rows is None:
+                rows = step.matrix[:, :1]
+            else:
+                rows = _act_back(step.matrix, _turned(rows, _inverse(phase)))
+            phase = step.phase
+    return rows, phase
+
+
+def _flux(last, light, shape):
+    """Return the intensity behind the last optic, which no rotation changes."""
+    row = last.matrix[..., 0, :]
+    if last.node.per_frame:
+        return _whole(np.einsum("wcs,wcs->wc", row, light), shape)
+    return _whole((light @ row[..., None])[..., 0], shape)
+
+
+def _whole(flux, shape):
+    return flux if flux.shape == shape else np.broadcast_to(flux, shape)
+
+
+def _back(steps, adjoint, behind, by_optic, result):
+    """
+    Carry the adjoint back through ``steps``, adding derivatives to ``result``.
+
+    Returns the adjoint, and adjoint and light as they enter the first optic. ``behind`` has
+    such pairs for the optics behind the steps. The product a . G s of a pair is the same on
+    either side of a rotation, so that each is needed at one optic only.
+    """
     for step in reversed(steps):
         wanted = by_optic.get(step.node.index, ())
         if step.matrix is None:
             if 0 in wanted:
-                _add(result, (step.node.index, 0), 2 * _cross(adjoint, step.light))
+                _add(result, (step.node.index, 0), 2 * _crossed(behind))
             continue
-        inward = _act(step.matrix.swapaxes(1, 2), adjoint)
-        if wanted:
-            _at_optic(step, wanted, adjoint, inward, result)
-        adjoint = _rotate(inward, -step.turn)
-    return adjoint
+        pair = [(_act_back(step.matrix, adjoint), step.light)]
+        if 0 in wanted:
+            # d/dtheta of T(-theta) M T(theta), with T' = 2 G T
+            _add(result, (step.node.index, 0), 2 * (_crossed(pair) - _crossed(behind)))
+        if wanted and max(wanted) > 0:
+            _at_optic(step, wanted, adjoint, result)
+        behind = pair
+        adjoint = _turned(pair[0][0], _inverse(step.phase))
+    return adjoint, behind
 
 
-def _at_optic(step, wanted, adjoint, inward, result):
-    """Add the derivatives to the wanted parameters of one optic."""
-    index = step.node.index
-    if 0 in wanted:
-        slope = 2 * (_cross(inward, step.light) - _cross(adjoint, step.out))
-        _add(result, (index, 0), slope)
-    if max(wanted) > 0:
-        derivatives = step.node.derivatives(step.values)
-        for parameter in wanted:
-            if parameter:
-                changed = _act(derivatives[parameter - 1], step.light)
-                _add(result, (index, parameter), np.einsum("wsc,wsc->wc", *_same(adjoint, changed)))
-
-
-def _same(a, b):
-    return np.broadcast_arrays(a, b) if a.shape != b.shape else (a, b)
+def _at_optic(step, wanted, adjoint, result):
+    """Add the derivatives to the wanted parameters of one optic other than ``theta``."""
+    derivatives = step.node.derivatives(step.values)
+    for parameter in wanted:
+        if parameter:
+            changed = _act(derivatives[parameter - 1], step.light)
+            # a product with ones sums the four of a column faster than sum or einsum
+            slope = (adjoint * changed) @ np.ones(4)
+            _add(result, (step.node.index, parameter), slope)
 
 
 def _add(result, key, value):
     result[key] = result[key] + value if key in result else value
 
 
-def _cross(a, s):
-    """Return a . G s, the product with the generator of rotations."""
-    return a[..., 1, :] * s[..., 2, :] - a[..., 2, :] * s[..., 1, :]
+def _crossed(pairs):
+    """Return the sum of a . G s over pairs; G is the generator of rotations."""
+    # a_Q s_U - a_U s_Q, with Q + iU as one number
+    products = [(_plane(a).conj() * _plane(s)).imag for a, s in pairs]
+    return sum(products[1:], start=products[0]) if products else np.zeros((1, 1))
 
 
-def _rotate(light, angle):
-    """Return T(angle) applied to the light; ``angle`` broadcasts against (wavelength, column)."""
-    dimensions = np.ndim(angle)
-    if dimensions == 0 and angle == 0:
+def _phase(stage, theta):
+    """Return what Q + iU is multiplied by at the entrance of an optic, or None for 1."""
+    if np.ndim(theta):
+        # one value a wavelength goes along the first axis, positions along the second
+        turn = np.exp(-2j * theta)[:, None]
+    elif theta:
+        turn = cmath.exp(-2j * theta)
+    else:
+        return stage
+    return turn if stage is None else stage * turn
+
+
+def _inverse(phase):
+    """Return the phase of the way back."""
+    return None if phase is None else phase.conjugate()
+
+
+def _turned(light, phase, in_place=False):
+    """Return T(angle) applied to the light, for the phase exp(-2i angle)."""
+    if phase is None:
         return light
-    double = 2 * angle
-    cosine, sine = np.cos(double), np.sin(double)
-    rows, _, columns = light.shape
+    rows, columns, _ = light.shape
+    dimensions = np.ndim(phase)
     if dimensions:
         # the shape of the product, without asking numpy for it
-        columns = max(columns, angle.shape[-1])
-        rows = max(rows, angle.shape[0]) if dimensions == 2 else rows
-    out = _blank(rows, columns)
-    q, u, new_q, new_u = light[:, 1], light[:, 2], out[:, 1], out[:, 2]
-    out[:, ::3] = light[:, ::3]
-    np.multiply(cosine, q, out=new_q)
-    new_q += sine * u
-    np.multiply(cosine, u, out=new_u)
-    new_u -= sine * q
-    return out
+        columns = max(columns, phase.shape[-1])
+        rows = max(rows, phase.shape[0]) if dimensions == 2 else rows
+    if not in_place or (rows, columns) != light.shape[:2]:
+        out = np.empty((rows, columns, 4))
+        out[:] = light
+        light = out
+    plane = _plane(light)
+    np.multiply(plane, phase, out=plane)
+    return light
+
+
+def _plane(light):
+    """Return Q + iU as a view."""
+    return light[..., 1:3].view(complex)[..., 0]
 
 
 def _act(matrix, light):
-    """Return matrix times light; the matrix may have a last axis of columns."""
-    if matrix.ndim == 3:
-        out = _blank(max(len(matrix), len(light)), light.shape[2])
-        return np.matmul(matrix, light, out=out)
-    return (matrix * light[:, None]).sum(axis=2)
+    """Return matrix times light."""
+    if matrix.ndim == 4:
+        return np.einsum("wcij,wcj->wci", matrix, light)
+    return light @ np.ascontiguousarray(matrix.swapaxes(1, 2))
 
 
-def _blank(rows, columns):
-    """Return light, (rows, 4, columns), where the values of each Stokes parameter lie together."""
-    return np.empty((4, rows, columns)).swapaxes(0, 1)
+def _act_back(matrix, adjoint):
+    """Return the adjoint times matrix."""
+    if matrix.ndim == 4:
+        return np.einsum("wci,wcij->wcj", adjoint, matrix)
+    return adjoint @ matrix

@@ -130,6 +130,50 @@ def test_as_many_frames_as_wavelengths(random_chain, seed):
     np.testing.assert_allclose(found, plain_fluxes(chain, positions, source), rtol=0, atol=1e-12)
 
 
+def moving_case(seed):
+    """A chain where any part stands still: stages in front of, at or behind the prism, or none."""
+    rng = np.random.default_rng(seed)
+    places = [name or None for name in rng.permutation(["", "", "a", "-b"]).tolist()]
+    train = [
+        optics.LinearPolarizer(theta=20 * u.deg, name="polarizer", mount=places[0]),
+        optics.DiattenuatorRetarder(diattenuation=0.3, retardance=[1, 2, 3] * u.rad, name="plate",
+                                    mount=places[1]),
+        optics.Rotator(theta=rng.choice([0, 30]) * u.deg, name="turn", mount=places[2]),
+        optics.EllipticalRetarder(diagonal=0.4 * u.rad, theta=[5, 6, 7] * u.deg, name="window"),
+        optics.WollastonPrism(efficiency=[0.9, 0.8, 0.7], theta=12 * u.deg, name="wollaston",
+                              mount=places[3]),
+        optics.LinearRetarder(retardance=1 * u.rad, theta=40 * u.deg, name="behind"),
+    ]  # fmt: skip
+    if rng.random() < 0.3:
+        train.insert(2, optics.HarmonicGain(cosine=0.2, mount="a", name="dust"))
+    if rng.random() < 0.3:
+        train.insert(-1, optics.Rotator(theta=8 * u.deg, name="last", mount="b"))
+    positions = {stage: rng.uniform(-3, 3, 4) for stage in "ab"}
+    return join(train), positions, np.array([1.0, *rng.uniform(-0.5, 0.5, 3)])
+
+
+@given(seed=SEED)
+@settings(max_examples=60)
+def test_fluxes_alone_are_those_of_the_sweep(seed):
+    # the fluxes alone meet what stands still as two rows, the sweep carries all light through
+    chain, positions, source = moving_case(seed)
+    propagator = Propagator(chain, LAM, positions, source)
+    found, expected = propagator.fluxes(), plain_fluxes(chain, positions, source)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(propagator.forward().fluxes, expected, rtol=0, atol=1e-13)
+
+
+def test_fluxes_leave_source_and_sweep_alone():
+    chain, positions, source = moving_case(3)
+    propagator = Propagator(chain, LAM, positions, source)
+    sweep = propagator.forward()
+    before = [flux.copy() for flux in sweep.fluxes]
+    propagator.fluxes()
+    propagator.forward()
+    np.testing.assert_array_equal(sweep.fluxes, before)
+    np.testing.assert_array_equal(propagator.source.ravel(), source)
+
+
 @given(seed=SEED, n_frames=st.sampled_from([1, 3, 4]))
 @settings(max_examples=25)
 def test_fluxes_through_frame_optics_are_those_of_the_matrices(seed, n_frames):

@@ -80,13 +80,13 @@ def _rotate(matrix, theta):
 def _linear_retarder(retardance):
     """Return a linear retarder for floats in radian."""
     retardance = np.asarray(retardance, dtype=float)
-    # elements by their number in the matrix, row by row: few assignments with plain strides
-    matrix = np.zeros((*retardance.shape, 16))
-    matrix[..., 0:6:5] = 1.0
-    matrix[..., 10:16:5] = np.cos(retardance)[..., None]
-    matrix[..., 11] = np.sin(retardance)
-    matrix[..., 14] = -matrix[..., 11]
-    return matrix.reshape(*retardance.shape, 4, 4)
+    sine = np.sin(retardance)
+    matrix = np.zeros((*retardance.shape, 4, 4))
+    matrix[..., 0, 0] = matrix[..., 1, 1] = 1.0
+    matrix[..., 2, 2] = matrix[..., 3, 3] = np.cos(retardance)
+    matrix[..., 2, 3] = sine
+    matrix[..., 3, 2] = -sine
+    return matrix
 
 
 def _diattenuator(diattenuation):
@@ -97,15 +97,16 @@ def _diattenuator(diattenuation):
 def _diattenuator_retarder(diattenuation, retardance):
     """Return a linear diattenuator-retarder for floats, radian."""
     diattenuation = np.asarray(diattenuation, dtype=float)
+    # the product keeps the digits that 1 - D^2 loses near D = 1
     transverse = np.sqrt((1 - diattenuation) * (1 + diattenuation))
-    cosine = transverse * np.cos(retardance)
-    matrix = np.zeros((*np.shape(cosine), 16))
-    matrix[..., 0:6:5] = 1.0
-    matrix[..., 1:5:3] = diattenuation[..., None]
-    matrix[..., 10:16:5] = cosine[..., None]
-    matrix[..., 11] = transverse * np.sin(retardance)
-    matrix[..., 14] = -matrix[..., 11]
-    return matrix.reshape(*np.shape(cosine), 4, 4)
+    cosine, sine = transverse * np.cos(retardance), transverse * np.sin(retardance)
+    matrix = np.zeros((*np.shape(cosine), 4, 4))
+    matrix[..., 0, 0] = matrix[..., 1, 1] = 1.0
+    matrix[..., 0, 1] = matrix[..., 1, 0] = diattenuation
+    matrix[..., 2, 2] = matrix[..., 3, 3] = cosine
+    matrix[..., 2, 3] = sine
+    matrix[..., 3, 2] = -sine
+    return matrix
 
 
 def _elliptical_retarder(horizontal, diagonal, circular):
