@@ -7,11 +7,13 @@ light travels. Nothing here depends on which optics they are.
 """
 
 import difflib
+import math
 
 import numpy as np
 from astropy.modeling import CompoundModel
 
 from astropolcal.exceptions import ChainError, ParameterError
+from astropolcal.mueller._light import act, turned
 from astropolcal.optics import Optic
 from astropolcal.optics.core import FLUXES, finite_position
 
@@ -432,10 +434,41 @@ def system_mueller(chain, wavelength=None, positions=None):
     (3, 2, 4, 4)
     """
     positions, shape = _check_axes(wavelength, positions)
-    total = np.eye(4)
+    has_grid = np.ndim(wavelength) == 1
+    n_waves = len(wavelength) if has_grid else 1
+    n_frames = math.prod(shape) // n_waves
+    # what comes out of the four unit sources of every frame is the four columns of its matrix
+    light, frame = np.tile(np.eye(4), (n_frames, 1))[None], 0.0
     for leaf, dispersion, angle, values in _oriented_leaves(chain, wavelength, positions):
-        total = leaf._oriented(dispersion, angle, values) @ total
-    return np.broadcast_to(total, (*shape, 4, 4)).copy()
+        angle = _waves_first(angle, 0, has_grid)
+        if leaf.rotates_frame:
+            frame = frame - angle
+            continue
+        matrix = _waves_first(leaf._matrix(dispersion, *values), 2, has_grid)
+        light = _turned(light, angle - frame)
+        light = act(matrix[:, 0] if matrix.shape[1] == 1 else _four_each(matrix), light)
+        frame = angle
+    light = _turned(light, -frame).reshape(-1, n_frames, 4, 4)
+    total = np.broadcast_to(light.transpose(1, 0, 3, 2), (n_frames, n_waves, 4, 4))
+    return total.reshape(*shape, 4, 4).copy()
+
+
+def _waves_first(value, own, has_grid):
+    """Bring (n_frames, n_wavelengths), either of which may be missing, to two axes, turned."""
+    value = np.asarray(value)
+    lead, rest = value.shape[: value.ndim - own], value.shape[value.ndim - own :]
+    full = (1,) * (2 - len(lead)) + lead if has_grid else (math.prod(lead), 1)
+    return value.reshape(*full, *rest).swapaxes(0, 1)
+
+
+def _four_each(value):
+    """Give what belongs to a frame to each of its four sources."""
+    return np.repeat(value, 4, axis=1) if value.shape[1] > 1 else value
+
+
+def _turned(light, angle):
+    """Return T(angle) applied to the light of four sources a frame."""
+    return turned(light, _four_each(np.exp(-2j * angle)) if np.any(angle) else None)
 
 
 def _check_axes(wavelength, positions):

@@ -16,12 +16,11 @@ matrix of an optic has shape (n_wavelengths, 4, 4), or (n_wavelengths, n_columns
 where it changes from frame to frame.
 """
 
-import cmath
-
 import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError
+from astropolcal.mueller._light import act, act_back, inverse, phase_of, plane, turned
 from astropolcal.optics import FrameOptic
 
 __all__ = ["Propagator"]
@@ -211,7 +210,7 @@ class Propagator:
         # what stands still meets the light of all frames as two rows a wavelength
         rows, phase = _inward(common[self._meeting :], np.concatenate([right, left], axis=1), phase)
         light, fresh = _behind(common[: self._meeting], self.source, keep=False)
-        fluxes = _turned(light, phase, fresh) @ np.ascontiguousarray(rows.swapaxes(1, 2))
+        fluxes = turned(light, phase, fresh) @ np.ascontiguousarray(rows.swapaxes(1, 2))
         return tuple(_whole(fluxes[..., beam], self.shape) for beam in (0, 1))
 
     def forward(self, values=None):
@@ -310,7 +309,7 @@ class Sweep:
         same = propagator._same_entrance
         if same:
             # in front of the splitter the light of both beams is the same
-            light = _turned(light, self._arms[0][0].phase, fresh)
+            light = turned(light, self._arms[0][0].phase, fresh)
         fluxes = []
         for arm in self._arms:
             last, seen = _enter(arm, light, entered=same)
@@ -369,7 +368,7 @@ def _at(nodes, values, frame):
             frame = frame - theta
             steps.append(_Step(node, own))
         else:
-            phase = _phase(node.phase, theta - frame)
+            phase = phase_of(node.phase, theta - frame)
             steps.append(_Step(node, own, phase, node.matrix(own)))
             frame = theta
     return steps, frame
@@ -388,9 +387,9 @@ def _enter(steps, light, *, entered=False, keep=True):
             continue
         if last is not None:
             # what comes out of a product belongs to nobody else
-            light = _turned(_act(last.matrix, light), step.phase, in_place=True)
+            light = turned(act(last.matrix, light), step.phase, in_place=True)
         elif not entered:
-            light = _turned(light, step.phase)
+            light = turned(light, step.phase)
         if keep:
             step.light = light
         last = step
@@ -400,7 +399,7 @@ def _enter(steps, light, *, entered=False, keep=True):
 def _behind(steps, light, keep=True):
     """Return the light behind all optics, and whether it may be overwritten."""
     last, light = _enter(steps, light, keep=keep)
-    return (light, False) if last is None else (_act(last.matrix, light), True)
+    return (light, False) if last is None else (act(last.matrix, light), True)
 
 
 def _inward(steps, rows=None, phase=None):
@@ -414,7 +413,7 @@ def _inward(steps, rows=None, phase=None):
             if rows is None:
                 rows = step.matrix[:, :1]
             else:
-                rows = _act_back(step.matrix, _turned(rows, _inverse(phase)))
+                rows = act_back(step.matrix, turned(rows, inverse(phase)))
             phase = step.phase
     return rows, phase
 
@@ -445,14 +444,14 @@ def _back(steps, adjoint, behind, by_optic, result):
             if 0 in wanted:
                 _add(result, (step.node.index, 0), 2 * _crossed(behind))
             continue
-        pair = [(_act_back(step.matrix, adjoint), step.light)]
+        pair = [(act_back(step.matrix, adjoint), step.light)]
         if 0 in wanted:
             # d/dtheta of T(-theta) M T(theta), with T' = 2 G T
             _add(result, (step.node.index, 0), 2 * (_crossed(pair) - _crossed(behind)))
         if wanted and max(wanted) > 0:
             _at_optic(step, wanted, adjoint, result)
         behind = pair
-        adjoint = _turned(pair[0][0], _inverse(step.phase))
+        adjoint = turned(pair[0][0], inverse(step.phase))
     return adjoint, behind
 
 
@@ -461,7 +460,7 @@ def _at_optic(step, wanted, adjoint, result):
     derivatives = step.node.derivatives(step.values)
     for parameter in wanted:
         if parameter:
-            changed = _act(derivatives[parameter - 1], step.light)
+            changed = act(derivatives[parameter - 1], step.light)
             # a product with ones sums the four of a column faster than sum or einsum
             slope = (adjoint * changed) @ np.ones(4)
             _add(result, (step.node.index, parameter), slope)
@@ -474,60 +473,5 @@ def _add(result, key, value):
 def _crossed(pairs):
     """Return the sum of a . G s over pairs; G is the generator of rotations."""
     # a_Q s_U - a_U s_Q, with Q + iU as one number
-    products = [(_plane(a).conj() * _plane(s)).imag for a, s in pairs]
+    products = [(plane(a).conj() * plane(s)).imag for a, s in pairs]
     return sum(products[1:], start=products[0]) if products else np.zeros((1, 1))
-
-
-def _phase(stage, theta):
-    """Return what Q + iU is multiplied by at the entrance of an optic, or None for 1."""
-    if np.ndim(theta):
-        # one value a wavelength goes along the first axis, positions along the second
-        turn = np.exp(-2j * theta)[:, None]
-    elif theta:
-        turn = cmath.exp(-2j * theta)
-    else:
-        return stage
-    return turn if stage is None else stage * turn
-
-
-def _inverse(phase):
-    """Return the phase of the way back."""
-    return None if phase is None else phase.conjugate()
-
-
-def _turned(light, phase, in_place=False):
-    """Return T(angle) applied to the light, for the phase exp(-2i angle)."""
-    if phase is None:
-        return light
-    rows, columns, _ = light.shape
-    dimensions = np.ndim(phase)
-    if dimensions:
-        # the shape of the product, without asking numpy for it
-        columns = max(columns, phase.shape[-1])
-        rows = max(rows, phase.shape[0]) if dimensions == 2 else rows
-    if not in_place or (rows, columns) != light.shape[:2]:
-        out = np.empty((rows, columns, 4))
-        out[:] = light
-        light = out
-    plane = _plane(light)
-    np.multiply(plane, phase, out=plane)
-    return light
-
-
-def _plane(light):
-    """Return Q + iU as a view."""
-    return light[..., 1:3].view(complex)[..., 0]
-
-
-def _act(matrix, light):
-    """Return matrix times light."""
-    if matrix.ndim == 4:
-        return np.einsum("wcij,wcj->wci", matrix, light)
-    return light @ np.ascontiguousarray(matrix.swapaxes(1, 2))
-
-
-def _act_back(matrix, adjoint):
-    """Return the adjoint times matrix."""
-    if matrix.ndim == 4:
-        return np.einsum("wci,wcij->wcj", adjoint, matrix)
-    return adjoint @ matrix
