@@ -8,7 +8,7 @@ from astropolcal.calibration.accuracy import (
     cross_validated_residuals,
     leave_out_groups,
 )
-from astropolcal.calibration.comparison import compare
+from astropolcal.calibration.comparison import compare, comparison_text
 from astropolcal.calibration.convergence import Convergence
 from astropolcal.calibration.covariance import Covariance, full_covariance
 from astropolcal.calibration.derived import Derived, propagate
@@ -39,11 +39,10 @@ from astropolcal.calibration.log_posterior import LogPosterior
 from astropolcal.calibration.mirrors import mirror_solutions
 from astropolcal.calibration.noise import (
     NoiseEstimate,
-    estimate_noise,
     noise_from_errors,
-    noise_from_null_channel,
     noise_from_replicates,
 )
+from astropolcal.calibration.null_channel import estimate_noise, noise_from_null_channel
 from astropolcal.calibration.posterior import Posterior, autocorrelation, autocorrelation_time
 from astropolcal.calibration.profile import Profile, profile
 from astropolcal.calibration.quantities import (
@@ -112,6 +111,7 @@ __all__ = [
     "calibrate",
     "changes",
     "compare",
+    "comparison_text",
     "complete",
     "content_hash",
     "cross_validated_residuals",

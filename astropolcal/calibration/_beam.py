@@ -9,9 +9,10 @@ from astropolcal.instruments import without_nuisance
 
 
 def instrument_of(calibration):
-    """Return the instrument of a calibration, or None if it is not a known one."""
+    """Return the instrument; None without one, or for a name that somebody chose."""
+    name = calibration.instrument
     try:
-        return instruments.get(calibration.instrument)
+        return None if name is None else instruments.get(name)
     except InstrumentError:
         return None
 
@@ -41,11 +42,13 @@ def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"
     for record, chain in zip(calibration.datasets, calibration.chains, strict=True):
         inner = split_chain(without_nuisance(chain))[1]
         if _matches(_optional(instrument, record), inner, known, beam or {}):
+            # chains of the same optics share them by name, so any one stands for all
             kinds.setdefault(tuple(leaf.name for leaf in inner), inner)
     if not kinds:
         wanted = beam_words(beam) if known is None else optics_words([tuple(sorted(known))])
         raise ChainError(f"{label}: no chain {wanted}; it holds for {validity_of(calibration)}")
     if len(kinds) > 1:
+        # only what differs helps to choose
         common = set.intersection(*map(set, kinds))
         shown = [",".join(n for n in names if n not in common) or "none" for names in kinds]
         raise ChainError(
@@ -64,6 +67,7 @@ def _optional(instrument, record):
 
 
 def _matches(optional, inner, wanted, beam):
+    # an instrument knows which of its optics are optional; without one all of the chain's may be
     present = {leaf.name for leaf in inner} if optional is None else optional
     if wanted is None:
         return all((name in present) == is_in for name, is_in in beam.items())
@@ -74,6 +78,7 @@ def telescope_optics(calibration):
     """Return the optics of a calibrated telescope, from the sky on; None if there are none."""
     for chain in calibration.chains:
         outer, _ = split_chain(chain)
+        # in front of the parallactic angle stands the star itself, which is no telescope
         start = next((i for i, leaf in enumerate(outer) if leaf.stage == "parallactic"), None)
         if start is not None:
             return outer[start:]

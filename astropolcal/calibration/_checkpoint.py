@@ -169,6 +169,7 @@ class Chain:
 
     def _record(self, crc):
         """Return count, random state, acceptance and their CRC as bytes."""
+        # little-endian whatever the machine, so that a run may move
         keys = np.zeros(_KEYS, dtype="<u4")
         head = (0, 0, 0.0)
         if self.random_state is not None:
@@ -304,6 +305,7 @@ def _small(h5py, file, name, kinds):
 def _latest(records):
     """Return the content of the record that counts more steps, of those that are whole."""
     found, end = [], _HEAD.size + 4 * _KEYS
+    # two records: while one is written the other one is whole
     for slot, record in enumerate(records):
         content, crc = record[:-4].tobytes(), record[-4:].tobytes()
         if _CRC.pack(zlib.crc32(content)) == crc and len(content) >= end:

@@ -4,6 +4,8 @@
 import astropy.units as u
 import numpy as np
 
+from astropolcal.units import canonical_factor
+
 # what is worth a word in a direction, as a share of its largest component
 _WORTH_A_WORD = 0.02
 # where a parameter is that uncertain, an error is no help: degree, micrometre, percent
@@ -23,8 +25,14 @@ def step_of(unit):
     if unit is None:
         return 0.01, 0.01, ""
     if u.Unit(unit).is_equivalent(u.rad):
+        # canonical is radian: one degree is the step that a user has a feeling for
         return np.deg2rad(1.0), 1.0, " deg"
     return 1.0, 1.0, " um"
+
+
+def declared_step(unit):
+    """Return the step of a parameter in its declared unit, such as 3600 for one in arcsec."""
+    return step_of(unit)[0] / canonical_factor(unit)
 
 
 # ---- open directions ----------------------------------------------------------------------
@@ -43,6 +51,7 @@ def _moved(free, vector):
     """Return what a direction changes, by parameter, in degree, micrometre or 1."""
     moved, worth = {}, _WORTH_A_WORD * min(1.0, np.abs(vector).max(initial=0.0))
     for slot in free.slots:
+        # a parameter per wavelength shows if any of its values moves
         part = vector[slot.slice]
         if np.abs(part).max() > worth:
             size = step_of(slot.unit)[1]
@@ -55,6 +64,7 @@ def led(free, null):
     if not len(null):
         return
     leads = _leads(free, null)
+    # a basis in which each leading parameter moves by one step in its own direction only
     for vector, lead in zip(np.linalg.solve(null[:, leads], null), leads, strict=True):
         yield vector, free.names[lead]
 
@@ -73,6 +83,7 @@ def _leads(free, null):
         pool = order[:n_single] if single.size and single.max() > 1e-3 else order
         lead = next(i for i in pool if size[i] > 0.3 * size[pool].max())
         direction = columns[:, lead] / size[lead]
+        # take out what this lead explains, as in a QR decomposition with pivots
         columns -= np.outer(direction, direction @ columns)
         leads.append(int(lead))
     return leads
@@ -135,11 +146,13 @@ def near_null_directions(free, whitened, level, sky_of):
     smaller than the largest. ``sky_of`` returns what canonical changes do on sky.
     """
     found = whitened.errors
+    # each row is a principal direction, as long as its standard error at the noise of the fit
     singular, errors = found.singular[: found.rank], whitened.factor() * level
     condition = found.singular[:1] / singular
     times_large = np.abs(errors) / _large(free)
     bad = (times_large > 1).any(axis=1) | (condition > _CONDITION)
     leads = np.argmax(times_large, axis=1) if len(errors) else np.zeros(0, dtype=int)
+    # the sign of a singular vector is arbitrary: the worst parameter goes up
     errors = errors * np.sign(errors[np.arange(len(errors)), leads])[:, None]
     worst = [i for i in np.argsort(singular, kind="stable") if bad[i]]
     skies = _skies(errors[worst] * whitened.scale, sky_of)
@@ -158,6 +171,7 @@ def _large(free):
 
 
 def _skies(changes, sky_of):
+    # each direction costs two evaluations of the whole chain
     some = sky_of(changes[:_ON_SKY]) if len(changes) else []
     return some + [None] * (len(changes) - len(some))
 

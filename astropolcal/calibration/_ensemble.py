@@ -41,11 +41,14 @@ class Laplace:
         #: Sign in which each parameter can leave the bound that it sits at, else 0.
         self.inward = _inward(log_posterior)
         self.free = self.inward == 0
+        # rows of the Jacobian are parameters: left vectors are directions among them, (n, n)
         left, singular, _ = np.linalg.svd(jacobian[self.free])
+        # the standard error along each, as the Jacobian is in units of the noise
         width = 1 / np.maximum(np.pad(singular, (0, len(left) - singular.size)), 1e-99)
         #: Which principal directions are determined.
         self.determined = width < _WIDEST
         width = np.where(self.determined, width, _START)
+        # columns lead from unit normal numbers to parameters, `_back` the other way
         self._out = left * width * scale[self.free][:, None]
         self._back = (left / width).T / scale[self.free]
         # what sits at a bound leaves it as far as its own slope allows
@@ -71,6 +74,7 @@ class Laplace:
         """
         low, high, centre = self.log_posterior.low, self.log_posterior.high, self.centre
         coords = self._draw(n_walkers, rng)
+        # a normal cut off at the bounds, by rejection; near many bounds that may take forever
         for _ in range(_MAX_DRAWS):
             wrong = ((coords < low) | (coords > high)).any(axis=1)
             coords[wrong] = self._draw(int(wrong.sum()), rng)
@@ -80,6 +84,7 @@ class Laplace:
             impossible = ~np.isfinite(self.log_posterior(coords))
             if not impossible.any():
                 return coords
+            # the fit itself is possible, so that halving the way to it ends somewhere that is
             offset[impossible] /= 2
         raise FitError("the walkers find no place to start: the fitted values have no probability")
 
@@ -134,6 +139,7 @@ def _crank_nicolson(emcee, laplace):
         anew = random.uniform(_LEAST_ANEW, 1.0, size=(len(coords), 1))
         noise = random.normal(size=(len(coords), int(moved.sum())))
         after[:, moved] = np.sqrt(1 - anew**2) * before[:, moved] + anew * noise
+        # log of the ratio of proposal densities; it undoes the normal part of the posterior
         gain = 0.5 * np.sum(after[:, moved] ** 2 - before[:, moved] ** 2, axis=1)
         return laplace.place(coords, after), gain
 
@@ -154,6 +160,8 @@ def _bound_move(emcee, laplace):
             moved, factors = super().get_proposal(s, c, random)
             return np.where(held, moved, s), factors
 
+    # the optimal scale for as many dimensions as move
+    # (ter Braak 2006, doi:10.1007/s11222-006-8769-1)
     return BoundDEMove(gamma0=2.38 / np.sqrt(2 * int(held.sum())))
 
 

@@ -42,6 +42,7 @@ def describe(header, instrument=None, stated=()):
     layout = found.files
     if layout is None:
         return {"instrument": found.name}
+    # what is stated by the user, or is the identity itself, is no contradiction
     own = _look_up(header, "instrument", layout)
     if "instrument" in stated or own in layout.identities:
         own = None
@@ -61,6 +62,7 @@ def _text(value):
 def _recognized(header):
     """Return the instrument whose identity a header bears."""
     seen = []
+    # each instrument looks under its own keyword, so that all of them are asked
     for name in instruments.names():
         instrument = instruments.get(name)
         layout = instrument.files
@@ -139,6 +141,8 @@ class FrameAngles:
         missing = [i for i, value in enumerate(values) if value is None]
         if not missing:
             return True
+        # some with and some without is a mixture of modes, or a
+        # broken header; none has it: not there
         if len(missing) < len(values):
             keyword = self._layout.keywords[column]
             raise ObservationError(
@@ -151,8 +155,10 @@ class FrameAngles:
         if column in _SKY:
             return _sky(column, values)
         keyword, layout = self._layout.keywords[column], self._layout
+        # states of a modulator, cameras and such
         if not u.Unit(layout.units.get(column, "deg")).is_equivalent(u.deg):
             return np.array([str(value).strip() for value in values])
+        # two turns: encoders count on past 360 deg, but what is further out is no angle
         low, high = RANGES.get(column, (-720.0, 720.0))
         angles = []
         for i, value in enumerate(values):
@@ -185,6 +191,7 @@ def _sky(column, values):
 
     try:
         numbers = [float(value) for value in values]
+        # plain numbers are degrees, also for the right ascension; sexagesimal ones are hours there
         return numbers * u.deg
     except (TypeError, ValueError):
         pass

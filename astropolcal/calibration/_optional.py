@@ -25,8 +25,9 @@ def need(module, what):
     try:
         return import_module(module)
     except ImportError as error:
+        # as pip knows it: arviz_stats.base is in arviz-stats
         package = module.split(".")[0].replace("_", "-")
         raise AstropolcalError(
             f"{what} needs the package {package}, which is not installed: "
-            "pip install astropolcal[mcmc]"
+            'pip install "astropolcal[mcmc]"'
         ) from error

@@ -12,10 +12,12 @@ class Refit:
     """The least-squares problem of a calibration: data, priors, bounds."""
 
     def __init__(self, calibration):
-        self.measurement = calibration._live()
+        self.measurement = calibration.live_measurement()
         self.solution = self.measurement.vector()
         weighting = weighting_of(calibration)
         weights = weighting.weight
+        # with equal weights residuals stay dimensionless, and the
+        # noise multiplies the priors instead
         self.weights = np.ones(self.measurement.n_data) if weights is None else weights
         self._noise = weighting.level
         self._low, self._high = self.measurement.free.bounds()
@@ -40,6 +42,7 @@ class Refit:
         """
         from scipy.optimize import least_squares
 
+        # a datum drawn k times adds k r^2 to chi-square; one never drawn adds nothing
         weights = self.weights if counts is None else self.weights * np.sqrt(counts)
         live = np.setdiff1d(np.arange(start.size), held)
         vector = start.copy()
@@ -50,9 +53,11 @@ class Refit:
 
         found = least_squares(
             lambda part: self.residuals(place(part), weights),
+            # least_squares refuses a start outside of the bounds by a rounding error
             np.clip(start[live], self._low[live], self._high[live]),
             jac=lambda part: self.jacobian(place(part), weights)[:, live],
             bounds=(self._low[live], self._high[live]),
+            # a radian, a micrometre and a 1 move the data by very different amounts
             x_scale=self._scale(start, weights)[live],
             max_nfev=_MAX_EVALUATIONS,
         )

@@ -5,9 +5,9 @@ import warnings
 
 import numpy as np
 
-from astropolcal import instruments
+from astropolcal.calibration._beam import instrument_of
 from astropolcal.calibration.accuracy import accuracy_table
-from astropolcal.exceptions import CalibrationFileError, InstrumentError, ObservationError
+from astropolcal.exceptions import CalibrationFileError, ObservationError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
 
@@ -46,6 +46,7 @@ def measurement_of_all(calibration, observations, positions=None):
         positions = _positions(calibration, tables)
     else:
         positions = [positions[i] for i in order]
+    # the same chains, ties and grid as in the fit: what the file holds is enough to predict
     measurement = Measurement(
         calibration.chains,
         tables,
@@ -58,18 +59,11 @@ def measurement_of_all(calibration, observations, positions=None):
     return measurement
 
 
-def _instrument(calibration):
-    """Return the instrument; None without one, or for a name that somebody chose."""
-    try:
-        return None if calibration.instrument is None else instruments.get(calibration.instrument)
-    except InstrumentError:
-        return None
-
-
 def _prepared(calibration, table):
     """Return a table with the masks of the instrument, if the calibration was made with them."""
+    # hashes are those of the tables as they were fitted, masks included
     wanted = {record.content_hash for record in calibration.datasets}
-    instrument = _instrument(calibration)
+    instrument = instrument_of(calibration)
     if table.content_hash in wanted or instrument is None:
         return table
     try:
@@ -96,12 +90,13 @@ def _order(records, given):
     if missing:
         listed = ", ".join(f"{r.name} (content hash {r.content_hash[:_SHOWN]})" for r in missing)
         raise CalibrationFileError(f"the calibration was also made from {listed}: give that table")
+    # the order of the fit, on which slices of data and residuals depend
     return [known.index(record.content_hash) for record in records]
 
 
 def _positions(calibration, tables):
     """Return the positions that the instrument reads; None, the columns, without one."""
-    instrument = _instrument(calibration)
+    instrument = instrument_of(calibration)
     if instrument is None:
         return None
     return [instrument.positions(*pair) for pair in zip(tables, calibration.chains, strict=True)]

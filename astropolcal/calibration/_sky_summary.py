@@ -16,6 +16,7 @@ def mirror_lines(calibration):
     if not tables:
         return []
     shown = {table.meta["name"]: table for table in tables}
+    # a grid of several tables need not ascend
     order = np.argsort(calibration.wavelength)
     rows = order[np.unique(np.linspace(0, order.size - 1, _N_MIRROR_ROWS).round().astype(int))]
     head = "       nm" + "".join(f"{name:>17}" for name in shown)

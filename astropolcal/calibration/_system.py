@@ -22,6 +22,7 @@ def match_wavelengths(grid, chain, wavelength):
         lam = np.atleast_1d(u.Quantity(wavelength)).to(grid.unit)
     except (TypeError, u.UnitConversionError):
         raise ParameterError(f"wavelength = {wavelength!r} needs a unit such as nm") from None
+    # relative, (n_wanted, n_grid)
     far = np.abs(lam[:, None] - grid) / grid
     bins = far.argmin(axis=1)
     off = far.min(axis=1) > _SAME_WAVELENGTH
@@ -38,6 +39,7 @@ def match_wavelengths(grid, chain, wavelength):
             f"{lam[off][0]:.2f} is none of the {grid.size} calibrated wavelengths, and "
             f"{several[0]} is known at these only: {grid.min():.2f} to {grid.max():.2f}"
         )
+    # laws of glass and metal interpolate between calibrated wavelengths, but are not trusted beyond
     outside = (lam < grid.min()) | (lam > grid.max())
     if (outside & off).any():
         raise WavelengthRangeError(
@@ -57,6 +59,7 @@ def errors(calibration, axes, value, slopes, bins):
     for w in range(shape[-3]):
         at = (..., w, slice(None), slice(None))
         place = None if bins is None else bins[w]
+        # derivatives per degree, micrometre or percent, (n_elements of the matrices, n_free)
         scaled = _along(free, slopes, at, place, value[at].shape) * axes.steps
         spread = axes.spread(scaled @ axes.known.T, scaled @ axes.open.T, scaled @ axes.blind.T)
         here = value[at].shape
@@ -74,7 +77,9 @@ def _along(free, slopes, at, place, shape):
         if slot is None:
             continue
         own = getattr(free.values_of(name), "unit", None)
+        # at one wavelength only its own value of a parameter per wavelength matters
         column = slot.start + (place if slot.per_wavelength else 0)
+        # per unit of the follower -> canonical -> the source of the tie -> per unit of the source
         result[:, column] += slope.value[at].ravel() / canonical_factor(own) * factor * slot.factor
     return result
 
@@ -82,6 +87,7 @@ def _along(free, slopes, at, place, shape):
 def split_chain(chain):
     """Return the optics in front of the first stage of the instrument, and the others."""
     found = leaves(chain)
+    # up to there it is the telescope or the calibration source
     start = next(
         (i for i, leaf in enumerate(found) if leaf.stage not in (None, *_TELESCOPE, *COORDINATES)),
         0,

@@ -36,6 +36,7 @@ def telescope_words(finding, measurement):
         for name in direction["parameters"]
     }
     held = measurement.free.at_bounds(measurement.vector()) if measurement.datasets else []
+    # what ran to a bound is as open as what drifts
     at_bound = [n for n, stuck in zip(_names(measurement), held, strict=True) if stuck]
     words = []
     for mirror in sorted(_mirrors(measurement)):

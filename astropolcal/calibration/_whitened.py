@@ -34,6 +34,7 @@ class Directions(NamedTuple):
     @property
     def half(self):
         """Determined rows, each as long as its standard error for unit noise."""
+        # covariance = V S^-2 V^T = half^T half
         return self.right[: self.rank] / self.singular[: self.rank, None]
 
 
@@ -44,8 +45,10 @@ def decompose(rows):
     All right vectors are there even if there are fewer rows than columns.
     """
     n_rows, n_columns = rows.shape
+    # null directions need all right vectors; with more rows than columns they are there anyway
     _, singular, right = np.linalg.svd(rows, full_matrices=n_rows < n_columns)
     singular = np.pad(singular, (0, n_columns - singular.size))
+    # without data the largest singular value is zero too: nothing is determined then
     threshold = max(_RANK_TOLERANCE * singular.max(initial=0.0), _NOTHING)
     return Directions(singular, right, int(np.sum(singular > threshold)))
 
@@ -102,12 +105,14 @@ class Whitened:
     @cached_property
     def leverage(self):
         """Derivative of each fitted to its observed datum, shape (n_data,)."""
+        # diagonal of the hat matrix J (J^T J + P)^-1 J^T
         return np.sum((self.rows[:, self.live] @ self.errors.half.T) ** 2, axis=1)
 
     @cached_property
     def n_taken(self):
         """Degrees of freedom that the parameters take from the data, the sum of the leverages."""
         if not len(self.prior_rows):
+            # trace of a projection
             return float(self.errors.rank)
         return float(np.sum((self._square[:, self.live] @ self.errors.half.T) ** 2))
 
@@ -131,6 +136,7 @@ class Whitened:
         NaN in the rows and columns of what is held or not determined.
         """
         out = np.full((self.scale.size, self.scale.size), np.nan)
+        # a pseudo-inverse would give a small number for what is open; it gets none
         known = self.errors.determined
         columns = self.live[known]
         half = self.errors.half[:, known] * self.scale[columns]

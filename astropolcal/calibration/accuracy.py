@@ -84,6 +84,8 @@ def accuracy_table(measurement, dataset, residuals, held_out=None):
     k = part.n_parameters_per_wavelength
     squares = np.array([np.sum(residuals[row] ** 2) for row in rows])
     with np.errstate(divide="ignore", invalid="ignore"):
+        # n - k as for independent data: every parameter that acts here takes one degree of freedom,
+        # also one common to all wavelengths, as in the paper
         s_res = np.where(n > k, np.sqrt(squares / np.where(n > k, n - k, 1)), np.nan)
         s_mean = s_res / np.sqrt(n)
     s_cv = [np.nan if held_out is None else _rms(held_out[row]) for row in rows]
@@ -189,6 +191,8 @@ def _held_out_linearly(measurement, vector, jacobian, weights, labels, groups):
     ends = np.flatnonzero(labels[order][1:] != labels[order][:-1]) + 1
     held_out = np.empty(measurement.n_data)
     for rows in np.split(order, ends):
+        # (1 - H_g)^-1 r_g without inverting a matrix of the size of the group: H_g = R R^T, and its
+        # eigenvalues are those of R^T R, (rank, rank)
         values, axes = np.linalg.eigh(root[rows].T @ root[rows])
         seen = root[rows] @ axes
         # along these the others determine nothing
@@ -199,6 +203,7 @@ def _held_out_linearly(measurement, vector, jacobian, weights, labels, groups):
             moved, _ = _undetermined(measurement, vector, jacobian, out, weights)
             raise FitError(_not_predicted(measurement, labels[rows[0]], out, moved))
         gain = np.where(alone, 0.0, 1 / np.where(alone, 1.0, 1 - values))
+        # (1 - R R^T)^-1 = 1 + R (1 - R^T R)^-1 R^T
         change = seen @ (gain * (seen.T @ residuals[rows]))
         held_out[rows] = np.where(blind, np.nan, (residuals[rows] + change) / weight[rows])
     return held_out
@@ -229,6 +234,7 @@ def _undetermined(measurement, vector, jacobian, out, weights):
     kept = jacobian[:, ~out] * (1.0 if weights is None else weights[~out])
     kept = np.concatenate([kept, measurement.free.prior_jacobian(vector)], axis=1)
     null = null_space(measurement.free, kept) * scale
+    # which combinations of what the others leave open do the data left out see, and how strongly
     left, seen, right = np.linalg.svd(null @ jacobian[:, out], full_matrices=False)
     limit = _STILL * np.abs(jacobian * scale[:, None]).max(initial=0.0)
     moves = seen > limit

@@ -54,6 +54,7 @@ def autocorrelation(chain):
     chain = np.asarray(chain, dtype=float)
     deviation = chain - chain.mean()
     n = len(chain)
+    # padded to twice the length: without it the end of the chain correlates with its beginning
     spectrum = np.fft.rfft(deviation, n=2 * n, axis=0)
     covariance = np.fft.irfft(np.mean(np.abs(spectrum) ** 2, axis=1), n=2 * n)[:n]
     return np.full(n, np.nan) if _is_flat(chain) else covariance / covariance[0]

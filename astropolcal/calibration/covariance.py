@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from astropolcal.calibration._directions import step_of
+from astropolcal.calibration._directions import declared_step
 from astropolcal.calibration.weighting import Weighting, around, weighting_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor
@@ -102,6 +102,7 @@ class Covariance:
         """
         units = [slot.unit for slot in free.slots for _ in range(slot.size)]
         per_unit = np.array([1 / canonical_factor(unit) for unit in units])
+        # one factor for the row and one for the column
         return cls(free.names, units, matrix * per_unit[:, None] * per_unit[None, :])
 
     def __len__(self):
@@ -218,7 +219,8 @@ class Covariance:
 
     def _axes(self):
         """Split the space of the parameters, each in degree, micrometre or percent."""
-        steps = np.array([step_of(unit)[0] / canonical_factor(unit) for unit in self.units])
+        steps = np.array([declared_step(unit) for unit in self.units])
+        # NaN on the diagonal marks what has no error; why is told by `null` and `factor`
         undetermined = ~np.isfinite(np.diag(self.matrix))
         empty = np.zeros((0, len(self)))
         null = empty if self.null is None else self.null / steps
@@ -229,6 +231,7 @@ class Covariance:
             blind = undetermined & ~moves
         else:
             factor, blind = self._factor_of_matrix(steps, ~undetermined), undetermined
+        # rows of `factor` are principal directions times their standard errors; here they part
         sigmas = np.linalg.norm(factor, axis=1)
         known = factor / np.where(sigmas > 0, sigmas, 1.0)[:, None]
         return _Axes(steps, known, sigmas, null, np.eye(len(self))[blind], self.factor is None)
@@ -236,6 +239,7 @@ class Covariance:
     def _factor_of_matrix(self, steps, known):
         """Return the determined directions of the parameters that have an error."""
         matrix = self.matrix[np.ix_(known, known)] / steps[known, None] / steps[known]
+        # a symmetric matrix: eigenvectors are the directions, roots of eigenvalues their errors
         variance, vectors = np.linalg.eigh(matrix)
         factor = np.zeros((len(variance), len(self)))
         factor[:, known] = (vectors * np.sqrt(variance.clip(0))).T
@@ -257,6 +261,7 @@ class _Axes:
         """Return the spread of quantities from their slopes along the axes, (k, n_axes) each."""
         parts = [along_known, along_open, along_blind]
         size = np.sqrt(sum(np.sum(part**2, axis=1) for part in parts))
+        # a rounding error along an open direction is no movement
         limit = _STILL * size
         is_open = np.abs(along_open).max(axis=1, initial=0.0) > limit
         blind = np.abs(along_blind).max(axis=1, initial=0.0) > limit
@@ -281,6 +286,7 @@ class _Spread:
     def covariance(self):
         matrix = self.moved @ self.moved.T
         unknown = self.is_open | self.is_blind
+        # a covariance with something infinite has no value
         matrix[unknown] = matrix[:, unknown] = np.nan
         diagonal = np.arange(len(matrix))[self.is_open]
         matrix[diagonal, diagonal] = np.inf
@@ -371,7 +377,7 @@ def prior_noise(measurement, weights):
 def _open_of_file(calibration):
     """Return the open directions that a file names, less those that a prior has closed."""
     known = calibration.covariance
-    steps = np.array([step_of(unit)[0] / canonical_factor(unit) for unit in known.units])
+    steps = np.array([declared_step(unit) for unit in known.units])
     null = np.asarray(calibration.identifiability.null_vectors).reshape(-1, len(known))
     undetermined = ~np.isfinite(np.diag(known.matrix))
     undetermined &= [name not in set(calibration.at_bound) for name in known.names]

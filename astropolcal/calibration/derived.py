@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration._directions import led as _reduced
+from astropolcal.calibration._directions import led
 from astropolcal.calibration.covariance import full_covariance
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement import FreeParameters
@@ -120,14 +120,16 @@ def propagate(calibration, function, derivatives=None):
     free = FreeParameters(chains, len(calibration.wavelength), calibration.ties)
     value = function(*chains)
     if derivatives is not None:
-        known = _slopes_of(free, derivatives(*chains), np.shape(value))
-        return _derive(calibration, free, value, known)
+        known = slopes_of(free, derivatives(*chains), np.shape(value))
+        return derive(calibration, free, value, known)
     unit = value.unit if isinstance(value, u.Quantity) else None
     start, canonical = free.start(), free.factors()
 
     def slope(direction):
         ends = []
         for sign in (1, -1):
+            # direction is in steps, `steps` leads to declared units,
+            # `canonical` on to those of the vector
             free.put_back(start + sign * _STEP * direction * axes.steps * canonical)
             end = function(*chains)
             ends.append(np.ravel(end.to_value(unit) if unit is not None else end))
@@ -140,11 +142,12 @@ def propagate(calibration, function, derivatives=None):
         else np.zeros((np.size(value), 0))
         for rows in (axes.known, axes.open, axes.blind)
     ]
+    # the basis of open directions is arbitrary; a user asks what one degree of a parameter does
     changes = parts[1] @ _to_leads(free, axes.open) if len(axes.open) else None
     return _package(free, axes, value, axes.spread(*parts), changes)
 
 
-def _slopes_of(free, derivatives, shape):
+def slopes_of(free, derivatives, shape):
     """Lay derivatives by name out over the flat vector, shape (size, n_free)."""
     size = int(np.prod(shape, dtype=int))
     slopes = np.zeros((size, free.size))
@@ -165,7 +168,7 @@ def _slopes_of(free, derivatives, shape):
     return slopes
 
 
-def _derive(calibration, free, value, slopes):
+def derive(calibration, free, value, slopes):
     """Return a quantity with its error from its derivatives per declared unit."""
     axes = full_covariance(calibration)._axes()
     scaled = slopes * axes.steps
@@ -177,14 +180,14 @@ def _derive(calibration, free, value, slopes):
 
 def _to_leads(free, null):
     """Return what turns changes along the open directions into those per leading parameter."""
-    reduced = np.array([vector for vector, _ in _reduced(free, null)])
+    reduced = np.array([vector for vector, _ in led(free, null)])
     return null @ reduced.T
 
 
 def _package(free, axes, value, spread, changes):
     shape, moved = np.shape(value), {}
     if changes is not None and spread.is_open.any():
-        names = [lead for _, lead in _reduced(free, axes.open)]
+        names = [lead for _, lead in led(free, axes.open)]
         limit = 1e-5 * np.abs(changes).max()
         moved = {
             name: change.reshape(shape)

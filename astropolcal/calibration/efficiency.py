@@ -70,6 +70,7 @@ def sky_path(chain):
     ['hwp', 'derotator', 'dichroic', 'nbs']
     """
     found = leaves(chain)
+    # the first optic that treats the two beams differently is the beam splitter
     end = next((i for i, leaf in enumerate(found) if leaf.depends_on_beam), len(found))
     moving = (i for i, leaf in enumerate(found) if leaf.stage not in (None, *COORDINATES))
     train = list(found[next(moving, end) : end])
@@ -272,12 +273,14 @@ def _measured(rows, aolp):
         total, difference = np.moveaxis(
             rows @ np.array([1.0, np.cos(angle), np.sin(angle), 0.0]), -1, 0
         )
+        # (2, ...): q from 0 and 45 deg, u from 22.5 and 67.5 deg
         double = (difference[0::2] - difference[1::2]) / (total[0::2] + total[1::2])
         return np.hypot(*double)
     # to first order of what the optics polarize themselves
     total = rows[0::2, ..., 0, 0] + rows[1::2, ..., 0, 0]
     difference = rows[0::2, ..., 1, 1:3] - rows[1::2, ..., 1, 1:3]
     response = np.moveaxis(difference / total[..., None], 0, -2)
+    # the worst angle of polarization is the direction of the least singular value
     return np.linalg.svd(response, compute_uv=False)[..., -1]
 
 
@@ -385,6 +388,7 @@ def best_derotator(
     efficiency = polarimetric_efficiency(
         chain,
         wavelength,
+        # (n_offsets, n_times)
         derotator=offsets[:, None] + f * p + g * a,
         altitude=a,
         parallactic=p,

@@ -194,11 +194,13 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
         residuals = residuals * weighting.weight
     # derivatives to the determined directions, each in units of its standard error
     slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T
+    # (n_groups, rank): how far each group alone pulls the solution, in standard errors
     pulls = [_pull(slopes[labels == g], residuals[labels == g], correction) for g in set(labels)]
     middle = np.transpose(pulls) @ np.array(pulls)
     if correction == "number":
         n, k, n_groups = len(labels), slopes.shape[1], len(pulls)
         middle *= n_groups / (n_groups - 1) * (n - 1) / max(n - k, 1)
+    # priors are taken at their word: their variance is not read from residuals
     prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T
     middle += weighting.level**2 * prior.T @ prior
     return _sandwich(calibration, whitened, middle)
@@ -234,8 +236,10 @@ def _sandwich(calibration, whitened, middle):
     """Return the covariance from that of the pulls on the determined directions."""
     variances, vectors = np.linalg.eigh(middle)
     stds = np.sqrt(variances.clip(0))
+    # with fewer groups than directions the sum of outer products is singular
     stds = np.maximum(stds, _LEAST * stds.max(initial=0.0))
     rows = (stds[:, None] * vectors.T) @ whitened.factor()
+    # back to orthogonal directions, as `Covariance` keeps them
     _, sizes, principal = np.linalg.svd(rows, full_matrices=False)
     free = calibration.measurement.free
     per_unit = whitened.scale / free.factors()
@@ -252,7 +256,7 @@ def _sandwich(calibration, whitened, middle):
 
 def _per_wavelength(calibration):
     """Return the errors of fits wavelength by wavelength, in declared units."""
-    measurement = calibration._live()
+    measurement = calibration.live_measurement()
     free, weights = measurement.free, weighting_of(calibration).weight
     weights = 1.0 if weights is None else weights
     jacobian = measurement.jacobian(measurement.vector()) * weights
@@ -266,6 +270,7 @@ def _per_wavelength(calibration):
         if own.size and rows.sum() > own.size:
             scale = physical_scale(free)[own]
             unit_noise = _stds(jacobian[np.ix_(own, rows)].T * scale) * scale
+            # the common parameters count as known, so that only a wavelength's own take freedom
             variance = np.sum(residuals[rows] ** 2) / (rows.sum() - own.size)
             stds[own] = np.sqrt(variance) * unit_noise
     return stds / free.factors()

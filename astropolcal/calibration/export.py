@@ -15,7 +15,7 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from astropolcal.exceptions import CalibrationFileError, ParameterError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, check_new
 
 __all__ = ["mueller_table", "write_mueller"]
 
@@ -83,6 +83,7 @@ def mueller_table(calibration, header=None, *, positions=None, light="sky", wave
     (44, (44, 4, 4))
     """
     options = {"positions": positions, "light": light, "wavelength": wavelength}
+    # positions, wavelengths and frames are the same for both beams
     beams = {beam: calibration.system_mueller(header, beam=beam, **options) for beam in _BEAMS}
     first = beams["right"]
     n_bins = first.wavelength.size
@@ -95,6 +96,7 @@ def mueller_table(calibration, header=None, *, positions=None, light="sky", wave
         table[stage] = np.repeat(np.broadcast_to(angle, n_frames, subok=True), n_bins)
     for beam, found in beams.items():
         table[f"mueller_{beam}"] = found.value.reshape(-1, 4, 4)
+        # errors of two rows are correlated, too, but a table has room for those of a row only
         table[f"cov_{beam}"] = found.covariance.reshape(-1, 16, 16)
     table.meta = _meta(calibration, light, n_frames, n_bins, first.assumed)
     return table
@@ -169,14 +171,10 @@ def write_mueller(table, path, overwrite=False):
     >>> float(QTable.read("mueller.ecsv")["right_00"][0])
     1.0
     """
-    path = Path(path)
-    kind = path.suffix.lower()
+    kind = Path(path).suffix.lower()
     if kind not in (".fits", ".fit", ".ecsv"):
         raise ParameterError(f"{path}: the name must end in .fits or .ecsv")
-    if path.exists() and not overwrite:
-        raise CalibrationFileError(f"{path}: exists already; overwrite=True replaces it")
-    if not path.parent.is_dir():
-        raise CalibrationFileError(f"{path}: cannot be written: no folder {path.parent}")
+    path = check_new(path, overwrite, CalibrationFileError)
     with atomic_path(path, error=CalibrationFileError) as temporary:
         if kind == ".ecsv":
             _plain(table).write(temporary, format="ascii.ecsv")
@@ -211,8 +209,10 @@ def _hdus(table):
         column = table[name]
         array = np.asarray(getattr(column, "value", column))
         unit = getattr(column, "unit", None)
+        # FITS: 32-bit integers and 64-bit floats
         code = "J" if array.dtype.kind in "iu" else "D"
         size = int(np.prod(array.shape[1:], dtype=int))
+        # TDIM counts the fastest axis first, numpy the slowest
         dim = f"({','.join(str(n) for n in array.shape[:0:-1])})" if array.ndim > 1 else None
         columns.append(
             fits.Column(

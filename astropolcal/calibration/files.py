@@ -22,7 +22,7 @@ from asdf.exceptions import AsdfConversionWarning, AsdfWarning, ValidationError
 
 from astropolcal.converters.calibration import CALIBRATION_TAG, CALIBRATION_TAGS
 from astropolcal.exceptions import CalibrationFileError
-from astropolcal.files import atomic_path, check_yaml, one_line, understood
+from astropolcal.files import atomic_path, check_new, check_yaml, one_line, understood
 from astropolcal.version import version as our_version
 
 __all__ = ["read_calibration", "write_calibration"]
@@ -79,13 +79,7 @@ def write_calibration(calibration, path, overwrite=False):
     >>> read_calibration("charis.asdf").covariance == cal.covariance
     True
     """
-    path = Path(path)
-    if path.is_dir():
-        raise CalibrationFileError(f"{path}: is a folder; name a file in it")
-    if path.exists() and not overwrite:
-        raise CalibrationFileError(f"{path}: exists already; overwrite=True replaces it")
-    if not path.parent.is_dir():
-        raise CalibrationFileError(f"{path}: cannot be written: no folder {path.parent}")
+    path = check_new(path, overwrite, CalibrationFileError)
     with _speaking_of(path, "cannot be written", "cannot be written: "):
         content = _to_bytes(calibration)
     with atomic_path(path, error=CalibrationFileError) as temporary:
@@ -132,6 +126,7 @@ def read_calibration(path):
         raise CalibrationFileError(f"{path}: {what}")
     with _speaking_of(path, "damaged"):
         content = path.read_bytes()
+        # cheap checks first: most broken files are truncated or something else
         _check_ends(content)
         _check_tree(content)
         return _from_bytes(content)
@@ -262,6 +257,7 @@ def _check_nodes(tree, size):
             raise CalibrationFileError(f"holds an object of unknown kind or version, {tag}")
         if isinstance(node, dict):
             if "$ref" in node or ("ndarray" in (tag or "") and isinstance(node.get("source"), str)):
+                # a file stands for itself, and reading it must not open others
                 raise CalibrationFileError("refers to another file")
             if "ndarray" in (tag or ""):
                 _check_array(node, size)

@@ -26,7 +26,8 @@ from astropolcal.calibration.covariance import covariance_around
 from astropolcal.calibration.gauge import describe_gauge, hold_silent, open_parameters, settled
 from astropolcal.calibration.goodness import lack_of_fit
 from astropolcal.calibration.identifiability import complete, finding_of
-from astropolcal.calibration.noise import noise_from_errors, noise_from_null_channel
+from astropolcal.calibration.noise import noise_from_errors
+from astropolcal.calibration.null_channel import noise_from_null_channel
 from astropolcal.calibration.result import Calibration, DatasetRecord
 from astropolcal.calibration.robust import LOSSES, outlying_data, robust_sigma
 from astropolcal.calibration.starts import BinProblem, search_branches
@@ -207,6 +208,7 @@ def _fixed(chain, fix):
             raise FitError(f"fix: no parameter {name!r}; there are {', '.join(table)}")
         for parameter in table[name]:
             if value is not None:
+                # every dataset's chain has its own Parameter object of the name
                 number = to_unit(value, parameter.unit, name)
                 parameter.value = np.broadcast_to(number, np.shape(parameter.value)).copy()
             parameter.fixed = True
@@ -246,11 +248,13 @@ def _check(measurement):
 
 def _run(measurement, weighting, fitter):
     """Fit in place until the noise agrees with the residuals; return how it went, and the noise."""
+    # one level for all data does not move the minimum, unless priors weigh against them
     told = weighting.choice == "wavelength" or (weighting.from_residuals and measurement.n_priors)
     if not told:
         return _fit(measurement, weighting, fitter), weighting
     if not weighting.is_known:
         weighting = weighting.started(measurement)
+    # noise from the residuals of a fit whose weights come from that noise: a fixed point
     for _ in range(ROUNDS):
         outcome = _fit(measurement, weighting, fitter)
         before, weighting = weighting, weighting.updated(measurement)
@@ -264,6 +268,7 @@ def _fit(measurement, weighting, fitter):
     """Fit in place; return whether it arrived, what it said, and how long it took."""
     index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
     with warnings.catch_warnings(record=True) as caught:
+        # recorded, not shown: whether the fit arrived is told once, in the words of this package
         warnings.simplefilter("always", AstropyWarning)
         try:
             fitter(
@@ -293,6 +298,7 @@ def _outside_bounds(measurement):
     """Return the names of parameters that a fitter without bounds left outside of theirs."""
     low, high = measurement.free.bounds()
     vector = measurement.vector()
+    # a fitter that minds the bounds ends on them only as exactly as rounding allows
     slack = _OUTSIDE * np.maximum(1.0, np.abs(vector))
     outside = (vector < low - slack) | (vector > high + slack)
     return [measurement.free.names[i] for i in np.flatnonzero(outside)]
@@ -305,6 +311,7 @@ def _joint(measurement, weighting, fitter, search, prepare):
     if search:
         small.parameters = _first_search(small, noise, origin)
     prepare(small)
+    # branches are found on few frames, so the long table starts from their fit
     if small is not measurement:
         _run(small, noise, fitter)
         measurement.parameters = small.vector()
@@ -361,6 +368,7 @@ class _Strategy:
         return _joint(measurement, weighting, self.fitter, self.search, prepare)
 
     def _stars(self, measurement):
+        # the law of a telescope's mirror is nearly degenerate: cheap steps with the rest held
         alone = telescope_alone(measurement, self.options)
         if alone is not None:
             self._run(alone, first_weighting(alone, None))
@@ -382,6 +390,7 @@ def _robust(measurement, fitter, loss, outcome):
     """Fit with the weights of a robust loss until they settle."""
     before = None
     for _ in range(_ROBUST_ROUNDS):
+        # iteratively reweighted least squares, which every fitter can do
         weighting = Weighting("given", robust_sigma(measurement, loss))
         if before is not None and weighting.agrees(before):
             return outcome, weighting

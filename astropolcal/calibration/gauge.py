@@ -87,6 +87,7 @@ def settled(problem, weighting, origin):
         null = whitened.together.null
         if not len(null):
             break
+        # open directions turn as one moves along them, so in steps with a new null space each
         step = _step(null, leaders, scale, vector - origin)
         if np.abs(step[leaders] / scale[leaders]).max() < _SETTLED:
             break
@@ -110,6 +111,7 @@ def hold_silent(measurement, origin):
     slopes = np.abs(measurement.jacobian(vector)).max(axis=1, initial=0.0) * scale
     still = (slopes < _SILENT) & (vector != origin)
     for slot, prior in measurement.free.priors:
+        # a prior that is not flat has put it where it belongs
         still[slot.slice] &= prior.is_flat
     predicted = measurement.predict(vector)
     for i in np.flatnonzero(still):
@@ -135,6 +137,7 @@ def _leaders(free):
 
 def _step(null, leaders, scale, moved):
     """Return the step along the open directions that brings the leaders nearest to home."""
+    # least squares of what the leaders are away from home, over shifts along the null directions
     along, *_ = np.linalg.lstsq(null[:, leaders].T, -(moved / scale)[leaders], rcond=1e-6)
     step = along @ null
     longest = np.abs(step).max()
@@ -146,6 +149,7 @@ def _move(problem, vector, step):
     low, high = problem.measurement.free.bounds()
     before = problem.total(vector)
     trial = np.clip(vector + step, low, high)
+    # a straight step leaves the curved surface of equal fits; the bins find back to it
     trial, _ = problem.polish(trial, iterations=8, still_gaining=1 - 1e-12)
     # noise-free data are fitted to rounding: there, a share of nothing is nothing
     spoilt = problem.total(trial) > (1 + _SPOILT) * before + 1e-12 * problem.measurement.n_data

@@ -204,6 +204,7 @@ def _low_rank(measurement, vector, sigma, weights, fitted):
     weights = np.append(weights, np.full(measurement.n_priors, level))
     slope = np.hstack([measurement.jacobian(vector), free.prior_jacobian(vector)])
     slope = slope[~free.at_bounds(vector)].T
+    # columns of unit length, lest the rank depend on units
     scale = np.sqrt(np.sum((slope * weights[:, None]) ** 2, axis=0))
     slope = slope[:, scale > 0] / scale[scale > 0]
     slope *= weights[:, None]
@@ -228,12 +229,14 @@ def _chi2_above(chi2, dof):
 
 def _moments(left, right, own):
     """Return mean and effective freedom of chi-square without the replicates' own."""
+    # tr(C) and tr(C^2) of C = 1 + P Q^T from the small matrix Q^T P, not the n x n one
     inner = right.T @ left
     n = len(left)
     mean = n + np.trace(inner) - own
     square = n + 2 * np.trace(inner) + np.sum(inner * inner.T) - own
     if mean <= _LEAST_FREEDOM or square <= 0:
         return max(mean, 0.0), np.nan
+    # mean and variance of chi-square match those of a scaled chi-square of this freedom
     return mean, mean**2 / square
 
 
@@ -251,6 +254,8 @@ def _together(table, whole, dof_noise, priors):
         mean, dof = whole
         return chi2, float(mean), float(_chi2_above(chi2 / mean * dof, dof))
     with np.errstate(divide="ignore"):
+        # p of the wavelengths are uniform and independent if the model is true: -2 sum ln p is then
+        # chi-square of twice their number
         fisher = -2 * np.sum(np.log(p))
     return chi2, mean, float(_chi2_above(fisher, 2 * p.size))
 

@@ -61,6 +61,7 @@ def leave_out_groups(measurement):
             first += int(group.max()) + 1
             continue
         angle = dataset.observations.position("derotator")[dataset.frames[:, 0]]
+        # sorted angles fall apart into groups at every step larger than the tolerance
         order = np.argsort(angle)
         new = np.concatenate([[0], np.cumsum(np.diff(angle[order]) > _SAME_ANGLE)])
         group = np.empty(len(angle), dtype=int)
@@ -75,6 +76,7 @@ def _star_runs(dataset):
     cycle = cycle_numbers(dataset.observations)[dataset.frames[:, 0]]
     rank = np.unique(cycle, return_inverse=True)[1]
     runs = min(_RUNS, int(rank.max()) + 1)
+    # equal runs of consecutive cycles; a derotator that follows the sky gives no angles to group by
     return rank * runs // (int(rank.max()) + 1)
 
 
@@ -141,6 +143,7 @@ def _groups(measurement, by):
             number = cycle_numbers(part.observations)[part.frames[:, 0]]
         number = np.unique(number, return_inverse=True)[1]
         groups.append(first + number[part.group_of_datum])
+        # groups of different datasets never share a number
         first += int(number.max()) + 1
     return np.concatenate(groups)
 

@@ -52,6 +52,7 @@ def harmonic_conditions(angles):
 def _condition(angles, harmonics):
     columns = []
     for k in harmonics:
+        # the frames' brightness or polarization as a Fourier series of the plate angle
         columns += [np.cos(k * angles), np.sin(k * angles)] if k else [np.ones_like(angles)]
     singular = np.linalg.svd(np.column_stack(columns), compute_uv=False)
     if len(angles) < len(columns) or singular[-1] < 1e-12 * singular[0]:
@@ -104,6 +105,7 @@ def _missing(degrees, harmonics):
     steps = np.diff(degrees)
     step = float(np.median(steps)) if steps.size else 22.5
     # a step that does not divide the period, or that is too coarse for harmonic 4
+    # Nyquist: two angles a period of the highest harmonic, and one more
     count = max(round(period / step), 2 * max(harmonics) // lowest + 1, 4)
     wanted = np.arange(count) * period / count + degrees[0]
     new = [angle for angle in wanted if np.abs(degrees - angle).min() > 0.1]

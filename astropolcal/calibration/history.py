@@ -184,6 +184,7 @@ class Change:
 
         if not self.dof or self.p_value >= 1:
             return 0.0
+        # half of the probability on each side of a normal deviate
         return float(-ndtri_exp(_log_p(self.chi2, self.dof) - np.log(2)))
 
     def __str__(self):
@@ -204,6 +205,7 @@ def _log_p(chi2, dof):
     from scipy.special import gammaincc, gammaln
 
     p = gammaincc(dof / 2, chi2 / 2)
+    # below that exp underflows, and sigma would be infinite
     if p > 1e-290:
         return np.log(p)
     half, x = dof / 2, chi2 / 2
@@ -261,6 +263,8 @@ def significance(calibrations, parameters=None):
     axes = [space._axes() for space in spaces]
     names, left_out = _with_errors(named, spaces, axes, names)
     places = [[space.names.index(name) for name in names] for space in spaces]
+    # compared is only what every calibration knows: rows of `basis` are orthogonal to all that is
+    # open in any of them
     basis = _determined([a.open[:, p] for a, p in zip(axes, places, strict=True)], len(names))
     values = [
         basis @ (_values(calibration, names) / a.steps[p])
@@ -349,8 +353,10 @@ def _chi_square(values, covariances):
     vectors = vectors[:, kept]
     if not kept.any():
         return 0.0, 0
+    # each calibration's own covariance, in the directions that are kept
     weights = [np.linalg.inv(vectors.T @ c @ vectors) for c in covariances]
     points = [vectors.T @ v for v in values]
+    # the common value that fits all of them best; chi-square is what is left about it
     mean = np.linalg.solve(sum(weights), sum(w @ x for w, x in zip(weights, points, strict=True)))
     chi2 = sum((x - mean) @ w @ (x - mean) for w, x in zip(weights, points, strict=True))
     return float(chi2), int(kept.sum())

@@ -95,6 +95,7 @@ class Identifiability:
     @property
     def silent(self):
         """Names of the parameters that change no datum; a fit leaves them where they start."""
+        # length of each axis within the null space: 1 if the axis lies in it
         own = np.sum(np.reshape(self.null_vectors, (-1, self.n_free)) ** 2, axis=0)
         return [self.names[i] for i in np.flatnonzero(own > 1 - _OWN)]
 
@@ -184,6 +185,7 @@ def finding_of(free, whitened):
         rank=found.rank,
         singular_values=found.singular,
         null_vectors=found.null,
+        # at a bound there is no error either, though the data may well push against it
         identifiable=found.determined & ~whitened.held,
         directions=open_directions(free, found.null),
     )
@@ -271,6 +273,7 @@ def complete(finding, measurement, vector, whitened=None, level=1.0):
     """
     free = measurement.free
     scaled = [direction for direction, _ in led(free, finding.null_vectors)]
+    # one degree, micrometre or percent of the leading parameter
     canonical = np.array(scaled).reshape(-1, free.size) * physical_scale(free)
     consequences = sky_consequences(measurement, vector, canonical)
     for direction, sky in zip(finding.directions, consequences, strict=True):
@@ -282,6 +285,7 @@ def complete(finding, measurement, vector, whitened=None, level=1.0):
             free, whitened, level, lambda changes: sky_consequences(measurement, vector, changes)
         )
     angles = {
+        # commanded angles repeat in many frames; a microradian is none
         round(float(angle), 6)
         for dataset in measurement.datasets
         for angle in dataset.observations.position("hwp")

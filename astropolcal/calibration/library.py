@@ -113,6 +113,7 @@ class Library:
         for path in self._files(source):
             try:
                 state = path.stat()
+                # read again only if the file has changed
                 self.entries.append(_entry(path.resolve(), state.st_mtime_ns, state.st_size))
             except (OSError, CalibrationFileError) as error:
                 reason = " ".join(str(error).split())
@@ -183,6 +184,8 @@ class Library:
                 continue
             kept = [e for e in found if _fits(e.validity, key, value)]
             if not kept:
+                # of several reasons the date says most: there is a
+                # calibration, but not of that time
                 if date is not None and not any(e.validity.holds(date) for e in found):
                     key, value = "date", date
                 raise CalibrationFileError(self._lacking(words, key, value, found))
@@ -258,6 +261,7 @@ class Library:
                 if entry.content_hash == new.content_hash:
                     return self.source / entry.name
                 _check_pair(entry, replace(new, path=path))
+            # within the lock, or two writers at once could both find nothing that overlaps
             write_calibration(calibration, path)
             self.__init__(self.source)
         return path
@@ -345,10 +349,12 @@ def _alike(one, other):
 
 def _check_pair(one, other):
     """Refuse two different files of which some frame could choose neither."""
+    # a copy under another name chooses the same
     if one.content_hash == other.content_hash or not _alike(one.validity, other.validity):
         return
     first, second = sorted([one, other], key=_order)
     end = first.validity.valid_until
+    # ISO texts in UTC compare as the moments do
     if end is None or end > (second.validity.valid_from or ""):
         _check_overlap(first, second)
 
@@ -388,6 +394,7 @@ def _name(entry):
 def _worst_median(calibration, key):
     tables = [r.accuracy for r in calibration.datasets if r.accuracy is not None]
     known = [t[key].value[np.isfinite(t[key].value)] for t in tables if key in t.colnames]
+    # NaN of a column that no dataset fills: there is no accuracy, not a perfect one
     return max((float(np.median(values)) for values in known if values.size), default=np.nan)
 
 

@@ -94,6 +94,7 @@ class SystemMueller:
         matrix = self.covariance_in_gauge
         is_open, is_blind = (self._flat(flags) for flags in (self.is_open, self.is_blind))
         unknown = is_open | is_blind
+        # no covariance with what has no error, whichever of the two it is
         matrix[unknown[..., :, None] | unknown[..., None, :]] = np.nan
         matrix[is_open[..., :, None] & np.eye(16, dtype=bool)] = np.inf
         return matrix
@@ -107,6 +108,7 @@ class SystemMueller:
         polarization where the data know misalignments up to a common turn; a prior on one
         of the angles in the calibration gives an error that is right.
         """
+        # rows: the elements of a matrix; columns: the determined directions of the parameters
         moved = self.factor.reshape(*self.value.shape[:-2], 16, -1)
         return moved @ np.swapaxes(moved, -1, -2)
 
@@ -295,6 +297,7 @@ class LoadedCalibration:
         """
         if (header is None) == (positions is None):
             raise ParameterError("give either header or positions")
+        # a Header of astropy is no Mapping
         single = isinstance(header, Mapping) or hasattr(header, "cards")
         headers = [header] if single else list(() if header is None else header)
         if header is not None:
@@ -302,6 +305,7 @@ class LoadedCalibration:
         chain, assumed = self._chain(light, headers)
         if header is not None:
             found = self.instrument.positions(FrameAngles(headers, self.instrument), chain)
+            # the same reader as for tables of observations, so that tracking laws and offsets agree
             positions = {name: angle * u.rad for name, angle in found.items()}
         lam, bins = match_wavelengths(self.wavelength, chain, wavelength)
         chain = with_beam(at_bins(chain, bins, len(self.wavelength)), beam)
@@ -368,6 +372,7 @@ class LoadedCalibration:
                 "light='internal' leaves it out"
             )
         known = {leaf.name for leaf in inner}
+        # axes of the telescope are optics, too, but there is nothing to calibrate in them
         assumed = tuple(o.name for o in leaves(chain) if o.name not in known and not o.stage)
         if assumed:
             warnings.warn(

@@ -112,6 +112,7 @@ class LogPosterior:
         return float(found[0]) if values.ndim == 1 else found
 
     def _of_rows(self, rows):
+        # an optic outside of its bounds may not exist, so nothing is evaluated there
         inside = ((rows >= self.low) & (rows <= self.high)).all(axis=1)
         found = np.full(len(rows), -np.inf)
         if not inside.any():
@@ -120,6 +121,7 @@ class LogPosterior:
         vectors[:, self.sampled] = rows[inside]
         likelihood = np.array([self._log_likelihood(vector) for vector in vectors])
         total = likelihood + self._log_prior(vectors)
+        # emcee stops at NaN; a model that fails somewhere makes that place impossible
         found[inside] = np.where(np.isnan(total), -np.inf, total)
         return found
 

@@ -13,6 +13,7 @@ from astropolcal.optics import EllipticalRetarder, LinearRetarder
 
 __all__ = ["mirror_solutions"]
 
+# far below any noise, far above rounding: a mirror solution is exact or it is none
 _SAME = 1e-9
 
 
@@ -72,6 +73,7 @@ def _retarders(measurement):
     for chain in measurement.chains:
         for leaf in leaves(chain):
             if isinstance(leaf, (LinearRetarder, EllipticalRetarder)):
+                # with one component held the others cannot go to the mirror solution
                 slots = [measurement.free.by_name.get(f"{leaf.name}.{k}") for k in leaf.own_names]
                 if all(slot is not None for slot in slots):
                     found[leaf.name] = slots
@@ -95,10 +97,13 @@ def _is_mirror(measurement, vector, edits):
 def _other_turn(retardance):
     """Turn the other way round the same axis; shape (1 or 3, n)."""
     length = np.linalg.norm(retardance, axis=0)
+    # turning by d about an axis is turning by d - 360 deg about it
     safe = np.where(length > 0, length, 1.0)
     return retardance * np.where(length > 0, 1 - 2 * np.pi / safe, 1.0)
 
 
 def _other_hand(retardance):
     """Change the sign of V before and behind."""
+    # V -> -V is a reflection of the Poincare sphere: it turns round rotations about axes in the
+    # equator (linear retardance), and leaves those about the axis of V
     return retardance * np.array([-1.0, -1.0, 1.0])[: len(retardance), None]

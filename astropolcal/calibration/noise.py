@@ -1,11 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Noise of the data, from stated errors or from the data themselves.
+Noise of the data, from stated errors or from repeated data.
 
 A chi-square means something only beside a noise that does not come from the
 residuals it is compared with. There are three sources: the errors in the
-table, the scatter among data taken at the same settings, and the null channel,
-which the double difference cancels. Each says what it includes.
+table, the scatter among data taken at the same settings, and the null channel
+(`~astropolcal.calibration.null_channel`). Each says what it includes.
 """
 
 from dataclasses import dataclass
@@ -20,17 +20,11 @@ from astropolcal.units import angle_to_rad
 __all__ = [
     "NoiseEstimate",
     "data_by_wavelength",
-    "estimate_noise",
+    "equal_axes",
     "noise_from_errors",
-    "noise_from_null_channel",
     "noise_from_replicates",
+    "noise_of_cells",
 ]
-
-_NULL_MODELS = ("constant", "smooth")
-_SAME_DEROTATOR = np.deg2rad(0.5)
-_SAME_PLATE = np.deg2rad(0.3)
-# what does not vary beyond this share is no column of its own
-_RANK = 1e-9
 
 
 @dataclass(frozen=True)
@@ -129,8 +123,38 @@ def data_by_wavelength(measurement):
     return np.array(numbers), np.concatenate(wavelengths) * u.nm, rows
 
 
-def _estimate(measurement, sigma, dof, method, words):
-    """Return an estimate of one sigma a cell, NaN without degrees of freedom."""
+def noise_of_cells(measurement, sigma, dof, method, words):
+    """
+    Return an estimate of one noise for each wavelength of each dataset.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    sigma : array_like
+        Standard deviation of a datum, dimensionless, in the order of `data_by_wavelength`.
+    dof : array_like
+        Degrees of freedom of each; without any the noise is not known.
+    method, words : str
+        As `NoiseEstimate` has them.
+
+    Returns
+    -------
+    NoiseEstimate
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.calibration.noise import noise_of_cells
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.observations import Observations, example_table
+    >>> chain = (optics.LinearPolarizer(name="polarizer")
+    ...          | optics.LinearRetarder(mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(name="wollaston"))
+    >>> measurement = Measurement(chain, Observations.from_table(example_table()))
+    >>> noise_of_cells(measurement, [0.01, 0.02, 0.03], [4, 4, 0], "made up", "").sigma
+    <Quantity [ 1.,  2., nan] %>
+    """
     numbers, wavelength, rows = data_by_wavelength(measurement)
     sigma = np.where(np.asarray(dof) > 0, sigma, np.nan)
     of_data = np.empty(measurement.n_data)
@@ -219,17 +243,15 @@ def _photon_sigma(measurement, gain, read_noise):
     found = []
     for part in measurement.datasets:
         obs = part.observations
-        right, left = (np.moveaxis(f.T[:, part.frames], 2, 0) for f in _fluxes(obs))
+        fluxes = obs.flux_right, obs.flux_left
+        right, left = (np.moveaxis(f.T[:, part.frames], 2, 0) for f in fluxes)
         with np.errstate(invalid="ignore", divide="ignore"):
+            # Poisson: var(F) = F / gain, plus the read noise in the same units
             variance = part.observable.variance(
                 right, left, right / gain + extra, left / gain + extra
             )
         found.append(np.sqrt(variance[part.valid]))
     return np.concatenate(found)
-
-
-def _fluxes(observations):
-    return observations.flux_right, observations.flux_left
 
 
 # ---- replicates ---------------------------------------------------------------------------
@@ -298,7 +320,7 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
         "scatter among repeated data: photon and read noise, flicker, repeatability of the "
         "stages; not what is the same in every repetition"
     )
-    return _estimate(measurement, sigma, dof, "replicates", words)
+    return noise_of_cells(measurement, sigma, dof, "replicates", words)
 
 
 def _scatter(values, group, rows):
@@ -315,7 +337,7 @@ def _scatter(values, group, rows):
 
 def _same_settings(part, tolerance):
     """Return a number for the settings of every group of frames of a dataset."""
-    columns = [_clusters(angle, tolerance) for row in part.positions.values() for angle in row]
+    columns = [equal_axes(angle, tolerance) for row in part.positions.values() for angle in row]
     frames = part.observations.frames
     if "flc_state" in frames.colnames:
         columns.append(np.unique(np.asarray(frames["flc_state"]), return_inverse=True)[1])
@@ -325,8 +347,29 @@ def _same_settings(part, tolerance):
     return np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
 
 
-def _clusters(angle, tolerance):
-    """Number axes (modulo 180 deg) so that those of one number lie within the tolerance."""
+def equal_axes(angle, tolerance):
+    """
+    Number axes, angles modulo 180 deg, so that those of one number lie within a tolerance.
+
+    Parameters
+    ----------
+    angle : `~numpy.ndarray`
+        In radian, shape (n,).
+    tolerance : float
+        Largest difference among those of one number, in radian.
+
+    Returns
+    -------
+    `~numpy.ndarray` of int
+        Shape (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.calibration.noise import equal_axes
+    >>> equal_axes(np.deg2rad([0, 45, 179.95, 225]), np.deg2rad(0.1)).tolist()
+    [0, 1, 0, 1]
+    """
     axis = np.mod(angle, np.pi)
     order = np.argsort(axis, kind="stable")
     gaps = np.diff(axis[order], append=axis[order[0]] + np.pi)
@@ -342,178 +385,3 @@ def _clusters(angle, tolerance):
     result = np.empty_like(label)
     result[order] = label
     return result
-
-
-# ---- the null channel -----------------------------------------------------------------------
-
-
-def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
-    r"""
-    Return the noise from the double sum of normalized differences.
-
-    With :math:`x = (R - L)/(R + L)` of the frames of a pair, 45 deg of
-    half-wave plate apart, the double difference is :math:`(x^+ - x^-)/2` and the
-    null :math:`z = (x^+ + x^-)/2`. The plate turns the sign of the signal, so
-    the null has next to none, while independent noise of the frames is the same
-    in both. Taken away from z are what the chain predicts of it (a plate that is not
-    exactly half a wave, with a retarder behind it, leaves some signal there),
-    a multiple of :math:`x^2` at each wavelength (what beams unequal by e add,
-    :math:`e(1 - x^2)`), and the null model. A datum of one frame is given
-    :math:`\sqrt2` times the scatter of what is left.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    vector : array_like, optional
-        Parameters for the chain's own null, by default the current ones.
-    null_model : {"constant", "smooth"}
-        The mean over the plate angles at each derotator angle; or for each
-        plate angle a curve over the derotator angle D,
-        :math:`a + b\cos 2D + c\sin 2D + d\cos 4D + f\sin 4D`.
-
-    Returns
-    -------
-    NoiseEstimate
-        An upper limit: besides photon and read noise and flicker that changes
-        the ratio of the beams it includes whatever else makes the null change
-        with the plate and is not in the chain, such as diattenuation. For strongly
-        polarized light that exceeds the noise; the smooth null model takes
-        away most of it. A change of the source's brightness cancels in x.
-
-    Raises
-    ------
-    FitError
-        If there are too few pairs for the null model, or no such model.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.calibration import noise_from_null_channel
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 57.5, 70] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> noise = noise_from_null_channel(Measurement(charis.chain(), observations))
-    >>> int(noise.dof[0]), noise.method
-    (8, 'null channel')
-    """
-    if null_model not in _NULL_MODELS:
-        raise FitError(f"null_model = {null_model!r}; allowed are {', '.join(_NULL_MODELS)}")
-    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    parts = [_null_scatter(part, vector, null_model) for part in measurement.datasets]
-    squares, dof = (np.concatenate(column) for column in zip(*parts, strict=True))
-    if not (dof > 0).any():
-        raise FitError(
-            f"the null channel has no degree of freedom left by the {null_model} null model; "
-            "two plate angles a derotator angle (constant) or six derotator angles a plate "
-            "angle (smooth) are needed"
-        )
-    per_datum = [
-        np.full(len(part.bins), 2.0 / part.observable.frames_per_datum)
-        for part in measurement.datasets
-    ]
-    sigma = np.sqrt(np.concatenate(per_datum) * squares / np.maximum(dof, 1))
-    words = (
-        f"scatter of the null channel about the chain's and a {null_model} null, an upper limit: "
-        "photon and read noise, flicker, and what the chain leaves out of the null"
-    )
-    return _estimate(measurement, sigma, dof, "null channel", words)
-
-
-def _null_scatter(part, vector, null_model):
-    """Return sum of squares of the null's residuals and freedom at each wavelength."""
-    obs = part.observations
-    right, left = _fluxes(obs)
-    pairs = obs.pairs()
-    predicted = _predicted_differences(part, vector)
-    null = 0.5 * ((right - left) / (right + left) - predicted)[pairs].sum(axis=1)
-    signal = 0.5 * (predicted[pairs[:, 0]] - predicted[pairs[:, 1]])
-    design = _null_design(obs, pairs[:, 0], null_model)
-    squares, dof = np.zeros(obs.n_bins), np.zeros(obs.n_bins, dtype=int)
-    for i, (z, x) in enumerate(zip(null.T, signal.T, strict=True)):
-        good = np.isfinite(z)
-        if good.any():
-            columns = np.column_stack([design, x**2])[good]
-            fit, _, rank, _ = np.linalg.lstsq(columns, z[good], rcond=_RANK)
-            squares[i] = np.sum((z[good] - columns @ fit) ** 2)
-            dof[i] = good.sum() - rank
-    return squares, dof
-
-
-def _predicted_differences(part, vector):
-    """Return the chain's normalized difference of every frame that gives a datum, (F, W)."""
-    right, left = part.forward(vector).fluxes
-    shape = (part.observations.n_bins, part.frames.size)
-    difference = np.broadcast_to((right - left) / (right + left), shape)
-    result = np.full((part.observations.n_frames, shape[0]), np.nan)
-    result[part.frames.T.ravel()] = difference.T
-    return result
-
-
-def _null_design(observations, frames, null_model):
-    angle = observations.position("derotator")[frames]
-    state = np.zeros(len(frames), dtype=int)
-    if "flc_state" in observations.frames.colnames:
-        column = np.asarray(observations.frames["flc_state"])
-        state = np.unique(column, return_inverse=True)[1][frames]
-    if null_model == "constant":
-        curves, setting = np.ones((1, len(angle))), _clusters(angle, _SAME_DEROTATOR)
-    else:
-        twice = 2 * angle
-        curves = np.stack([np.ones_like(twice), *_harmonics(twice), *_harmonics(2 * twice)])
-        setting = _clusters(observations.position("hwp")[frames], _SAME_PLATE)
-    _, setting = np.unique(np.stack([setting, state], axis=1), axis=0, return_inverse=True)
-    steps = setting.ravel()[:, None] == np.arange(setting.max() + 1)
-    return np.concatenate([curve[:, None] * steps for curve in curves], axis=1)
-
-
-def _harmonics(angle):
-    return np.cos(angle), np.sin(angle)
-
-
-def estimate_noise(measurement, vector=None, *, null_model="constant"):
-    """
-    Return the noise estimated from the data, replicates where there are any.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    vector : array_like, optional
-        Parameters, by default the current ones.
-    null_model : {"constant", "smooth"}
-        For the null channel, see `noise_from_null_channel`.
-
-    Returns
-    -------
-    NoiseEstimate
-        Of replicates where every wavelength has some, otherwise of the null channel.
-
-    Raises
-    ------
-    FitError
-        If neither is possible.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.calibration import estimate_noise
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 57.5, 57.5] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> estimate_noise(Measurement(charis.chain(), observations)).method
-    'replicates'
-    """
-    try:
-        noise = noise_from_replicates(measurement, vector)
-    except FitError:
-        return noise_from_null_channel(measurement, vector, null_model=null_model)
-    if (noise.dof > 0).all():
-        return noise
-    return noise_from_null_channel(measurement, vector, null_model=null_model)

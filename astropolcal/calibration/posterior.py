@@ -146,6 +146,7 @@ class Posterior:
     def __eq__(self, other):
         if not isinstance(other, Posterior):
             return NotImplemented
+        # arrays with NaN in the same places are equal, which `==` of dictionaries is not
         return _equal(self.to_dict(), other.to_dict())
 
     __hash__ = None
@@ -167,9 +168,11 @@ class Posterior:
     def _usual_burn_in(self):
         """Return 5 autocorrelation times, at most half of all."""
         half = len(self.chain) // 2
+        # from the second half: the way from the start would look like a long memory
         times = autocorrelation_times(self.chain[half:])
         if not np.isfinite(times).any():
             return half
+        # the slowest parameter decides
         return int(min(half, np.ceil(_BURN_IN * np.nanmax(times))))
 
     @property
@@ -418,6 +421,7 @@ class Posterior:
             step = int(np.ceil(left / max(draws // walkers, 1)))
         if step < 1 or step > left:
             raise ParameterError(f"step = {step}; allowed are 1 to {left}")
+        # the last of every `step` steps, which is the furthest from the start
         rows = slice(start + step - 1, None, step)
         parts = {"chain": self.chain[rows].copy(), "log_prob": self.log_prob[rows].copy()}
         parts |= {"thin": self.thin * step, "burn_in": None, "convergence": self.convergence}

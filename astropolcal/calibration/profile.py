@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration._directions import declared_step
 from astropolcal.calibration._refit import Refit
 from astropolcal.calibration.covariance import residual_variance
 from astropolcal.exceptions import FitError, ParameterError
@@ -80,7 +81,9 @@ class Profile:
         values = np.asarray(getattr(self.values, "value", self.values))
         unit = getattr(self.values, "unit", None)
         here = int(np.argmin(np.abs(values - getattr(self.best, "value", self.best))))
+        # of a parabola the root is a straight line, so that interpolation is exact
         root = np.sqrt(np.clip(self.delta_chi2, 0, None))
+        # left half turned round, so that both sides are searched outwards from the best value
         ends = (
             -_crossing(-values[here::-1], root[here::-1], np.sqrt(rise)),
             _crossing(values[here:], root[here:], np.sqrt(rise)),
@@ -186,7 +189,7 @@ def profile(calibration, name, values=None, n=21):
     best = refit.solution[index] / factor
     low, high = (bounds[index] / factor for bounds in refit.measurement.free.bounds())
     if values is None:
-        grid = _grid(best, covariance.stds[index], 0.01 if unit is None else _step(unit), n)
+        grid = _grid(best, covariance.stds[index], declared_step(unit), n)
         grid = np.unique(np.clip(grid, low, high))
     else:
         grid = np.unique(np.append(to_unit(values, unit, name), best))
@@ -202,11 +205,6 @@ def _some(names):
     return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
 
 
-def _step(unit):
-    unit = u.Unit(unit)
-    return (1 * (u.deg if unit.is_equivalent(u.deg) else u.um)).to_value(unit)
-
-
 def _grid(best, std, step, n):
     """Return values around the best; an odd number of them, so that it is one."""
     half = _WIDTH * std if np.isfinite(std) else _OPEN_WIDTH * step
@@ -217,6 +215,7 @@ def _follow(refit, index, values, here):
     """Refit at every value, starting from the solution and going outward on both sides."""
     chi2, vectors = np.empty(values.size), np.empty((values.size, refit.solution.size))
     for side in (range(here, values.size), range(here, -1, -1)):
+        # each fit starts from its neighbour's, so that it stays in the same valley
         vector = refit.solution
         for i in side:
             start = vector.copy()

@@ -4,7 +4,7 @@
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration.derived import _derive, _slopes_of, propagate
+from astropolcal.calibration.derived import derive, propagate, slopes_of
 from astropolcal.chain import (
     find_optic,
     join,
@@ -88,6 +88,7 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
         value, slopes = parts[0], np.ones((1, *np.shape(lam)))
     else:
         value = np.sqrt(np.sum(parts**2, axis=0))
+        # d|Delta| / d Delta_k = Delta_k / |Delta|
         slopes = parts / np.where(value > 0, value, 1.0)
     return _of_parameters(calibration, leaf, components, value * u.deg, slopes, weights)
 
@@ -145,6 +146,7 @@ def _at_wavelengths(calibration, leaf, keys, lam):
     grid = calibration.wavelength.to_value(u.nm)
     order = np.argsort(grid)
     wanted = np.atleast_1d(lam.to_value(u.nm))
+    # one number for all wavelengths holds anywhere
     several = any(np.size(getattr(leaf, key).value) > 1 for key in keys)
     slack = 1e-6 * grid.max()
     outside = (wanted < grid.min() - slack) | (wanted > grid.max() + slack)
@@ -153,6 +155,8 @@ def _at_wavelengths(calibration, leaf, keys, lam):
             f"wavelength {wanted[outside][0]:.2f} nm is outside the calibrated range "
             f"{grid.min():.2f} to {grid.max():.2f} nm"
         )
+    # interpolation is linear in the values: row i says how much of grid point i goes into each
+    # wavelength, (n_grid, n_wanted)
     rows = [np.interp(wanted, grid[order], unit[order]) for unit in np.eye(grid.size)]
     weights = np.stack(rows, axis=1)
     parts = []
@@ -176,8 +180,8 @@ def _of_parameters(calibration, leaf, keys, value, slopes, weights):
             own = np.ravel(slope)[:, None] * weights if slot.per_wavelength else np.ravel(slope)
             shape = (*np.shape(value), slot.size) if slot.per_wavelength else np.shape(value)
             derivatives[f"{leaf.name}.{key}"] = (own * factor).reshape(shape)
-    slopes = _slopes_of(free, derivatives, np.shape(value))
-    return _derive(calibration, free, value[()], slopes)
+    slopes = slopes_of(free, derivatives, np.shape(value))
+    return derive(calibration, free, value[()], slopes)
 
 
 def derived_mueller(calibration, positions=None, wavelength=None, beam="right", dataset=0):
@@ -231,7 +235,7 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     }
     axis = None if lam.ndim == 0 else -3
     free = _free(calibration)
-    return _derive(calibration, free, value, _slopes_of(free, *_spread_out(free, slopes, axis)))
+    return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
 
 
 def _grid(calibration, wavelength):
@@ -265,6 +269,7 @@ def _spread_out(free, slopes, axis):
             wide = np.zeros((*shape, slot.size))
             for i in range(slot.size):
                 here = (*[slice(None)] * (len(shape) + axis), i)
+                # the matrices of wavelength i depend on the i-th value of the parameter alone
                 wide[(*here, ..., i)] = slope[here]
             slope = wide
         spread[name] = slope
@@ -308,16 +313,18 @@ def derived_data(calibration, observations=None, dataset=0):
     True
     """
     if observations is None:
-        measurement = calibration._live()
+        measurement = calibration.live_measurement()
     else:
         measurement = calibration.measurement_of(observations, dataset)
     vector = measurement.vector()
+    # per declared unit, (n_data, n_free)
     jacobian = measurement.jacobian(vector).T * measurement.free.factors()
     free = _free(calibration)
     slopes = np.zeros((measurement.n_data, free.size))
     columns = {name: i for i, name in enumerate(free.names)}
+    # a dataset's chain may have fewer parameters than the whole calibration
     slopes[:, [columns[name] for name in measurement.free.names]] = jacobian
-    return _derive(calibration, free, measurement.predict(vector).copy(), slopes)
+    return derive(calibration, free, measurement.predict(vector).copy(), slopes)
 
 
 def derived_sky(
@@ -386,7 +393,9 @@ def derived_sky(
     stokes = np.array([1.0, q, u, 0.0])
     total = denominator[""] @ stokes
     ratio = numerator[""] @ stokes / total
+    # derivative of the quotient n s / d s to the Stokes vector s: (n - x d) / (d s)
     rows = (numerator[""] - ratio[..., None] * denominator[""]) / total[..., None]
+    # of q and u only, shape (n_wavelengths, 2, n_pairs): least squares where there are more pairs
     inverse = _inverse(rows[..., 1:3])
     slopes = {}
     for name in numerator:
@@ -396,7 +405,7 @@ def derived_sky(
     value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
     free = _free(calibration)
     axis = None if np.ndim(lam) == 0 else -2
-    return _derive(calibration, free, value, _slopes_of(free, *_spread_out(free, slopes, axis)))
+    return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
 
 
 def _sky_chain(chain):

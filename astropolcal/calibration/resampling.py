@@ -171,6 +171,7 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
     refit = Refit(calibration)
     groups = _blocks(refit.measurement, block)
     rng = np.random.default_rng(seed)
+    # what all data determine, a resample must determine too
     wanted = _singular_values(refit, 1.0)
     samples, rejected = [], 0
     while len(samples) < n:
@@ -217,6 +218,7 @@ def _draw(rng, groups):
     parts = []
     for _, numbers in groups:
         n_blocks = numbers.max() + 1
+        # as many blocks as there are, with replacement
         drawn = np.bincount(rng.integers(n_blocks, size=n_blocks), minlength=n_blocks)
         parts.append(drawn[numbers])
     return np.concatenate(parts).astype(float)
@@ -249,6 +251,7 @@ def _result(calibration, refit, vectors, block, groups, rejected):
     known = full_covariance(calibration)
     samples = vectors / refit.measurement.free.factors()
     is_open = (np.abs(known._axes().open) > 1e-5).any(axis=0)
+    # where the data leave a direction open, a fit ends anywhere along it
     samples[:, is_open] = np.nan
     n_blocks = sum(int(numbers.max()) + 1 for _, numbers in groups)
     return Resampled(known.names, known.units, samples, block, n_blocks, rejected)

@@ -1,11 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Refit what changed since a calibration, and hold the rest."""
 
-from astropolcal import instruments
+from astropolcal.calibration._beam import instrument_of
 from astropolcal.calibration.fit import calibrate
 from astropolcal.calibration.validity import content_hash
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import InstrumentError, ParameterError
+from astropolcal.exceptions import ParameterError
 from astropolcal.measurement import parameter_table
 from astropolcal.observations import Observations
 
@@ -65,25 +65,18 @@ def restart(calibration, observations, free, *, chain=None, positions=None, **op
     old = getattr(calibration, "calibration", calibration)
     datasets = [observations] if isinstance(observations, Observations) else list(observations)
     free = [free] if isinstance(free, str) else list(free)
-    instrument = _instrument(old)
+    instrument = instrument_of(old)
     chains = _new_chains(old, datasets, instrument, chain)
     _hold(old, chains, free)
     if positions is None and instrument is not None:
         positions = [instrument.positions(*pair) for pair in zip(datasets, chains, strict=True)]
+    # another mirror branch would look like a change of the instrument
     start = {"observable": old.settings["observable"], "search": False}
     options = start | {"wavelength": old.wavelength} | options
     fixed = {"ties": _ties(old, chains), "instrument": old.instrument}
     new = calibrate(chains, datasets, positions=positions, **(fixed | options))
     new.settings["restarted"] = {"from": content_hash(old), "free": free}
     return new
-
-
-def _instrument(old):
-    """Return the instrument; None without one, or for a name that somebody chose."""
-    try:
-        return None if old.instrument is None else instruments.get(old.instrument)
-    except InstrumentError:
-        return None
 
 
 def _new_chains(old, datasets, instrument, chain):
@@ -96,6 +89,7 @@ def _new_chains(old, datasets, instrument, chain):
         chains = [old.chains[0]] * len(datasets)
     if len(chains) != len(datasets):
         raise ParameterError(f"{len(chains)} chains for {len(datasets)} datasets")
+    # reversed, so that of optics in several chains the first dataset's is taken
     known = {leaf.name: leaf for chain in reversed(old.chains) for leaf in leaves(chain)}
     return [join(known.get(leaf.name, leaf).copy() for leaf in leaves(c)) for c in chains]
 
@@ -115,6 +109,7 @@ def _hold(old, chains, free):
         for key in leaf.param_names:
             parameter, names = getattr(leaf, key), (leaf.name.lower(), f"{leaf.name}.{key}".lower())
             for text in (t for t in free if t.lower() in names):
+                # as it was before it is held below
                 found.setdefault(text, []).append((parameter, parameter.fixed))
             if leaf.name in known:
                 parameter.fixed = True

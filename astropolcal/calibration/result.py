@@ -139,9 +139,21 @@ class Calibration:
         CalibrationFileError
             If the calibration was read from a file, which holds no data.
         """
-        return self._live().residuals()
+        return self.live_measurement().residuals()
 
-    def _live(self):
+    def live_measurement(self):
+        """
+        Return the fitted measurement, for what needs the data.
+
+        Returns
+        -------
+        Measurement
+
+        Raises
+        ------
+        CalibrationFileError
+            If the calibration was read from a file, which holds no data.
+        """
         if self.measurement is None:
             raise CalibrationFileError(
                 "this calibration was read from a file, which holds no observations; "
@@ -193,6 +205,7 @@ class Calibration:
         from astropolcal.calibration._reunite import measurement_of_all
 
         measurement = measurement_of_all(self, observations, positions)
+        # so that a cross-validation of the new one does not change the old one's accuracies
         records = deepcopy(self.datasets)
         return replace(self, chains=measurement.chains, measurement=measurement, datasets=records)
 
@@ -253,7 +266,8 @@ class Calibration:
         Calibration
             Itself.
         """
-        live = self._live()
+        live = self.live_measurement()
+        # what was left out before is no longer true, should the refits fail
         self.fit.pop("groups", None)
         if groups is not None:
             self.fit["groups"] = groups if isinstance(groups, str) else "given"
@@ -263,6 +277,7 @@ class Calibration:
         residuals = live.residuals()
         for i, record in enumerate(self.datasets):
             before, record.accuracy = record.accuracy, accuracy_table(live, i, residuals, held_out)
+            # predictions of standards stay: they do not depend on what was left out
             if before is not None and "s_standard" in before.colnames:
                 record.accuracy["s_standard"] = before["s_standard"]
         return self
@@ -296,12 +311,14 @@ class Calibration:
             for leaf in leaves(chain):
                 for key in leaf.param_names:
                     name = f"{leaf.name}.{key}"
+                    # chains share optics by name, and the values of the fit
                     if name not in result:
                         result[name] = self._describe(name, getattr(leaf, key))
         return result
 
     def _describe(self, name, parameter):
         size = int(np.size(parameter.value))
+        # the covariance has rows of free parameters only
         free = not parameter.fixed and name not in self.ties
         elements = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
         shape = np.shape(parameter.value)

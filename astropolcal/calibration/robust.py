@@ -15,6 +15,7 @@ from astropolcal.exceptions import FitError
 
 __all__ = ["LOSSES", "outlying_data", "robust_sigma"]
 
+# standard deviation over median absolute deviation of normal noise
 _MAD = 1.4826
 # noise of a wavelength is at least this share of the median of its dataset
 _FLOOR = 0.1
@@ -73,6 +74,7 @@ def robust_sigma(measurement, loss):
         raise FitError(f"loss = {loss!r}; allowed are {', '.join(LOSSES)}")
     residuals = measurement.residuals()
     scale = _scales(measurement, residuals)
+    # least squares weighs by 1 / sigma^2: sigma = scale / sqrt(weight of the loss)
     return scale / np.sqrt(np.maximum(LOSSES[loss](residuals / scale), _LEAST))
 
 
@@ -129,7 +131,7 @@ def outlying_data(calibration, limit=_FAR):
     >>> len(outlying_data(cal))
     0
     """
-    live, rows = calibration._live(), []
+    live, rows = calibration.live_measurement(), []
     residuals = live.residuals()
     scaled = residuals / _scales(live, residuals)
     for part, where in zip(live.datasets, live.segments, strict=True):
@@ -148,6 +150,7 @@ def _outliers(part, residuals, scaled, limit):
 
     groups = np.unique(part.group_of_datum)
     members = [part.group_of_datum == g for g in groups]
+    # one number a pair of frames, the median over its wavelengths
     common = np.array([np.median(scaled[rows]) for rows in members])
     off = common - np.median(common)
     # what noise alone gives a median of so many wavelengths

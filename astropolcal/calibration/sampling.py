@@ -134,7 +134,7 @@ def sample(
     True
     """
     emcee = need("emcee", "sampling")
-    measurement = calibration._live()
+    measurement = calibration.live_measurement()
     weights = "given" if noise is not None else weighting_of(calibration).choice
     log_posterior = LogPosterior(measurement, noise=noise, parameters=parameters)
     n = log_posterior.sampled.size
@@ -147,6 +147,7 @@ def sample(
     refuse_biased(moves, emcee.__version__)
     sampler = emcee.EnsembleSampler(n_walkers, n, log_posterior, moves=moves, vectorize=True)
     chain = Chain((n_steps // thin, n_walkers, n), checkpoint_every)
+    # a checkpoint may only be continued by the very run that wrote it
     description, arrays = _fingerprint(log_posterior, n_walkers, thin, moves, seed)
     with chain.open(checkpoint, description, arrays, resume):
         _run(emcee, sampler, laplace, chain, thin, seed, progress)
@@ -168,6 +169,7 @@ def _kept_burn_in(burn_in, n_steps, thin):
     """Return the number of kept steps to leave out, None for the usual one."""
     if burn_in is None:
         return None
+    # two kept steps at least must be left, for a standard deviation
     most = (n_steps // thin - 2) * thin
     if not isinstance(burn_in, (int, np.integer)) or not 0 <= burn_in <= most:
         raise FitError(
@@ -203,6 +205,7 @@ def _run(emcee, sampler, laplace, chain, thin, seed, progress):
         total=total, initial=done, desc="sampling", disable=None if progress else True
     ) as bar:
         for step, state in enumerate(steps, done + 1):
+            # counted at every step, not only at those that are kept
             accepted += (state.coords != previous).any(axis=1)
             previous[...] = state.coords
             if step % thin == 0:
@@ -216,8 +219,10 @@ def _first_state(emcee, laplace, chain, n_walkers, seed):
         return emcee.State(
             chain.coords[last], log_prob=chain.log_prob[last], random_state=chain.random_state
         )
+    # independent streams: the start does not depend on how many numbers the steps draw
     start, steps = np.random.SeedSequence(seed).spawn(2)
     coords = laplace.start(n_walkers, np.random.default_rng(start))
+    # emcee takes the state of numpy's old generator only
     legacy = np.random.RandomState(np.random.MT19937(steps)).get_state()
     return emcee.State(coords, log_prob=laplace.log_posterior(coords), random_state=legacy)
 
@@ -231,6 +236,7 @@ def _fingerprint(log_posterior, n_walkers, thin, moves, seed):
     free = measurement.free
     low, high = free.bounds()
     held = log_posterior.fitted.copy()
+    # what varies starts at the fit, but does not define the run
     held[log_posterior.sampled] = 0.0
     description = {
         "parameters": [[n, str(u or "")] for n, u in _pairs(log_posterior)],
@@ -277,6 +283,7 @@ def _result(log_posterior, chain, thin, seed, burn_in, settings):
     return Posterior(
         log_posterior.names,
         log_posterior.units,
+        # from canonical to declared units
         chain.coords[:kept] / log_posterior.factors,
         chain.log_prob[:kept],
         acceptance=chain.accepted / (max(chain.accepted_over, kept) * thin),

@@ -111,5 +111,6 @@ def _rows(measurement, vector, derotators, index):
         single = (right - left) - (dark_right - dark_left)
         total = dark_right + dark_left
         plus, minus = single[:, 0::2], single[:, 1::2]
+        # response of the double difference to q or u, without what the optics polarize themselves
         columns.append((plus - minus) / (total[:, 0::2] + total[:, 1::2]))
     return np.stack(columns, axis=-1)

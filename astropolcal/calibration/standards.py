@@ -164,6 +164,7 @@ def _rows_on_grid(calibration, observations):
 
 def _calibrated_chain(calibration, chain, rows, name, sources=False):
     """Return the chain with the calibration's values, bounds and flags where it has the optic."""
+    # reversed, so that of optics in several chains the first dataset's counts
     fitted = {leaf.name: leaf for item in calibration.chains[::-1] for leaf in leaves(item)}
     train, unknown = [], []
     for leaf in leaves(chain):
@@ -247,6 +248,7 @@ def _own_s_cv(calibration, source, rows):
         at = np.abs(table["wavelength"].to_value(u.nm)[:, None] - grid).argmin(axis=1)
         s_cv, count = table["s_cv"].to_value(u.percent), np.asarray(table["n"])
         known = np.isfinite(s_cv)
+        # mean square over datasets, weighted by their number of data
         np.add.at(squares, at[known], (count * s_cv**2)[known])
         np.add.at(n, at[known], count[known])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -257,11 +259,13 @@ def _moved_by_open(calibration, measurement, rows):
     """Return by how many percent a step along the open directions moves the prediction."""
     finding, free = calibration.identifiability, measurement.free
     place = {name: i for i, name in enumerate(finding.names)}
+    # columns of the finding that belong to the standard's free parameters, at its wavelengths
     columns = []
     for slot in free.slots:
         single = slot.name in place
         names = [slot.name] if single else [f"{slot.name}[{row}]" for row in rows]
         columns += [place[name] for name in names]
+    # open directions of the calibration, as far as the standard's chain has the parameters
     null = np.asarray(finding.null_vectors).reshape(-1, len(place))[:, columns]
     moved = (null * physical_scale(free)) @ measurement.jacobian(measurement.vector())
     return float(100 * np.linalg.norm(moved, axis=0).max(initial=0.0))

@@ -14,7 +14,7 @@ from astropolcal.exceptions import (
     ObservationError,
     WavelengthRangeError,
 )
-from astropolcal.stokes import _angle
+from astropolcal.stokes import polarization_angle
 
 __all__ = ["add_star_check", "star_check"]
 
@@ -129,20 +129,26 @@ def _add_known(table, q, stokes_u, covariance):
     length = np.hypot(q, stokes_u)
     table["q_known"], table["u_known"] = q * percent, stokes_u * percent
     table["dolp_known"] = length * percent
-    table["aolp_known"] = np.where(length > 0, _angle(q, stokes_u), np.nan) * u.deg
+    table["aolp_known"] = np.where(length > 0, polarization_angle(q, stokes_u), np.nan) * u.deg
     along, across = np.full((2, length.size), np.nan)
     if covariance is not None:
-        c, s = (np.divide(x, length, out=np.ones_like(x), where=length > 0) for x in (q, stokes_u))
+        # the direction of the polarization in the (q, u) plane; of a star without any that of q,
+        # as good as another one, and its error of the angle ends in the division by zero below
+        c = np.divide(q, length, out=np.ones_like(length), where=length > 0)
+        s = np.divide(stokes_u, length, out=np.zeros_like(length), where=length > 0)
         matrix = np.broadcast_to(np.asarray(covariance), (length.size, 2, 2))
-        along = np.sqrt(np.einsum("wi,wij,wj->w", *_thrice(np.stack([c, s], -1), matrix)))
-        across = np.sqrt(np.einsum("wi,wij,wj->w", *_thrice(np.stack([-s, c], -1), matrix)))
+        along = _error_along(np.stack([c, s], -1), matrix)
+        across = _error_along(np.stack([-s, c], -1), matrix)
     table["dolp_known_err"] = along * percent
     with np.errstate(divide="ignore", invalid="ignore"):
         table["aolp_known_err"] = np.rad2deg(0.5 * across / length) * u.deg
 
 
-def _thrice(direction, matrix):
-    return direction, matrix, direction
+def _error_along(direction, matrix):
+    """Return the standard error along unit vectors, shape (n_wavelengths, 2)."""
+    variance = np.einsum("wi,wij,wj->w", direction, matrix, direction)
+    # where it is zero rounding may leave less
+    return np.sqrt(np.maximum(variance, 0.0))
 
 
 def _words(table):
@@ -208,6 +214,7 @@ def add_star_check(calibration, chain, observations, positions=None):
         suffix = "percent" if unit == u.percent else "deg"
         entry[f"{key}_{suffix}"] = table[key].to_value(unit).tolist()
     others = calibration.fit.get("stars", [])
+    # checked again, a star replaces its entry
     others = [other for other in others if other["content_hash"] != entry["content_hash"]]
     calibration.fit["stars"] = [*others, entry]
     return table

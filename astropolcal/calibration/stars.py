@@ -80,6 +80,7 @@ def star_stokes(calibration, chain, observations, positions=None):
         positions=None if positions is None else [positions],
     )
     vector, (part,) = measurement.vector(), measurement.datasets
+    # around an unpolarized star (q = u = 0): what is left is the star's, to first order linear
     residuals, slopes = measurement.residuals(vector), _star_slopes(measurement, vector)
     cycle = cycle_numbers(observations)[part.frames[:, 0]][part.group_of_datum]
     labels = np.unique(cycle)
@@ -108,6 +109,7 @@ def _star_slopes(measurement, vector):
 
 
 def _solved(slopes, residuals):
+    # the smaller singular value is the efficiency in the direction that is measured worst
     if slopes.shape[1] < 2 or np.linalg.svd(slopes, compute_uv=False)[1] < 1e-3:
         return np.nan
     return np.linalg.lstsq(slopes.T, residuals, rcond=None)[0]
@@ -117,17 +119,20 @@ def _table(wavelength, found):
     count = np.isfinite(found[0]).sum(axis=1)
     mean = np.nanmean(found, axis=2)
     with np.errstate(invalid="ignore", divide="ignore"):
+        # standard error of the mean: s / sqrt(n - 1) with the standard deviation s over n
         error = np.nanstd(found, axis=2) / np.sqrt(np.maximum(count - 1, 0))
     percent = 100 * u.percent
     table = QTable({"wavelength": wavelength})
     for key, value in zip(("q", "u", "q_err", "u_err"), (*mean, *error), strict=True):
         table[key] = value * percent
+    # rms of both components: the degree has the error of one of them
     spread = np.hypot(*error) / np.sqrt(2)
     dolp = np.hypot(*mean)
     table["dolp"] = stokes.debias_dolp(dolp, spread) * percent
     table["dolp_err"] = spread * percent
-    table["aolp"] = stokes._angle(*mean) * u.deg
+    table["aolp"] = stokes.polarization_angle(*mean) * u.deg
     with np.errstate(divide="ignore", invalid="ignore"):
+        # chi = atan2(u, q) / 2, so that an error s across the polarization turns it by s / (2 p)
         table["aolp_err"] = np.rad2deg(0.5 * spread / dolp) * u.deg
     table["n_cycles"] = count
     for key, value in zip(("q_cycles", "u_cycles"), found, strict=True):
@@ -171,8 +176,10 @@ def star_accuracy(table, q=0.0, u_=0.0):
     length, percent = np.hypot(*known), 100 * u.percent
     with np.errstate(divide="ignore", invalid="ignore"):
         along = np.einsum("kw,kwc->wc", known / length, off)
+    # an unpolarized star has no direction: the mean square of q and u
     squares = np.where(length[:, None] > 0, along**2, 0.5 * (off**2).sum(axis=0))
     angle = 0.5 * (np.arctan2(mean[1], mean[0]) - np.arctan2(known[1], known[0]))
+    # angles of polarization repeat after 180 deg: the shortest way, -90 to 90 deg
     turn = np.mod(angle + np.pi / 2, np.pi) - np.pi / 2
     result = QTable({"wavelength": table["wavelength"]})
     result["dolp_error"] = (np.hypot(*mean) - length) * percent

@@ -76,6 +76,7 @@ class BinProblem:
 
     def residuals(self, vector):
         """Return weighted residuals by bin, zero where a bin has fewer data."""
+        # all bins at once: a prediction costs as much for one bin as for all
         residual = (self.measurement.predict(vector) - self.measurement.observed) * self.weights
         return residual[self._data] * self._present
 
@@ -93,6 +94,7 @@ class BinProblem:
 
     def _normal_equations(self, vector):
         jacobian = self.measurement.jacobian(vector) * self.weights
+        # (n_bins, n_slots, n_data_of_a_bin): in other bins these parameters change nothing
         blocks = jacobian[self.elements.T[:, :, None], self._data[:, None, :]]
         blocks *= self._present[:, None, :]
         residual = self.residuals(vector)
@@ -133,6 +135,7 @@ class BinProblem:
             trial = vector.copy()
             trial[self.elements] = self._step(vector, damping)
             new = self.costs(trial)
+            # each bin has its own damping, and takes or leaves its own step
             better = new < costs
             gaining = new < still_gaining * costs
             vector[self.elements[:, better]] = trial[self.elements[:, better]]
@@ -153,6 +156,7 @@ class BinProblem:
         gradient = np.where(held, 0.0, gradient)
         size = normal.shape[-1]
         diagonal = np.einsum("bss->bs", normal)
+        # relative to the diagonal (Marquardt), plus a little for what changes nothing
         ridge = damping[:, None] * diagonal + 1e-12 * (1 + diagonal.max(axis=1, keepdims=True))
         step = np.linalg.solve(normal + ridge[:, :, None] * np.eye(size), gradient[..., None])
         return np.clip(here - step[..., 0].T, self._low, self._high)
@@ -163,6 +167,8 @@ class BinProblem:
         for row, slot in enumerate(self.slots):
             optic, key = slot.name.split(".")
             low, high = slot.canonical_bounds()
+            # only a phase that may go round has mirror branches; an
+            # orientation is within its bounds
             is_phase = key != "theta" and slot.unit is not None and slot.unit.is_equivalent(u.rad)
             if is_phase and high - low > np.pi and optic not in seen:
                 seen.add(optic)
@@ -185,6 +191,7 @@ class BinProblem:
             trial[self.elements[row]] = value
             costs[i] = self.costs(trial)
         padded = np.pad(costs, ((1, 1), (0, 0)), constant_values=np.inf)
+        # local minima of the scan; the ends count, as valleys may open beyond a bound
         valley = (costs <= padded[:-2]) & (costs <= padded[2:])
         order = np.argsort(np.where(valley, costs, np.inf), axis=0)[:_N_VALLEYS]
         return grid[order]

@@ -93,6 +93,7 @@ def two_step(measurement, weighting, joint, run, options):
     options = options | {"wavelength": measurement.wavelength * u.um}
     stages = []
 
+    # in the first step each wavelength has its own retardance, also of a plate that follows a law
     loose = [_loosened(chain, measurement.wavelength * u.um) for chain in measurement.chains]
     first = _step_of(loose, single, parts, ties, options)
     outcome, weighting = joint(first, weighting)
@@ -156,6 +157,7 @@ def sequential(measurement, weights, joint, run, options):
     options = options | {"wavelength": measurement.wavelength * u.um}
     parts = [d.observations for d in measurement.datasets]
     kinds = [kind_of_source(o.source) for o in parts]
+    # stable: datasets of one kind keep their order
     order = sorted(range(len(parts)), key=lambda i: _ORDER.index(kinds[i]))
     held, outcomes, stages = set(), [], []
     for kind, group in groupby(order, key=lambda i: kinds[i]):
@@ -169,6 +171,7 @@ def sequential(measurement, weights, joint, run, options):
             outcomes.append(outcome)
         stages.append(_stage(f"{kind}, what came before held" if stages else kind, step))
         _copy_values(step.put_back(), chains)
+        # what this step has found is known for the next ones
         held |= {slot.name for slot in step.free.slots}
     measurement.parameters = measurement.free.start()
     return _worst(outcomes), stages
@@ -211,6 +214,7 @@ def telescope_alone(measurement, options):
     rows = [i for i, star in enumerate(seen) if star]
     if not rows or all(seen):
         return None
+    # what a lamp sees as well is found better with it
     lamps = {name for i, star in enumerate(seen) if not star for name in parameter_table(chains[i])}
     own = {s.name for s in measurement.free.slots if not s.per_wavelength} - lamps
     if not own:
@@ -266,6 +270,7 @@ def _worst(outcomes):
 def _step_of(chains, held, parts, ties, options):
     """Return the measurement of one step; what follows a held parameter is held too."""
     known = set(parameter_table(chains))
+    # a tie needs a source that is free in this step
     live = {n: tie for n, tie in ties.items() if n in known and tie.source in known - held}
     return Measurement(_held(chains, held | (set(ties) - set(live))), parts, ties=live, **options)
 

@@ -9,6 +9,7 @@ import numpy as np
 from astropolcal.calibration._sky_summary import mirror_lines, mirrors, star_lines
 from astropolcal.calibration.groups import what_is_left_out
 from astropolcal.calibration.target_accuracy import TARGETS, target_accuracies
+from astropolcal.words import counted
 
 __all__ = ["summary", "to_dict"]
 
@@ -86,7 +87,7 @@ def _heading(calibration):
     state = "converged" if calibration.converged else "NOT CONVERGED"
     return [
         f"Calibration of {calibration.instrument or 'an instrument'} from {names}",
-        f"{settings['strategy']} fit of {len(calibration.covariance)} parameters to "
+        f"{settings['strategy']} fit of {counted(len(calibration.covariance), 'parameter')} to "
         f"{fit['n_data']} {settings['observable'].replace('_', ' ')}s,",
         f"{settings['fitter']}, {fit['seconds']:.2f} s, {state}",
     ]
@@ -102,8 +103,9 @@ def _number(entry):
     elif not np.isfinite(std):
         note = "not determined alone, see below"
     else:
-        return f"{value:12.5f} +- {std:.5f} {unit}"
-    return f"{value:12.5f} {unit} ({note})"
+        # z: what rounds to zero has no sign
+        return f"{value:z12.5f} +- {std:.5f} {unit}"
+    return f"{value:z12.5f} {unit} ({note})"
 
 
 def _global_lines(known):
@@ -114,9 +116,10 @@ def _global_lines(known):
 
 def _accuracy_lines(record, reasons):
     table = record.accuracy
-    masked = f", {record.n_masked} cells masked" if record.n_masked else ""
+    masked = f", {counted(record.n_masked, 'cell')} masked" if record.n_masked else ""
     why = "; ".join(f"{reason}: {count}" for reason, count in reasons.items())
-    counts = f"  ({record.n_frames} frames x {len(table)} wavelengths{masked}"
+    size = f"{counted(record.n_frames, 'frame')} x {counted(len(table), 'wavelength')}"
+    counts = f"  ({size}{masked}"
     return [
         f"Accuracy on {record.name}, in percent of polarization",
         *_rows({name: _percent(table, name) for name in _ACCURACIES}),
@@ -172,7 +175,8 @@ def _standard_lines(entry):
     lines = [
         f"Prediction of {entry['name']} (not fitted), in percent",
         *_rows({name: np.array(values, dtype=float) for name, values in columns.items()}),
-        f"  {entry['words']} ({entry['n_frames']} frames x {len(entry['n'])} wavelengths)",
+        f"  {entry['words']} ({counted(entry['n_frames'], 'frame')} x "
+        f"{counted(len(entry['n']), 'wavelength')})",
     ]
     return list(_wrap(lines))
 
@@ -203,6 +207,7 @@ def _target_row(table):
         f"{'any':>10}" if angle is None else f"{angle.to_value(u.deg):10.4g}"
     )
     for key in ("s_Q", "s_U", "s_p", "s_chi"):
+        # s_Q and s_U only lead to s_p: their worst values would crowd the table
         worst = (np.max,) if key in ("s_p", "s_chi") else ()
         for function in (np.median, *worst):
             row += f"{_short(table[key].value, function):>10}"
@@ -225,6 +230,7 @@ def _wavelength_lines(calibration, known):
     several = {n: e for n, e in known.items() if e["value"].ndim and not e["fixed"]}
     if not several:
         return []
+    # five of 12 characters behind wavelength and accuracy fill the 80 columns
     shown = dict(list(several.items())[:_N_COLUMNS])
     left_out = (
         f"; not shown: {', '.join(list(several)[_N_COLUMNS:])}" if len(several) > len(shown) else ""
@@ -236,6 +242,7 @@ def _wavelength_lines(calibration, known):
         mean = s_mean.get(round(wavelength, 2), np.nan)
         row = f"{wavelength:9.1f}" + (f"{mean:9.3f}" if np.isfinite(mean) else f"{'-':>9}")
         for entry in shown.values():
+            # degrees to 0.01, shares of one to 0.0001
             digits = 2 if entry["unit"] else 4
             row += f"{entry['value'][i]:11.{digits}f}" + ("*" if entry["at_bound"][i] else " ")
         rows.append(row.rstrip())

@@ -294,6 +294,8 @@ def _kind(source, chain):
     """Return which of the three calibrations a dataset belongs to, or None."""
     words = (source or "").lower()
     if "star" in words or "sky" in words:
+        # a polarized star does not tell s_sky, as its own
+        # polarization is fitted or from a catalogue
         return "on_sky" if "unpolarized" in words else None
     if "polarized" in words:
         return "unpolarized" if "unpolarized" in words else "polarized"
@@ -314,6 +316,7 @@ def _tables_of_kinds(calibration, column):
         own = record.accuracy["wavelength"]
         value = _values(kind, record.accuracy, column, own).value
         row = np.full(grid.size, np.nan)
+        # a dataset may cover a part of the grid; the rest stays unknown
         row[np.abs(own[:, None] - grid).argmin(axis=1)] = value**2
         squares.setdefault(kind, []).append(row)
     for kind, row in _standards_of_kinds(calibration, column):
@@ -339,6 +342,7 @@ def _standards_of_kinds(calibration, column):
             continue
         own, n = np.array(entry["wavelength_nm"]), np.array(entry["n"], dtype=float)
         with np.errstate(divide="ignore", invalid="ignore"):
+            # nothing was fitted: its rms over sqrt(n) is what s_mean is for a fit
             share = 1 / n if column == "s_mean" else 1.0
         row = np.full(grid.size, np.nan)
         at = np.abs(own[:, None] - grid).argmin(axis=1)

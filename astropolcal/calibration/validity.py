@@ -131,6 +131,7 @@ def optics_sets(optics_in):
     flat = [name for names in given for name in names]
     if not all(isinstance(name, str) for name in flat) or any(isinstance(s, str) for s in given):
         raise CalibrationFileError(f"optics_in = {optics_in!r}; names of optics are needed")
+    # one form whatever the order, because validities are compared and hashed
     return tuple(sorted({tuple(sorted(set(names))) for names in given}))
 
 
@@ -168,6 +169,7 @@ def validity_of(calibration):
         raise CalibrationFileError(f"validity = {stated!r}; allowed are {', '.join(_STATED)}")
     records = calibration.datasets
     dates = [text for record in records if (text := _day(record.meta.get("date")))]
+    # of several modes none is that of the calibration
     modes = {record.meta.get("mode") for record in records}
     mode = modes.pop() if len(modes) == 1 else None
     derived = {
@@ -183,6 +185,7 @@ def _day(value):
     match = _DAY.fullmatch(str(value or "").strip())
     if match is None:
         return None
+    # a month alone begins on its first day
     text = match[0] if match[1] or match[2] else f"{match[0]}-01"
     try:
         return _moment(text, "date")

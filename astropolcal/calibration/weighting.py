@@ -241,7 +241,7 @@ def weighting_of(calibration):
     >>> bool(weighting_of(cal).level < 0.01)
     True
     """
-    measurement, settings = calibration._live(), calibration.settings
+    measurement, settings = calibration.live_measurement(), calibration.settings
     if measurement.weighting is None:
         given = settings.get("weights") == GIVEN
         noise = _from_settings(measurement, settings) if given else settings.get("weights")

@@ -104,6 +104,7 @@ class Dataset:
         self.observations = observations
         self.observable = observable
         self.n_free = free.size
+        # indices of this dataset's wavelengths on the grid common to all, (n_wavelengths,)
         self.bins = _bins_on_grid(observations, wavelength)
         self.frames = self._frames_of_data()
         columns = self.frames.T.ravel()
@@ -122,6 +123,8 @@ class Dataset:
 
     def _place(self, chain, columns):
         n_nodes = self._node_weights.size
+        # node after node, each with all columns: (n_nodes *
+        # n_columns,) is the frame axis of a sweep
         placed = {stage: _at_nodes(angle, columns, n_nodes) for stage, angle in self._given.items()}
         # where nothing moves all frames are alike, but there are as many
         placed = placed or {"frame": np.zeros(n_nodes * columns.size)}
@@ -162,14 +165,17 @@ class Dataset:
 
     def _observe(self, columns):
         obs = self.observations
+        # the table is (n_frames, n_wavelengths), an observable wants the frames of a datum first
         right, left = (self._grouped(f[columns].T) for f in (obs.flux_right, obs.flux_left))
         errors = [
             self._grouped(v[columns].T)
             for v in (obs.variance_right, obs.variance_left, obs.covariance)
         ]
+        # one masked frame spoils the whole difference
         bad = self._grouped(obs.mask[columns].T).any(axis=0)
         #: True where a group of frames gives a datum, (n_wavelengths, n_groups).
         self.valid = ~bad
+        # what is masked may be zero or NaN; it is dropped by the index, not by the arithmetic
         with np.errstate(invalid="ignore", divide="ignore"):
             self.observed = self.observable.evaluate(right, left)[self.valid]
             variance = self.observable.variance(right, left, *errors)
@@ -199,6 +205,7 @@ class Dataset:
         if weights.size == 1:
             return array
         nodes = array.reshape(array.shape[0], weights.size, -1)
+        # derivatives carry the weights of the nodes already (`_to_nodes`) and are only added up
         return np.einsum("wnc,n->wc", nodes, weights if mean else np.ones_like(weights))
 
     def _to_nodes(self, array):
@@ -212,6 +219,8 @@ class Dataset:
     def _plan(self, chain, free):
         """Note which values of the chain come from which part of the flat vector."""
         self._constants = self.propagator.values()
+        # ((leaf, parameter), place in the flat vector, factor,
+        # offset): value = factor * vector + offset
         self._live = []
         for i, leaf in enumerate(leaves(chain)):
             for j, key in enumerate(leaf.param_names):
@@ -219,12 +228,14 @@ class Dataset:
                 if slot is not None:
                     where = slot.start + self.bins if slot.per_wavelength else slot.start
                     self._live.append(((i, j), where, factor, offset))
+                # a fixed value a wavelength is cut down to this dataset's wavelengths
                 elif np.size(self._constants[i][j]) > 1:
                     self._constants[i][j] = self._constants[i][j][self.bins]
 
     @property
     def n_parameters_per_wavelength(self):
         """Number of free parameters that act on the data of one wavelength."""
+        # one start a slot: a follower shares that of its source, and one free number counts once
         starts = {int(np.min(where)) if np.ndim(where) else where for _, where, *_ in self._live}
         return len(starts)
 
@@ -246,12 +257,16 @@ class Dataset:
         right, left = self._fluxes(sweep)
         derivative = self.observable.derivative(right, left)
         weights = [self._to_nodes(self._flat(d)) for d in derivative]
+        # backward sweep: d(datum)/d(parameter) = sum over frames and beams of
+        # d(datum)/d(flux) * d(flux)/d(parameter), without ever building the fluxes' own Jacobian
         slopes = sweep.derivatives([key for key, *_ in self._live], weights)
         n_groups, n_bins = self.frames.shape[0], len(self.bins)
         out = np.zeros((self.n_free, n_bins, n_groups))
         each = np.arange(n_bins)
         for key, where, factor, _ in self._live:
             slope = factor * self._grouped(self._over_nodes(slopes[key])).sum(axis=0)
+            # a value a wavelength moves the data of its own wavelength
+            # only, one for all moves all of them
             if np.ndim(where):
                 out[where, each] += slope
             else:
@@ -261,6 +276,7 @@ class Dataset:
 
 def _bins_on_grid(observations, wavelength):
     own = observations.wavelength.to_value(u.um)
+    # (n_own, n_grid)
     nearest = np.abs(own[:, None] - wavelength[None, :]).argmin(axis=1)
     off = np.abs(wavelength[nearest] - own) > SAME_WAVELENGTH * own
     if off.any():
@@ -301,6 +317,7 @@ def _node_weights(positions, observations):
     if not counts:
         return np.ones(1)
     _, weights = np.polynomial.legendre.leggauss(next(iter(counts.values())))
+    # Gauss-Legendre weights on (-1, 1) sum to 2, the length of that interval
     return weights / 2
 
 

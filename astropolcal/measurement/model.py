@@ -103,6 +103,7 @@ class Measurement(FittableModel):
 
     def _finish(self, name):
         sizes = [dataset.n_data for dataset in self.datasets]
+        # data vector: dataset after dataset, within each wavelength after wavelength
         edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
         #: Slice of the data vector that belongs to each dataset.
         self.segments = [slice(a, b) for a, b in pairwise(edges)]
@@ -118,6 +119,8 @@ class Measurement(FittableModel):
         self.bins = np.concatenate([d.bin_of_datum for d in self.datasets])
         #: Noise that a fit assumed of the data, a `~astropolcal.calibration.Weighting`.
         self.weighting = None
+        # vector and sweeps of the last prediction: fitters ask for
+        # data and Jacobian at the same point
         self._last = (None, None)
         self._add_parameters()
         super().__init__(name=name)
@@ -128,6 +131,7 @@ class Measurement(FittableModel):
         self._param_names = tuple(self.free.labels)
         start = self.free.start()
         for label, value, a, b in zip(self._param_names, start, low, high, strict=True):
+            # astropy writes an open bound as None
             bounds = (a if np.isfinite(a) else None, b if np.isfinite(b) else None)
             parameter = Parameter(name=label, default=float(value), bounds=bounds)
             parameter.model = self
@@ -234,6 +238,7 @@ class Measurement(FittableModel):
             if len(groups) < self.datasets[i].frames.shape[0]:
                 new.datasets[i] = self.datasets[i].thinned(self._chains[i], groups)
         new._finish(self.name)
+        # the thinned measurement starts where this one stands, not where the chains do
         new.parameters = self.vector()
         parts = zip(self.datasets, chosen, strict=True)
         kept = [np.isin(dataset.group_of_datum, groups) for dataset, groups in parts]
@@ -255,6 +260,7 @@ class Measurement(FittableModel):
         known, sweeps = self._last
         if known is None or not np.array_equal(known, vector):
             sweeps = [dataset.forward(vector) for dataset in self.datasets]
+            # a copy, because fitters change their vector in place
             self._last = (vector.copy(), sweeps)
         return sweeps
 
@@ -305,8 +311,10 @@ class Measurement(FittableModel):
         return self._pick(self.jacobian(vector), x, self.free.prior_jacobian, vector)
 
     def _pick(self, values, x, prior, vector):
+        # all data in order, without the priors: what `predict` asks for, and nothing to be picked
         if np.array_equal(x, self.index):
             return values
+        # index n_data + i is the i-th residual of the priors, of observed value zero
         if self.n_priors:
             values = np.concatenate([values, prior(vector)], axis=-1)
         index = np.asarray(x)
@@ -346,6 +354,8 @@ class Measurement(FittableModel):
         return (
             np.concatenate([index, self.n_data + np.arange(self.n_priors)]),
             np.concatenate([observed, np.zeros(self.n_priors)]),
+            # a prior's residual is in units of its own width; times
+            # the noise it is in those of a datum
             np.concatenate([weights, np.full(self.n_priors, noise)]),
         )
 
@@ -385,6 +395,7 @@ def _drawn(count, most):
     """Return which of so many groups to keep."""
     if count <= most:
         return np.arange(count)
+    # drawn, not every n-th, which could hit the same plate angle each time
     return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
 
 

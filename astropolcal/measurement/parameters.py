@@ -144,6 +144,8 @@ def parameter_table(chains):
         for leaf in leaves(chain):
             if not leaf.name:
                 raise ParameterError(f"{type(leaf).__name__} needs a name to be calibrated")
+            # one name is one piece of glass: it cannot be a mirror for
+            # one dataset and a plate for another
             if kinds.setdefault(leaf.name, type(leaf)) is not type(leaf):
                 raise ParameterError(
                     f"optic {leaf.name!r} is a {kinds[leaf.name].__name__} in one dataset and a "
@@ -187,6 +189,7 @@ class FreeParameters:
         self.ties = dict(ties or {})
         self._table = parameter_table(chains)
         for parameter in (p for parameters in self._table.values() for p in parameters):
+            # as `Normal`, which an ASDF file can hold where scipy's frozen distribution cannot
             if parameter.prior is not None:
                 parameter.prior = normal_per_wavelength(parameter.prior, parameter.unit)
         self._check_ties()
@@ -243,6 +246,7 @@ class FreeParameters:
                 f"{name} has a callable tie, which makes analytic Jacobians silently wrong; "
                 "pass ties={...: Tie(...)} instead"
             )
+        # also of what is fixed: an array of another length would be broadcast silently
         size = np.size(first.value)
         if size not in (1, n_wavelengths):
             raise ParameterError(
@@ -292,6 +296,7 @@ class FreeParameters:
             # a value that the prior excludes starts at the prior's mode
             low, high = prior.canonical_support()
             here = vector[slot.slice]
+            # a fitter with bounds refuses a start outside of them
             excluded = (here < low) | (here > high)
             vector[slot.slice] = np.where(excluded, prior.mode * slot.factor, here)
         return vector
@@ -304,6 +309,7 @@ class FreeParameters:
     def at_bounds(self, vector):
         """Return which elements of a vector sit at a bound, or beyond it; shape (n_free,)."""
         low, high = self._bounds
+        # fitters stop just inside of a bound; relative above one, as a retardance of 2 pi is
         near = _AT_BOUND * np.maximum(1.0, np.abs(vector))
         return (vector - low < near) | (high - vector < near)
 
@@ -312,6 +318,7 @@ class FreeParameters:
         low, high = np.array(pairs, dtype=float).reshape(-1, 2).T.copy()
         for slot, prior in self.priors:
             start, end = prior.canonical_support()
+            # where the density is zero there is a bound, whichever is tighter
             low[slot.slice] = np.maximum(low[slot.slice], start)
             high[slot.slice] = np.minimum(high[slot.slice], end)
         return low, high
@@ -350,6 +357,8 @@ class FreeParameters:
         for slot, prior in self.priors:
             if not prior.is_flat:
                 block = np.zeros((self.size, slot.size))
+                # a prior looks at each element alone, so the block is
+                # diagonal, (slot.size, slot.size)
                 np.fill_diagonal(block[slot.slice], prior.slope(vector[slot.slice]))
                 parts.append(block)
         return np.concatenate(parts, axis=1) if parts else np.empty((self.size, 0))
@@ -365,6 +374,7 @@ class FreeParameters:
         factor, offset : float
             ``value = factor * vector[slot] + offset``.
         """
+        # free itself: the value is the element of the vector
         if name in self.by_name:
             return self.by_name[name], 1.0, 0.0
         return self._followers.get(name, (None, 0.0, 0.0))
@@ -381,6 +391,8 @@ class FreeParameters:
             slot, factor, offset = self.lookup(name)
             if slot is None:
                 continue
+            # linear in canonical units, so that the Jacobian of a
+            # follower is `factor` times the source's
             canonical = factor * np.asarray(vector)[slot.slice] + offset
             for parameter in parameters:
                 shape = np.shape(parameter.value)

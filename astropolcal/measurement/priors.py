@@ -85,6 +85,7 @@ class Uniform:
         low, high = (float(to_unit(v, unit, f"prior of {name}")) for v in (self.low, self.high))
         if not (np.isfinite(low) and np.isfinite(high) and high > low):
             raise ParameterError(f"prior of {name}: Uniform({low}, {high}) needs low below high")
+        # scipy's uniform takes the start and the width
         return uniform(low, high - low)
 
 
@@ -151,6 +152,8 @@ class BoundPrior:
         value = canonical / self.factor
         if self._is_normal:
             mean, std = self._moments
+            # scipy's logpdf checks its arguments at every call, which
+            # a sampler makes a million times
             return self._log_peak - 0.5 * ((value - mean) / std) ** 2
         if self.is_flat:
             low, high = self._support
@@ -167,7 +170,10 @@ class BoundPrior:
         value = np.asarray(canonical, dtype=float) / self.factor
         if self._is_normal:
             mean, std = self._moments
+            # signed, and without the square root below, whose slope jumps at the mode
             return (value - mean) / std
+        # r = sign(x - mode) sqrt(2 (log p(mode) - log p(x))), so
+        # that r^2 / 2 is minus the log density
         depth = self._log_peak - self.distribution.logpdf(value)
         return np.sign(value - self.mode) * np.sqrt(2 * np.maximum(depth, 0.0))
 
@@ -178,6 +184,7 @@ class BoundPrior:
         if self._is_normal:
             return np.broadcast_to(1 / std, canonical.shape).copy()
         low, high = self._support
+        # never beyond the support, where the density is zero and the residual infinite
         up = np.minimum(canonical + _STEP * std, high)
         down = np.maximum(canonical - _STEP * std, low)
         return (self.residual(up) - self.residual(down)) / (up - down)
@@ -226,6 +233,7 @@ def bind_prior(prior, name, unit, bounds):
         np.inf if bounds[1] is None else bounds[1],
     )
     start, end = distribution.support()
+    # a flat prior has no peak that would have to be inside
     inside = (low <= mode) & (mode <= high) | (distribution.dist.name == "uniform")
     if np.any(start >= high) or np.any(end <= low) or not np.all(inside):
         worst = mode if np.ndim(mode) == 0 else mode[np.argmin(inside)]
@@ -280,6 +288,7 @@ def _mode(distribution):
 
     if distribution.dist.name in ("norm", "uniform"):
         return _plain(distribution.mean())
+    # a search needs finite ends; a peak beyond them would be one in a millionth of the probability
     ends = distribution.ppf([1e-6, 1 - 1e-6])
     inside = minimize_scalar(
         lambda x: -distribution.logpdf(x),
@@ -287,5 +296,6 @@ def _mode(distribution):
         method="bounded",
         options={"xatol": 1e-10 * (ends[1] - ends[0])},
     ).x
+    # a density cut off at a bound (truncnorm) may peak there, where no search by derivative ends
     candidates = [inside, *(x for x in distribution.support() if np.isfinite(x))]
     return float(max(candidates, key=distribution.logpdf))

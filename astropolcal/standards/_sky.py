@@ -1,8 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Where a star stands over a site: altitude, parallactic angle, the hours of a night."""
 
-import difflib
-
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import AltAz, EarthLocation, get_sun
@@ -12,12 +10,15 @@ from astropy.time import Time
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations.pointing import offline, pointing
 from astropolcal.units import angle_to_rad
+from astropolcal.words import did_you_mean
 
 __all__ = ["offline", "pointing"]
 
 LIMIT = 30 * u.deg
+# end of nautical twilight: standards are bright, the sky need not be quite dark
 TWILIGHT = -12 * u.deg
 STEP = 10 * u.min
+# a coarser table would miss a transit, where the parallactic angle of a high star turns fast
 _LARGEST_STEP = 60 * u.min
 
 # east longitude and latitude in degree, height in metre
@@ -36,17 +37,16 @@ def location(site):
     key = str(site).strip().lower().replace(" ", "_").replace("-", "_")
     if key in SITES:
         return EarthLocation.from_geodetic(*SITES[key])
-    near = difflib.get_close_matches(key, SITES, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
     raise ParameterError(
-        f"site = {site!r} is not known{hint} (known: {', '.join(SITES)}; any other as an "
-        "EarthLocation)"
+        f"site = {site!r} is not known{did_you_mean(key, SITES)} (known: {', '.join(SITES)}; any "
+        "other as an EarthLocation)"
     )
 
 
 def night_times(site, night, *, twilight, step):
     """Return the times of a night with the Sun below ``twilight``, ``step`` apart."""
     with offline():
+        # from noon to noon, so that a night is never cut in two whatever the longitude
         times = _evening_noon(site, night) + np.arange(0, 1, step.to_value(u.day)) * u.day
         sun = get_sun(times).transform_to(AltAz(obstime=times, location=site)).alt
     dark = sun < twilight
@@ -63,6 +63,8 @@ def _evening_noon(site, night):
     text = date_of(night)
     try:
         date = Time(text, scale="utc", format="iso", out_subfmt="date")
+        # astropy reads more than dates, such as 2025-11 or a time
+        # of day, and would fill in the rest
         if date.to_value("iso", "date") != text:
             raise ValueError
     except (ValueError, TypeError):
@@ -71,6 +73,7 @@ def _evening_noon(site, night):
         ) from None
     # a time of its own, which is not printed as a date
     noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
+    # local mean noon is 12 h UTC minus the east longitude
     return noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day
 
 
@@ -96,6 +99,7 @@ def checked(min_altitude, twilight, step):
 
 def night_table(times, altitude, parallactic, limit):
     """Return the table of one star over the dark hours."""
+    # a star that culminates north of the zenith jumps from -180 to +180 deg there
     smooth, up = np.unwrap(parallactic, period=360 * u.deg), altitude >= limit
     lowest = np.min(smooth[up]) if np.any(up) else smooth[0]
     # from -180 deg on, so that a star that culminates in the north passes +180

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The catalogue of standard stars that comes with the package."""
 
-import difflib
 import re
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -15,6 +14,7 @@ from astropy.table import QTable
 from astropolcal.exceptions import ParameterError
 from astropolcal.standards.law import LinearStokes, SerkowskiLaw
 from astropolcal.units import length_to_um
+from astropolcal.words import did_you_mean
 
 __all__ = ["KINDS", "MAGNITUDES", "StandardStar", "catalogue", "get", "names"]
 
@@ -159,8 +159,11 @@ class StandardStar:
     def _unpolarized(self, x):
         table = self.polarization
         distance = np.abs(np.log(x[..., None] / table["wavelength"].to_value(u.um)))
+        # (n_wavelengths, n_measurements) nearest in the logarithm:
+        # bands are about equally wide in it
         error = table["p_err"].to_value(u.dimensionless_unscaled)
         degree = table["p"].to_value(u.dimensionless_unscaled)
+        # that q = u = 0 is wrong by the measured p itself, and p by its error
         variance = (degree**2 + np.where(np.isfinite(error), error, 0) ** 2)[
             np.argmin(distance, axis=-1)
         ]
@@ -230,9 +233,8 @@ def get(name):
     index = _index()
     if key in index:
         return _stars()[index[key]]
-    near = difflib.get_close_matches(key, index, n=3)
-    near = list(dict.fromkeys(index[k] for k in near))
-    hint = f"; did you mean {' or '.join(near)}?" if near else ""
+    # the index holds aliases too; what is suggested are the catalogue's own names
+    hint = did_you_mean(key, index, most=3, show=index.get)
     raise ParameterError(f"the catalogue has no standard star {str(name)!r}{hint}")
 
 
@@ -270,6 +272,7 @@ def _normal(name):
 
 @lru_cache(maxsize=1)
 def _tables():
+    # stars and measurements in two tables: a star has one position and many measurements
     files = ("standards.ecsv", "standards_polarization.ecsv")
     return tuple(_read(_DATA / name) for name in files)
 
@@ -318,11 +321,13 @@ def _law(row, measured):
     if not np.isfinite(row["p_max"]):
         return None, {}
     theta, error = row["law_theta"], np.nan * u.deg
+    # a law published without its angle takes that of the measurements
     if not np.isfinite(theta):
         theta, error = _mean_angle(measured)
     law = SerkowskiLaw(row["p_max"], row["lambda_max"], float(row["width"]), theta)
     errors = {"p_max": row["p_max_err"], "lambda_max": row["lambda_max_err"]}
     errors |= {"K": float(row["width_err"]), "theta": error}
+    # errors of some parameters only would give a covariance that is too small
     return law, errors if all(np.isfinite(e) for e in errors.values()) else {}
 
 
@@ -330,8 +335,11 @@ def _mean_angle(measured):
     """Return the weighted mean of the angles, and an error no smaller than their scatter."""
     weight = measured["theta_err"].to_value(u.rad) ** -2.0
     double = 2 * measured["theta"].to_value(u.rad)
+    # an angle of polarization is one of period 180 deg, so the
+    # double angle is averaged on the circle
     mean = np.angle(np.sum(weight * np.exp(1j * double)))
     offset = np.angle(np.exp(1j * (double - mean))) / 2
     variance = np.sum(weight * offset**2) / np.sum(weight)
+    # bands may disagree by more than their errors: the larger of scatter and stated error
     error = np.sqrt(max(variance / max(len(measured) - 1, 1), 1 / np.sum(weight)))
     return np.mod(np.rad2deg(mean) / 2, 180) * u.deg, np.rad2deg(error) * u.deg

@@ -156,6 +156,7 @@ def _design(psi, turn, offset):
     """Return the derivatives of all q' and u' by the parameters, shape (2 n, 3 or 5)."""
     # in the frame of the instrument; the turn itself changes no information
     star, mirror = _rotation(psi - turn), _rotation(-turn)[..., :1]
+    # columns: star q, star u, diattenuation, and with an offset its q and u
     parts = [star, mirror]
     if offset:
         parts.append(np.broadcast_to(np.eye(2), star.shape))
@@ -169,6 +170,7 @@ def _rotation(angle):
 
 
 def _prior(width, star_error):
+    # a star known beforehand is two more measurements, of its q and u
     rows = np.zeros((2, width))
     rows[:, :2] = np.eye(2) / _positive(star_error, "star_error")
     return rows
@@ -176,10 +178,16 @@ def _prior(width, star_error):
 
 def _covariance(columns):
     """Return the covariance of least squares; infinite where nothing is determined."""
-    _, size, directions = np.linalg.svd(columns, full_matrices=True)
+    # all right vectors are there even if one frame gives fewer rows than columns; with more rows
+    # the full matrix of left ones would have the square of their number
+    short = columns.shape[0] < columns.shape[1]
+    _, size, directions = np.linalg.svd(columns, full_matrices=short)
+    # one frame gives two rows for three or more columns: the missing singular values are zero
     size = np.concatenate([size, np.zeros(columns.shape[1] - len(size))])
     good = size > _RANK * size.max()
     covariance = (directions[good].T / size[good] ** 2) @ directions[good]
+    # a parameter that takes part in an open direction has an infinite error, not that of a
+    # pseudo-inverse; null vectors are exact to about the root of the rank tolerance
     lost = np.any(np.abs(directions[~good]) > np.sqrt(_RANK), axis=0)
     covariance[lost, :] = covariance[:, lost] = np.inf
     return covariance

@@ -143,6 +143,7 @@ class SerkowskiLaw(Fittable1DModel):
 
     measured_range = [0.36, 2.04] * u.um
     valid_range = [0.28, 2.5] * u.um
+    # `evaluate` gets micrometres, whatever unit of length the wavelengths have
     input_units_strict = True
     _input_units_allow_dimensionless = False
 
@@ -159,6 +160,7 @@ class SerkowskiLaw(Fittable1DModel):
         super().__init__(
             p_max=to_unit(p_max, None, "p_max"),
             lambda_max=longest * u.um,
+            # the relation only gives the start: K is a free parameter unless it is tied
             K=_INTERCEPT + _SLOPE * longest if K is None else to_unit(K, None, "K"),
             theta=angle_to_rad(theta, "theta") * u.rad.to(u.deg) * u.deg,
             rotation=to_unit(rotation, _TURN, "rotation") * _TURN,
@@ -185,6 +187,7 @@ class SerkowskiLaw(Fittable1DModel):
     @property
     def fit_deriv(self):
         """Derivatives by the parameters, or None if a tie of the user's makes them wrong."""
+        # astropy drops the columns of tied parameters, so theirs must be in that of their source
         ties = {name: tie for name, tie in self.tied.items() if tie}
         if not ties:
             return self._columns
@@ -196,11 +199,14 @@ class SerkowskiLaw(Fittable1DModel):
         shape = np.exp(-K * log**2)
         degree = p_max * shape
         none = np.zeros_like(shape)
+        # d/dp_max, d/dlambda_max, d/dK of p_max exp(-K ln^2(lambda_max /
+        # lambda)); the degree does not depend on the angle
         return [shape, -2 * K * log / lambda_max * degree, -(log**2) * degree, none, none]
 
     @classmethod
     def _tied_columns(cls, x, *parameters):
         columns = cls._columns(x, *parameters)
+        # chain rule through K = intercept + slope * lambda_max
         columns[1] = columns[1] + _SLOPE * columns[2]
         return columns
 
@@ -339,8 +345,11 @@ class SerkowskiLaw(Fittable1DModel):
         q_u = degree[..., None] * along
         if covariance is None:
             return LinearStokes(q_u[..., 0], q_u[..., 1], None)
+        # (q, u) = p (cos 2 theta, sin 2 theta): along is d/dp, across d/dtheta
         across = 2 * degree[..., None] * np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
         one = np.ones_like(x)
+        # derivatives of theta(lambda) = theta + rotation (lambda -
+        # lambda_max) to the five parameters
         turns = [0 * one, -values["rotation"] * one, 0 * one, one, x - values["lambda_max"]]
         pairs = zip(degree_columns, turns, strict=True)
         jacobian = np.stack([d[..., None] * along + t[..., None] * across for d, t in pairs], -1)

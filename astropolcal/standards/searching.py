@@ -26,6 +26,7 @@ __all__ = ["search"]
 
 # frames spread over the observable hours, for the error of the diattenuation
 FRAMES = 32
+# where m3_score and m3_error agree; photon noise grows as 10^(0.2 m)
 _REFERENCE_MAGNITUDE = 10
 _FORMATS = dict.fromkeys(("m3_error", "m3_score"), ".3f")
 _FORMATS |= dict.fromkeys(("altitude_min", "altitude_max", "hours"), ".1f")
@@ -143,6 +144,7 @@ def _around(stars, center, radius):
     radius = float(angle_to_rad(radius, "radius"))
     if not 0 < radius <= np.pi:
         raise ParameterError(f"radius = {np.rad2deg(radius):g} deg must be from 0 to 180 deg")
+    # separation of no coordinates is an error in astropy
     near = _places(stars).separation(center).rad <= radius if stars else []
     return [star for star, inside in zip(stars, near, strict=True) if inside]
 
@@ -187,8 +189,10 @@ def _from_law(star, band):
     place = dict(zip(_BANDS, (0.36, 0.44, 0.55, 0.65, 0.8, 1.25, 1.65, 2.2), strict=True))
     wavelength = place.get(band, 0.55) * u.um
     q, stokes_u, covariance = star.stokes(wavelength)
+    # the error of the degree is that along the direction of polarization in the (q, u) plane
     along = np.array([q, stokes_u]) / np.hypot(q, stokes_u)
-    error = np.nan if covariance is None else np.sqrt(along @ covariance @ along)
+    # where the angle alone is uncertain rounding may leave less than zero
+    error = np.nan if covariance is None else np.sqrt(max(along @ covariance @ along, 0.0))
     return 100 * float(np.hypot(q, stokes_u)), 100 * float(error)
 
 

@@ -83,6 +83,7 @@ class Observability:
     def hours(self):
         """How long it is observable."""
         mjd = self.table["time"].mjd
+        # each row stands for one step; a star may set and rise again, so not last less first
         return len(self._seen) * 24 * (mjd[1] - mjd[0] if len(mjd) > 1 else 0) * u.h
 
     @property
@@ -90,9 +91,11 @@ class Observability:
         """Time of the highest altitude in the dark hours: the transit, if it is in them."""
         time, altitude = self.table["time"], self.table["altitude"].value
         top = int(np.argmax(altitude))
+        # highest at dusk or dawn: the transit itself is by day
         if not 0 < top < len(time) - 1:
             return time[top]
         before, at, after = altitude[top - 1 : top + 2]
+        # vertex of the parabola through three rows, so that a coarse table gives the same transit
         shift = 0.5 * (before - after) / (before - 2 * at + after)
         with offline():
             return time[top] + shift * (time[top + 1] - time[top])
@@ -199,4 +202,5 @@ def _spread(count, frames):
     """Return ``frames`` indices that are spread evenly over ``count`` rows."""
     if frames != int(frames) or frames < 1:
         raise ParameterError(f"frames = {frames!r} must be a positive whole number")
+    # more frames than rows repeat rows, so that the number of frames still counts
     return np.round(np.linspace(0, count - 1, int(frames))).astype(int)

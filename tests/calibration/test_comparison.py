@@ -7,10 +7,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from astropolcal import calibrate, instruments, optics
-from astropolcal.calibration import compare
+from astropolcal.calibration import compare, comparison_text, full_covariance
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments.telescope import published_mirror, telescope
+from astropolcal.measurement import FreeParameters
 from astropolcal.plotting import plot_comparison
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -20,6 +21,7 @@ COLUMNS = [
     "derotator_retardance", "derotator_diattenuation", "path_diattenuation",
     "least_efficiency", "most_efficiency",
 ]  # fmt: skip
+COLUMNS += [f"{name}_std" for name in COLUMNS[3:]]
 
 
 def bench(plate=170.0, derotator=150.0, attenuation=0.02):
@@ -78,7 +80,7 @@ def test_telescope_does_not_count():
     inside = bench()
     sky = join([*telescope(published_mirror()), *list(inside)[1:]])
     a, b = compare({"a": (inside, LAM)}), compare({"b": (sky, LAM)})
-    for name in COLUMNS[3:]:
+    for name in COLUMNS[3:10]:
         np.testing.assert_allclose(u.Quantity(a[name]), u.Quantity(b[name]))
 
 
@@ -125,3 +127,151 @@ def test_figure_shows_every_member_and_value():
         "diattenuation (%)",
         "measured share of the polarization",
     ]
+
+
+# --- errors -----------------------------------------------------------------------------
+
+QUANTITIES = COLUMNS[3:10]
+
+
+def calibrated(plate=130.0, derotator=140.0, fixed=(), frames=None, seed=3):
+    """Return the calibration of a bench whose retardances and diattenuation are free."""
+    # double differences see a diattenuation in second order only, and a plate far from half a
+    # wave tells it from the retardance
+    chain = bench(plate, derotator, 0.3)
+    chain["mirrors"].theta.fixed = False
+    for name, key in fixed:
+        getattr(chain[name], key).fixed = True
+    frames = (
+        half_wave_plate_cycles(derotator=[20, 50, 75, 110] * u.deg) if frames is None else frames
+    )
+    frames["rotator"] = frames["derotator"]
+    data = simulate(chain, LAM, frames, flux=1e8, seed=seed)
+    return calibrate(chain, data, search=False, cross_validate=False)
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return calibrated()
+
+
+def drawn(calibration, n, seed=1):
+    """Return the smooth quantities of chains drawn from the covariance, shape (n, 7, n_lam)."""
+    chain = calibration.chains[0].copy()
+    free = FreeParameters([chain], len(LAM))
+    factor = full_covariance(calibration).factor
+    z = np.random.default_rng(seed).normal(size=(n, len(factor)))
+    found, start = [], free.start()
+    for row in z @ factor:
+        free.put_back(start + row * free.factors())
+        table = compare({"draw": (chain, LAM)})
+        found.append([u.Quantity(table[key]).value for key in QUANTITIES])
+    return np.array(found)
+
+
+def test_errors_are_the_scatter_over_the_covariance(calibration):
+    table = compare([calibration])
+    scatter = drawn(calibration, 100).std(axis=0)
+    for key, expected in zip(QUANTITIES, scatter, strict=True):
+        found = u.Quantity(table[f"{key}_std"]).value
+        if key == "hwp_diattenuation":
+            assert np.isnan(found).all()
+        elif key != "most_efficiency":
+            # 100 draws give a standard deviation to 7 %
+            np.testing.assert_allclose(found, expected, rtol=0.25, err_msg=key)
+
+
+def test_error_of_a_retardance_is_that_of_its_parameter(calibration):
+    table = compare([calibration])
+    for column, name in (("hwp", "plate"), ("derotator", "mirrors")):
+        expected = calibration.covariance.std(f"{name}.retardance").to_value(u.deg)
+        found = table[f"{column}_retardance_std"].to_value(u.deg)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    expected = calibration.covariance.std("mirrors.diattenuation")
+    np.testing.assert_allclose(table["derotator_diattenuation_std"], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("plate", [179.999, 180.0, 180.001, -180.0])
+def test_half_a_wave_is_no_kink(plate):
+    """The folded retardance has a kink at 180 deg, where its error is still that of the angle."""
+    cal = calibrated(plate, fixed=[("mirrors", "diattenuation")])
+    found = compare([cal])["hwp_retardance_std"]
+    np.testing.assert_allclose(found, cal.covariance.std("plate.retardance"), rtol=1e-6)
+
+
+def test_what_is_fixed_has_no_error():
+    held = [("mirrors", "retardance"), ("mirrors", "diattenuation"), ("mirrors", "theta")]
+    table = compare([calibrated(fixed=held)])
+    for key in ("derotator_retardance", "derotator_diattenuation", "path_diattenuation"):
+        assert np.isnan(u.Quantity(table[f"{key}_std"]).value).all(), key
+    assert np.isfinite(table["hwp_retardance_std"]).all()
+
+
+def test_instruments_and_chains_have_no_errors():
+    table = compare({"irdis": "irdis", "bench": (bench(), LAM)})
+    for key in QUANTITIES:
+        assert np.isnan(u.Quantity(table[f"{key}_std"]).value).all(), key
+    assert table["hwp_retardance_std"].unit == u.deg
+
+
+def test_what_the_data_leave_open_has_an_infinite_error():
+    """With the derotator at one angle only, its retardance and orientation are one number."""
+    cal = calibrated(frames=half_wave_plate_cycles(derotator=[20] * u.deg))
+    table = compare([cal])
+    assert np.isinf(table["derotator_retardance_std"].to_value(u.deg)).any()
+    assert " ± inf" in comparison_text(table)
+
+
+def test_errors_survive_the_file(calibration, tmp_path):
+    path = calibration.write(tmp_path / "cal.asdf") or tmp_path / "cal.asdf"
+    a, b = compare([calibration]), compare({"chain 1": type(calibration).read(path)})
+    for key in QUANTITIES:
+        name = f"{key}_std"
+        np.testing.assert_allclose(u.Quantity(a[name]), u.Quantity(b[name]), rtol=1e-6)
+
+
+def test_text_has_two_digits_of_the_error():
+    table = compare({"bench": (bench(170, None), LAM)})
+    table["hwp_retardance_std"] = [0.0123, 4.0] * u.deg
+    table["path_diattenuation_std"] = [np.nan, 0.0011]
+    head, first, second = comparison_text(table).splitlines()
+    assert head.split() == COLUMNS[:10]
+    assert first.split()[:6] == ["bench", "-", "1200.0", "170.000", "±", "0.012"]
+    assert second.split()[3:6] == ["170.0", "±", "4.0"]
+    # no derotator; no error of the path; errors in percent like the value
+    assert first.split()[7:9] == ["-", "-"]
+    assert "0.00 ± 0.11" in second
+    assert "±" not in first.split(maxsplit=6)[-1]
+
+
+def test_text_names_filters_and_aligns():
+    lines = comparison_text(compare(["irdis"])).splitlines()
+    assert [line.split()[1] for line in lines[1:]] == ["Y", "J", "H", "Ks"]
+    place = lines[0].index("hwp_retardance")
+    assert all(line[place - 1] == " " and line[place] != " " for line in lines)
+
+
+def test_figure_has_a_bar_for_each_error(calibration):
+    table = compare({"calibrated": calibration, "published": "irdis"})
+    figure = plot_comparison(table, figure=Figure())
+    bars = figure.axes[1].collections
+    assert len(bars) == 1
+    found = np.array(bars[0].get_segments())
+    value = table["derotator_retardance"][:2].to_value(u.deg)
+    std = table["derotator_retardance_std"][:2].to_value(u.deg)
+    np.testing.assert_allclose(found[:, 0, 0], LAM.to_value(u.nm))
+    np.testing.assert_allclose(found[:, :, 1], np.stack([value - std, value + std], axis=1))
+    # in percent, as its axis
+    (path,) = figure.axes[2].collections
+    span = np.ptp(np.array(path.get_segments())[:, :, 1], axis=1)
+    np.testing.assert_allclose(span, 200 * table["path_diattenuation_std"][:2])
+
+
+def test_figure_shows_what_is_open_and_takes_tables_without_errors():
+    table = compare({"one": (bench(), LAM)})
+    table["hwp_retardance_std"] = [np.inf, 0.1] * u.deg
+    figure = plot_comparison(table, figure=Figure())
+    (line,) = [x for x in figure.axes[0].get_lines() if list(x.get_ydata()) == [0, 1]]
+    np.testing.assert_allclose(line.get_xdata(), 1200)
+    table.remove_columns([f"{key}_std" for key in QUANTITIES])
+    assert not plot_comparison(table, figure=Figure()).axes[0].collections

@@ -614,7 +614,7 @@ def test_folder_in_place_of_a_file(calibration, tmp_path):
 
 
 def test_missing_folder(calibration, tmp_path):
-    assert_not_written(calibration, tmp_path / "no" / "x.asdf", "cannot be written: no folder")
+    assert_not_written(calibration, tmp_path / "no" / "x.asdf", "there is no folder")
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write all")

@@ -15,7 +15,7 @@ from astropolcal.calibration import (
     noise_from_null_channel,
     noise_from_replicates,
 )
-from astropolcal.calibration.noise import _clusters, data_by_wavelength
+from astropolcal.calibration.noise import data_by_wavelength, equal_axes
 from astropolcal.chain import join
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement
@@ -172,20 +172,20 @@ def test_masked_data_do_not_count(repeated):
 @given(
     st.lists(st.floats(-720, 720), min_size=1, max_size=30), st.floats(0.01, 30), st.floats(-1, 1)
 )
-def test_clusters_are_no_wider_than_the_tolerance(angles, tolerance, turn):
+def testequal_axes_are_no_wider_than_the_tolerance(angles, tolerance, turn):
     axis = np.deg2rad(angles)
-    label = _clusters(axis, np.deg2rad(tolerance))
+    label = equal_axes(axis, np.deg2rad(tolerance))
     for k in np.unique(label):
         members = axis[label == k]
         apart = np.abs(np.mod(members[:, None] - members + np.pi / 2, np.pi) - np.pi / 2)
         assert np.rad2deg(apart.max()) <= tolerance + 1e-6
-    same = _clusters(axis + np.pi * np.rint(3 * turn), np.deg2rad(tolerance))
+    same = equal_axes(axis + np.pi * np.rint(3 * turn), np.deg2rad(tolerance))
     if np.ptp(np.mod(np.array(angles) * 64, 1.0)) == 0:
         np.testing.assert_array_equal(same, label)
 
 
-def test_clusters_join_0_and_180_deg():
-    label = _clusters(np.deg2rad([179.99, 45, 0.01, 180, 45.02]), np.deg2rad(0.1))
+def testequal_axes_join_0_and_180_deg():
+    label = equal_axes(np.deg2rad([179.99, 45, 0.01, 180, 45.02]), np.deg2rad(0.1))
     assert label[0] == label[2] == label[3]
     assert label[1] == label[4] != label[0]
 

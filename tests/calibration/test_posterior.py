@@ -127,7 +127,7 @@ def test_r_hat_of_walkers_that_stay_apart():
 
 def test_summary_without_arviz(monkeypatch):
     monkeypatch.setitem(sys.modules, "arviz_stats.base", None)
-    with pytest.raises(AstropolcalError, match=r"arviz-stats, .*pip install astropolcal\[mcmc\]"):
+    with pytest.raises(AstropolcalError, match=r'arviz-stats, .*pip install "astropolcal\[mcmc\]"'):
         make_posterior().summary()
 
 

@@ -597,7 +597,7 @@ def test_no_place_to_start(small, monkeypatch):
 @pytest.mark.parametrize(("module", "package"), [("emcee", "emcee"), ("h5py", "h5py")])
 def test_missing_package(small, tmp_path, monkeypatch, module, package):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(AstropolcalError, match=rf"{package}, .*pip install astropolcal\[mcmc\]"):
+    with pytest.raises(AstropolcalError, match=rf'{package}, .*pip install "astropolcal\[mcmc\]"'):
         sample(small, **RUN, checkpoint=tmp_path / "chain.h5")
 
 

@@ -155,6 +155,17 @@ def test_a_tied_width_carries_the_error_of_lambda_max():
     assert law.stokes(1.5 * u.um, matrix).covariance[0, 0] == pytest.approx(expected, rel=1e-6)
 
 
+def test_a_width_that_is_fixed_and_not_tied_has_no_error():
+    """A fit of p_max and lambda_max with K held: its 2 x 2 matrix says nothing of K."""
+    law = SerkowskiLaw(theta=20 * u.deg)
+    law.K.fixed = True
+    fitted = np.array([[1e-6, 2e-6], [2e-6, 1e-4]])
+    full = np.zeros((5, 5))
+    full[:2, :2] = fitted
+    one, other = (law.stokes(1.6 * u.um, matrix).covariance for matrix in (fitted, full))
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("covariance", "words"),
     [

@@ -1,0 +1,408 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What stands between a header and a Mueller matrix: wavelengths, chains, angles, statements."""
+
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+
+from astropolcal import instruments, optics
+from astropolcal.calibration import Validity, validity_of, with_validity
+from astropolcal.calibration._beam import (
+    inner_optics,
+    instrument_of,
+    telescope_optics,
+    told_beam,
+)
+from astropolcal.calibration._header import FrameAngles, describe
+from astropolcal.calibration._system import at_bins, match_wavelengths, split_chain
+from astropolcal.calibration.validity import beam_words, optics_sets, optics_words
+from astropolcal.chain import leaves
+from astropolcal.exceptions import (
+    CalibrationFileError,
+    ChainError,
+    InstrumentError,
+    ObservationError,
+    ParameterError,
+    WavelengthRangeError,
+)
+
+CHARIS = instruments.get("charis")
+GRID = np.array([1200.0, 1600.0, 2200.0]) * u.nm
+
+
+def _several():
+    """Efficiency at each wavelength of the grid, retardance by one number for all."""
+    hwp = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    return hwp | optics.WollastonPrism(efficiency=np.array([0.9, 0.95, 1.0]), name="wollaston")
+
+
+def _law():
+    hwp = optics.TwoLayerWaveplate(mount="hwp", name="hwp")
+    return hwp | optics.WollastonPrism(name="wollaston")
+
+
+# --- wavelengths ------------------------------------------------------------------------------
+
+
+def test_without_a_wish_all_wavelengths_are_taken():
+    lam, bins = match_wavelengths(GRID, _several(), None)
+    assert lam is GRID
+    assert bins.tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "bins"),
+    [
+        (1.6 * u.um, [1]),
+        ([2200, 1200] * u.nm, [2, 0]),
+        (GRID[1] * (1 + 5e-7), [1]),
+        ([1.2e-6] * u.m, [0]),
+    ],
+)
+def test_wavelengths_are_recognized_in_any_unit_and_order(wanted, bins):
+    lam, found = match_wavelengths(GRID, _several(), wanted)
+    assert found.tolist() == bins
+    np.testing.assert_allclose(lam.to_value(u.nm), GRID.value[bins], rtol=1e-6)
+
+
+def test_between_the_grid_a_law_answers_and_a_table_does_not():
+    lam, bins = match_wavelengths(GRID, _law(), [1400, 1600] * u.nm)
+    assert bins is None
+    np.testing.assert_allclose(lam.value, [1400, 1600])
+    with pytest.raises(WavelengthRangeError, match=r"1400\.00 nm is none of the 3.*wollaston\.eff"):
+        match_wavelengths(GRID, _several(), [1400, 1600] * u.nm)
+
+
+@pytest.mark.parametrize("wanted", [1100, 2300])
+def test_beyond_the_grid_nothing_answers(wanted):
+    with pytest.raises(
+        WavelengthRangeError, match=rf"{wanted}\.00 nm is outside.*1200\.00 nm to 2200"
+    ):
+        match_wavelengths(GRID, _law(), wanted * u.nm)
+
+
+@pytest.mark.parametrize("wanted", [1600, "H", 1600 * u.s])
+def test_a_wavelength_has_a_unit_of_length(wanted):
+    with pytest.raises(ParameterError, match="needs a unit such as nm"):
+        match_wavelengths(GRID, _several(), wanted)
+
+
+def test_a_chain_at_some_bins_has_their_values():
+    chain = _several()
+    part = at_bins(chain, np.array([2, 0]), 3)
+    assert part["wollaston"].efficiency.value.tolist() == [1.0, 0.9]
+    assert part["hwp"].retardance.value == 180
+    assert part["hwp"].mount == "hwp"
+    # a copy, also where nothing is cut
+    whole = at_bins(chain, np.arange(3), 3)
+    whole["wollaston"].efficiency = [0.5] * 3
+    assert chain["wollaston"].efficiency.value.tolist() == [0.9, 0.95, 1.0]
+
+
+# --- chains -----------------------------------------------------------------------------------
+
+
+def test_a_chain_is_split_where_the_instrument_begins():
+    outer, inner = split_chain(CHARIS.published())
+    assert [leaf.name for leaf in outer] == ["calibration_polarizer"]
+    assert inner[0].name == "hwp"
+    outer, inner = split_chain(CHARIS.on_sky(CHARIS.published()))
+    # the axes of the telescope are stages, but not the instrument's
+    assert [leaf.name for leaf in outer] == ["parallactic", "m3", "altitude"]
+    assert inner[0].name == "hwp"
+
+
+def test_a_chain_without_stages_is_all_instrument():
+    outer, inner = split_chain(optics.Diattenuator(name="a") | optics.WollastonPrism(name="b"))
+    assert [len(outer), len(inner)] == [0, 2]
+
+
+def _calibration(*chains, instrument=None, metas=None):
+    metas = [{}] * len(chains) if metas is None else metas
+    records = [
+        SimpleNamespace(name=f"night {i}", meta=m, source=m.get("source"))
+        for i, m in enumerate(metas)
+    ]
+    return SimpleNamespace(
+        chains=list(chains), datasets=records, instrument=instrument, settings={}
+    )
+
+
+@pytest.mark.parametrize(("name", "known"), [("charis", "charis"), ("own", None), (None, None)])
+def test_instrument_of_a_calibration(name, known):
+    found = instrument_of(SimpleNamespace(instrument=name))
+    assert (found and found.name) == known
+
+
+def test_telescope_of_a_calibration_begins_behind_its_star():
+    sky = CHARIS.on_sky(CHARIS.published())
+    star = optics.PolarizedSource(q=0.01, name="star") | sky
+    found = telescope_optics(_calibration(CHARIS.published(), star))
+    assert [leaf.name for leaf in found] == ["parallactic", "m3", "altitude"]
+    assert telescope_optics(_calibration(CHARIS.published())) is None
+
+
+def _with_and_without():
+    plate = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    window = optics.Diattenuator(diattenuation=0.01, name="window")
+    splitter = optics.WollastonPrism(name="wollaston")
+    return _calibration(plate | window | splitter, plate.copy() | splitter.copy())
+
+
+@pytest.mark.parametrize(
+    ("choice", "names"),
+    [
+        ({"optics_in": ["window"]}, ["hwp", "window", "wollaston"]),
+        ({"beam": {"window": False}}, ["hwp", "wollaston"]),
+        ({"beam": {"window": True}}, ["hwp", "window", "wollaston"]),
+    ],
+)
+def test_optics_in_the_beam_tell_chains_apart(choice, names):
+    assert [leaf.name for leaf in inner_optics(_with_and_without(), **choice)] == names
+
+
+def test_chains_that_cannot_be_told_apart_are_named():
+    with pytest.raises(ChainError, match=r"which optics are in the beam.*: window or none"):
+        inner_optics(_with_and_without())
+    with pytest.raises(ChainError, match=r"mine: no chain with lens; it holds for"):
+        inner_optics(_with_and_without(), ["lens"], label="mine")
+    with pytest.raises(ChainError, match="no chain without hwp"):
+        inner_optics(_with_and_without(), beam={"hwp": False})
+
+
+def test_equal_chains_are_one():
+    cal = _with_and_without()
+    cal.chains = [cal.chains[0], cal.chains[0].copy()]
+    assert len(inner_optics(cal)) == 3
+
+
+class _Beam:
+    def optics_of(self, header):
+        return header
+
+
+def test_frames_must_agree_on_the_beam():
+    told = [{"nbs": True}, {"nbs": True, "lens": False}, {}]
+    assert told_beam(told, _Beam()) == {"nbs": True, "lens": False}
+    with pytest.raises(ChainError, match="nbs was in the beam in frame 0, and not in frame 1"):
+        told_beam([{"nbs": True}, {"nbs": False}], _Beam())
+    with pytest.raises(ChainError, match="nbs was not in the beam in a, and in it in b"):
+        told_beam([{"nbs": False}, {"nbs": True}], _Beam(), labels=["a", "b"])
+
+
+# --- headers ------------------------------------------------------------------------------------
+
+
+def _header(**changes):
+    header = {"INSTRUME": "CHARIS", "MJD": 60988.5, "RET-ANG1": 22.5, "D_IMRANG": 60.0}
+    header |= {
+        key.replace("_", "-") if key.startswith("RET") else key: v for key, v in changes.items()
+    }
+    return {key: value for key, value in header.items() if value is not None}
+
+
+def test_a_header_tells_instrument_and_date():
+    told = describe(_header())
+    assert told["instrument"] == "charis"
+    assert told["stated"] is None
+    # MJD 60988.5 is noon of 9 November 2025
+    assert told["date"].startswith("2025-11-09T12:00:00")
+
+
+def test_what_the_user_states_is_not_looked_for():
+    assert describe(_header(), "charis", {"date"})["date"] is None
+    # what another instrument wrote is told as it stands, unless the user vouches for it
+    assert describe(_header(INSTRUME="HICIAO"), "charis")["stated"] == "HICIAO"
+    assert describe(_header(INSTRUME="HICIAO"), "charis", {"instrument"})["stated"] is None
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ({}, "the header does not say it; give instrument=, one of charis"),
+        ({"INSTRUME": "HICIAO"}, "the header says 'HICIAO', which is not known"),
+    ],
+)
+def test_an_unknown_instrument_is_asked_for(header, words):
+    with pytest.raises(InstrumentError, match=words):
+        describe(header)
+
+
+def test_a_date_that_is_none_is_shown():
+    with pytest.raises(CalibrationFileError, match="date 'yesterday' cannot be understood"):
+        describe(_header(MJD="yesterday"))
+
+
+def test_angles_of_frames_are_in_radian():
+    frames = FrameAngles([_header(), _header(RET_ANG1=67.5, D_IMRANG="61.5")], CHARIS)
+    assert frames.n_frames == 2
+    np.testing.assert_allclose(frames.position("hwp"), np.deg2rad([22.5, 67.5]))
+    np.testing.assert_allclose(frames.position("derotator"), np.deg2rad([60, 61.5]))
+    assert isinstance(frames.frames["time"], Time)
+    # a copy: a pipeline may write into it
+    frames.frames["hwp"][0] = 0 * u.deg
+    np.testing.assert_allclose(frames.position("hwp")[0], np.deg2rad(22.5))
+
+
+@pytest.mark.parametrize(
+    ("headers", "error", "words"),
+    [
+        ([], ObservationError, "no header: at least one frame"),
+        ([_header(RET_ANG1="fast")], ObservationError, "frame 0: RET-ANG1 = 'fast', a number"),
+        ([_header(), _header(RET_ANG1=721.0)], ObservationError, "frame 1: RET-ANG1 = 721.0, all"),
+        ([_header(ALTITUDE=91)], ObservationError, "frame 0: ALTITUDE = 91, allowed are 0 to 90"),
+        ([_header(), _header(D_IMRANG=None)], ObservationError, "frame 1: no D_IMRANG in the hea"),
+        ([_header(D_IMRANG="")] * 2, ObservationError, "position of 'derotator': no D_IMRANG"),
+    ],
+)
+def test_angles_that_cannot_be_used(headers, error, words):
+    with pytest.raises(error, match=words):
+        FrameAngles(headers, CHARIS).position("derotator")
+
+
+def test_a_stage_without_a_keyword():
+    with pytest.raises(ObservationError, match="'wheel': no keyword is known for it"):
+        FrameAngles([_header()], CHARIS).position("wheel")
+
+
+def test_two_turns_are_the_most_an_encoder_counts():
+    frames = FrameAngles([_header(D_IMRANG=-720.0), _header(D_IMRANG=720.0)], CHARIS)
+    np.testing.assert_allclose(frames.position("derotator"), [-4 * np.pi, 4 * np.pi])
+
+
+def test_positions_on_sky_may_be_sexagesimal_or_degrees():
+    """6 h and 90 deg are the same right ascension."""
+    text, number = (
+        FrameAngles([_header(RA=ra, DEC=dec)], CHARIS).frames
+        for ra, dec in (("06:00:00", "-30:30:00"), (90.0, -30.5))
+    )
+    for key, expected in (("right_ascension", 90), ("declination", -30.5)):
+        for frames in (text, number):
+            assert frames[key][0].to_value(u.deg) == pytest.approx(expected)
+    with pytest.raises(ObservationError, match="right_ascension: "):
+        FrameAngles([_header(RA="north", DEC="0")], CHARIS)
+
+
+def test_cards_of_a_real_header_will_do():
+    header = fits.Header(_header().items())
+    assert describe(header)["instrument"] == "charis"
+    np.testing.assert_allclose(FrameAngles([header], CHARIS).position("hwp"), np.deg2rad(22.5))
+
+
+def test_an_instrument_without_files_has_no_map():
+    instrument = SimpleNamespace(name="lab", files=None)
+    with pytest.raises(InstrumentError, match="lab: no map of header keywords; give positions"):
+        FrameAngles([_header()], instrument)
+
+
+# --- statements ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "sets", "words"),
+    [
+        (None, None, "optics in the beam not known"),
+        ([], ((),), "no optional optics"),
+        (["nbs", "a", "nbs"], (("a", "nbs"),), "with a + nbs"),
+        ([["nbs"], []], ((), ("nbs",)), "no optional optics or with nbs"),
+        ([["b", "a"], ("a", "b")], (("a", "b"),), "with a + b"),
+    ],
+)
+def test_sets_of_optics_have_one_form(given, sets, words):
+    assert optics_sets(given) == sets
+    assert optics_words(sets) == words
+
+
+@pytest.mark.parametrize("given", ["nbs", [1], ["nbs", ["a"]], [["a", 2]]])
+def test_what_is_no_set_of_optics(given):
+    with pytest.raises(CalibrationFileError, match="names of optics are needed"):
+        optics_sets(given)
+
+
+@pytest.mark.parametrize(
+    ("beam", "words"),
+    [
+        ({"nbs": True, "a": True}, "with a + nbs"),
+        ({"nbs": False}, "without nbs"),
+        ({"b": False, "a": True, "c": False}, "with a, without b + c"),
+    ],
+)
+def test_a_beam_in_words(beam, words):
+    assert beam_words(beam) == words
+
+
+def test_validity_in_words_and_as_a_dictionary():
+    held = Validity("lab", "J", "2025-10-01", "2026-01-01T12:00", ["nbs"])
+    assert str(held) == "lab, J, from 2025-10-01 until 2026-01-01T12:00:00.000, with nbs"
+    again = held.to_dict()
+    assert again["optics_in"] == [["nbs"]]
+    assert Validity(**again) == held
+    assert (
+        str(Validity()) == "an instrument, any mode, from any date on, optics in the beam not known"
+    )
+
+
+@pytest.mark.parametrize(
+    ("date", "inside"),
+    [
+        ("2025-09-30T23:59:59.999", False),
+        ("2025-10-01", True),
+        (Time("2025-11-01"), True),
+        ("2025-12-31T23:59:59", True),
+        ("2026-01-01", False),
+    ],
+)
+def test_the_start_belongs_to_the_range_and_the_end_does_not(date, inside):
+    assert Validity(valid_from="2025-10-01", valid_until="2026-01-01").holds(date) == inside
+
+
+def test_without_limits_every_moment_is_inside():
+    assert Validity().holds("1999-01-01")
+    assert Validity(valid_until="2000-01-01").holds("1999-01-01")
+    assert not Validity(valid_until="2000-01-01").holds("2001-01-01")
+
+
+@pytest.mark.parametrize(
+    ("dates", "start"),
+    [
+        (["2025-10-05", "2025-09-30"], "2025-09-30"),
+        (["2025-10", None], "2025-10-01"),
+        (["sometime", 5], None),
+        (["2025-13-01", "2025-10-05T09:30"], "2025-10-05T09:30:00.000"),
+        ([], None),
+    ],
+)
+def test_start_is_the_first_date_that_is_one(dates, start):
+    chain = _several()
+    cal = _calibration(*[chain] * len(dates), metas=[{"date": d} for d in dates])
+    assert validity_of(cal).valid_from == start
+
+
+@pytest.mark.parametrize(
+    ("modes", "mode"), [(["J", "J"], "J"), (["J", "H"], None), (["J", None], None), ([3], None)]
+)
+def test_mode_is_that_of_all_datasets(modes, mode):
+    cal = _calibration(*[_several()] * len(modes), metas=[{"mode": m} for m in modes])
+    assert validity_of(cal).mode == mode
+
+
+def test_nonsense_in_a_file_is_told():
+    cal = _calibration(_several())
+    cal.settings = {"validity": {"mode": "J", "color": "red"}}
+    with pytest.raises(CalibrationFileError, match="allowed are mode, valid_from, valid_until"):
+        validity_of(cal)
+    with pytest.raises(CalibrationFileError, match="validity: no 'color'; allowed are mode"):
+        with_validity(cal, color="red")
+
+
+def test_stating_nothing_changes_nothing():
+    cal = _calibration(_several())
+    assert with_validity(cal) is cal
+
+
+def test_leaves_of_the_test_chain_are_what_it_says():
+    assert [leaf.name for leaf in leaves(_several())] == ["hwp", "wollaston"]

@@ -1,0 +1,255 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Every line of a summary from numbers made up for it, and the same numbers for machines."""
+
+import json
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from astropolcal.calibration._sky_summary import star_lines
+from astropolcal.calibration.summary import (
+    _accuracy_lines,
+    _bound_lines,
+    _global_lines,
+    _goodness_lines,
+    _heading,
+    _plain,
+    _rows,
+    _standard_lines,
+    _wavelength_lines,
+    _wrap,
+)
+
+
+def _entry(value, std=np.nan, unit=None, **flags):
+    shape = np.shape(value)
+    known = {"value": np.asarray(value, float), "std": np.broadcast_to(std, shape), "unit": unit}
+    known |= {"fixed": False, "tied": None, "at_bound": np.zeros(shape, bool)}
+    return known | {"identifiable": np.ones(shape, bool)} | flags
+
+
+def _accuracy(n=3, **columns):
+    names = ("s_res", "s_mean", "s_cv", "s_standard")
+    values = {name: columns.get(name, np.full(n, np.nan)) * u.percent for name in names}
+    return QTable({"wavelength": np.linspace(1200, 2200, n) * u.nm, **values})
+
+
+def _record(name="night", n_masked=0, **columns):
+    return SimpleNamespace(name=name, n_frames=16, n_masked=n_masked, accuracy=_accuracy(**columns))
+
+
+def _calibration(**changes):
+    made = {
+        "instrument": "lab",
+        "converged": True,
+        "covariance": range(7),
+        "datasets": [_record()],
+        "wavelength": np.linspace(1200, 2200, 3) * u.nm,
+        "settings": {"strategy": "joint", "fitter": "F", "observable": "normalized_difference"},
+        "fit": {"n_data": 48, "seconds": 1.234},
+        "at_bound": [],
+    }
+    return SimpleNamespace(**made | changes)
+
+
+# --- lines ------------------------------------------------------------------------------------
+
+
+def test_long_lines_are_broken_behind_their_bullet():
+    long = "  - " + "word " * 30
+    lines = list(_wrap([long, "short", ""]))
+    assert all(len(line) <= 80 for line in lines)
+    assert lines[0].startswith("  - word")
+    assert lines[1].startswith("    word")
+    assert lines[-2:] == ["short", ""]
+    assert " ".join(" ".join(lines).split()) == " ".join((long + " short").split())
+
+
+@pytest.mark.parametrize(
+    ("converged", "instrument", "words"),
+    [
+        (True, "lab", ["Calibration of lab from night", "F, 1.23 s, converged"]),
+        (False, None, ["Calibration of an instrument from night", "F, 1.23 s, NOT CONVERGED"]),
+    ],
+)
+def test_heading(converged, instrument, words):
+    lines = _heading(_calibration(converged=converged, instrument=instrument))
+    assert [lines[0], lines[2]] == words
+    assert lines[1] == "joint fit of 7 parameters to 48 normalized differences,"
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (_entry(1.5, 0.25, u.deg), "     1.50000 +- 0.25000 deg"),
+        (_entry(1.5, 0.25), "     1.50000 +- 0.25000"),
+        (_entry(1.5, 0.25, u.deg, at_bound=np.array(True)), "     1.50000 deg (at a bound)"),
+        (_entry(1.5, np.nan, u.deg), "     1.50000 deg (not determined alone, see below)"),
+        (_entry(1.5, 0.25, u.deg, tied="b.c"), "     1.50000 deg (follows b.c)"),
+    ],
+)
+def test_a_parameter_for_all_wavelengths(entry, words):
+    head, line = _global_lines({"a.theta": entry})
+    assert head == "Parameters for all wavelengths"
+    assert line == f"  {'a.theta':<28}{words}"
+
+
+def test_fixed_ones_and_those_of_a_wavelength_are_not_among_them():
+    known = {"a.b": _entry(1.0, fixed=True), "c.d": _entry([1.0, 2.0])}
+    assert _global_lines(known) == []
+
+
+# --- accuracies ---------------------------------------------------------------------------------
+
+
+def test_median_best_and_worst_leave_out_what_is_not_known():
+    head, median, best, worst = _rows({"a": np.array([3.0, -1.0, np.nan, 2.0]), "b": [np.nan]})
+    assert head.split() == ["a", "b"]
+    # a bias may be negative: its size counts
+    assert median.split() == ["median", "2.000", "-"]
+    assert best.split() == ["best", "1.000", "-"]
+    assert worst.split() == ["worst", "3.000", "-"]
+
+
+def test_accuracy_of_a_dataset_says_what_is_masked_and_why():
+    lines = _accuracy_lines(
+        _record(n_masked=5, s_res=np.array([1.0, 2, 3])), {"cloud": 3, "hot": 2}
+    )
+    assert lines[0] == "Accuracy on night, in percent of polarization"
+    assert lines[2].split() == ["median", "2.000", "-", "-", "-"]
+    assert lines[-1] == "  (16 frames x 3 wavelengths, 5 cells masked; cloud: 3; hot: 2)"
+    assert _accuracy_lines(_record(), {})[-1] == "  (16 frames x 3 wavelengths)"
+
+
+def test_a_table_from_before_a_column_existed():
+    record = _record(s_res=np.ones(3))
+    record.accuracy.remove_column("s_standard")
+    assert _accuracy_lines(record, {})[2].split()[-1] == "-"
+
+
+def test_a_standard_shows_its_prediction():
+    keys = ("s_standard_percent", "bias_percent", "scatter_percent", "s_cv_percent", "chi")
+    entry = {key: [0.5, None, 1.5] for key in keys} | {"bias_percent": [-0.4, -0.2, 0.1]}
+    entry |= {"name": "star", "words": "errors 1 times s_cv", "n_frames": 8, "n": [4, 0, 4]}
+    lines = _standard_lines(entry)
+    assert lines[0] == "Prediction of star (not fitted), in percent"
+    assert lines[1].split() == ["s_standard", "|bias|", "scatter", "s_cv", "/", "s_cv"]
+    assert lines[2].split() == ["median", "1.000", "0.200", "1.000", "1.000", "1.000"]
+    assert lines[-1] == "  errors 1 times s_cv (8 frames x 3 wavelengths)"
+
+
+# --- parameters per wavelength -----------------------------------------------------------------
+
+
+def test_a_row_a_wavelength_with_stars_at_bounds():
+    known = {
+        "hwp.retardance": _entry(
+            [10.0, 20.0, 30.0], unit=u.deg, at_bound=np.array([0, 1, 0], bool)
+        ),
+        "w.efficiency": _entry([0.9, 0.95, 1.0]),
+        "hwp.theta": _entry(1.0),
+        "held.retardance": _entry([1.0, 2.0, 3.0], fixed=True),
+    }
+    cal = _calibration(datasets=[_record(s_mean=np.array([0.1, np.nan, 0.3]))])
+    title, optics, keys, units, *rows = _wavelength_lines(cal, known)
+    assert title == "Parameters for each wavelength (* at a bound)"
+    assert optics.split() == ["hwp", "w"]
+    assert keys.split() == ["s_mean", "retardance", "efficiency"]
+    assert units.split() == ["nm", "%", "deg"]
+    assert [row.split() for row in rows] == [
+        ["1200.0", "0.100", "10.00", "0.9000"],
+        ["1700.0", "-", "20.00*", "0.9500"],
+        ["2200.0", "0.300", "30.00", "1.0000"],
+    ]
+
+
+def test_more_than_five_columns_are_named():
+    known = {f"o{i}.p": _entry([1.0, 2.0, 3.0]) for i in range(7)}
+    lines = _wavelength_lines(_calibration(), known)
+    assert lines[0] == "Parameters for each wavelength (* at a bound; not shown: o5.p, o6.p)"
+    assert all(len(line) <= 80 for line in lines)
+
+
+def test_a_wavelength_that_the_first_table_lacks_has_no_accuracy():
+    cal = _calibration(wavelength=[1000, 1200] * u.nm)
+    cal.datasets[0].accuracy["s_mean"] = [0.1, 0.2, 0.3] * u.percent
+    rows = _wavelength_lines(cal, {"a.b": _entry([1.0, 2.0])})[-2:]
+    assert [row.split()[:2] for row in rows] == [["1000.0", "-"], ["1200.0", "0.100"]]
+
+
+def test_nothing_per_wavelength_no_table():
+    assert _wavelength_lines(_calibration(), {"a.b": _entry(1.0)}) == []
+
+
+# --- goodness, bounds, stars ---------------------------------------------------------------------
+
+
+def _outlier(i):
+    return {
+        "frames": f"{i}, {i + 1}",
+        "dataset": "night",
+        "residual_percent": -0.5 * i,
+        "sigma": 6.6,
+        "brightness": 0.25,
+    }
+
+
+@pytest.mark.parametrize(("count", "more"), [(1, None), (5, None), (6, 1), (9, 4)])
+def test_some_outliers_are_named_and_the_others_counted(count, more):
+    cal = _calibration(fit={"outliers": [_outlier(i) for i in range(count)]})
+    text = " ".join(" ".join(_goodness_lines(cal)).split())
+    assert text.startswith("Goodness of fit - frames 0, 1 of night are at odds with the fit")
+    assert text.count("robust sigma, brightness 0.25") == min(count, 5)
+    assert ("more pairs at odds with the fit" in text) == (more is not None)
+    if more:
+        assert f"- and {more} more pairs" in text
+
+
+def test_nothing_tested_nothing_said():
+    assert _goodness_lines(_calibration()) == []
+    assert _bound_lines(_calibration()) == []
+    lines = _bound_lines(_calibration(at_bound=["a.b", "c.d[3]"]))
+    assert lines == ["At a bound, so without an error: a.b, c.d[3]"]
+
+
+def test_a_star_beside_its_catalogue():
+    keys = [
+        f"{k}{s}"
+        for k in ("dolp", "dolp_known", "dolp_err", "dolp_known_err")
+        for s in ("_percent",)
+    ]
+    keys += [f"{k}_deg" for k in ("aolp", "aolp_known", "aolp_err", "aolp_known_err")]
+    entry = {key: [1.23456, np.nan] for key in keys} | {"star": "HD 1", "name": "night"}
+    entry |= {"wavelength_nm": [1200.0, 1600.0], "aolp_known_err_deg": [np.nan, np.nan]}
+    title, head, first, second = star_lines(entry)
+    assert title == "HD 1 against the catalogue; no fit saw night"
+    assert head.split() == ["nm", "DoLP", "(%)", "catalogue", "AoLP", "(deg)", "catalogue"]
+    assert " ".join(first.split()) == "1200.0 1.235 +- 1.235 1.235 +- 1.235 1.2 +- 1.2 1.2"
+    assert second.split() == ["1600.0", "-", "-", "-", "-"]
+
+
+# --- for machines ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (np.float64(1.5), 1.5),
+        (np.int32(3), 3),
+        (np.bool_(True), True),
+        (np.nan, None),
+        (np.inf, None),
+        (np.array([[1.0, np.nan]]), [[1.0, None]]),
+        ((1, "a", None), [1, "a", None]),
+        (2 * u.deg, {"value": 2.0, "unit": "deg"}),
+        ([1, 2] * u.mm, {"value": [1.0, 2.0], "unit": "mm"}),
+        ({"a": {"b": np.array([1])}}, {"a": {"b": [1]}}),
+    ],
+)
+def test_what_json_knows(value, expected):
+    found = _plain(value)
+    assert found == expected
+    assert json.loads(json.dumps(found, allow_nan=False)) == expected
