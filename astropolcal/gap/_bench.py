@@ -13,7 +13,7 @@ from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import scan
 from astropolcal.gap.channels import Channels
 from astropolcal.gap.effects import EFFECTS, Context, get_effect
-from astropolcal.gap.model import Model, _canonical
+from astropolcal.gap.model import Model
 from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.observations import Observations
 from astropolcal.propagation import Propagator
@@ -22,11 +22,12 @@ from astropolcal.units import canonical_factor
 
 #: An effect that explains this share of the evidence cannot be told from the true one.
 ENOUGH = 0.95
-# what the library may explain of an effect that it is not to know
-_UNKNOWN = 0.3
+#: What the library may explain of an effect that it is not to know.
+UNKNOWN = 0.3
 # an effect that lifts chi-square by less than this at its usual size is absorbed
 _INVISIBLE = 0.5
 _WEAKEST = 3.0
+# the scan is linear: a share as large as this is checked by a full fit
 _REFIT_FROM = 0.5
 _TRIES = 40
 
@@ -167,7 +168,7 @@ class _Planted:
     values: dict = field(default_factory=dict)
 
 
-class _Bench:
+class Bench:
     """A true instrument, its lamps, and the nominal problem at the truth."""
 
     def __init__(self, setup, rng):
@@ -175,6 +176,7 @@ class _Bench:
         self.wavelength = setup.wavelength
         self.chains = _varied(setup.chains(), self.wavelength.to_value(u.um), rng)
         instrument = instruments.get(setup.instrument)
+        # a lamp is not white: a law of second degree, between 0.3 and 3 times the flux asked for
         slope = law_basis(self.wavelength.to_value(u.um), 2) @ (1, *rng.normal(0, 0.2, 2))
         flux = setup.flux * np.clip(slope, 0.3, 3.0)
         self.clean = [
@@ -199,6 +201,7 @@ class _Bench:
         self.problem.settle_noise(self.problem.start)
 
     def _lamp(self, n_frames):
+        # drift in the logarithm: higher orders fall as one over the degree
         x = np.linspace(-1, 1, n_frames)
         drift = np.polynomial.legendre.legval(x, [0, *self.rng.normal(0, 1, 3) / (1, 2, 3)])
         flicker = self.rng.normal(0, self.rng.uniform(0, 2 * self.setup.flicker), n_frames)
@@ -226,6 +229,7 @@ class _Bench:
         """Return observations with photon noise."""
         found = []
         for clean, ideal, one in zip(self.clean, self.chains, fluxes, strict=True):
+            # what a unit lamp does not explain is the brightness, (W, F)
             lamp = (clean.flux_right + clean.flux_left).T / self.fluxes(ideal, clean).sum(axis=0)
             table = clean.to_table()
             for beam, flux in zip(("right", "left"), (one * lamp).clip(0.0), strict=True):
@@ -242,6 +246,8 @@ class _Bench:
         """Return the nominal model fitted to noiseless data with an effect."""
         for channel, flux in zip(self.problem.channels, self.expose([planted])[0], strict=True):
             lit = np.maximum(flux, 1e-9)
+            # noiseless data in the place of the noisy ones; their noise stays, so that chi-square
+            # is SNR squared
             channel.observed = Channels.predicted(SimpleNamespace(fluxes=lit))
         return Model(self.problem, self.problem.fit(self.problem.start))
 
@@ -288,12 +294,14 @@ def _vary(leaf, key, wavelength, rng, known):
     angle = unit.is_equivalent(u.deg)
     if not value.ndim:
         return (value * unit) + (rng.normal(0, 0.3) * u.deg if angle else rng.normal(0, 0.003))
+    # smooth in wavelength, and a little that is not, so that a stiff law alone does not fit
     law = law_basis(wavelength, 2) @ (rng.normal(0, 1, 3) / (1, 2, 3))
     law = law + rng.normal(0, 0.2, value.shape)
     new = value * unit + (2 * u.deg if angle else 0.005) * law
     low, high = (
         np.inf * s if b is None else b for s, b in zip((-1, 1), parameter.bounds, strict=True)
     )
+    # a truth at its bound could be fitted from one side only
     margin = 0.0 if angle else 0.002
     return np.clip(new.to_value(unit), low + margin, high - margin) * unit
 
@@ -309,7 +317,9 @@ class _Drawn:
         rng = bench.rng
         edit = effect.edit([chain.copy() for chain in bench.chains], self.context)
         self.laws = {p.name: _law(p, _size(edit.chains, p.name), rng) for p in edit.parameters}
-        sizes = [_canonical(p.limit) / np.abs(self.laws[p.name]).max() for p in edit.parameters]
+        #: Values at which the effect is absent: a law says by how much they are left.
+        self.absent = {p.name: p.canonical_neutral for p in edit.parameters}
+        sizes = [p.canonical_limit / np.abs(self.laws[p.name]).max() for p in edit.parameters]
         #: The largest size within the effect's limits.
         self.largest = 0.9 * min(sizes) if sizes else 1.0
 
@@ -325,29 +335,26 @@ class _Drawn:
 
     def values(self, size):
         """Return the canonical values of the parameters at a size."""
-        return {name: _neutral(name) + size * law for name, law in self.laws.items()}
+        return {name: self.absent[name] + size * law for name, law in self.laws.items()}
 
 
 def _law(parameter, n, rng):
     """Return a random law, in canonical units and of the parameter's usual size."""
-    scale = _canonical(parameter.scale)
+    scale = parameter.canonical_scale
     if n == 1:
         return scale * rng.normal()
     k = n if parameter.basis is None else parameter.basis.shape[1]
+    # an effect that is free at each wavelength is tried where it is sharp
     if n == k and k > 3:
         # a resonance anywhere
         at, width = rng.uniform(0, n), rng.uniform(0.5, 0.3 * n)
         return scale * rng.normal() / (1 + ((np.arange(n) - at) / width) ** 2)
     basis = np.eye(n) if parameter.basis is None else parameter.basis
     law = basis @ (rng.normal(0, 1, k) / (1 + np.arange(k)))
-    if _neutral(parameter.name):
+    if parameter.is_retained:
         # no optic gives more polarization than there is
         law = -(law - law.min() + 0.3 * (np.ptp(law) + 0.1))
     return scale * law
-
-
-def _neutral(name):
-    return 1.0 if name.split(".")[1].startswith("retained") else 0.0
 
 
 def _carriers(chains, name):
@@ -391,8 +398,10 @@ class _Unlisted:
 
     def _pattern(self, clean, noise, size):
         plate, turn = clean.position("hwp"), clean.position("derotator")
+        # size 1 turns a stage by 0.05 deg, or changes a gain by 0.1 percent
         angle, still = size * np.deg2rad(0.05), np.zeros(len(plate))
         if self.name == "hysteresis":
+            # backlash has the sign of the motion; its random size keeps it out of every harmonic
             way = np.sign(np.diff(plate, prepend=plate[0]))
             return {"hwp": plate + angle * way * np.abs(noise)}, still
         if self.name == "jitter":
@@ -402,7 +411,7 @@ class _Unlisted:
         return {"derotator": turn + angle * noise}, still
 
 
-def _plant(bench, kind, name, snr):
+def plant(bench, kind, name, snr):
     """Return the effects of a challenge, at their sizes."""
     if kind == "pair":
         return _pair(bench, name, snr)
@@ -440,6 +449,7 @@ def _scale(bench, one, kind, snr):
     one.snr = float(np.sqrt(model.fit.chi2))
     if kind == "absorbed":
         return model
+    # the SNR is nearly proportional to the size: a few steps reach two percent
     for _ in range(8):
         if one.snr <= 0 or abs(one.snr / snr - 1) < 0.02:
             break
@@ -475,14 +485,14 @@ def _fits(bench, one, model, kind, snr):
         for name, share in one.shares.items()
         if kind == "unlisted" or (name != one.name and share < ENOUGH)
     ]
-    return max(others, default=0.0) < _UNKNOWN
+    return max(others, default=0.0) < UNKNOWN
 
 
 def _pair(bench, name, snr):
     """Return two effects that the data can tell from each other."""
     for _ in range(_TRIES):
-        first = _plant(bench, "single", name, snr)[0]
-        second = _plant(bench, "single", None, snr)[0]
+        first = plant(bench, "single", name, snr)[0]
+        second = plant(bench, "single", None, snr)[0]
         apart = first.shares.get(second.name, 0) < 0.5 and second.shares.get(first.name, 0) < 0.5
         if first.name != second.name and apart and min(first.snr, second.snr) > 0.7 * snr:
             return [first, second]

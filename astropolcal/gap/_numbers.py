@@ -8,13 +8,10 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration import accuracy_table, target_accuracies
-from astropolcal.gap.model import _neutral
-from astropolcal.gap.shrinkage import _STEPS, frame_groups
+from astropolcal.gap.problem import OPEN, TOUCHES
+from astropolcal.gap.shrinkage import frame_groups, left_out_fits
 
 ACCURACIES = ("s_res", "s_mean", "s_cv")
-# what a singular value must be of the largest to count
-_OPEN = 1e-7
-_TOUCHES = 1e-3
 # parameters correlated more than this with what is uncertain are named
 _STRONG, _MOST_TRADES = 0.5, 3
 
@@ -52,6 +49,7 @@ class Fitted:
         block = np.eye(where.stop - where.start) if block is None else block
         value = block @ self.model.fit.coefficients[where] / slot.factor
         std = np.sqrt(np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block))
+        # one open coefficient leaves every value of a law open
         std = np.where(self.is_open[where].any(), np.nan, std / slot.factor)
         return {
             "value": _number(value),
@@ -82,7 +80,7 @@ class Fitted:
     def _absent(self, parameter):
         """Return the coefficients at which an effect is absent."""
         where = self.problem.slices[parameter.name]
-        neutral, size = _neutral(parameter), where.stop - where.start
+        neutral, size = parameter.canonical_neutral, where.stop - where.start
         if not self.problem.free.by_name[parameter.name].per_wavelength:
             return np.broadcast_to(neutral, size)
         basis = np.eye(size) if parameter.basis is None else parameter.basis
@@ -104,7 +102,7 @@ class Fitted:
         strength /= np.sqrt(weakest @ correlation[np.ix_(rows, rows)] @ weakest) or 1.0
         if self.is_open[rows].any():
             # what the data leave open altogether is worse than what they know badly
-            touching = self.null[np.abs(self.null[:, rows]).max(axis=1) > _TOUCHES]
+            touching = self.null[np.abs(self.null[:, rows]).max(axis=1) > TOUCHES]
             strength = np.linalg.norm(touching, axis=0)
         own = {p.name for p in self.model.added[name]}
         others = {
@@ -122,21 +120,18 @@ class Fitted:
     @cached_property
     def _decomposed(self):
         """Singular values and vectors of the slopes, of unit columns, and the length of these."""
-        problem = self.problem
-        slopes = problem.jacobian(self.model.fit.coefficients)
-        table = np.concatenate([slopes, np.diag(problem.tight)])
-        scale = np.linalg.norm(table, axis=0)
-        scale = np.where(scale > 0, scale, 1.0)
-        _, singular, right = np.linalg.svd(table / scale, full_matrices=False)
-        return singular, right, scale
+        return self.problem.decomposed(self.model.fit.coefficients)
 
     @cached_property
     def covariance(self):
         """Covariance of the coefficients, without what the data leave open."""
         singular, right, scale = self._decomposed
-        good = singular > _OPEN * singular[0]
+        good = singular > OPEN * singular[0]
+        # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
         half = right[good] / singular[good, None] / scale
         problem = self.problem
+        # residuals larger than the noise make the errors larger, smaller ones do not make them
+        # smaller
         scatter = self.model.fit.chi2 / max(problem.n_data - problem.size, 1)
         return max(1.0, scatter) * (half.T @ half)
 
@@ -144,12 +139,12 @@ class Fitted:
     def null(self):
         """Directions of unit columns that the data leave open, shape (n, n_coefficients)."""
         singular, right, _ = self._decomposed
-        return right[singular <= _OPEN * singular[0]]
+        return right[singular <= OPEN * singular[0]]
 
     @property
     def is_open(self):
         """Which coefficients the data leave open."""
-        return np.sum(self.null**2, axis=0) > _TOUCHES**2
+        return np.sum(self.null**2, axis=0) > TOUCHES**2
 
 
 def _number(values):
@@ -201,16 +196,12 @@ def _flat(model, coefficients):
 def _held_out(model):
     """Return the differences of every datum predicted by a fit without its group."""
     labels, numbers = frame_groups(model.observations)
-    problem, start = model.problem, model.fit.coefficients
+    problem = model.problem
     found = np.full(problem.measurement.n_data, np.nan)
     group = np.concatenate(
         [n[d.group_of_datum] for n, d in zip(numbers, problem.datasets, strict=True)]
     )
-    for i in range(len(labels)):
-        shapes = [c.shape for c in problem.channels]
-        kept = [np.broadcast_to(n != i, s) for n, s in zip(numbers, shapes, strict=True)]
-        # as far as `held_out` goes, so that both report the same prediction
-        fit = problem.fit(start, rows=np.concatenate([k.ravel() for k in kept]), steps=_STEPS)
+    for i, fit in enumerate(left_out_fits(model, labels, numbers)):
         found[group == i] = _flat(model, fit.coefficients)[group == i]
     return found
 

@@ -48,7 +48,7 @@ def p_is(value):
 
 def share(value):
     """Return a share as percent."""
-    return "less than 1 %" if 0 < value < 0.005 else f"{100 * value:.0f} %"
+    return "less than 1 %" if 0 < value <= 0.005 else f"{100 * value:.0f} %"
 
 
 def short_share(value):
@@ -121,6 +121,7 @@ def is_determined(std, limit):
 
 def _digits(std):
     """Return the decimals that show two digits of an error."""
+    # an error of 0.0123 is written with three decimals
     return max(0, 1 - int(np.floor(np.log10(std)))) if std > 0 else 3
 
 
@@ -226,6 +227,7 @@ def _how_large(content):
             f"{chance})."
         )
     real = f"the gap is real (residuals as large by noise alone: {chance})"
+    # a pattern can be certain where the sum of squares is not conspicuous
     if content["gap_p_value"] > content["alpha"]:
         real = f"the residuals are no larger than noise ({chance}), but their pattern is not one"
     return (
@@ -244,6 +246,7 @@ def _what(content):
             "the cause is not in the library."
         )
     explained = share(sum(entry["explained"] for entry in causes))
+    # in the order of what they explain, not of when they were found
     largest = sorted(causes, key=lambda entry: -entry["explained"])
     named = listed([entry["title"] for entry in largest], most=_NAMED)
     if content["verdict"] == "unexplained":
@@ -310,6 +313,7 @@ def _what_is_left(content):
     if shrunk["low"] is not None:
         details.append(f"68 % interval {shrunk['low']:.0f} to {shrunk['high']:.0f} %")
     rest = "is noise" if left > _REMAINDER else "is more than noise and unexplained"
+    # such a size stands for an effect that the library does not have
     strange = [entry["title"] for entry in causes if not entry["physical"]]
     doubt = f"; physically impossible is the size of {listed(strange)}" if strange else ""
     return (
@@ -338,6 +342,7 @@ def text(content, accuracies):
 
 def _wrapped(lines):
     for line in lines:
+        # continued lines begin under the words, not under the bullet, the number or the share
         indent = len(re.match(r"\s*(?:- |\d+\. |\d+ %  )?", line).group())
         ends = " " * indent
         yield from textwrap.wrap(
@@ -360,6 +365,7 @@ def _table_lines(content):
         errors = (entry["gap_cv_before_percent"], entry["gap_cv_after_percent"])
         told = "-" if errors == (None, None) else " -> ".join(map(percent, errors))
         rows.append((entry["effect"], entry["place"], short_share(entry["explained"]), told))
+    # the place has what the other columns leave of the width
     a, _, c, d = (max(map(len, column)) for column in zip(*rows, strict=True))
     a = min(a, _LONGEST)
     b = _WIDTH - a - c - d - 6
@@ -393,8 +399,13 @@ def _where_lines(where):
         + ("" if e["p_value"] < _TINY else f" ({p_is(e['p_value'])})")
         for e in where
     ]
-    title = "Where the gap of the nominal model lies, share of the excess over the noise"
-    title += f" (p < {_TINY:g} where no p is given)"
+    # the patterns are taken in one after the other, the places are the same gap seen again
+    title = (
+        "Where the gap of the nominal model lies, share of the excess over the noise "
+        f"(p < {_TINY:g} where no p is given). Patterns come first: each has the share that those "
+        "before it have left. Places overlap with them and with one another: the shares of both "
+        "lists together do not add up"
+    )
     return [title, *lines] if lines else []
 
 

@@ -123,6 +123,7 @@ def scan(model, effects, *, residual=None, nominal=None, context=None):
     """
     nominal = model.problem.tangent(model.fit.coefficients) if nominal is None else nominal
     residual = model.residual if residual is None else residual
+    # where the fit has not quite arrived the rest of the step is no effect
     residual = residual - nominal @ (nominal.T @ residual)
     total, freedom = residual @ residual, model.degrees_of_freedom(nominal)
     context, chains, scores = context or model.context, model.chains, []
@@ -133,6 +134,7 @@ def scan(model, effects, *, residual=None, nominal=None, context=None):
         rank = basis.shape[1]
         if rank:
             statistic = float(np.sum((basis.T @ residual) ** 2))
+            # among structure everything is significant: it is measured by what it leaves
             scale = max(1.0, (total - statistic) / max(freedom - rank, 1))
             scores.append(Score(effect, statistic, rank, basis, scale))
     for score, p in zip(scores, false_discovery([s.single_p for s in scores]), strict=True):
@@ -215,20 +217,14 @@ class Candidate:
         return self.score.effect, self.context
 
 
-def choose(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
+def choose(model, scores, **limits):
     """
     Fit the best effects in full, and return the best with its alias group.
 
     Parameters
     ----------
-    model : Model
-        The model so far.
-    scores : list of Score
-        As `scan` gives them.
-    alpha : float
-        False discovery rate.
-    most : int
-        So many are fitted in full.
+    model, scores, **limits
+        As `contenders` takes them.
 
     Returns
     -------
@@ -241,7 +237,7 @@ def choose(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
     >>> choose(None, []) is None
     True
     """
-    return best_of(contenders(model, scores, alpha=alpha, most=most))
+    return best_of(contenders(model, scores, **limits))
 
 
 def best_of(fitted):
@@ -304,6 +300,7 @@ def contenders(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
         return []
     freedom = model.problem.n_data - model.problem.size
     best = max(s.evidence(freedom) for s in significant)
+    # the scan is linear, a full fit may change the order: those not far behind are fitted too
     worth = [s for s in significant if s.evidence(freedom) > min(_WORTH_A_REFIT * best, best - 20)][
         :most
     ]

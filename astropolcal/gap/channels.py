@@ -27,7 +27,7 @@ class Channels:
 
     Parameters
     ----------
-    dataset : `~astropolcal.measurement.Dataset`
+    dataset : `~astropolcal.measurement.datasets.Dataset`
         A dataset with one frame a datum.
 
     Examples
@@ -53,6 +53,8 @@ class Channels:
         total = right + left
         with np.errstate(divide="ignore", invalid="ignore"):
             self.observed = np.stack([(right - left) / total, np.log(total)])
+            # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2,
+            # d ln(R + L) = (dR + dL) / (R + L)
             to_right, to_left = 2 * left / total**2, -2 * right / total**2
             self.variance = np.stack(
                 [
@@ -108,8 +110,10 @@ class Channels:
         weight = np.where(self.valid, 1 / sigma, 0.0)
         self.sigma = sigma
         self.lamp = _Lamp(residual[1], weight[1], self.sequence, saturating)
+        # the flicker makes the sums of a frame correlated: its inverse root is a rank-one change
         self._whitening = weight, self.lamp.shrink(weight[1])
-        self._nuisance = _orthonormal(self._sum_whitened(self.lamp.design(self.valid)))
+        #: Orthonormal directions of the sums that the lamp takes up, (W * F, n).
+        self.nuisance = _orthonormal(self._sum_whitened(self.lamp.design(self.valid)))
 
     def whiten(self, array):
         """
@@ -130,7 +134,7 @@ class Channels:
         out[..., 0, :, :] = array[..., 0, :, :] * weight[0]
         sums = self._sum_whitened(array[..., 1, :, :])
         flat = sums.reshape(*sums.shape[:-2], sums.shape[-2] * sums.shape[-1])
-        flat = flat - (flat @ self._nuisance) @ self._nuisance.T
+        flat = flat - (flat @ self.nuisance) @ self.nuisance.T
         out[..., 1, :, :] = flat.reshape(sums.shape)
         return out
 
@@ -143,7 +147,7 @@ class Channels:
     @property
     def n_nuisance(self):
         """Number of numbers that describe the lamp."""
-        return self._nuisance.shape[1]
+        return self.nuisance.shape[1]
 
 
 class _Lamp:
@@ -183,6 +187,7 @@ class _Lamp:
         """Return, for each frame, the direction of the flicker and how much it is shrunk."""
         norm = np.sqrt((weight**2).sum(axis=0))
         direction = weight / np.where(norm > 0, norm, 1.0)
+        # (1 + s^2 n n^T)^-1/2 = 1 - (1 - 1 / sqrt(1 + s^2)) n n^T for a unit vector n
         return direction, 1 - 1 / np.sqrt(1 + (self.flicker * norm) ** 2)
 
     def brightness(self, shift, weight):
@@ -203,6 +208,7 @@ class _Lamp:
         """
         curve, root = self._curve(self.degree), np.sqrt(weight)
         drift = curve @ np.linalg.lstsq(curve * root[:, None], shift * root, rcond=None)[0]
+        # Wiener filter: a frame is believed by its share of flicker in flicker and noise
         signal = weight * self.flicker**2
         return drift + signal / (1 + signal) * (shift - drift)
 
@@ -243,6 +249,7 @@ def _best_degree(sequence, values, seen):
     for trial in range(_LARGEST_DEGREE + 1):
         curve = np.polynomial.legendre.legvander(sequence, trial)
         left, freedom = _left_over(curve, nothing, values, seen)
+        # a curve through all frames would leave no flicker to be seen
         if freedom < 3:
             break
         score = n * np.log(max(left @ left / n, 1e-24)) + (n - freedom) * np.log(n)

@@ -131,6 +131,7 @@ class Diagnosis:
     @property
     def gap_before_percent(self):
         """Gap of the nominal model on left-out frames (else of its fit), in percent."""
+        # a chain of the wrong parity has no fit that could predict left-out frames
         if self.held_out and not any(c.effect.kind == "discrete" for c in self.causes):
             return self.held_out[0].percent
         return _gap_of_fit(self.nominal)
@@ -220,7 +221,9 @@ def diagnose(
     nominal, causes = starting_model(calibration, observations, library, say)
     base = causes[-1].model if causes else nominal
     say("scanning the effects")
+    # what has a place depends on the alternative that was taken
     library = adapted(library, base.chains)
+    # the alternatives were tried already, from the start: a scan of derivatives cannot see them
     smooth = [effect for effect in library if effect.kind != "discrete"]
     scores = scan(base, smooth)
     selected, improved, history = select(base, scores, smooth, alpha, groups, say)
@@ -248,6 +251,7 @@ def _check_instruments(observations):
 def _conclude(nominal, improved, causes, selected, scores, history, alpha, started):
     chosen = [*causes, *selected]
     total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
+    # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
     before, found = nominal, []
     errors = [None] * len(causes) + history[1:]

@@ -5,17 +5,15 @@ import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 
-import astropy.units as u
 import numpy as np
 from scipy import stats
 
 from astropolcal.calibration import calibrate
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
-from astropolcal.gap.effects import Context, tracking_laws
+from astropolcal.gap.effects import Context
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.units import canonical_factor
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
@@ -88,9 +86,7 @@ class Model:
     @property
     def context(self):
         """What an effect may know of the data."""
-        fluxes = [np.nanmedian(o.flux_right + o.flux_left) / 2 for o in self.observations]
-        laws = tracking_laws(self.observations)
-        return Context(self.problem.wavelength, float(np.median(fluxes)), tracking=laws)
+        return Context.of(self.problem.wavelength, self.observations)
 
     def degrees_of_freedom(self, tangent):
         """Return the number of data less that of the directions fitted."""
@@ -128,10 +124,10 @@ class Model:
             edit.chains,
             self.observations,
             ties=self.problem.ties | edit.ties,
-            laws=self.problem.laws | _laws(edit.parameters),
-            priors=self.problem.priors | _priors(edit),
-            neutral=self.problem.neutral | {p.name: _neutral(p) for p in edit.parameters},
-            limits=self.problem.limits | _limits(edit),
+            laws=self.problem.laws | edit.laws,
+            priors=self.problem.priors | edit.priors,
+            neutral=self.problem.neutral | {p.name: p.canonical_neutral for p in edit.parameters},
+            limits=self.problem.limits | edit.limits,
             like=self.problem,
         )
         return problem, edit.parameters
@@ -181,6 +177,7 @@ class Model:
                 continue
             problem, parameters = model.edited(effect, context)
             added = model.added | {effect.name: parameters}
+            # not fitted in between: one fit at the end is enough
             model = Model(problem, Fit(problem.start, np.inf, False), added)
         if like is not None:
             model = Model(model.problem, like.start_of(model.problem), model.added)
@@ -192,9 +189,10 @@ class Model:
         vector = mine.vector(self.fit.coefficients)
         for slot in problem.free.slots:
             known = mine.free.by_name.get(slot.name)
+            # a law that was freed has other coefficients but the same values
             if known is not None and known.size == slot.size:
                 theirs[slot.slice] = vector[known.slice]
-        return Fit(problem._coefficients(theirs), np.inf, False)
+        return Fit(problem.coefficients(theirs), np.inf, False)
 
     def polished(self):
         """Return the model with its fit carried on to the end."""
@@ -239,7 +237,8 @@ class Model:
         vector = self.problem.vector(self.fit.coefficients)
         for parameter in self.added[name]:
             slot = self.problem.free.by_name[parameter.name]
-            size = np.abs(vector[slot.slice] - _neutral(parameter)) / _canonical(parameter.limit)
+            size = np.abs(vector[slot.slice] - parameter.canonical_neutral)
+            size = size / parameter.canonical_limit
             pressed = np.mean(size > 1 - _AT_LIMIT)
             if size.max() > 1 + _AT_LIMIT or pressed > _MOST_PRESSED:
                 return False
@@ -248,31 +247,6 @@ class Model:
     def impossible(self):
         """Return the names of the effects whose fitted values are out of their limits."""
         return {name for name in self.added if not self.is_physical(name)}
-
-
-def _neutral(parameter):
-    """Return the value at which an effect is absent, canonical; scalar or one a wavelength."""
-    if parameter.neutral is not None:
-        value = u.Quantity(parameter.neutral)
-        return value.value * canonical_factor(value.unit)
-    return 1.0 if parameter.name.split(".")[1].startswith("retained") else 0.0
-
-
-def _laws(parameters):
-    return {p.name: p.basis for p in parameters if p.basis is not None}
-
-
-def _limits(edit):
-    return {p.name: _canonical(p.limit) for p in edit.parameters}
-
-
-def _priors(edit):
-    return {name: limit / 2 for name, limit in _limits(edit).items()}
-
-
-def _canonical(value):
-    value = u.Quantity(value)
-    return float(value.value * canonical_factor(value.unit))
 
 
 def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):
@@ -327,6 +301,7 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
     if like is None:
         problem.settle_noise()
     found = _lowest(problem, chains)
+    # in turn: the residuals of a better fit tell the noise better
     for _ in range(_ROUNDS - 1 if like is None else 0):
         problem.settle_noise(found.coefficients)
         found = problem.fit(found.coefficients)
@@ -348,7 +323,7 @@ def _lowest(problem, chains):
     for slot in problem.free.slots:
         value = np.ravel(known[slot.name][0].value) * slot.factor
         vector[slot.slice] = value if value.size in (1, slot.size) else vector[slot.slice]
-    other = problem.fit(np.clip(problem._coefficients(vector), problem.low, problem.high))
+    other = problem.fit(np.clip(problem.coefficients(vector), problem.low, problem.high))
     return other if other.converged and other.chi2 < found.chi2 else found
 
 
@@ -405,6 +380,7 @@ def nominal_calibration(chains, observations):
     if not measurement.free.size:
         return _AsGiven(measurement)
     with warnings.catch_warnings():
+        # a model that lacks something is expected to fit badly; the report says how badly
         warnings.simplefilter("ignore", AstropolcalWarning)
         return calibrate(list(chains), list(observations), cross_validate=False)
 
@@ -452,16 +428,16 @@ def effect_tangent(model, effect, nominal, context=None):
         edit.chains,
         model.observations,
         ties={name: tie for name, tie in edit.ties.items() if tie.source in names},
-        laws=_laws(edit.parameters),
+        laws=edit.laws,
         like=model.problem,
         copy=False,
     )
     if not problem.size:
         return np.zeros((problem.n_rows, 0))
-    limits = _priors(edit)
+    priors = edit.priors
     size = np.concatenate(
         [
-            np.full(problem.slices[n].stop - problem.slices[n].start, limits[n])
+            np.full(problem.slices[n].stop - problem.slices[n].start, priors[n])
             for n in problem.slices
         ]
     )
@@ -471,6 +447,7 @@ def effect_tangent(model, effect, nominal, context=None):
     # twice is enough to be orthogonal to rounding
     left -= nominal @ (nominal.T @ left)
     basis, singular, _ = np.linalg.svd(left, full_matrices=False)
+    # a column is what half the limit does: singular values are in units of the noise
     floor = max(_VISIBLE, _ABSORBED * np.linalg.norm(slopes, axis=0).max())
     return basis[:, singular > floor]
 

@@ -8,6 +8,7 @@ __all__ = ["SAME_ANGLE", "badly_separated", "frame_blocks", "frame_patterns"]
 # harmonics in the order of who gives a name to what the angles cannot tell apart
 _PLATE = (0, 4, 2, 8, 1, 3, 5, 6, 7, 12)
 _DEROTATOR = (2, 4, 1)
+# condition number of a constant, harmonic 4 and another one, beyond which they are hardly told
 _POOR = 10.0
 _ORDER = "the order of frames within a block at one derotator angle"
 _SAME_ORDER = "the plate angles come in the same order in every block"
@@ -70,6 +71,7 @@ def _harmonics(angle, axis, title, orders):
     for k in orders:
         waves = [np.cos(k * angle), np.sin(k * angle)] if k else [np.ones_like(angle)]
         columns = np.array([w for w in waves if np.abs(w).max() > 1e-6])
+        # the simpler name was given already: at steps of 22.5 deg harmonic 12 is harmonic 4
         if k and _within(columns, spans, angle.size):
             continue
         words = (
@@ -133,6 +135,7 @@ def _same_order(observations):
         return True
     angle, place = observations.position("hwp"), _places(observations)
     first = np.array([angle[place == p][0] for p in range(place.max() + 1)])
+    # the sine, for a plate turned by half a turn is the same plate
     return bool(np.all(np.abs(np.sin(angle - first[place])) < SAME_ANGLE))
 
 
@@ -200,6 +203,7 @@ def frame_blocks(observations):
     """
     if "derotator" not in observations.frames.colnames:
         return np.arange(observations.n_frames)
+    # the first frame begins a run but is no step
     step = np.abs(np.diff(observations.position("derotator"), prepend=np.nan)) > SAME_ANGLE
     step[0] = False
     return np.cumsum(step)

@@ -11,35 +11,25 @@ lesser of both directions counts.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import combinations, pairwise
+from itertools import combinations
 
-import astropy.units as u
 import numpy as np
-from astropy.table import QTable
-from scipy.linalg import qr
 
-from astropolcal.chain import leaves, remove_optic, stages
+from astropolcal.chain import stages
 from astropolcal.exceptions import GapError
+from astropolcal.gap._forecast import LEAST_GAIN, MODULATOR, STATES, Foreseen, Known, separation
 from astropolcal.gap.effects import EFFECTS, Roles, get_effect
 from astropolcal.gap.model import nominal_model
-from astropolcal.gap.problem import GapProblem, orthonormal
 from astropolcal.optics import COORDINATES
-from astropolcal.simulation import simulate
 
 __all__ = ["Exposure", "exposures", "few", "plan"]
 
+# eight steps of 56.25 deg cover a turn and all angles modulo 90 deg in 11.25 deg steps
 _TURN = tuple(float(a) for a in np.mod(np.arange(8) * 56.25, 360))
 _DEROTATOR = tuple(float(a) for a in np.arange(0, 180, 20))
+# degree; low to high, the range in which stars are usually observed
 _ALTITUDE = (25.0, 45.0, 65.0, 80.0)
 _LEVELS = (0.5, 2.0)
-_MODULATOR, _STATES = "flc_state", ("A", "B")
-# singular values of unit columns below this are open directions
-_OPEN = 1e-6
-# a change of this size (radian or relative) has to be seen
-_WANTED = 0.01
-# what cannot be seen to one standard deviation is not worth an exposure
-_LEAST_GAIN = 1.0
 # exposures of different kinds for the same purpose, and the gain that each deviation from the
 # set-up of the data must bring
 _SAME_PURPOSE, _WORTH_A_CHANGE = 2, 1.1
@@ -174,8 +164,9 @@ def exposures(model, *, flux_matters=False):
         if "hwp" not in observations.frames.colnames:
             continue
         taken = np.unique(np.round(np.rad2deg(observations.position("hwp")), 2))
+        # the angles that are taken anyway, and a full turn, which tells odd harmonics
         cycles = [tuple(float(a) for a in taken[:8]), _TURN]
-        states = _STATES if _MODULATOR in stages(chain) else ()
+        states = STATES if MODULATOR in stages(chain) else ()
         base = [
             Exposure(i, cycle, where, states=states)
             for cycle in cycles
@@ -184,7 +175,9 @@ def exposures(model, *, flux_matters=False):
         found += base
         roles = Roles(chain)
         if roles.polarizer is not None:
+            # Q into U: what acts on one of them alone shows
             found += [replace(one, polarizer_turned=45.0) for one in base]
+            # a dataset without it is that exposure already
             if not any(Roles(other).polarizer is None for other in model.chains):
                 found += [replace(one, without=(roles.polarizer.name,)) for one in base]
         if flux_matters:
@@ -256,18 +249,19 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=4):
     everyone = [model, *members.values()]
     if candidates is None:
         used = {s for m in everyone for c in m.chains for s in stages(c)}
-        matters = bool(used & set(COORDINATES) - {_MODULATOR})
+        matters = bool(used & set(COORDINATES) - {MODULATOR})
         candidates = exposures(model, flux_matters=matters)
     candidates = list(candidates)
     _check(candidates, model)
-    old = {name: _Old(member, model) for name, member in {None: model, **members}.items()}
+    old = {name: Known(member, model) for name, member in {None: model, **members}.items()}
     lists = {pair: [] for pair in pairs}
     n_open, fixing = old[None].directions[1].shape[1] if model.problem.size else 0, []
     for group in _groups(candidates):
-        new = {name: _New(old[name], model, group) for name in old}
+        new = {name: Foreseen(old[name], model, group) for name in old}
         for j, exposure in enumerate(group):
             for a, b in pairs:
-                gain = min(_separation(old, new, a, b, j), _separation(old, new, b, a, j))
+                # whichever of both is the truth, the other has to fail
+                gain = min(separation(old, new, a, b, j), separation(old, new, b, a, j))
                 purpose = f"tells {_titled(a)} from {_titled(b)}"
                 _note(lists[a, b], exposure, (a, b), gain, purpose)
             if n_open:
@@ -301,9 +295,9 @@ def _check(candidates, model):
             )
         if not (np.isfinite(one.lamp) and one.lamp > 0):
             raise GapError(f"exposure with lamp = {one.lamp}: it must be positive")
-        if not set(one.states) <= set(_STATES):
-            raise GapError(f"exposure with states {one.states}: allowed are {', '.join(_STATES)}")
-        if bool(one.states) != (_MODULATOR in stages(model.chains[one.dataset])):
+        if not set(one.states) <= set(STATES):
+            raise GapError(f"exposure with states {one.states}: allowed are {', '.join(STATES)}")
+        if bool(one.states) != (MODULATOR in stages(model.chains[one.dataset])):
             raise GapError(
                 f"exposure of dataset {one.dataset} with states {one.states}: they are needed "
                 "where the chain has a modulator, and nowhere else"
@@ -322,9 +316,10 @@ def _titled(name):
 
 
 def _note(rows, exposure, names, gain, purpose):
-    if gain >= _LEAST_GAIN:
+    if gain >= LEAST_GAIN:
         words = f"Take {exposure.words}: {purpose} at {_sigmas(gain)} standard deviations"
         entry = {"words": words, "separates": list(names), "gain": float(gain)}
+        # of nearly equal gain the one with less to change comes first
         rows.append((gain / _WORTH_A_CHANGE**exposure.effort, exposure, entry))
 
 
@@ -344,6 +339,7 @@ def _best(lists, limit):
 
 
 def _in_turn(lists, limit):
+    # the best of every purpose, then the second of each
     chosen = [one[i] for i in range(limit) for one in lists if i < len(one)]
     return sorted(chosen[:limit], key=lambda entry: -entry["gain"])
 
@@ -377,6 +373,7 @@ def few(entries, limit=4):
     """
     purposes = {}
     for entry in sorted(entries, key=lambda entry: -entry["gain"]):
+        # a pair is the same purpose in either order
         found = purposes.setdefault(frozenset(entry["separates"]), {})
         found.setdefault(_exposure(entry), entry)
     best = [list(found.values())[:_SAME_PURPOSE] for found in purposes.values()]
@@ -396,187 +393,3 @@ def _merged(exposure, entries):
     names = dict.fromkeys(name for entry in entries for name in entry["separates"])
     words = f"{exposure}: {'; '.join(purposes)}"
     return entries[0] | {"words": words, "separates": list(names)}
-
-
-# ---- what the data know already -------------------------------------------------------------
-
-
-class _Old:
-    """A fitted model, and the triangle of its least-squares problem on the data taken."""
-
-    def __init__(self, member, base):
-        self.member, self.base, self.problem = member, base, member.problem
-        q = member.fit.coefficients
-        raw = self.problem.jacobian(q, whitened=False).T
-        slopes = np.concatenate(
-            [
-                c.whiten(raw[:, rows].reshape(-1, *c.shape)).reshape(len(raw), -1)
-                for c, rows in zip(base.problem.channels, base.problem.segments, strict=True)
-            ],
-            axis=1,
-        ).T
-        self.slopes = np.concatenate([slopes, np.diag(self.problem.tight)])
-        self.scale = np.linalg.norm(self.slopes, axis=0)
-        self.scale = np.where(self.scale > 0, self.scale, 1.0)
-        self.gaps = self.problem.differences(q)
-        self._triangles = {}
-
-    def triangle(self, other):
-        """Return the triangle of slopes and of the difference to another model's predictions."""
-        if id(other) not in self._triangles:
-            parts = zip(self.base.problem.channels, self.gaps, other.gaps, strict=True)
-            difference = [c.whiten(mine - theirs).ravel() for c, mine, theirs in parts]
-            target = np.concatenate([*difference, np.zeros(self.problem.size)])
-            table = np.concatenate([self.slopes / self.scale, target[:, None]], axis=1)
-            self._triangles[id(other)] = qr(table, mode="r")[0][: table.shape[1]]
-        return self._triangles[id(other)]
-
-    @cached_property
-    def directions(self):
-        """Directions of unit columns that the data determine, and those that they leave open."""
-        _, singular, right = np.linalg.svd(self.slopes / self.scale, full_matrices=False)
-        is_open = singular < _OPEN * singular[0]
-        return right[~is_open].T, right[is_open].T
-
-    def fixes(self, columns):
-        """
-        Return what new rows say of the open directions.
-
-        That is the parameters of the one seen best, at how many standard deviations a
-        change of it shows, and how many directions show at all.
-        """
-        known, unknown = self.directions
-        table = np.concatenate([self.slopes, columns]) / self.scale
-        basis = orthonormal(table @ known)
-        left = table @ unknown
-        # twice is enough to be orthogonal to rounding
-        left -= basis @ (basis.T @ left)
-        left -= basis @ (basis.T @ left)
-        _, singular, right = np.linalg.svd(left, full_matrices=False)
-        steps = np.abs(unknown @ right.T) / self.scale[:, None]
-        sigmas = _WANTED * singular / steps.max(axis=0)
-        best = int(np.argmax(sigmas))
-        step = steps[:, best]
-        main = [i for i in np.argsort(-step)[:3] if step[i] > 0.3 * step.max()]
-        names = [self.problem.names[i] for i in main]
-        return names, float(sigmas[best]), int(np.sum(sigmas > _LEAST_GAIN))
-
-
-# ---- what it would see -----------------------------------------------------------------------
-
-
-class _New:
-    """Predictions of a fitted model, and their slopes, for exposures of one set-up."""
-
-    def __init__(self, old, base, group):
-        member, first = old.member, group[0]
-        chain = _set_up(member.chains[first.dataset], first)
-        observations = _hypothetical(base, group)
-        own = {leaf.name for leaf in leaves(chain)}
-        ties = {
-            name: tie
-            for name, tie in member.problem.ties.items()
-            if name.split(".")[0] in own and tie.source.split(".")[0] in own
-        }
-        problem = GapProblem([chain], [observations], ties=ties, laws=member.problem.laws)
-        channel, vector = problem.channels[0], problem.vector(problem.start)
-        self.predicted = channel.predicted(problem.datasets[0].forward(vector))
-        slopes = problem.jacobian(problem.start, whitened=False).T.reshape(-1, *channel.shape)
-        self.slopes = np.zeros((member.problem.size, *channel.shape))
-        for name, where in problem.slices.items():
-            self.slopes[member.problem.slices[name]] = slopes[where]
-        edges = np.cumsum([0, *(one.n_frames for one in group)])
-        self.frames = [slice(a, b) for a, b in pairwise(edges)]
-        self.noise = _Noise(base, first)
-
-    def columns(self, j):
-        """Return the whitened slopes of one exposure, shape (rows, n_coefficients)."""
-        whitened = self.noise.whiten(self.slopes[..., self.frames[j]])
-        return whitened.reshape(len(whitened), -1).T
-
-    def against(self, other, j):
-        """Return the whitened difference of the predictions of one exposure."""
-        frames = self.frames[j]
-        return self.noise.whiten(other.predicted[..., frames] - self.predicted[..., frames]).ravel()
-
-
-def _separation(old, new, truth, fitted, j):
-    """Return by how many standard deviations an exposure speaks against a wrong model."""
-    triangle = old[fitted].triangle(old[truth])
-    added = np.column_stack(
-        [new[fitted].columns(j) / old[fitted].scale, new[fitted].against(new[truth], j)]
-    )
-    table = np.concatenate([triangle, added])
-    basis = orthonormal(table[:, :-1])
-    left = table[:, -1] - basis @ (basis.T @ table[:, -1])
-    return float(np.sqrt(max(left @ left - triangle[-1, -1] ** 2, 0.0)))
-
-
-def _set_up(chain, exposure):
-    """Return a copy of a chain as the exposure needs it."""
-    chain = chain.copy()
-    polarizer = Roles(chain).polarizer
-    if exposure.polarizer_turned:
-        if polarizer is None:
-            raise GapError("no polarizer to turn in the chain of this dataset")
-        angle = exposure.polarizer_turned
-        theta = polarizer.theta
-        theta.bounds = tuple(None if b is None else b + angle for b in theta.bounds)
-        theta.value = theta.value + angle
-    for name in exposure.without:
-        chain = remove_optic(chain, name)
-    return chain
-
-
-def _hypothetical(base, group):
-    """Return noiseless observations of the exposures, as bright as their dataset."""
-    i, exposure = group[0].dataset, group[0]
-    problem, observations = base.problem, base.observations[group[0].dataset]
-    chain = _set_up(base.chains[i], exposure)
-    for leaf in leaves(chain):
-        if leaf.stage in COORDINATES and leaf.stage != _MODULATOR:
-            chain = remove_optic(chain, leaf.name)
-    sweep = problem.datasets[i].forward(problem.vector(base.fit.coefficients))
-    expected = np.median(np.sum(sweep.fluxes, axis=0), axis=1)
-    measured = np.exp(np.median(problem.channels[i].observed[1], axis=1))
-    frames = QTable({"hwp": np.concatenate([one.plate for one in group]) * u.deg})
-    for name, _ in exposure.positions:
-        values = [np.full(one.n_frames, dict(one.positions)[name]) for one in group]
-        frames[name] = np.concatenate(values) * u.deg
-    if "derotator" not in frames.colnames:
-        # tables have it, also those of instruments without one
-        frames["derotator"] = np.zeros(len(frames)) * u.deg
-    if exposure.states:
-        states = np.concatenate([one.modulator for one in group])
-        frames[_MODULATOR] = (states == _STATES[1]).astype(float)
-    return simulate(
-        chain,
-        problem.wavelength * u.um,
-        frames,
-        flux=exposure.lamp * measured / expected,
-        noise=False,
-        name=f"next {observations.name}",
-    )
-
-
-class _Noise:
-    """Noise of new frames: that of the dataset, and a lamp of unknown brightness."""
-
-    def __init__(self, base, exposure):
-        channel = base.problem.channels[exposure.dataset]
-        sigma = np.where(channel.valid, channel.sigma, np.nan)
-        self.weight = np.sqrt(exposure.lamp) / np.nanmedian(sigma, axis=2)[..., None]
-        self.flicker = channel.lamp.flicker
-
-    def whiten(self, array):
-        """Divide by the noise; take out flicker and the brightness at each wavelength."""
-        weight = np.where(np.isfinite(self.weight), self.weight, 0.0)
-        out = array * weight
-        # the brightness at each wavelength is that of this block alone
-        sums = out[..., 1, :, :] - out[..., 1, :, :].mean(axis=-1, keepdims=True)
-        norm = np.sqrt(np.sum(weight[1] ** 2))
-        direction = weight[1] / (norm if norm > 0 else 1.0)
-        shrink = 1 - 1 / np.sqrt(1 + (self.flicker * norm) ** 2)
-        common = np.sum(sums * direction, axis=-2, keepdims=True)
-        out[..., 1, :, :] = sums - shrink * common * direction
-        return out

@@ -12,13 +12,17 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import lsq_linear
 
-from astropolcal.exceptions import FitError
+from astropolcal.gap._bases import law_basis, orthonormal
+from astropolcal.gap._noise import expected_fluxes, noise, settings
 from astropolcal.gap.channels import Channels
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
 
 __all__ = ["Fit", "GapProblem", "law_basis", "orthonormal"]
 
+#: A direction whose singular value is below this share of the largest is open; a
+#: coefficient with more than that of its length in such a direction is open too.
+OPEN, TOUCHES = 1e-7, 1e-3
 _MAX_STEPS = 40
 # a step that lowers chi-square by less than this, or than this share of it, has arrived
 _ARRIVED, _ARRIVED_SHARE = 1e-4, 1e-5
@@ -27,41 +31,8 @@ _HOLD = 1e-6
 # Marquardt's damping, of columns of unit length: where it begins, below what it is dropped,
 # below what it does not count, and above what no step leads down
 _FIRST_DAMPING, _LEAST_DAMPING, _FREE, _STUCK = 1e-5, 1e-7, 1e-3, 1e3
-# the share of the frames' freedom that harmonics may take from the measure of the noise
-_MOST_TURNING = 0.7
 # a coefficient closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-9
-
-
-def law_basis(wavelength, degree):
-    """
-    Return the basis of a polynomial law in wavelength.
-
-    Parameters
-    ----------
-    wavelength : `~numpy.ndarray`
-        Micrometre, shape (W,).
-    degree : int or None
-        Degree of the polynomial (Legendre, over the range of the wavelengths);
-        None for one value a wavelength.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (W, k).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.gap.problem import law_basis
-    >>> law_basis(np.array([1.0, 1.5, 2.0]), 1).tolist()
-    [[1.0, -1.0], [1.0, 0.0], [1.0, 1.0]]
-    """
-    n = len(wavelength)
-    if degree is None or degree >= n - 1:
-        return np.eye(n)
-    middle, half = (wavelength.max() + wavelength.min()) / 2, np.ptp(wavelength) / 2
-    return np.polynomial.legendre.legvander((wavelength - middle) / half, degree)
 
 
 class GapProblem:
@@ -145,11 +116,11 @@ class GapProblem:
         #: Slice of the rows that belongs to each dataset.
         self.segments = [slice(a, b) for a, b in pairwise(edges)]
         self.n_rows = int(edges[-1])
-        self.start = self._coefficients(self.free.start())
+        self.start = self.coefficients(self.free.start())
         self.tight = np.zeros(self.size)
         for name, sigma in self.priors.items():
             self.tight[self.slices[name]] = 1 / sigma
-        self.centre = np.where(self.tight > 0, self._coefficients(self._absent()), 0.0)
+        self.centre = np.where(self.tight > 0, self.coefficients(self._absent()), 0.0)
 
     def _absent(self):
         """Return the vector of values about which the priors are."""
@@ -188,7 +159,8 @@ class GapProblem:
             high[where] = np.minimum(high[where], absent[where] + room)
         return low, high
 
-    def _coefficients(self, vector):
+    def coefficients(self, vector):
+        """Return the coefficients whose laws are nearest to canonical values, see `vector`."""
         parts = [
             np.linalg.lstsq(block, vector[slot.slice], rcond=None)[0]
             for slot, block in zip(self.free.slots, self._blocks, strict=True)
@@ -263,11 +235,10 @@ class GapProblem:
             self.channels, self.datasets, self.differences(q), strict=True
         ):
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
-            settings = _settings(angles, dataset.observations.n_frames)
-            noise = _noise(channel, residual, angles)
-            channel.set_noise(noise, residual, settings)
+            saturating = settings(angles, dataset.observations.n_frames)
+            channel.set_noise(noise(channel, residual, angles), residual, saturating)
         self.fluxes = [
-            _expected_fluxes(channel, dataset.forward(self.vector(q)))
+            expected_fluxes(channel, dataset.forward(self.vector(q)))
             for channel, dataset in zip(self.channels, self.datasets, strict=True)
         ]
 
@@ -370,16 +341,25 @@ class GapProblem:
         """Number of rows that hold data, less the numbers that describe the lamps."""
         return sum(2 * int(c.valid.sum()) - c.n_nuisance for c in self.channels)
 
-    def errors(self, coefficients):
-        """Return the standard errors of the coefficients, infinite where they are open."""
-        slopes = self.jacobian(coefficients)
-        table = np.concatenate([slopes, np.diag(self.tight)])
+    def decomposed(self, coefficients):
+        """
+        Return what data and priors determine: singular values, directions, and scale.
+
+        Of the derivatives with columns of unit length; rows of the second are directions
+        in these columns, the third is the length that the columns had.
+        """
+        table = np.concatenate([self.jacobian(coefficients), np.diag(self.tight)])
         scale = np.linalg.norm(table, axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         _, singular, right = np.linalg.svd(table / scale, full_matrices=False)
-        good = singular > 1e-7 * singular[0]
+        return singular, right, scale
+
+    def errors(self, coefficients):
+        """Return the standard errors of the coefficients, infinite where they are open."""
+        singular, right, scale = self.decomposed(coefficients)
+        good = singular > OPEN * singular[0]
         variance = np.sum((right[good] / singular[good, None]) ** 2, axis=0)
-        is_open = np.sum(right[~good] ** 2, axis=0) > 1e-6
+        is_open = np.sum(right[~good] ** 2, axis=0) > TOUCHES**2
         prior = np.divide(1, self.tight, out=np.full(self.size, np.inf), where=self.tight > 0)
         return np.minimum(np.where(is_open, np.inf, np.sqrt(variance) / scale), prior)
 
@@ -390,38 +370,6 @@ def _triangle(matrix, target):
     table = np.concatenate([matrix, target[:, None]], axis=1)
     factors = qr(table, mode="raw", check_finite=False, overwrite_a=True)[0][0][:n]
     return np.triu(factors[:, :n]), factors[:, n].copy()
-
-
-def orthonormal(columns, keep=1e-9):
-    """
-    Return an orthonormal basis of columns.
-
-    Parameters
-    ----------
-    columns : `~numpy.ndarray`
-        Shape (n_rows, k).
-    keep : float
-        Directions below this share of the strongest are left out; columns are
-        compared at unit length.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_rows, rank).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.gap.problem import orthonormal
-    >>> orthonormal(np.array([[1.0, 2.0], [1.0, 2.0]])).shape
-    (2, 1)
-    """
-    norm = np.linalg.norm(columns, axis=0)
-    columns = columns[:, norm > 0] / norm[norm > 0]
-    if not columns.shape[1]:
-        return np.zeros((len(columns), 0))
-    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > keep * singular[0]]
 
 
 class Fit:
@@ -449,25 +397,6 @@ class Fit:
         self.coefficients, self.chi2, self.converged = coefficients, chi2, converged
 
 
-def _expected_fluxes(channel, sweep):
-    """
-    Return the fluxes of both beams as chain and lamp give them, shape (2, W, F).
-
-    An effect that depends on the flux must not depend on the noise of the datum
-    that it is to explain.
-    """
-    right, left = sweep.fluxes
-    level = channel.observed[1] - np.log(right + left)
-    weight = channel.valid / np.square(channel.sigma[1])
-    level = np.where(channel.valid, level, 0.0)
-    scale = (level * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
-    certain = np.maximum(weight.sum(axis=0), 1e-300)
-    shift = ((level - scale[:, None]) * weight).sum(axis=0) / certain
-    shift = channel.lamp.brightness(shift, certain)
-    lamp = np.exp(scale[:, None] + shift)
-    return np.stack([right * lamp, left * lamp])
-
-
 def _positions(chain, observations, fluxes):
     """Return the positions of all stages, fluxes as expected where they are known."""
     found = _read_positions(chain, observations, None)
@@ -480,93 +409,3 @@ def _positions(chain, observations, fluxes):
         "previous_flux": fluxes / before,
     }
     return found | {stage: expected[stage] for stage in expected.keys() & found.keys()}
-
-
-def _by_state(waves, angles):
-    """Return the waves, and for a modulator with two states those that change sign with them."""
-    state = angles.get("flc_state", np.zeros(1))
-    return (
-        waves
-        if np.ptp(state) == 0
-        else [w for wave in waves for w in (wave, wave * (1 - 2 * state))]
-    )
-
-
-def _settings(angles, n):
-    """
-    Return what optics could do to the sums: columns of the plate angle, (F, k).
-
-    Not of the derotator angle alone, which changes as slowly as a lamp drifts.
-    """
-    if "hwp" not in angles:
-        return np.zeros((n, 0))
-    plate = angles["hwp"]
-    waves = [np.exp(1j * k * plate) for k in (2, 4)]
-    columns = list(waves)
-    if "derotator" in angles:
-        turn = np.exp(2j * angles["derotator"])
-        columns += [wave * other for wave in waves for other in (turn, turn.conj())]
-    columns += [np.exp(1j * k * plate) for k in (1, 3, 6, 8)]
-    columns = _by_state(columns, angles)[: n // 6]
-    return np.stack([part(c) for c in columns for part in (np.real, np.imag)], axis=1).reshape(
-        n, -1
-    )
-
-
-def _noise(channel, residual, angles):
-    """
-    Return the noise of every datum: the stated errors, or more where the data say so.
-
-    What optics that stand still or turn can do to a beam is a sum of a few
-    harmonics of the stages' angles, sharp in wavelength or not; everything else
-    is smooth in wavelength. So noise is what is left without either.
-    """
-    sigma = np.sqrt(channel.variance)
-    basis = _turning(angles, channel.valid)
-    for i in range(2):
-        rough = _roughness(residual[i], channel.valid, basis)
-        stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & channel.valid
-        if not stated.any():
-            if not rough > 0:
-                raise FitError("no errors in the table, and the residuals tell no noise")
-            sigma[i] = rough
-            continue
-        if np.isfinite(rough):
-            sigma[i] *= max(1.0, rough / _roughness_of(sigma[i], channel.valid))
-        sigma[i] = np.where(stated, sigma[i], np.median(sigma[i][stated]))
-    return sigma
-
-
-def _turning(angles, valid):
-    """Return an orthonormal basis of the harmonics of the stages, (F, k); k may be 0."""
-    waves = [np.ones(valid.shape[1], dtype=complex)]
-    for stage, orders in (("hwp", (2, 4)), ("derotator", (2, 4))):
-        if stage in angles:
-            turns = [np.exp(1j * k * angles[stage]) for k in orders]
-            waves += [wave * t for wave in waves for turn in turns for t in (turn, turn.conj())]
-    waves = _by_state(waves, angles)
-    whole = valid.all(axis=0)
-    columns = np.concatenate([part(np.array(waves)) for part in (np.real, np.imag)]).T
-    basis = orthonormal(columns * whole[:, None], keep=1e-6)
-    # too few frames would be left to tell the noise
-    return basis if basis.shape[1] <= _MOST_TURNING * whole.sum() else basis[:, :0]
-
-
-def _roughness(residual, valid, basis):
-    """Return the scatter of second differences along the wavelengths, per datum."""
-    if len(residual) < 5:
-        return np.nan
-    whole = valid.all(axis=0) if basis.shape[1] else np.ones(valid.shape[1], dtype=bool)
-    left = np.where(whole, residual, 0.0)
-    left = left - (left @ basis) @ basis.T
-    second = (left[:-2] - 2 * left[1:-1] + left[2:]) / np.sqrt(6)
-    second = second - np.median(second, axis=1, keepdims=True)
-    keep = valid[:-2] & valid[1:-1] & valid[2:] & whole
-    shrunk = np.sqrt(1 - basis.shape[1] / whole.sum())
-    return float(1.4826 * np.median(np.abs(second[keep])) / shrunk) if keep.any() else np.nan
-
-
-def _roughness_of(sigma, valid):
-    total = np.sqrt((sigma[:-2] ** 2 + 4 * sigma[1:-1] ** 2 + sigma[2:] ** 2) / 6)
-    keep = valid[:-2] & valid[1:-1] & valid[2:]
-    return float(np.median(total[keep]))

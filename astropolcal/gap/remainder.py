@@ -16,6 +16,7 @@ from scipy import stats
 
 from astropolcal.gap.channels import CHANNELS
 from astropolcal.gap.patterns import frame_blocks, frame_patterns
+from astropolcal.observations.quality import MAD_TO_SIGMA, robust_curve
 
 __all__ = ["Component", "outlying_frames", "remainder"]
 
@@ -26,10 +27,12 @@ _MOST = 4
 _TW_SHAPE, _TW_SCALE, _TW_SHIFT = 46.446, 0.186054, 9.84801
 # robust standard deviations beyond which a frame is at odds with the others
 _FAR = 6.0
+# a real departure of a frame moves nearly all wavelengths the same way, noise half of them
 _SAME_SIGN = 0.9
 _LARGEST_DRIFT = 4
 _LEAST_SHARE = 0.01
 _CLEARLY = 0.02
+# below half of its variance a pattern does not describe a shape
 _PLAIN = 0.5
 
 
@@ -104,6 +107,7 @@ def remainder(model, *, alpha=_ALPHA):
     freedom = problem.n_data - problem.tangent(model.fit.coefficients).shape[1]
     scale = max(residual @ residual - freedom, np.sqrt(2 * max(freedom, 1)))
     found = []
+    # Bonferroni: two channels of every dataset are looked at
     looks = 2 * len(problem.datasets)
     for dataset, channel, rows in zip(
         problem.datasets, problem.channels, problem.segments, strict=True
@@ -123,6 +127,7 @@ def _shapes(table, channel, observations, wavelength, alpha):
     n, m = table.shape
     found = []
     for k in range(min(_MOST, len(singular))):
+        # what is left once k shapes are out is a table with as many rows and columns less
         p = _chance(singular[k] ** 2, n - k, m - k)
         if p > alpha:
             break
@@ -238,7 +243,7 @@ def outlying_frames(model):
             known = channel.valid & np.isfinite(channel.sigma[i])
             common, error, agree = _common(np.where(known, table, np.nan), channel.sigma[i])
             curve = _drift(channel.sequence, common, _LARGEST_DRIFT if name == "sum" else 0)
-            spread = max(1.4826 * np.nanmedian(np.abs(common - curve)), np.nanmedian(error))
+            spread = max(MAD_TO_SIGMA * np.nanmedian(np.abs(common - curve)), np.nanmedian(error))
             score = (common - curve) / spread
             far = np.abs(np.nan_to_num(score)) > _FAR
             far &= agree if name == "difference" else True
@@ -256,6 +261,7 @@ def _common(table, sigma):
     common = np.nanmedian(centred, axis=0)
     same = np.nanmean(np.sign(centred) == np.sign(common), axis=0)
     count = np.maximum(np.isfinite(table).sum(axis=0), 1)
+    # the variance of a median of n is pi / 2 times that of their mean: 1.25 squared
     return common, np.nanmedian(sigma, axis=0) * 1.25 / np.sqrt(count), same >= _SAME_SIGN
 
 
@@ -263,27 +269,12 @@ def _drift(sequence, values, largest):
     """Return the curve whose median deviation is least for what its degree costs."""
     best, chosen, n = np.inf, None, np.isfinite(values).sum()
     for degree in range(min(largest, max(n // 4, 0)) + 1):
-        curve = _robust_curve(sequence, values, degree)
+        curve = robust_curve(2 * sequence - 1, values, degree)
         middle = max(np.nanmedian(np.abs(values - curve)), 1e-12)
         score = n * np.log(middle) + degree * np.log(max(n, 2))
         if score < best:
             best, chosen = score, curve
     return chosen
-
-
-def _robust_curve(sequence, values, degree):
-    """Return a curve by least absolute deviations, so that a bad run does not bend it."""
-    curve = np.polynomial.legendre.legvander(2 * sequence - 1, degree)
-    known = np.isfinite(values)
-    solution = np.zeros(degree + 1)
-    solution[0] = np.nanmedian(values)
-    for _ in range(50):
-        left = np.abs(values - curve @ solution)[known]
-        weight = 1 / np.sqrt(np.maximum(left, 1e-3 * max(np.median(left), 1e-12)))
-        solution = np.linalg.lstsq(
-            curve[known] * weight[:, None], values[known] * weight, rcond=None
-        )[0]
-    return curve @ solution
 
 
 def _runs(observations, channel, far, deviation, score):

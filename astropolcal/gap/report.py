@@ -143,6 +143,8 @@ def _cause(diagnosis, i, fitted):
         "significance": fitted.significance(cause.name),
         "physical": bool(cause.physical),
     }
+    # what can be exchanged for it is asked only where the size is not told: it costs a
+    # decomposition
     open_size = not all(_words.has_sizes(entry))
     return entry | {"trades_with": fitted.trades(cause.name) if open_size else []}
 
@@ -175,6 +177,7 @@ def _next(diagnosis):
     if len(smooth) < len(diagnosis.causes):
         # the fit goes on from chains in which an optic was exchanged
         return plan(diagnosis.improved)
+    # each alias group at the model without it, but with all that was found before
     for i, cause in enumerate(smooth):
         last = i + 1 == len(smooth)
         fresh = diagnosis.improved if last else model.with_effect(cause.effect)
@@ -190,6 +193,7 @@ def _plain(value):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
+    # JSON knows neither numpy's numbers nor NaN
     value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
@@ -367,6 +371,7 @@ def _images(figures):
 
 def _image(figure):
     """Return a figure as a data URI, with its width and height in CSS pixels."""
+    # part of the page, which has to be one file that can be sent
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=_DPI)
     width, height = (round(_CSS * inches) for inches in figure.get_size_inches())

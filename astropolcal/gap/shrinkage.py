@@ -14,8 +14,9 @@ import numpy as np
 
 from astropolcal.exceptions import GapError
 
-__all__ = ["HeldOut", "frame_groups", "held_out"]
+__all__ = ["HeldOut", "frame_groups", "held_out", "left_out_fits"]
 
+# degree; angles that differ by less are one group
 _SAME_ANGLE = 0.5
 # next to the solution of all frames the fit to most of them takes few steps
 _STEPS, _SHARE = 8, 1e-5
@@ -78,6 +79,7 @@ class HeldOut:
         """
         value = 1 - other.squares.sum() / self.squares.sum()
         rng = np.random.default_rng(20261121)
+        # groups and not data are drawn: frames at one angle share what the model misses
         draws = rng.integers(0, len(self.counts), (1000, len(self.counts)))
         spread = 1 - other.squares[draws].sum(axis=1) / self.squares[draws].sum(axis=1)
         low, high = np.percentile(spread, [16, 84])
@@ -102,6 +104,7 @@ class HeldOut:
         error = difference.std(ddof=1) / np.sqrt(len(difference))
         if error > 0:
             return float(difference.mean() / error)
+        # all groups differ by exactly the same
         return float(np.inf * difference.mean()) if difference.mean() else 0.0
 
 
@@ -141,6 +144,7 @@ def frame_groups(observations):
         angles = [np.rad2deg(o.position("derotator")) for o in observations]
         rounded = [np.round(a / _SAME_ANGLE) for a in angles]
         kinds = np.unique(np.concatenate(rounded))
+        # an angle that moves from frame to frame would make every frame a group
         several = len(kinds) < sum(map(len, rounded)) / 2
         if several and len(kinds) >= 3:
             every = np.concatenate(rounded)
@@ -196,22 +200,45 @@ def held_out(model, groups):
     labels, numbers = groups
     problem = model.problem
     squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
-    for i in range(len(labels)):
-        out = [number == i for number in numbers]
-        rows = np.concatenate(
-            [
-                np.broadcast_to(~o, channel.shape).ravel()
-                for o, channel in zip(out, problem.channels, strict=True)
-            ]
-        )
-        fit = problem.fit(model.fit.coefficients, rows=rows, steps=_STEPS, share=_SHARE)
-        for o, channel, gap in zip(
-            out, problem.channels, problem.differences(fit.coefficients), strict=True
+    for i, fit in enumerate(left_out_fits(model, labels, numbers)):
+        for number, channel, gap in zip(
+            numbers, problem.channels, problem.differences(fit.coefficients), strict=True
         ):
-            seen = channel.valid & o
+            seen = channel.valid & (number == i)
             squares[i] += np.sum(gap[0][seen] ** 2)
+            # two channels a datum: half, so that noise gives 1 a datum
             whitened[i] += np.sum(channel.whiten(gap)[:, seen] ** 2) / 2
             counts[i] += seen.sum()
     keep = counts > 0
     labels = [label for label, here in zip(labels, keep, strict=True) if here]
     return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
+
+
+def left_out_fits(model, labels, numbers):
+    """
+    Yield the fit of a model without each group of frames.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    labels, numbers
+        As `frame_groups` gives them.
+
+    Yields
+    ------
+    Fit
+
+    Examples
+    --------
+    >>> from astropolcal.gap.shrinkage import left_out_fits
+    >>> list(left_out_fits(None, [], []))
+    []
+    """
+    for i in range(len(labels)):
+        kept = [
+            np.broadcast_to(number != i, channel.shape).ravel()
+            for number, channel in zip(numbers, model.problem.channels, strict=True)
+        ]
+        rows = np.concatenate(kept)
+        yield model.problem.fit(model.fit.coefficients, rows=rows, steps=_STEPS, share=_SHARE)

@@ -8,6 +8,7 @@ from astropolcal.plotting._style import (
     BLACK,
     GREY,
     SIGMA,
+    legend_entries,
     legend_outside,
     nanometres,
 )
@@ -87,6 +88,7 @@ def _draw_constant(axes, calibration, entry, color):
 def draw_law(axes, calibration, leaf, known, look):
     """Draw a retardance that follows a law, its band, and the stages' points."""
     lam = nanometres(calibration.wavelength)
+    # a law is smooth between the wavelengths unless its parameters are given at these
     if not any(np.size(getattr(leaf, key).value) > 1 for key in leaf.param_names):
         lam = np.linspace(lam.min(), lam.max(), _FINE)
     lam = np.sort(lam)
@@ -122,6 +124,7 @@ def _law_std(calibration, leaf, lam):
     if not np.isfinite(matrix).all():
         return None
     slopes = np.stack([_slope(leaf, key, lam) for key, _ in rows])
+    # sigma^2(lambda) = g^T C g with the slopes g (n_parameters, n_wavelengths)
     return np.sqrt(np.clip(np.einsum("in,ij,jn->n", slopes, matrix, slopes), 0, None))
 
 
@@ -129,6 +132,7 @@ def _slope(leaf, key, lam):
     """Return the derivative of the law to a parameter, per its unit, by central differences."""
     parameter = getattr(leaf, key)
     unit = 1 if parameter.unit is None else parameter.unit
+    # relative, but for parameters that are zero
     step = _STEP * max(abs(float(parameter.value)), 1e-6)
     high, low = (
         _retardance(leaf.with_parameters(**{key: (parameter.value + sign * step) * unit}), lam)
@@ -171,6 +175,7 @@ def _in_rows(words):
 
 def mark_half_wave(axes):
     """Draw the line of a perfect half-wave plate where the data come near to it."""
+    # the limits of the data, not of the axes, which a line would widen
     low, high = axes.dataLim.intervaly
     for half in (180, -180):
         if abs(low - half) < _NEAR_HALF_WAVE and abs(high - half) < _NEAR_HALF_WAVE:
@@ -182,10 +187,7 @@ def mark_half_wave(axes):
 
 def legend_of(figure, axes, calibration):
     """Put one legend for all panels below them: each label once, in neutral colours."""
-    entries = {}
-    for one in axes:
-        for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
+    entries = legend_entries(axes)
     labels = [label for label in _ORDER if label in entries]
     labels += [label for label in entries if label not in labels]
     handles = [_neutral(entries[label], label) for label in labels]

@@ -129,3 +129,39 @@ def degrees(angle):
     """Return an angle in degree as short text: ``11.25°``."""
     text = f"{angle:.2f}".rstrip("0").rstrip(".")
     return f"{'0' if text == '-0' else text}°"
+
+
+def rms(values, axis=None):
+    """Return the root mean square of the known values, NaN where there is none."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    total = (np.where(known, values, 0.0) ** 2).sum(axis=axis)
+    return np.sqrt(np.where(count, total / np.maximum(count, 1), np.nan))
+
+
+def cell_edges(centres):
+    """Return the edges of cells half way between their centres, which ascend."""
+    if len(centres) == 1:
+        # one wavelength: a cell of a few percent, so that there is something to see
+        return centres[0] * np.array([0.98, 1.02])
+    middle = (centres[1:] + centres[:-1]) / 2
+    first, last = 2 * centres[0] - middle[0], 2 * centres[-1] - middle[-1]
+    return np.concatenate([[first], middle, [last]])
+
+
+def element_places(names):
+    """Return ``optic.parameter`` with the places of its elements, in their order."""
+    places = {}
+    for i, name in enumerate(names):
+        # one of a parameter given per wavelength is called optic.parameter[3]
+        places.setdefault(name.split("[")[0], []).append(i)
+    return places
+
+
+def legend_entries(panels):
+    """Return the handles of all panels by label, each label once."""
+    entries = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    return entries

@@ -90,11 +90,14 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     curves = {label: _reference(label, pair) for label, pair in (reference or {}).items()}
     records, standards = calibration.datasets, calibration.fit.get("standards", [])
     sources = {record.source for record in records}
+    # a standard of a source that was not fitted has no panel to be drawn into
     others = [entry for entry in standards if entry["source"] not in sources]
     count = len(records) + len(others)
     with style():
         figure = canvas(figure, 8.5, 2.4 + 3.6 * count)
+        # one scale, so that datasets can be compared by eye
         panels = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+        # by name, for the curves of all panels look alike and share one legend
         handles = {}
         for axes, record in zip(panels, records, strict=False):
             name = f"{record.name}: " if count > 1 else ""
@@ -142,6 +145,7 @@ def _draw_record(axes, record, calibration):
     for name, (color, marker, label) in _CURVES.items():
         values = record.accuracy[name].to_value(u.percent)
         label = label.format(what_is_left_out(calibration)) if name == "s_cv" else label
+        # a curve that is missing is said to be so in the legend, not left out
         if not np.isfinite(values).any():
             label = f"{name}: not known (too few data or groups)"
         lam = nanometres(record.accuracy["wavelength"])
@@ -217,14 +221,17 @@ def _all_values(records, standards, curves):
 
 def scale_axis(axes, values):
     """Use a logarithmic axis where the values need it, with plain numbers on it."""
+    # zero stands for what is missing and has no logarithm
     known = values[np.isfinite(values) & (values > 0)]
     if known.size and known.max() > _LOGARITHMIC_FROM * known.min():
         from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
         axes.set_yscale("log")
         axes.set_ylim(known.min() / 1.3, known.max() * 1.3)
+        # powers of ten alone would give an axis over half a decade no number at all
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
     else:
+        # accuracies of similar size are compared by their lengths from zero
         axes.set_ylim(bottom=0)

@@ -12,6 +12,14 @@ __all__ = ["plot_comparison"]
 
 # fewer wavelengths than these are filters: nothing is known in between
 _LEAST_SPECTRUM = 8
+# panel, column, unit of the axis, and what differs from the look of the member
+_DRAWN = (
+    (0, "hwp_retardance", u.deg, {}),
+    (1, "derotator_retardance", u.deg, {}),
+    (2, "path_diattenuation", u.percent, {}),
+    (3, "least_efficiency", u.one, {}),
+    (3, "most_efficiency", u.one, {"markerfacecolor": "white"}),
+)
 
 
 def plot_comparison(members, *, title=None, figure=None):
@@ -32,7 +40,8 @@ def plot_comparison(members, *, title=None, figure=None):
     `~matplotlib.figure.Figure`
         Against the wavelength: retardance of half-wave plate and of derotator, diattenuation
         of the path behind the telescope, and the range of the efficiency over the derotator
-        angles. Spectra are lines, filters are points on dotted lines.
+        angles. Spectra are lines, filters are points on dotted lines. Bars are standard errors of
+        calibrations; where the data leave a value open, the bar goes through the whole panel.
 
     Examples
     --------
@@ -57,17 +66,34 @@ def plot_comparison(members, *, title=None, figure=None):
 
 
 def _draw(axes, rows, label, color, marker):
+    # tables hold the wavelengths as they were given, not in order
     rows = rows[np.argsort(rows["wavelength"])]
     lam, few = rows["wavelength"].to_value(u.nm), len(rows) < _LEAST_SPECTRUM
     settings = {"color": color, "marker": marker, "linestyle": ":" if few else "-"}
     settings |= {"markersize": 6.5 if few else 4.0}
-    (handle,) = axes[0].plot(lam, rows["hwp_retardance"].to_value(u.deg), label=label, **settings)
-    axes[1].plot(lam, rows["derotator_retardance"].to_value(u.deg), **settings)
-    axes[2].plot(lam, 100 * np.asarray(rows["path_diattenuation"]), **settings)
-    least, most = (np.asarray(rows[f"{key}_efficiency"]) for key in ("least", "most"))
-    axes[3].plot(lam, least, **settings)
-    axes[3].plot(lam, most, **settings | {"markerfacecolor": "white"})
-    return handle
+    handles = []
+    for panel, key, unit, look in _DRAWN:
+        value, std = _column(rows, key, unit), _column(rows, f"{key}_std", unit)
+        handles += axes[panel].plot(lam, value, label=label, **settings | look)
+        _bars(axes[panel], lam, value, std, color)
+    return handles[0]
+
+
+def _column(rows, key, unit):
+    """Return a column as plain numbers, NaN where a table of before there were errors has none."""
+    if key not in rows.colnames:
+        return np.full(len(rows), np.nan)
+    return u.Quantity(rows[key]).to_value(unit)
+
+
+def _bars(ax, lam, value, std, color):
+    """Draw the standard errors; a value that the data leave open may be anywhere."""
+    known = np.isfinite(value) & np.isfinite(std)
+    if known.any():
+        bars = {"color": color, "elinewidth": 1.2, "zorder": 3}
+        ax.errorbar(lam[known], value[known], std[known], fmt="none", **bars)
+    for x in lam[np.isinf(std)]:
+        ax.axvline(x, color=color, linewidth=1.0, alpha=0.6)
 
 
 def _label(axes):

@@ -105,6 +105,7 @@ def plot_images(corrected, *, wavelength=None, figure=None):
         figure = canvas(figure, 12.5, 8.2)
         grid = figure.subplots(2, 3, sharex=True, sharey=True)
         polarized = [np.abs(panels[name]) for name in ("Q", "U", "Q$_\\phi$", "U$_\\phi$")]
+        # Q, U and their azimuthal components hold the same flux: one scale for all four
         limit = _top(np.stack(polarized))
         for axes, (name, image) in zip(grid.flat, panels.items(), strict=True):
             _panel(figure, axes, name, image, corrected, limit)
@@ -146,6 +147,7 @@ def _mean(images):
     """Return the mean of the known values."""
     known = np.isfinite(images)
     count = known.sum(axis=0)
+    # np.nanmean would warn of pixels that no wavelength knows
     total = np.where(known, images, 0.0).sum(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
@@ -190,13 +192,16 @@ def _extent(corrected):
     height, width = corrected.stokes.shape[2:]
     x, y = corrected._middle()
     step = _step(corrected)
+    # pixel centres are whole numbers: the image reaches half a pixel further
     edges = np.array([-0.5 - x, width - 0.5 - x, -0.5 - y, height - 0.5 - y]) * step
     if corrected.north_up:
+        # east is to the left on the sky
         edges[:2] *= -1
     return edges
 
 
 def _step(corrected):
+    # milliarcseconds to arcseconds
     return 1.0 if corrected.pixel_scale is None else corrected.pixel_scale / 1000
 
 
@@ -267,6 +272,7 @@ def plot_spectrum(corrected, *, figure=None):
         _error_lines(middle, nm, corrected)
         bottom.plot(nm, corrected.condition, "o-", color=PURPLE)
         bottom.set_ylabel("condition")
+        # 1 is the condition of an ideal instrument, the best there is
         bottom.set_ylim(bottom=1 if np.nanmax(corrected.condition) < 1e3 else None)
         if np.nanmax(corrected.condition) >= 1e3:
             bottom.set_yscale("log")
@@ -298,6 +304,7 @@ def _values(axes, nm, corrected, name):
     color = _COLORS[name]
     known = np.isfinite(statistical)
     label = f"{name}, statistical error" if known.any() else name
+    # a point without an error keeps its place and has no bar
     bars = np.where(known, statistical, 0.0)
     axes.errorbar(nm, value, bars, fmt=_MARKERS[name], color=color, label=label)
     if np.isfinite(systematic).any():

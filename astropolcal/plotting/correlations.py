@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting._style import canvas, heading, legend_outside, style
+from astropolcal.plotting._style import canvas, element_places, heading, legend_outside, style
 
 __all__ = ["plot_correlations"]
 
@@ -59,7 +59,7 @@ def plot_correlations(calibration, *, figure=None):
     covariance = getattr(calibration, "covariance", calibration)
     if not len(covariance):
         raise ParameterError("no free parameter, so no correlation to draw")
-    groups = _groups(covariance.names)
+    groups = [(stem, len(at)) for stem, at in element_places(covariance.names).items()]
     with np.errstate(invalid="ignore"):
         matrix = covariance.correlation
     with style():
@@ -74,12 +74,6 @@ def plot_correlations(calibration, *, figure=None):
         _explain(figure, matrix)
         heading(figure, calibration, "Correlations of the parameters")
     return figure
-
-
-def _groups(names):
-    """Return ``optic.parameter`` and the number of elements of each, in their order."""
-    stems = [name.split("[")[0] for name in names]
-    return [(stem, stems.count(stem)) for stem in dict.fromkeys(stems)]
 
 
 def _edges(groups):

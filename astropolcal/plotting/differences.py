@@ -19,6 +19,7 @@ from astropolcal.plotting._style import (
 __all__ = ["plot_double_differences"]
 
 _PANELS = 4
+# so many that a curve over 180 deg has no corners
 _CURVE_POINTS = 241
 
 
@@ -100,6 +101,7 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
 
 def _panels(figure, count, rows, columns):
     """Return (data, residual) axes for each wavelength, all with the same scales."""
+    # residuals need less height than data
     spec = figure.add_gridspec(2 * rows, columns, height_ratios=(3, 1.5) * rows)
     pairs = []
     for i in range(count):
@@ -134,6 +136,7 @@ def _draw_series(pair, grid, row, one, look):
     points = {"color": color, "marker": marker, "linestyle": "none", "label": one.label}
     pair[0].errorbar(angle, value, yerr=_bars(sigma), **points)
     pair[1].errorbar(angle, 100 * residual, yerr=_bars(100 * sigma), **points)
+    # where a stage moves from datum to datum there is no model between the data
     if one.positions is None:
         pair[0].plot(angle, value - residual, "x", color=color, markersize=8)
 
@@ -143,12 +146,14 @@ def _curve(grid, one, bins, fine):
 
 
 def _bars(sigma):
+    # bars of length zero would look like errors that are very small
     return np.nan_to_num(sigma) if np.isfinite(sigma).any() else None
 
 
 def _fine(angle):
     """Return angles for the curve: a little beyond the data, ten degrees around a single one."""
     low, high = angle.min(), angle.max()
+    # a single angle would give a curve without a length
     margin = 0.04 * (high - low) if high - low > 1 else 10
     return np.linspace(low - margin, high + margin, _CURVE_POINTS)
 
@@ -179,6 +184,7 @@ def _legend(figure, grid, series, bins, s_res):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
+    # what is not drawn has no entry in the legend
     curves = any(one.positions is not None for one in series)
     handles = [
         Line2D([], [], color=color, marker=marker, linestyle="-" if curves else "", label=one.label)

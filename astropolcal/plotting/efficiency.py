@@ -15,6 +15,7 @@ _ALTITUDE = np.arange(20, 91, 5.0)
 _PARALLACTIC = np.arange(-180, 181, 10.0)
 _MOST_LINES = 6
 _LEAST_SPECTRUM = 8
+# white contours on the dark end of the colours, black ones on the bright end
 _LEVELS = (0.2, 0.4, 0.6, 0.8, 0.9)
 
 
@@ -74,6 +75,7 @@ def plot_polarimetric_efficiency(
     at = {"altitude": altitude} if "altitude" in moving else {}
     at |= {"parallactic": parallactic} if "parallactic" in moving else {}
     asked = _Asked(chain, wavelength, {"instrument": instrument, "mode": mode})
+    # without an altitude axis there is no pointing to map
     turns, maps = has_derotator(chain), "altitude" in at
     panels = (2 if turns else int(not maps)) + maps
     with style():
@@ -135,6 +137,7 @@ def _lines(ax, lam, angles, values, shown):
     if shown is None:
         rows = np.unique(np.linspace(0, lam.size - 1, min(_MOST_LINES, lam.size)).astype(int))
     else:
+        # two wavelengths asked for may be nearest to the same one
         rows = np.unique(np.abs(nanometres(shown)[:, None] - lam).argmin(axis=1))
     for (color, marker), row in zip(looks(len(rows)), rows, strict=True):
         ax.plot(
@@ -142,6 +145,7 @@ def _lines(ax, lam, angles, values, shown):
             values[:, row],
             color=color,
             marker=marker,
+            # markers tell the lines apart without colour; at all points they would be a band
             markevery=6,
             label=f"{lam[row]:.0f} nm",
         )
@@ -176,6 +180,7 @@ def _map_of_pointings(fig, ax, asked, derotator):
 
 
 def _mesh(ax, x, y, values, contours):
+    # 0 to 1 in all maps of wavelengths, so that colours of two instruments mean the same
     mesh = ax.pcolormesh(x, y, values, cmap="cividis", vmin=0, vmax=1, shading="nearest")
     for levels, color in ((_LEVELS[:3], "white"), (_LEVELS[3:], "black")) * contours:
         # a level that no value reaches is no fault

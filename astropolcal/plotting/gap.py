@@ -1,13 +1,16 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Figures of a diagnosis: the gap by wavelength, its maps, what causes it, where it lies."""
+"""
+Figures of a diagnosis: the gap by wavelength, its maps, where it lies.
+
+Those of its effects are in `astropolcal.plotting.effects`, and to be had from here too.
+"""
 
 import textwrap
 
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.gap._numbers import Fitted
-from astropolcal.gap._words import in_title, is_determined, shortened
+from astropolcal.gap._words import shortened
 from astropolcal.gap.residuals import locate
 from astropolcal.plotting._style import (
     BLACK,
@@ -15,13 +18,15 @@ from astropolcal.plotting._style import (
     GREY,
     MINUS,
     ORANGE,
-    SKY,
     VERMILION,
     canvas,
+    cell_edges,
     legend_outside,
+    rms,
     style,
     wavelength_label,
 )
+from astropolcal.plotting.effects import plot_effect_scores, plot_effect_sizes, verdict_line
 
 __all__ = [
     "plot_effect_scores",
@@ -52,25 +57,6 @@ def _gaps(model, noise):
         percent = 100 * channel.whiten(gap) * channel.sigma
         found.append(np.where(channel.valid, percent, np.nan))
     return found
-
-
-def _rms(values, axis=None):
-    known = np.isfinite(values)
-    total = np.where(known, values, 0.0) ** 2
-    return np.sqrt(total.sum(axis=axis) / np.maximum(known.sum(axis=axis), 1))
-
-
-def _title(diagnosis):
-    """Return the verdict as a line that fits a figure."""
-    largest = sorted(diagnosis.causes, key=lambda cause: -cause.explained)
-    names = in_title([cause.name for cause in largest])
-    several = "effects are" if len(largest) > 1 else "effect is"
-    return {
-        "effect": f"{len(largest)} {several} missing: {names}",
-        "none": "no gap beyond the noise",
-        "unexplained": "a real gap that no effect explains"
-        + (f"\n(in part: {names})" if names else ""),
-    }.get(diagnosis.verdict, diagnosis.verdict)
 
 
 def _name(channel):
@@ -125,11 +111,11 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
             nm = 1000 * nominal.problem.wavelength[nominal.problem.datasets[i].bins]
             order = np.argsort(nm)
             for c, axes in enumerate(row):
-                floor = _rms(np.where(valid, 100 * sigma[c], np.nan), axis=1)[order]
+                floor = rms(np.where(valid, 100 * sigma[c], np.nan), axis=1)[order]
                 axes.fill_between(nm[order], floor, color="0.85", label="noise")
                 axes.plot(nm[order], floor, color=GREY, linewidth=1)
-                one = _rms(before[i][c], axis=1)[order]
-                two = _rms(after[i][c], axis=1)[order]
+                one = rms(before[i][c], axis=1)[order]
+                two = rms(after[i][c], axis=1)[order]
                 axes.plot(nm[order], two, "o-", color=BLUE, markersize=4, label="after")
                 # hollow and larger, so that both are seen where they are the same
                 hollow = {"markerfacecolor": "none", "markersize": 8}
@@ -138,13 +124,14 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
                 _spectrum_labels(axes, nominal.observations[i].name, c, i == n - 1)
         handles = grid[0, 0].get_legend_handles_labels()[0]
         legend_outside(figure, handles, columns=3)
-        figure.suptitle(f"Gap between model and data\n{_title(diagnosis)}")
+        figure.suptitle(f"Gap between model and data\n{verdict_line(diagnosis)}")
     return figure
 
 
 def _percent_axis(axes, values):
     """Choose a logarithmic axis where the values need it."""
-    low, high = values[values > 0].min(), values.max()
+    # a wavelength that is masked wholly has none
+    low, high = np.nanmin(values[values > 0]), np.nanmax(values)
     if high > 5 * low:
         axes.set_yscale("log")
         axes.set_ylim(low / 1.6, high * 1.6)
@@ -217,6 +204,7 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     nominal, improved = diagnosis.nominal, diagnosis.improved
     pairs = list(zip(_gaps(nominal, nominal), _gaps(improved, nominal), strict=True))
     sizes = np.abs(np.concatenate([gap[c].ravel() for pair in pairs for gap in pair]))
+    # one hot pixel must not blank the maps
     limit = max(np.nanpercentile(sizes, _COVERED), 1e-12)
     with style():
         figure = canvas(figure, 12, 1.5 + 3.2 * len(pairs))
@@ -226,27 +214,25 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
             wavelength = nominal.problem.wavelength[dataset.bins]
             for axes, gap, when in zip(row, pair, ("before", "after"), strict=True):
                 drawn = _map(axes, gap[c], wavelength, limit)
-                rms = _rms(gap[c])
+                size = rms(gap[c])
                 name = shortened(observations.name, _LONGEST_NAME)
-                axes.set_title(f"{name}, {when}: rms {rms:.2g} %", loc="left")
+                axes.set_title(f"{name}, {when}: rms {size:.2g} %", loc="left")
                 _frame_axis(axes, observations)
             row[0].set_ylabel("wavelength (nm)")
         extend = "both" if np.nanmax(sizes) > limit else "neither"
         bar = figure.colorbar(drawn, ax=grid, extend=extend, shrink=0.85, aspect=35)
         bar.set_label(f"observed {MINUS} model (%); grey: masked")
-        figure.suptitle(f"Residuals of the {_CHANNELS[channel][0]}\n{_title(diagnosis)}")
+        figure.suptitle(f"Residuals of the {_CHANNELS[channel][0]}\n{verdict_line(diagnosis)}")
     return figure
 
 
 def _map(axes, gap, wavelength, limit):
-    from astropolcal.plotting.residuals import _edges
-
     order = np.argsort(wavelength)
     axes.grid(False)
     axes.set_facecolor("0.75")
     return axes.pcolormesh(
         np.arange(gap.shape[1] + 1),
-        _edges(1000 * wavelength[order]),
+        cell_edges(1000 * wavelength[order]),
         np.ma.masked_invalid(gap[order]),
         cmap="RdBu_r",
         vmin=-limit,
@@ -269,191 +255,12 @@ def _frame_axis(axes, observations):
     for edge in starts[1:]:
         axes.axvline(edge, color=BLACK, linewidth=0.6)
     angles = np.rad2deg(observations.position("derotator")[starts])
+    # rounded up, so that there are never more labels than fit
     step = -(-count // _MOST_TICKS)
     labels = [f"{angle:.4g}" for angle in angles[::step]]
     axes.set_xticks(((starts + ends) / 2)[::step], labels=labels)
     axes.tick_params(axis="x", length=0)
     axes.set_xlabel("frames by derotator angle (deg)")
-
-
-def plot_effect_scores(diagnosis, *, limit=12, figure=None):
-    """
-    Draw how much of the gap each effect of the library would explain.
-
-    The length of a bar is the signal-to-noise ratio of the effect in the scan,
-    the square root of the expected lowering of chi-square over the scatter that
-    remains. Effects that were found and their aliases have their own colours,
-    effects that are not significant are pale.
-
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-        The diagnosis.
-    limit : int
-        Most effects to draw, best first.
-    figure : `~matplotlib.figure.Figure`, optional
-        An empty figure to draw into.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap import diagnose
-    >>> from astropolcal.plotting.gap import plot_effect_scores
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
-    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
-    >>> plot_effect_scores(diagnosis).axes[0].get_xlabel()[:8]
-    'signal-t'
-    """
-    scores = sorted(diagnosis.scores[:limit], key=lambda s: -_strength(s))
-    alpha = diagnosis.settings.get("alpha", 0.01)
-    found = {cause.name for cause in diagnosis.causes}
-    aliases = {name for cause in diagnosis.causes for name in cause.aliases} - found
-    used = set()
-    with style():
-        figure = canvas(figure, 10, 2.2 + 0.36 * max(len(scores), 2))
-        axes = figure.subplots()
-        for i, score in enumerate(scores):
-            name, size = score.effect.name, _strength(score)
-            kind = _kind(name, score.p_value < alpha, found, aliases)
-            used.add(kind)
-            axes.barh(i, size, **_LOOKS[kind])
-            axes.text(size, i, f"  {_chance(score.p_value)}", va="center", fontsize=9.5)
-        axes.set_yticks(range(len(scores)), labels=[s.effect.name for s in scores])
-        axes.invert_yaxis()
-        axes.grid(visible=False, axis="y")
-        axes.set_xlabel("signal-to-noise ratio in the scan; at the bars: corrected probability")
-        axes.set_xlim(0, 1.18 * max(map(_strength, scores), default=1.0))
-        legend_outside(figure, _keys(used), columns=4)
-        figure.suptitle(f"Scan of the effects\n{_title(diagnosis)}")
-        if not scores:
-            axes.text(0.5, 0.5, "no effect to score", transform=axes.transAxes, ha="center")
-    return figure
-
-
-def _chance(p):
-    return "p < 1e-15" if p < 1e-15 else f"p = {p:.1g}"
-
-
-_LOOKS = {
-    "found": {"color": VERMILION},
-    "alias: the data cannot tell": {"facecolor": ORANGE, "edgecolor": BLACK, "hatch": "//"},
-    "significant": {"color": SKY},
-    "not significant": {"color": "0.85"},
-}
-
-
-def _strength(score):
-    return float(np.sqrt(score.statistic / score.scale))
-
-
-def _kind(name, significant, found, aliases):
-    if name in found:
-        return "found"
-    if name in aliases:
-        return "alias: the data cannot tell"
-    return "significant" if significant else "not significant"
-
-
-def _keys(used):
-    from matplotlib.patches import Patch
-
-    return [Patch(label=label, **look) for label, look in _LOOKS.items() if label in used]
-
-
-def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
-    """
-    Draw the fitted size of a cause with its errors by wavelength.
-
-    One panel a parameter. Where the data do not tell the size, the wavelength
-    is marked at the foot of the panel.
-
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-        The diagnosis.
-    effect : str
-        Name of one of its causes.
-    content : dict, optional
-        What `~astropolcal.gap.report.to_dict` returned for it, if it is known already.
-    figure : `~matplotlib.figure.Figure`, optional
-        An empty figure to draw into.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-
-    Raises
-    ------
-    ParameterError
-        If the effect is no cause, or has no size that depends on wavelength.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap import diagnose
-    >>> from astropolcal.optics import BeamGain
-    >>> from astropolcal.plotting.gap import plot_effect_sizes
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> wavelength = [1200, 1600, 2000] * u.nm
-    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=wavelength)
-    >>> truth = chain | BeamGain(imbalance=0.02, name="flat")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 70, 95, 120] * u.deg)
-    >>> data = simulate(truth, wavelength, frames, seed=1)
-    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
-    >>> plot_effect_sizes(diagnosis, "beam_gain").axes[0].get_ylabel()
-    'imbalance'
-    """
-    sizes = _sizes_by_wavelength(diagnosis, effect, content)
-    nm = 1000 * diagnosis.nominal.problem.wavelength
-    with style():
-        figure = canvas(figure, 4.9 * min(len(sizes), 2) + 0.6, 0.4 + 2.5 * -(-len(sizes) // 2))
-        grid = figure.subplots(-(-len(sizes) // 2), min(len(sizes), 2), squeeze=False, sharex=True)
-        for axes in grid.flat[len(sizes) :]:
-            axes.set_axis_off()
-        for axes, (name, size) in zip(grid.flat, sizes.items(), strict=False):
-            _size_panel(axes, nm, size)
-            unit = f" ({size['unit']})" if size["unit"] else ""
-            axes.set_ylabel(f"{name.partition('.')[2].replace('_', ' ')}{unit}")
-            wavelength_label(axes)
-    return figure
-
-
-def _sizes_by_wavelength(diagnosis, effect, content):
-    names = [cause.name for cause in diagnosis.causes]
-    if effect not in names:
-        raise ParameterError(f"effect = {effect!r} is no cause; these are: {', '.join(names)}")
-    if content is None:
-        sizes = Fitted(diagnosis.improved).sizes(effect)
-    else:
-        sizes = content["causes"][names.index(effect)]["parameters"]
-    found = {name: size for name, size in sizes.items() if isinstance(size["value"], list)}
-    if not found:
-        raise ParameterError(f"effect = {effect!r} has no size that depends on wavelength")
-    return found
-
-
-def _size_panel(axes, nm, size):
-    known = np.array([is_determined(std, size["limit"]) for std in size["std"]])
-    value = np.array(size["value"], dtype=float)
-    error = np.array(size["std"], dtype=float)
-    axes.axhline(0, color=BLACK, linewidth=0.8)
-    axes.errorbar(nm[known], value[known], error[known], fmt="o", color=BLUE, elinewidth=1.5)
-    if not known.all():
-        foot = axes.get_xaxis_transform()
-        axes.plot(nm[~known], np.full((~known).sum(), 0.05), "x", color=VERMILION, transform=foot)
-        axes.set_title("crosses: not determined", loc="left", fontsize=10)
-    if not known.any():
-        axes.set_yticks([])
 
 
 def plot_where(diagnosis, *, limit=12, figure=None):
@@ -494,7 +301,9 @@ def plot_where(diagnosis, *, limit=12, figure=None):
     """
     where = diagnosis if hasattr(diagnosis, "table") else _where(diagnosis)
     told = where.told
+    # two panels, for the shares of one list add up and those of the other do not
     kinds = [told[told["kind"] == kind][:limit] for kind in ("pattern", "place")]
+    # bars of the same height in both panels
     heights = [max(len(rows), 1) + 0.4 for rows in kinds]
     titles = (
         "what the gap follows (one after the other, shares add up)",

@@ -109,11 +109,13 @@ def _draw(ax, own, name, most):
     suffix = f" ({unit})" if unit else ""
     if several:
         lam = lam[np.unique(np.linspace(0, lam.size - 1, min(most, lam.size)).astype(int))]
+    # a single date has no range to take a share of: one day
     width = max(np.ptp(_days(own)), 1.0) * _SPREAD if several else 0.0
     offsets = np.linspace(-width, width, lam.size) if lam.size > 1 else [0.0]
     for wavelength, shift, (color, marker) in zip(lam, offsets, looks(lam.size), strict=True):
         here = own[own["wavelength"].value == wavelength] if several else own
         days, value, std = _days(here) + shift, here["value"], here["std"]
+        # retardances of the wavelengths differ by tens of degrees, their changes by tenths
         value = value - np.mean(value) if several else value
         label = f"{wavelength:.0f} nm" if several else None
         dates = Time(days, format="mjd").datetime
@@ -144,6 +146,7 @@ def _mark_changes(ax, calibrations, own, name):
         if not found.dof or not {first[0], second[0]} <= set(held):
             continue
         middle = Time((held[first[0]] + held[second[0]]) / 2, format="mjd").datetime
+        # one tail of a normal law beyond three sigma
         certain = found.p_value < 0.00135
         ax.annotate(
             f"{found.sigma:.1f} {SIGMA}",

@@ -9,8 +9,17 @@ import numpy as np
 
 from astropolcal.calibration.harmonics import _POOR, SETS, harmonic_conditions
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting._style import BLACK, BLUE, GREY, ORANGE, VERMILION, canvas, heading, style
-from astropolcal.plotting.correlations import _groups
+from astropolcal.plotting._style import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    VERMILION,
+    canvas,
+    element_places,
+    heading,
+    style,
+)
 from astropolcal.units import angle_to_rad
 
 __all__ = ["plot_identifiability"]
@@ -161,7 +170,7 @@ def _weak_rows(finding, known, count):
 
 def _near_null_words(near_null, names, units, vector):
     """Return the words of the near-null direction that this is, or none."""
-    places = _places(names)
+    places = element_places(names)
     for direction in near_null:
         change = np.zeros(len(names))
         for name, value in direction["parameters"].items():
@@ -175,7 +184,7 @@ def _near_null_words(near_null, names, units, vector):
 def _weak_words(names, units, vector, sigma):
     """Say what a step of one standard error along a direction changes."""
     parts = []
-    for stem, places in _places(names).items():
+    for stem, places in element_places(names).items():
         part = vector[places]
         share = np.linalg.norm(part)
         if share > _WORTH_A_WORD:
@@ -192,14 +201,6 @@ def _step_unit(unit):
     if unit is None:
         return "%"
     return "deg" if u.Unit(unit).is_equivalent(u.deg) else "µm"
-
-
-def _places(names):
-    """Return ``optic.parameter`` with the places of its elements, in their order."""
-    places = {}
-    for i, name in enumerate(names):
-        places.setdefault(name.split("[")[0], []).append(i)
-    return places
 
 
 # ---- (a) singular values ---------------------------------------------------------------------
@@ -282,11 +283,11 @@ def _draw_loadings(figure, axes, finding, rows):
     if not rows:
         _say(axes, "no open direction; errors are not known")
         return
-    places = _places(finding.names)
+    places = element_places(finding.names)
     table = np.array([[_loading(row.loadings[at]) for at in places.values()] for row in rows])
     image = axes.imshow(np.abs(table), cmap="Blues", vmin=0, vmax=1, aspect="auto")
     axes.grid(False)
-    labels = [f"{n} ({count})" if count > 1 else n for n, count in _groups(finding.names)]
+    labels = [f"{n} ({len(at)})" if len(at) > 1 else n for n, at in places.items()]
     axes.set_xticks(
         range(len(labels)), labels, rotation=30, ha="right", rotation_mode="anchor", fontsize=9.5
     )

@@ -17,6 +17,7 @@ from astropolcal.plotting._style import (
     SKY,
     canvas,
     heading,
+    legend_entries,
     legend_outside,
     nanometres,
     style,
@@ -25,6 +26,7 @@ from astropolcal.plotting._style import (
 
 __all__ = ["plot_mirrors"]
 
+# dashes of their own: a thin metal line must not look like a fit
 _METAL_LOOKS = dict(zip(METALS, ((SKY, "--"), (ORANGE, "-."), (GREEN, ":")), strict=True))
 _LAW_ALONE = "fitted law, not determined: a choice of the law"
 _LABELS = {"diattenuation": "diattenuation (%)", "retardance": "retardance (°)"}
@@ -82,12 +84,14 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
     if not names:
         raise ChainError("the calibration has no mirror to draw")
     tables = [mirror_values(calibration, name) for name in names]
+    # an empty dict is a wish to see none
     reference = _published(calibration) if reference is None else reference
     rows = ["diattenuation"]
     if any("retardance" in table.colnames for table in tables):
         rows.append("retardance")
     with style():
         figure = canvas(figure, 2.5 + 5 * len(names), 2.4 + 3.2 * len(rows))
+        # mirrors side by side on one scale
         panels = figure.subplots(len(rows), len(names), sharex=True, sharey="row", squeeze=False)
         for column, table in zip(panels.T, tables, strict=True):
             column[0].set_title(table.meta["name"])
@@ -98,6 +102,7 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
                 _draw(axes, calibration, table, key, reference.get(table.meta["name"], {}))
                 axes.set_ylabel(_LABELS[key])
                 axes.tick_params(labelleft=True)
+            # a mirror that only attenuates has no lower panel
             for axes in column[len(shown) :]:
                 axes.remove()
             last = column[len(shown) - 1]
@@ -133,6 +138,7 @@ def _draw_metals(axes, lam, table, key):
 
 def _has_law(calibration, name):
     """Return whether the values follow a law in wavelength."""
+    # with a law the diattenuation is computed and no parameter
     return f"{name}.diattenuation" not in calibration.parameter_values()
 
 
@@ -156,10 +162,11 @@ def _draw_values(axes, lam, table, key, law):
 
 
 def _legend(figure, panels):
-    entries = {}
-    for axes in panels.ravel():
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(f"{label} (bare, 45°)" if label in METALS else label, handle)
+    entries = {
+        f"{label} (bare, 45°)" if label in METALS else label: handle
+        for label, handle in legend_entries(panels.ravel()).items()
+    }
+    # sorting is stable: what was calibrated stays in its order, the metals come last
     ordered = sorted(entries, key=lambda label: "bare" in label)
     handles = [entries[label] for label in ordered]
     for handle, label in zip(handles, ordered, strict=True):

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Calibrated parameters against wavelength, with what is known of their errors."""
 
-import difflib
 import textwrap
 
 import astropy.units as u
@@ -12,6 +11,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.plotting._points import draw_entry, draw_law, legend_of, mark_half_wave
 from astropolcal.plotting._style import canvas, heading, looks, style, wavelength_label
+from astropolcal.words import did_you_mean
 
 __all__ = ["plot_efficiency", "plot_parameters", "plot_retardances"]
 
@@ -100,8 +100,10 @@ def _has_retardance(leaf, key, known):
     """Return whether an optic retards in this way: a law, or a parameter that is not fixed at 0."""
     if key in leaf.param_names:
         entry = known[f"{leaf.name}.{key}"]
+        # a component that is held at zero is one that the retarder does not have
         return not entry["fixed"] or bool(np.any(entry["value"] != 0))
     law = getattr(leaf, key, None)
+    # a law is a method; astropy's parameters can be called, too
     return callable(law) and not isinstance(law, Parameter)
 
 
@@ -151,6 +153,7 @@ def plot_efficiency(calibration, *, figure=None):
         figure, axes = _grid(figure, len(names))
         for one, name, look in zip(axes, names, looks(len(names)), strict=True):
             draw_entry(one, calibration, known[name], look)
+            # above 1 there is no physical efficiency
             one.axhline(1, color="black", linestyle="--", linewidth=1, label="perfect: 1")
             one.set_title(name)
             one.set_ylabel(_EFFICIENCY)
@@ -217,9 +220,9 @@ def plot_parameters(calibration, names=None, *, figure=None):
 
 def _check_name(name, known):
     if name not in known:
-        near = difflib.get_close_matches(str(name), known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ParameterError(f"no parameter {name!r}; allowed are {', '.join(known)}{hint}")
+        raise ParameterError(
+            f"no parameter {name!r}; allowed are {', '.join(known)}{did_you_mean(name, known)}"
+        )
 
 
 def _describe(parameter):
@@ -260,6 +263,7 @@ def _grid(figure, count):
     spec = figure.add_gridspec(rows, columns)
     first, axes = None, []
     for i in range(count):
+        # all on one wavelength axis, labelled at the lowest panels alone
         axes.append(figure.add_subplot(spec[divmod(i, columns)], sharex=first))
         first = axes[0]
         if i + columns >= count:

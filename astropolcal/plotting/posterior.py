@@ -88,6 +88,7 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
             label_kwargs={"fontsize": 9.5},
             labelpad=0.06,
             quantiles=(0.16, 0.5, 0.84),
+            # the content of 1, 2 and 3 sigma ellipses in two dimensions: 1 - exp(-s^2 / 2)
             levels=1 - np.exp([-0.5, -2.0, -4.5]),
             fill_contours=True,
             plot_datapoints=False,
@@ -114,6 +115,7 @@ def _corner_canvas(figure, size):
     with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         if figure is None:
             return Figure(figsize=(size, size))
+        # corner sets margins of its own, which a layout engine would undo
         if isinstance(figure, Figure):
             figure.set_layout_engine(None)
     return figure
@@ -138,6 +140,7 @@ def _labels(posterior, columns, samples):
     labels, shifts = [], []
     for i, column in enumerate(columns):
         middle, width = np.median(samples[:, i]), np.ptp(samples[:, i])
+        # decimals that resolve a tenth of the range
         digits = 1 - int(np.floor(np.log10(width)))
         shift = round(middle, digits - 1) if abs(middle) > 20 * width else 0.0
         taken = f"{'+' if shift < 0 else MINUS} {abs(shift):.{max(digits - 1, 0)}f}"
@@ -203,6 +206,7 @@ def _heading(posterior, marked):
     walkers = posterior.chain.shape[1]
     lines = [f"Posterior: {posterior.n_steps} steps of {walkers} walkers"]
     lines.append(f"{int(posterior.n_times)} times the longest autocorrelation time τ")
+    # fewer autocorrelation times than these say nothing of convergence
     if posterior.n_times < ENOUGH:
         lines.append("(CHAIN TOO SHORT)")
     elif not posterior.converged:
@@ -282,11 +286,14 @@ def _join(panels, title, label):
 
 def _trace(axes, posterior, column):
     chain, steps = posterior.chain[:, :, column], posterior.steps
+    # the larger of both strides keeps either limit
     every = max(len(chain) // _DRAWN_STEPS, chain.size // _DRAWN_POINTS, 1)
     axes.plot(steps[::every], chain[::every], color=BLUE, alpha=0.25, linewidth=0.5)
     axes.plot(steps[::every], np.median(chain[::every], axis=1), color=BLACK, linewidth=1.0)
     if posterior.burn_in:
+        # steps are counted before thinning
         axes.axvspan(0, posterior.burn_in * posterior.thin, color=GREY, alpha=0.25, linewidth=0)
+    # the chain begins at the axis, so that a burn-in is seen as such
     axes.margins(x=0)
     axes.set_ylabel(_label(posterior, column), fontsize=9.5)
 
@@ -318,7 +325,7 @@ def _write_time(axes, posterior, column):
 
 
 def _correlation(axes, posterior, column):
-    """Draw the autocorrelation out to twenty of the longest times, or as far as it goes."""
+    """Draw the autocorrelation out to ten of the longest times, or as far as it goes."""
     values = autocorrelation(posterior.chain[posterior.burn_in :, :, column])
     longest = np.nanmax(posterior.autocorrelation_times, initial=1.0) / posterior.thin
     shown = values[: max(int(10 * longest), 10)]

@@ -149,7 +149,9 @@ def _draw_image(panel, image):
     if not known.size:
         panel.text(0.5, 0.5, "no values", transform=panel.transAxes, ha="center")
         return
+    # a few hot pixels must not hide the spots, nor a few dead ones the background
     low, high = np.percentile(known, (2, 99.8))
+    # square root: wings and core of a star in one picture
     norm = PowerNorm(0.5, vmin=low, vmax=max(high, low + 1e-12), clip=True)
     drawn = panel.imshow(image, origin="lower", cmap="gray_r", norm=norm, interpolation="nearest")
     drawn.set_cmap(drawn.cmap.with_extremes(bad=_GAP))
@@ -163,6 +165,7 @@ def _draw_circles(panel, photometry, k, annulus):
     for beam, name in enumerate(BEAMS):
         r = photometry.radius[beam, k]
         place = (photometry.x[beam, k], photometry.y[beam, k])
+        # a spot that was not found has neither centre nor radius
         if r > 0 and place != (0.0, 0.0):
             look = {"fill": False, "ec": _COLORS[name]}
             panel.add_patch(Circle(place, r, ls=_LINES[name], lw=1.6, **look))
@@ -176,6 +179,7 @@ def _draw_rectangles(panel, layout):
     for name, (x, y) in (("right", right), ("left", left)):
         panel.add_patch(
             Rectangle(
+                # matplotlib counts from a corner, the layout from the centre
                 (x - width / 2, y - height / 2),
                 width,
                 height,
@@ -240,8 +244,10 @@ def plot_run(reduction, *, wavelength=None, figure=None):
 def _clock(frames):
     """Return when the frames were taken and the label of that axis."""
     times = [frame.values.get("mjd") for frame in frames]
+    # headers without times, or all the same: number the frames
     if None in times or np.ptp(times) == 0:
         return np.arange(len(frames)), "frame"
+    # days of the modified Julian date to minutes
     minutes = (np.array(times) - min(times)) * 1440.0
     return minutes, "time since the first frame (min)"
 
@@ -250,6 +256,7 @@ def _cells(reduction, k, name):
     """Return an array of the photometry over the run, (2, F), NaN where a cell failed."""
     values = np.array([getattr(frame.photometry, name)[:, k] for frame in reduction.frames]).T
     failed = np.array([bool(frame.photometry.reasons[k]) for frame in reduction.frames])
+    # a frame that was masked has numbers, which mean nothing
     return np.where(failed, np.nan, values)
 
 
@@ -261,6 +268,7 @@ def _draw_fluxes(top, below, reduction, clock, k):
     top.set_ylabel(f"flux ({reduction.frames[0].unit})")
     total = flux.sum(axis=0)
     single = (flux[0] - flux[1]) / total
+    # d[(R - L) / (R + L)] = 2 (L dR - R dL) / (R + L)^2
     scatter = 2 * np.hypot(flux[1] * error[0], flux[0] * error[1]) / total**2
     below.errorbar(clock, single, scatter, fmt="D", color=GREEN, ms=5, lw=0, elinewidth=1.2)
     below.axhline(0.0, color="0.6", lw=0.8)
@@ -268,6 +276,7 @@ def _draw_fluxes(top, below, reduction, clock, k):
     failed = np.isnan(flux[0])
     if failed.any():
         for axes in (top, below):
+            # at the foot of the panel, whatever the fluxes are
             height = axes.get_xaxis_transform()
             axes.plot(
                 clock[failed], np.full(failed.sum(), 0.05), "x", color=BLACK, transform=height
@@ -283,6 +292,8 @@ def _look(name):
 def _draw_places(panels, reduction, clock, k):
     for panel, key in zip(panels, ("x", "y", "fwhm"), strict=True):
         for values, name in zip(_cells(reduction, k, key), BEAMS, strict=True):
+            # centres of both beams are hundreds of pixels apart; their motion is what is looked
+            # for
             if key != "fwhm" and np.isfinite(values).any():
                 values = values - np.nanmedian(values)
             panel.plot(clock, values, **_look(name))

@@ -8,9 +8,11 @@ from astropolcal.plotting._style import (
     BLUE,
     MINUS,
     canvas,
+    cell_edges,
     clusters,
     degrees,
     heading,
+    rms,
     style,
 )
 
@@ -92,6 +94,7 @@ def plot_residuals(calibration, *, figure=None):
 def _limit(grids):
     """Return the end of the colour scale in percent, and whether data lie beyond it."""
     size = np.concatenate([np.abs(g.residual[np.isfinite(g.residual)]) for g in grids]) * 100
+    # exact data would leave a scale of no width
     limit = max(np.percentile(size, _COVERED), 1e-12)
     return limit, bool(size.max() > limit)
 
@@ -99,7 +102,7 @@ def _limit(grids):
 def _draw_dataset(main, above, right, grid, limit):
     order, group, ends = _layout(grid)
     lam = np.argsort(grid.wavelength)
-    edges = _edges(grid.wavelength[lam])
+    edges = cell_edges(grid.wavelength[lam])
     percent = 100 * grid.residual[np.ix_(lam, order)]
     columns = np.arange(len(order) + 1)
     main.grid(False)
@@ -110,10 +113,10 @@ def _draw_dataset(main, above, right, grid, limit):
     main.vlines(ends[:-1], edges[0], edges[-1], color="black", linewidth=0.8)
     main.set_ylabel("wavelength (nm)")
     _name_groups(main, grid, order, group, ends)
-    above.stairs(_rms(percent, axis=0), columns, color=BLUE, fill=True)
+    above.stairs(rms(percent, axis=0), columns, color=BLUE, fill=True)
     above.tick_params(labelbottom=False)
     above.set_ylabel("rms (%)")
-    _wavelength_rms(right, _rms(percent, axis=1), grid.wavelength[lam])
+    _wavelength_rms(right, rms(percent, axis=1), grid.wavelength[lam])
     for axes in (above, right):
         axes.margins(0)
     above.set_ylim(bottom=0)
@@ -123,9 +126,11 @@ def _draw_dataset(main, above, right, grid, limit):
 def _layout(grid):
     """Return the data by derotator then half-wave plate angle, groups, and where these end."""
     derotator = clusters(grid.derotator, SAME_ANGLE)
+    # number of the setting of the plate of each datum
     plate = np.empty(len(derotator), dtype=int)
     for i, series in enumerate(grid.series()):
         plate[series.data] = i
+    # the last key is the first: by derotator angle, within it by plate
     order = np.lexsort((plate, derotator))
     group = derotator[order]
     ends = np.flatnonzero(np.diff(group, append=group[-1] + 1)) + 1
@@ -145,24 +150,8 @@ def _name_groups(main, grid, order, group, ends):
     main.set_xlabel(f"derotator angle; at each, left to right, half-wave plate at\n{within}")
 
 
-def _edges(centres):
-    """Return edges half way between wavelengths."""
-    if len(centres) == 1:
-        return centres[0] * np.array([0.98, 1.02])
-    middle = (centres[1:] + centres[:-1]) / 2
-    first, last = 2 * centres[0] - middle[0], 2 * centres[-1] - middle[-1]
-    return np.concatenate([[first], middle, [last]])
-
-
-def _rms(percent, axis):
-    known = np.isfinite(percent)
-    count = known.sum(axis=axis)
-    total = np.where(known, percent, 0.0) ** 2
-    return np.sqrt(np.where(count, total.sum(axis=axis) / np.maximum(count, 1), np.nan))
-
-
-def _wavelength_rms(axes, rms, wavelength):
-    axes.plot(rms, wavelength, "o-", color=BLUE)
+def _wavelength_rms(axes, values, wavelength):
+    axes.plot(values, wavelength, "o-", color=BLUE)
     axes.set_xlabel("rms (%)")
     axes.tick_params(labelleft=False)
-    axes.set_xlim(0, 1.1 * np.nanmax(rms) or 1)
+    axes.set_xlim(0, 1.1 * np.nanmax(values) or 1)

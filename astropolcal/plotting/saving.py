@@ -99,6 +99,7 @@ def save_all(calibration, folder):
     for name, draw in _figures(calibration):
         try:
             figure = draw()
+        # no such optic, no data in a file, or no datum left: the figure has nothing to show
         except (ChainError, CalibrationFileError, ObservationError):
             continue
         paths.append(save(figure, folder / f"{name}.png"))
@@ -116,6 +117,8 @@ def _save_posterior(posterior, folder):
         path = folder / f"{name}.png"
         try:
             figure = draw(posterior, _drawn(posterior, most, fill=draw is plot_traces))
+        # a package that is not installed, or a parameter that did not move, costs one figure, not
+        # all
         except AstropolcalError as error:
             warnings.warn(f"{path} is not drawn: {error}", AstropolcalWarning, stacklevel=3)
             continue
@@ -128,6 +131,7 @@ def _drawn(posterior, most, fill):
     names = posterior.names
     if len(names) <= most:
         return names
+    # one per wavelength ends in its index: hwp.retardance[3]
     common = [name for name in names if not name.endswith("]")][:most]
     times = posterior.autocorrelation_times
     # what does not move comes first

@@ -89,6 +89,7 @@ def _place(site):
 
 def _hours(star, first):
     """Return hours UTC, counted from the midnight before the first dark hour."""
+    # one midnight for all stars, that of the first
     start = np.floor(first.table["time"][0].mjd)
     return (star.table["time"].mjd - start) * 24
 
@@ -99,6 +100,7 @@ def _wrapped(angle):
 
 def _broken(hours, angle):
     """Put a gap where the angle jumps by a turn."""
+    # within a step of minutes no star turns by half a turn, except in the wrapping
     jump = [i + 1 for i, (a, b) in enumerate(pairwise(angle)) if abs(a - b) > 180]
     return np.insert(hours, jump, np.nan), np.insert(angle, jump, np.nan)
 
@@ -106,6 +108,7 @@ def _broken(hours, angle):
 def _curve(axes, hours, values, star, look):
     """Draw one star: faint below the limit, with markers where it is observable."""
     color, marker = look
+    # the curve may have gaps put in: its hours are not those of the table
     good = np.interp(hours, _hours(star, star), star.table["observable"]) > 0.5
     good |= np.isnan(hours)
     axes.plot(hours, values, color=color, linestyle=":", linewidth=1)

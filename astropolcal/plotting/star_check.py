@@ -11,6 +11,7 @@ from astropolcal.plotting._style import (
     VERMILION,
     canvas,
     heading,
+    legend_entries,
     legend_outside,
     style,
     wavelength_label,
@@ -79,7 +80,7 @@ def plot_star_check(calibration, entry=None, *, figure=None):
             wavelength_label(bottom)
         what = f"{entry['star']}, which no fit saw"
         heading(figure, calibration, what, [entry["name"]])
-        legend_outside(figure, _handles(panels), columns=2)
+        legend_outside(figure, list(legend_entries(panels.ravel()).values()), columns=2)
     return figure
 
 
@@ -92,6 +93,7 @@ def _last(calibration):
 
 
 def _draw(top, bottom, values, key, unit, label, short):
+    # lines are drawn through the points as they come
     order = np.argsort(values["wavelength_nm"])
     lam = values["wavelength_nm"][order]
     seen, error, known, spread, off = (
@@ -101,11 +103,13 @@ def _draw(top, bottom, values, key, unit, label, short):
     points = {"color": BLUE, "marker": "o", "linestyle": "none"}
     observed = f"observed, with 1{SIGMA} errors of the mean"
     top.errorbar(lam, seen, yerr=np.nan_to_num(error), label=observed, **points)
+    # a star whose polarization no catalogue has is drawn alone
     if np.isfinite(known).any():
         top.plot(lam, known, color=VERMILION, label="catalogue, with the published errors")
         top.fill_between(lam, known - spread, known + spread, color=VERMILION, alpha=0.2, lw=0)
     bottom.axhline(0, color=GREY, linewidth=1)
     bottom.errorbar(lam, off, yerr=np.nan_to_num(error), **points)
+    # of the angle no such error is known
     if key == "dolp":
         single = values["s_dolp_percent"][order]
         for sign in (1, -1):
@@ -113,11 +117,3 @@ def _draw(top, bottom, values, key, unit, label, short):
             bottom.plot(lam, sign * single, color=GREY, linestyle="--", label=label_of)
     top.set_ylabel(label)
     bottom.set_ylabel(f"obs. {MINUS} catalogue\n({short})")
-
-
-def _handles(panels):
-    entries = {}
-    for axes in panels.ravel():
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    return list(entries.values())

@@ -80,6 +80,7 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
         panels = figure.subplots(3, 1, sharex=True)
         handles = _draw_parts(panels[0], tables[0])
         lines = _draw_targets(panels[1], tables, "s_p")
+        # the lines of the angle look as those of the degree, and need no entries of their own
         _draw_targets(panels[2], tables, "s_chi")
         for axes, label in zip(panels, ("accuracy (%)", "s_p (%)", "s_chi (°)"), strict=True):
             axes.set_ylabel(label)
@@ -92,6 +93,7 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
 
 
 def _draw_parts(axes, table):
+    # the parts are those of the instrument and the same for every target: the first will do
     axes.set_title("What it is made of")
     lam = nanometres(table["wavelength"])
     handles, values = [], []

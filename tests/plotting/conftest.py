@@ -102,3 +102,18 @@ def single_angle():
     chain["derotator"].retardance.fixed = True
     observations = make_observations(chain, [70] * u.deg)
     return calibrate(chain, observations, observable="normalized_single_difference")
+
+
+@pytest.fixture(scope="session")
+def with_mirror():
+    """Calibrates a mirror in front of the half-wave plate; what stands behind that is known."""
+
+    def calibrated(mirror):
+        chain = make_chain("linear", first=mirror)
+        chain["derotator"].retardance.fixed = True
+        # a little polarization less cannot be told from a little less of its modulation
+        chain["wollaston"].efficiency.fixed = True
+        observations = make_observations(chain, ANGLES[:3], name="unpolarized")
+        return calibrate(chain, observations, search=False, cross_validate=False)
+
+    return calibrated

@@ -146,7 +146,7 @@ def test_unknown_parameter(posterior):
 
 def test_missing_corner(posterior, monkeypatch):
     monkeypatch.setitem(sys.modules, "corner", None)
-    with pytest.raises(AstropolcalError, match=r"corner, .*pip install astropolcal\[mcmc\]"):
+    with pytest.raises(AstropolcalError, match=r"corner, .*pip install \"astropolcal\[mcmc\]\""):
         plot_corner(posterior)
 
 

@@ -5,8 +5,6 @@ The library of effects that a model of a polarimeter may lack.
 One class each, registered in `EFFECTS`; `register_effect` adds your own.
 """
 
-import difflib
-
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import (
     derotator,
@@ -29,6 +27,7 @@ from astropolcal.gap.effects.base import (
 )
 from astropolcal.gap.effects.check import check_against, check_declared
 from astropolcal.gap.effects.roles import Roles, adapted
+from astropolcal.words import did_you_mean
 
 __all__ = [
     "EFFECTS",
@@ -131,6 +130,7 @@ def check_effect(effect, chains, observations):
     """
     one = effect() if isinstance(effect, type) else get_effect(effect)
     check_declared(one)
+    # the registered effect itself may be checked, a namesake may not
     if one.name in EFFECTS and type(EFFECTS[one.name]) is not type(one):
         raise _taken(one.name)
     check_against(one, chains, observations)
@@ -168,14 +168,18 @@ def get_effect(name):
     whole, _, optic = str(name).partition(":")
     if optic and whole in EFFECTS and EFFECTS[whole].acts_on:
         return EFFECTS[whole].at(optic)
-    near = difflib.get_close_matches(str(name), EFFECTS, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise GapError(f"no effect {name!r}; there are {', '.join(EFFECTS)}{hint}")
+    near = did_you_mean(name, EFFECTS, most=3)
+    # all names would be a line of more than a thousand characters
+    raise GapError(
+        f"no effect {name!r}{f'{near} All' if near else '; all'} {len(EFFECTS)} are listed by "
+        "'astropolcal diagnose --effects help', and by list(astropolcal.gap.EFFECTS)"
+    )
 
 
 for _module in (plate, derotator, relay, source, telescope, detector, held, discrete):
     for _name in _module.__all__:
         register_effect(getattr(_module, _name))
+# the class itself is registered for 8 um
 for _thickness in (4.0, 12.0):
     register_effect(relay.Fringes(_thickness))
     register_effect(relay.FringesDrift(_thickness))

@@ -23,6 +23,7 @@ from astropolcal.gap.effects.roles import SEVERAL, Roles
 from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointing import TRACKING
+from astropolcal.units import canonical_factor
 
 __all__ = [
     "KINDS",
@@ -71,6 +72,35 @@ class EffectParameter:
     basis: np.ndarray | None = None
     neutral: object = None
 
+    @property
+    def canonical_scale(self):
+        """Size to expect in canonical units."""
+        return _canonical(self.scale)
+
+    @property
+    def canonical_limit(self):
+        """Largest size that is physical in canonical units."""
+        return _canonical(self.limit)
+
+    @property
+    def canonical_neutral(self):
+        """Value at which the effect is absent, canonical; scalar or one a wavelength."""
+        if self.neutral is not None:
+            value = u.Quantity(self.neutral)
+            return value.value * canonical_factor(value.unit)
+        # an optic that keeps all of the polarization is none
+        return 1.0 if self.is_retained else 0.0
+
+    @property
+    def is_retained(self):
+        """Whether it is a share of polarization that an optic retains, 1 where it does nothing."""
+        return self.name.split(".")[1].startswith("retained")
+
+
+def _canonical(value):
+    value = u.Quantity(value)
+    return float(value.value * canonical_factor(value.unit))
+
 
 @dataclass(frozen=True)
 class Edit:
@@ -96,6 +126,22 @@ class Edit:
     chains: list
     parameters: list
     ties: dict = field(default_factory=dict)
+
+    @property
+    def laws(self):
+        """Law in wavelength of the parameters that follow one, by name."""
+        return {p.name: p.basis for p in self.parameters if p.basis is not None}
+
+    @property
+    def limits(self):
+        """Largest physical size of every parameter, canonical, by name."""
+        return {p.name: p.canonical_limit for p in self.parameters}
+
+    @property
+    def priors(self):
+        """Standard deviation of the prior of every parameter, canonical, by name."""
+        # two standard deviations reach the limit: sizes are held where the data are silent only
+        return {name: limit / 2 for name, limit in self.limits.items()}
 
 
 @dataclass(frozen=True)
@@ -129,12 +175,19 @@ class Context:
     degree: object = "default"
     tracking: tuple = ()
 
+    @classmethod
+    def of(cls, wavelength, observations):
+        """Return what the datasets tell, on their common grid of wavelengths."""
+        fluxes = [np.nanmedian(o.flux_right + o.flux_left) / 2 for o in observations]
+        return cls(wavelength, float(np.median(fluxes)), tracking=tracking_laws(observations))
+
     def basis(self, degree, constant=True):
         """Return the law's basis; without its constant where that is known already."""
         wanted = degree if self.degree == "default" else self.degree
         found = law_basis(self.wavelength, wanted)
         if constant:
             return found
+        # a constant over the wavelengths is the orientation of the optic, which is known by itself
         if wanted is None:
             # one value a wavelength, less their mean
             n = len(found)
@@ -168,6 +221,7 @@ def tracking_laws(observations):
 
 
 def _tracking_law(observations):
+    # a table of no known instrument: the law of a plate that follows the sky as usual
     if observations.instrument is None:
         return TRACKING
     try:
@@ -263,6 +317,7 @@ class Effect(ABC):
         if self.acts_on is None or self.optic is not None:
             return [self]
         every = [Roles(chain).all(self.acts_on) for chain in chains]
+        # the first of a kind keeps the plain name, in whichever dataset it is
         first = {found[0].name for found in every if found}
         others = dict.fromkeys(o.name for found in every for o in found if o.name not in first)
         return [self, *(self.at(name) for name in others)]
@@ -387,6 +442,7 @@ class Insertion(Effect):
                 edited.append(chain)
                 continue
             optic = self._freed(self.build(size, anchor, context))
+            # turned with its optic: an effect of a plate has the axes of that plate
             if self.follows:
                 optic.theta = anchor.theta.value * u.deg
                 if not anchor.theta.fixed:
@@ -410,6 +466,7 @@ class Insertion(Effect):
 
     def law(self, key, context):
         """Return the law of a parameter in wavelength, None for a single number."""
+        # free values need no basis, one wavelength no law
         if self.degree is None or len(context.wavelength) == 1:
             return None
         return context.basis(self.degree, self.constant)

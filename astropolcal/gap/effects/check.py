@@ -5,13 +5,14 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, GapError
-from astropolcal.gap.effects.base import KINDS, Context, Effect, tracking_laws
+from astropolcal.gap.effects.base import KINDS, Context, Effect
 from astropolcal.gap.problem import GapProblem
 from astropolcal.units import canonical_factor, to_unit
 
 __all__ = ["check_against", "check_declared"]
 
 _NEEDED = ("name", "title", "kind", "place", "shows", "reference")
+# of the largest flux: far above rounding, far below any noise
 _SAME = 1e-10
 # step of the differences, in units of the size to expect, and error that they may have
 _STEP, _ERROR = 1e-3, 1e-4
@@ -80,11 +81,12 @@ def check_against(effect, chains, observations):
     chains, observations = list(chains), list(observations)
     if not effect.applies(chains):
         raise _failed(effect, "has no place in these chains")
+    # a diagnosis edits the same chains for a hundred effects: they must stay as they are
     before = [_state(chain) for chain in chains]
     nominal = GapProblem(chains, observations)
     nominal.settle_noise()
     try:
-        edit = effect.edit(chains, _context(nominal, observations))
+        edit = effect.edit(chains, Context.of(nominal.wavelength, observations))
     except AstropolcalError as error:
         raise _failed(effect, f"cannot edit the chains: {error}") from error
     if len(edit.chains) != len(chains):
@@ -120,12 +122,6 @@ def _state(chain):
     ]
 
 
-def _context(problem, observations):
-    fluxes = [np.nanmedian(o.flux_right + o.flux_left) / 2 for o in observations]
-    flux = float(np.median(fluxes))
-    return Context(problem.wavelength, flux, tracking=tracking_laws(observations))
-
-
 def _check_discrete(effect, edit, observations):
     if edit.parameters:
         raise _failed(effect, "is discrete and has parameters; make it another kind")
@@ -143,9 +139,8 @@ def _edited(effect, edit, nominal, observations):
 
 
 def _built(effect, edit, observations, like=None):
-    laws = {p.name: p.basis for p in edit.parameters if p.basis is not None}
     try:
-        return GapProblem(edit.chains, observations, ties=edit.ties, laws=laws, like=like)
+        return GapProblem(edit.chains, observations, ties=edit.ties, laws=edit.laws, like=like)
     except AstropolcalError as error:
         raise _failed(effect, f"gives chains that cannot be fitted: {error}") from error
 
@@ -157,6 +152,7 @@ def _check_names(effect, edit, problem, nominal):
         if name not in problem.free.by_name:
             known = ", ".join(sorted(set(problem.free.by_name) - set(nominal.free.by_name)))
             raise _failed(effect, f"{name} is not free in its chains; new and free: {known or '-'}")
+        # a lifted bound frees nothing that was not free: it gives room
         if name in nominal.free.by_name and effect.kind != "bound":
             raise _failed(effect, f"{name} is free in the chains without it already")
         slot = problem.free.by_name[name]
@@ -198,6 +194,7 @@ def _check_derivative(effect, problem, parameter):
         slopes = problem.jacobian(middle, whitened=False)
         for column in range(where.start, where.stop):
             found, expected = slopes[:, column], _difference(problem, middle, column, scale)
+            # a derivative that is zero has no relative error
             size = max(np.abs(expected).max(), 1e-9 / scale)
             worst = np.abs(found - expected).max() / size
             if not worst < _ERROR:
@@ -211,6 +208,7 @@ def _check_derivative(effect, problem, parameter):
 def _difference(problem, middle, column, scale):
     """Return the derivative of the predicted rows by differences of fourth order."""
     step, total = _STEP * scale, 0.0
+    # f' = (8 [f(h) - f(-h)] - [f(2h) - f(-2h)]) / 12 h, with an error of h^4
     for factor, weight in ((1, 8), (-1, -8), (2, -1), (-2, 1)):
         q = middle.copy()
         q[column] += factor * step

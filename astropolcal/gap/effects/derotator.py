@@ -6,9 +6,9 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import insert_optic, replace_optic
+from astropolcal.gap.effects._shared import LAG, Around, BandAverage, lagging
 from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, label_of
-from astropolcal.gap.effects.plate import PlateDiattenuation, PlateEccentricity, _Around
-from astropolcal.gap.effects.relay import _BandAverage
+from astropolcal.gap.effects.plate import PlateDiattenuation, PlateEccentricity
 from astropolcal.measurement import Tie
 
 __all__ = [
@@ -38,6 +38,7 @@ class DerotatorDiagonal(Effect):
     'diagonal'
     """
 
+    # with the horizontal component it turns the axis: by half the arctangent of their ratio
     name, kind, place = "derotator_45_retardance", "parameter", "derotator"
     title = "retardance of the derotator at 45 deg"
     shows = "rotation of Q and U that depends on wavelength and derotator angle"
@@ -63,6 +64,7 @@ class DerotatorDiagonal(Effect):
         edited, names, ties = [], {}, {}
         for chain in chains:
             derotator = self.roles(chain).derotator
+            # exchanged in place, as two retarders one behind the other do not commute
             if isinstance(derotator, _EXCHANGED):
                 chain = replace_optic(chain, derotator.name, self._elliptical(derotator, context))
                 names[derotator.name] = None
@@ -112,6 +114,7 @@ class DerotatorDiagonal(Effect):
                 name=old.name,
                 **dict.fromkeys(self.components, zero),
             )
+            # what was free stays free, so that the nominal parameters keep their meaning
             for ours, theirs in (("theta", "theta"), ("horizontal", "retardance")):
                 source, target = getattr(old, theirs), getattr(new, ours)
                 target.fixed, target.bounds = source.fixed, source.bounds
@@ -156,7 +159,7 @@ class DerotatorElliptical(DerotatorDiagonal):
     components = ("diagonal", "circular")
 
 
-class DerotatorBandAverage(_BandAverage):
+class DerotatorBandAverage(BandAverage):
     """
     Retardance of the derotator that changes within a wavelength bin.
 
@@ -232,7 +235,7 @@ class DerotatorTwoLobes(DerotatorEccentricity):
     harmonic = 2
 
 
-class DerotatorMotion(_Around):
+class DerotatorMotion(Around):
     """
     Derotator angle of another moment than that of the exposure.
 
@@ -250,16 +253,18 @@ class DerotatorMotion(_Around):
     shows = "rotation of Q and U by the rate of the derotator, most near transit"
     reference = "van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
     anchor, side, degree = "derotator", "before", None
-    free = {"rate": (0.25 * u.rad, 2 * u.rad)}
+    free = {"rate": LAG}
 
     def applies_to(self, roles):
         """Return whether there is a derotator, in the chain of a star: elsewhere it stops."""
+        # for internal sources the derotator stands still during an exposure
         moving = any(leaf.stage == "parallactic" for leaf in roles.leaves)
         return moving and roles.derotator is not None
 
     def edit(self, chains, context):
         """Return the chains with the pair at zero, in those of stars; see `Effect.edit`."""
         moves = [self.applies_to(self.roles(chain)) for chain in chains]
+        # bench data would tie the lag to a rate that they do not have
         edit = super().edit([c for c, moving in zip(chains, moves, strict=True) if moving], context)
         ready = iter(edit.chains)
         edited = [next(ready) if moving else c for c, moving in zip(chains, moves, strict=True)]
@@ -267,7 +272,6 @@ class DerotatorMotion(_Around):
 
     def build(self, size, anchor, context):
         """Return a rotator by the lag times the rate."""
+        # the lag turns the way in which the stage counts
         sign = "-" if anchor.stage_sign < 0 else ""
-        turn = optics.DriftRotator(mount=f"{sign}{anchor.stage}_rate", name=self.label)
-        turn.rate.bounds = (-360, 360)
-        return turn
+        return lagging(f"{sign}{anchor.stage}", self.label)

@@ -55,6 +55,7 @@ class Background(Insertion):
         """Return light that is added at a constant flux."""
         return optics.StrayLight(
             amount=np.zeros(size),
+            # the amount is then a share of the usual flux of both beams together
             reference=2 * context.flux,
             mount="total_flux",
             name=self.label,
@@ -82,6 +83,7 @@ class _BothBeams(Insertion):
     def edit(self, chains, context):
         """Return the chains with the gain at zero; see `Effect.edit`."""
         edit = super().edit(chains, context)
+        # one detector: the same law for both beams
         ties = edit.ties | {f"{self.label}.left": Tie(f"{self.label}.right")}
         return Edit(edit.chains, edit.parameters[:1], ties)
 
@@ -119,5 +121,6 @@ class Persistence(_BothBeams):
     title = "light of the frame before that is still in the detector"
     shows = "differences that follow those of the frame before"
     reference = "Smith et al. 2008, doi:10.1117/12.789372"
+    # the gain of a beam grows as the flux before over the flux now
     power, stage, is_ratio = -1, "previous_flux", True
     free = {"right": (0.003, 0.1), "left": (0.003, 0.1)}

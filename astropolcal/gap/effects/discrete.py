@@ -1,13 +1,12 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Discrete alternatives: parity, signs of angles, exchanged beams."""
 
-from abc import abstractmethod
-
 import astropy.units as u
 
 from astropolcal import optics
 from astropolcal.chain import insert_optic, leaves, remove_optic
-from astropolcal.gap.effects.base import Edit, Effect, label_of
+from astropolcal.gap.effects._shared import Discrete
+from astropolcal.gap.effects.base import label_of
 
 __all__ = [
     "DerotatorOffset",
@@ -20,26 +19,7 @@ __all__ = [
 ]
 
 
-class _Discrete(Effect):
-    """An alternative without parameters: it is fitted from the start, or not at all."""
-
-    kind = "discrete"
-    reference = "McIntosh et al. 2026, Sec. 4; the reflections and signs of a chain"
-
-    @abstractmethod
-    def change(self, chain, roles):
-        """Return the changed chain."""
-
-    def edit(self, chains, context):
-        """Return the changed chains; nothing is added that could be fitted."""
-        edited = []
-        for chain in chains:
-            roles = self.roles(chain)
-            edited.append(self.change(chain.copy(), roles) if self.applies_to(roles) else chain)
-        return Edit(edited, [])
-
-
-class MirrorFlip(_Discrete):
+class MirrorFlip(Discrete):
     """
     A reflection more or less between derotator and splitter.
 
@@ -63,13 +43,14 @@ class MirrorFlip(_Discrete):
         order = [leaf.name for leaf in roles.leaves]
         behind = roles.leaves[order.index(roles.relay.name) :]
         flips = [leaf for leaf in behind if isinstance(leaf, optics.ParityFlip)]
+        # a flip twice is none: one too many and one too few are the same alternative
         if flips:
             return remove_optic(chain, flips[0].name)
         flip = optics.ParityFlip(name=label_of(self.name))
         return insert_optic(chain, flip, before=roles.splitter.name)
 
 
-class MirrorBeforePlate(_Discrete):
+class MirrorBeforePlate(Discrete):
     """
     A reflection more in front of the half-wave plate.
 
@@ -81,6 +62,7 @@ class MirrorBeforePlate(_Discrete):
     """
 
     name, place = "mirror_flip_before_plate", "in front of the half-wave plate"
+    # an odd number in all: two flips with only rotators between them are a rotation
     title = "odd number of reflections in front of the half-wave plate that the model lacks"
     shows = "everywhere: the polarization turns the other way"
 
@@ -94,7 +76,12 @@ class MirrorBeforePlate(_Discrete):
         return insert_optic(chain, flip, before=roles.plate.name)
 
 
-class PlateSign(_Discrete):
+def _in_copy(chain, optic):
+    """Return the optic of that name in a copy of the chain in which a role was found."""
+    return next(leaf for leaf in leaves(chain) if leaf.name == optic.name)
+
+
+class PlateSign(Discrete):
     """
     Half-wave plate whose angle counts the other way.
 
@@ -116,7 +103,7 @@ class PlateSign(_Discrete):
 
     def change(self, chain, roles):
         """Return the chain with the sign of the stage turned."""
-        leaf = next(o for o in leaves(chain) if o.name == getattr(roles, self.acts_on).name)
+        leaf = _in_copy(chain, getattr(roles, self.acts_on))
         leaf.mount = leaf.stage if leaf.stage_sign < 0 else f"-{leaf.stage}"
         return chain
 
@@ -137,7 +124,7 @@ class DerotatorSign(PlateSign):
     shows = "everywhere that depends on the derotator angle"
 
 
-class SwappedBeams(_Discrete):
+class SwappedBeams(Discrete):
     """
     Ordinary and extraordinary beam exchanged.
 
@@ -158,7 +145,8 @@ class SwappedBeams(_Discrete):
 
     def change(self, chain, roles):
         """Return the chain with the splitter turned by 90 deg."""
-        leaf = next(o for o in leaves(chain) if o.name == roles.splitter.name)
+        leaf = _in_copy(chain, roles.splitter)
+        # T(-90) exchanges the axes of the prism, and with them the beams
         leaf.theta = (leaf.theta.value + 90) * u.deg
         return chain
 
@@ -177,12 +165,14 @@ class PlateOffset(PlateSign):
     name = "hwp_offset"
     title = "angle of the half-wave plate from another zero or keyword, off by 45 deg"
     shows = "everywhere: the polarization is turned by 90 deg"
+    # two plates 45 deg apart differ by the sign of Q and U: polarization turned by 90 deg
     offset = 45 * u.deg
 
     def change(self, chain, roles):
         """Return the chain with the optic turned, and the bounds of its angle with it."""
-        name, offset = getattr(roles, self.acts_on).name, self.offset.to_value(u.deg)
-        leaf = next(o for o in leaves(chain) if o.name == name)
+        offset = self.offset.to_value(u.deg)
+        leaf = _in_copy(chain, getattr(roles, self.acts_on))
+        # bounds of a misalignment are about the nominal zero, which is what moves
         bounds = [None if b is None else b + offset for b in leaf.theta.bounds]
         leaf.theta = (leaf.theta.value + offset) * u.deg
         leaf.theta.bounds = tuple(bounds)

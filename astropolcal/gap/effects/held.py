@@ -53,6 +53,7 @@ class _Freed(Effect):
             optic = getattr(self.roles(chain), self.acts_on)
             if optic is not None:
                 fresh = optic.copy()
+                # a dict, for the same parameter in two datasets is one
                 added |= self._release(fresh)
                 chain = replace_optic(chain, optic.name, fresh)
             edited.append(chain)
@@ -65,6 +66,7 @@ class _Freed(Effect):
             parameter = getattr(optic, key)
             if not self.is_open(parameter, limit):
                 continue
+            # where it was held is where the effect is absent
             value = u.Quantity(parameter.value, parameter.unit or u.one)
             parameter.fixed = False
             parameter.bounds = _around(parameter, limit)
@@ -151,6 +153,7 @@ class MirrorMisalignment(PlateMisalignment):
     name, place, acts_on = "mirror_misalignment", "mirror in front of the half-wave plate", "mirror"
     title = "orientation of the mirror in front of the half-wave plate, held fixed by the model"
     shows = "phase of harmonic 4 of the plate angle, unpolarized data alone"
+    # a mirror's plane may be anywhere: 45 deg is as far as an axis can be off
     free = {"theta": (1 * u.deg, 45 * u.deg)}
 
 
@@ -163,6 +166,7 @@ class _Lifted(_Freed):
 
     def is_open(self, parameter, limit):
         """Return whether a parameter is at its lower or upper bound."""
+        # a bounded fit may end a little before its bound
         value, near = np.asarray(parameter.value), _NEAR * _in_unit(limit, parameter)
         low, high = parameter.bounds
         at_low = low is not None and np.any(value <= low + near)

@@ -5,9 +5,8 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import insert_optic
+from astropolcal.gap.effects._shared import Around
 from astropolcal.gap.effects.base import Edit, EffectParameter, Insertion
-from astropolcal.measurement import Tie
 
 __all__ = [
     "PlateAxisDispersion",
@@ -60,6 +59,7 @@ class PlateRetardanceFree(PlateRetardance):
     True
     """
 
+    # one value a wavelength, for two layers and any smooth law may be too stiff
     name, degree = "hwp_retardance_free", None
     title = "retardance of the half-wave plate that no smooth law describes"
     shows = "harmonics 2 and 4 of the plate angle, any course with wavelength"
@@ -90,11 +90,13 @@ class WavelengthScale(PlateRetardance):
         """Return the chains with a retarder whose law is the plate's slope."""
         plates = (self.roles(chain).plate for chain in chains)
         plate = next(plate for plate in plates if self._has_law(plate))
+        # relative: small against the course of the indices, large against rounding
         step = 1e-4
         up, down = (
             plate.retardance(context.wavelength * (1 + s) * u.um).to_value(u.rad)
             for s in (step, -step)
         )
+        # d retardance / d ln(wavelength), radian; a shift and a stretch are this times a line
         self_law = (up - down) / (2 * step)
         edit = super().edit(chains, context)
         basis = self_law[:, None] * context.basis(1) / np.abs(self_law).max()
@@ -147,6 +149,7 @@ class PlateTransmission(Insertion):
     title = "transmission of the half-wave plate that changes twice a turn"
     shows = "harmonic 2 of the plate angle in sums, none in differences"
     reference = "Essinger-Hileman et al. 2016, doi:10.1063/1.4962023"
+    # cosine and sine are single numbers, the same at all wavelengths
     anchor, degree, harmonic = "plate", None, 2
     free = {"cosine": (0.003, 0.1), "sine": (0.003, 0.1)}
 
@@ -195,6 +198,7 @@ class PlateBeamWander(Insertion):
 
     def build(self, size, anchor, context):
         """Return a gain of opposite sign in the two beams."""
+        # light that leaves one aperture enters none: seen as opposite gains
         return optics.HarmonicGain(differential=True, mount=self.stage, name=self.label)
 
 
@@ -213,6 +217,7 @@ class PlateTilt(Insertion):
     title = "tilt of the half-wave plate, retardance that changes as it turns"
     shows = "harmonics 2, 4, 6 and 8 of the plate angle"
     reference = "Patanchon et al. 2024, doi:10.1088/1475-7516/2024/01/074"
+    # its retardance depends on whether the fast axis lies along the tilt or across: twice a turn
     anchor, side, follows, degree, harmonic = "plate", "before", True, None, 2
     free = {"cosine": (0.5 * u.deg, 20 * u.deg), "sine": (0.5 * u.deg, 20 * u.deg)}
 
@@ -221,32 +226,7 @@ class PlateTilt(Insertion):
         return optics.HarmonicRetarder(harmonic=self.harmonic, mount=anchor.mount, name=self.label)
 
 
-class _Around(Insertion):
-    """An optic in front of another and its inverse behind it: an error of its orientation."""
-
-    constant = True
-
-    def inverse_name(self):
-        """Name of the inverse."""
-        return f"{self.label}_back"
-
-    def edit(self, chains, context):
-        """Return the chains with the pair at zero."""
-        edit = super().edit(chains, context)
-        edited, ties = [], dict(edit.ties)
-        for chain in edit.chains:
-            anchor = getattr(self.roles(chain), self.anchor)
-            if anchor is not None:
-                back = self._freed(self.build(len(context.wavelength), anchor, context))
-                back.name = self.inverse_name()
-                chain = insert_optic(chain, back, after=anchor.name)
-                for key in self.free:
-                    ties[f"{back.name}.{key}"] = Tie(f"{self.label}.{key}", factor=-1.0)
-            edited.append(chain)
-        return Edit(edited, edit.parameters, ties)
-
-
-class PlateAxisDispersion(_Around):
+class PlateAxisDispersion(Around):
     """
     Fast axis of the half-wave plate that turns with wavelength.
 
@@ -261,6 +241,7 @@ class PlateAxisDispersion(_Around):
     title = "fast axis of the half-wave plate that turns with wavelength"
     shows = "phase of harmonic 4 of the plate angle, with wavelength, at all derotator angles"
     reference = "chromatic zero angles of FORS; Bagnulo et al. 2009, doi:10.1086/605654"
+    # a constant is the misalignment of the plate, which the model fits
     anchor, side, constant = "plate", "before", False
     free = {"circular": (1 * u.deg, 20 * u.deg)}
 
@@ -269,7 +250,7 @@ class PlateAxisDispersion(_Around):
         return optics.EllipticalRetarder(circular=np.zeros(size) * u.deg, name=self.label)
 
 
-class PlateEccentricity(_Around):
+class PlateEccentricity(Around):
     """
     Scale of the half-wave plate's encoder that is not centred.
 
@@ -284,6 +265,7 @@ class PlateEccentricity(_Around):
     title = "angle of the half-wave plate wrong once a turn (eccentric encoder)"
     shows = "harmonics 3 and 5 of the plate angle, none for unpolarized light"
     reference = "geometry of an eccentric scale; compare Millar-Blanchaer et al. 2016"
+    # a scale off its axis by d reads wrong by d sin(angle) over its radius
     anchor, side, degree, harmonic = "plate", "before", None, 1
     free = {"cosine": (0.1 * u.deg, 5 * u.deg), "sine": (0.1 * u.deg, 5 * u.deg)}
 

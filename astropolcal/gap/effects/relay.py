@@ -1,15 +1,12 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Effects of what stands still between the derotator and the beam splitter."""
 
-from abc import abstractmethod
-
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import insert_optic
-from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion, label_of
-from astropolcal.measurement import Tie
+from astropolcal.gap.effects._shared import BandAverage, retardance_slopes
+from astropolcal.gap.effects.base import EffectParameter, Insertion, label_of
 
 __all__ = [
     "AnisotropicDepolarizer",
@@ -22,9 +19,6 @@ __all__ = [
     "StaticDiattenuator",
     "StaticRetarder",
 ]
-
-# a retardance that changes by less than this (radian) from bin to bin is flat
-_FLAT = 1e-3
 
 
 class StaticRetarder(Insertion):
@@ -42,6 +36,7 @@ class StaticRetarder(Insertion):
     title = "retarder that stands still behind the derotator"
     shows = "pattern in derotator angle, smooth in wavelength"
     reference = "Harrington et al. 2019, doi:10.1117/1.JATIS.5.3.038001"
+    # beyond half a turn a retardance comes back with the other sign
     free = {key: (2 * u.deg, 180 * u.deg) for key in ("horizontal", "diagonal", "circular")}
 
     def build(self, size, anchor, context):
@@ -71,6 +66,7 @@ class DichroicRetarder(Insertion):
 
     def law(self, key, context):
         """Return one value a wavelength."""
+        # free at each wavelength, whatever degree the context asks for
         return None if len(context.wavelength) == 1 else np.eye(len(context.wavelength))
 
     def build(self, size, anchor, context):
@@ -123,8 +119,10 @@ class Fringes(StaticRetarder):
 
     def law(self, key, context):
         """Return a sine and a cosine in the wavenumber."""
+        # fewer wavelengths than a sine, a cosine and what they must be told from
         if len(context.wavelength) < 5:
             return None
+        # two reflections interfere with the phase of their difference of path
         phase = 2 * np.pi * self.thickness / context.wavelength
         return np.stack([np.cos(phase), np.sin(phase)], axis=1)
 
@@ -146,6 +144,7 @@ class Fringes(StaticRetarder):
         wavenumber = np.sort(1 / np.asarray(context.wavelength))
         if len(wavenumber) < 5:
             return [self]
+        # one fringe more over the band for each step; the largest has two bins a fringe (Nyquist)
         step = 1 / np.ptp(wavenumber)
         largest = 1 / (2 * np.diff(wavenumber).max())
         return [type(self)(step * (i + 1)) for i in range(int(largest / step))]
@@ -230,93 +229,13 @@ class AnisotropicDepolarizer(Insertion):
 
     def build(self, size, anchor, context):
         """Return a depolarizer between the axes of the splitter, which keeps everything."""
+        # at 0 deg it would scale what the splitter sees: the efficiency takes that up
         optic = optics.Depolarizer(retained_q=np.ones(size), theta=22.5 * u.deg, name=self.label)
         optic.retained_q.bounds = (0.0, 1.5)
         return optic
 
 
-class _BandAverage(Effect):
-    r"""
-    Retarder whose retardance changes within a wavelength bin.
-
-    Averaged over a bin in which it changes by s, a retarder keeps the polarization
-    along its axis and loses the share :math:`1 - \mathrm{sinc}(s/2) \approx s^2/24` of
-    what is at 45 deg to it, or circular: a depolarizer with the axes of the retarder
-    and a law in wavelength that is tied to the square of its slope. The constant of the law
-    is a loss at all wavelengths.
-
-    A subclass gives `retarder`.
-    """
-
-    reference = "Harrington et al. 2019, doi:10.1117/1.JATIS.5.3.038001"
-    #: Size to expect and limit of the loss.
-    sizes = (0.005, 0.2)
-
-    @property
-    def label(self):
-        """Name of the depolarizer in the chain."""
-        return label_of(self.name)
-
-    @abstractmethod
-    def retarder(self, roles):
-        """Return the retarder, None where there is none."""
-
-    def applies_to(self, roles):
-        """Return whether there is a retarder whose retardance depends on the wavelength."""
-        present = any(leaf.name == self.label for leaf in roles.leaves)
-        return not present and _slopes(self.retarder(roles)) is not None
-
-    def edit(self, chains, context):
-        """Return the chains with the depolarizer at zero; see `Effect.edit`."""
-        edited, law = [], None
-        for chain in chains:
-            roles = self.roles(chain)
-            if self.applies_to(roles):
-                law, chain = self._behind(chain, self.retarder(roles))
-            edited.append(chain)
-        name = f"{self.label}.retained_u"
-        basis = np.column_stack([np.ones(len(law)), law])
-        ties = {f"{self.label}.retained_v": Tie(name)}
-        return Edit(edited, [EffectParameter(name, *self.sizes, basis)], ties)
-
-    def _behind(self, chain, retarder):
-        """Return the law, and the chain with a depolarizer along the axis of the retarder."""
-        slopes = _slopes(retarder)
-        axis = np.linalg.svd(slopes, full_matrices=False)[2][0]
-        square = (slopes @ axis) ** 2
-        keep = np.ones(len(slopes))
-        optic = optics.Depolarizer(
-            retained_u=keep,
-            retained_v=keep,
-            theta=retarder.theta.value * u.deg + np.arctan2(axis[1], axis[0]) / 2 * u.rad,
-            mount=retarder.mount,
-            name=self.label,
-        )
-        optic.retained_q.fixed, optic.theta.bounds = True, (None, None)
-        optic.retained_u.bounds = optic.retained_v.bounds = (0.0, 1.5)
-        return square / square.max(), insert_optic(chain, optic, after=retarder.name)
-
-
-def _slopes(retarder):
-    """
-    Return the change of both linear retardances within a bin, radian, shape (W, 2).
-
-    None where there is no retarder, or its retardance does not depend on the wavelength.
-    """
-    if isinstance(retarder, optics.LinearRetarder):
-        parts = retarder.retardance.value, 0.0
-    elif isinstance(retarder, optics.EllipticalRetarder):
-        parts = retarder.horizontal.value, retarder.diagonal.value
-    else:
-        return None
-    parts = np.stack(np.broadcast_arrays(*parts), axis=-1)
-    if parts.ndim == 1 or len(parts) < 3:
-        return None
-    slopes = np.gradient(np.unwrap(np.deg2rad(parts), axis=0), axis=0)
-    return slopes if np.abs(slopes).max() > _FLAT else None
-
-
-class DichroicBandAverage(_BandAverage):
+class DichroicBandAverage(BandAverage):
     """
     Dichroic whose retardance changes within a wavelength bin.
 
@@ -343,10 +262,11 @@ class DichroicBandAverage(_BandAverage):
             return None
         names = [leaf.name for leaf in roles.leaves]
         behind = roles.leaves[names.index(roles.derotator.name) + 1 :]
+        # a dict by slope: the steepest one is where the average over a bin matters most
         steep = {
             np.abs(slopes).max(): leaf
             for leaf in behind
-            if leaf.stage is None and (slopes := _slopes(leaf)) is not None
+            if leaf.stage is None and (slopes := retardance_slopes(leaf)) is not None
         }
         return steep[max(steep)] if steep else None
 

@@ -34,12 +34,15 @@ class SourceCircular(Insertion):
     shows = "constant in plate angle, varies with derotator angle"
     reference = "computed from the measurement equation; McIntosh et al. 2026, Sec. 2"
     anchor = "polarizer"
+    # degree of circular polarization = sin(retardance): 1 deg is 1.7 percent
     free = {"retardance": (1 * u.deg, 45 * u.deg)}
 
     def build(self, size, anchor, context):
         """Return a retarder at 45 deg to the polarizer."""
         return optics.LinearRetarder(
             retardance=np.zeros(size) * u.deg,
+            # along the polarizer a retarder does nothing; at 45 deg it turns linear into circular
+            # light
             theta=(anchor.theta.value + 45) * u.deg,
             name=self.label,
         )
@@ -138,6 +141,7 @@ class PolarizerLeak(Insertion):
         optic = optics.Depolarizer(
             retained_q=np.ones(size), theta=anchor.theta.value * u.deg, name=self.label
         )
+        # a bound at 1 would leave no room on one side of where the effect is absent
         optic.retained_q.bounds = (0.0, 1.5)
         return optic
 
@@ -190,6 +194,7 @@ class StandardPolarization(Effect):
     def _parameters(self, star, context):
         for key, (scale, limit) in self.free.items():
             held = np.array(getattr(star, key).value)
+            # the law must hold the catalogue's values, from which the size counts
             basis = None if held.size == 1 else _able_to_hold(held, context.basis(self.degree))
             yield EffectParameter(f"{star.name}.{key}", scale, limit, basis, held)
 

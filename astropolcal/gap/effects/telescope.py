@@ -11,8 +11,8 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import insert_optic
+from astropolcal.gap.effects._shared import LAG, Discrete, lagging
 from astropolcal.gap.effects.base import Edit, EffectParameter, Insertion, label_of
-from astropolcal.gap.effects.discrete import _Discrete
 from astropolcal.observations.pointing import TRACKING
 
 __all__ = [
@@ -28,8 +28,6 @@ __all__ = [
     "TertiaryRetardance",
 ]
 
-# lag of an angle in frames, written as an angle over that of one frame: 0.25, at most 2
-_LAG = (0.25 * u.rad, 2 * u.rad)
 _VAN_HARTEN = "van Harten et al. 2009, arXiv:0903.2740"
 _SIGNS = "McIntosh et al. 2026, Sec. 6.1; van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
 
@@ -40,6 +38,7 @@ class _Telescope:
     def __init__(self, roles):
         self.parallactic = next((o for o in roles.leaves if _turns(o, "parallactic")), None)
         self.star = self.altitude = None
+        # without a rotation by the parallactic angle the light is that of an internal source
         if self.parallactic is not None:
             i = next(i for i, o in enumerate(roles.leaves) if o is self.parallactic)
             before, behind = roles.leaves[:i], roles.leaves[i:]
@@ -59,9 +58,11 @@ class _Telescope:
 
     def mirror_leaves(self, *keys):
         """Return whether no parameter of the mirror is free, its angle and ``keys`` aside."""
+        # nothing is free in what is not there
         if self.mirror is None:
             return True
         others = (getattr(self.mirror, k) for k in self.mirror.param_names if k not in keys)
+        # a free diattenuation or retardance of the mirror takes the effect up
         return all(parameter.fixed for parameter in others)
 
     @property
@@ -118,6 +119,7 @@ class _OfMirror(_OnSky):
     def place_in(self, telescope):
         """Return next to what the new optic stands, and on which side."""
         if telescope.mirror is not None:
+            # behind the mirror: small diattenuations of one plane add up in any order
             return {"after": telescope.mirror.name}
         return {"before": telescope.altitude.name}
 
@@ -127,7 +129,15 @@ def _along(mirror):
     return {} if mirror is None else {"theta": mirror.theta.value * u.deg, "mount": mirror.mount}
 
 
-class TertiaryDiattenuation(_OfMirror):
+class _MirrorDiattenuation(_OfMirror):
+    """A diattenuator in the plane of the mirror."""
+
+    def build(self, size, telescope, context):
+        """Return a diattenuator in the plane of the mirror."""
+        return optics.Diattenuator(diattenuation=np.zeros(size), **_along(telescope.mirror))
+
+
+class TertiaryDiattenuation(_MirrorDiattenuation):
     """
     Diattenuation of the tertiary mirror that the model lacks or holds fixed.
 
@@ -152,10 +162,6 @@ class TertiaryDiattenuation(_OfMirror):
         """Return whether there is a telescope whose mirror has no free diattenuation."""
         open_ = _Telescope(roles).mirror_leaves("theta", "retardance")
         return open_ and super().applies_to(roles)
-
-    def build(self, size, telescope, context):
-        """Return a diattenuator in the plane of the mirror."""
-        return optics.Diattenuator(diattenuation=np.zeros(size), **_along(telescope.mirror))
 
 
 class TertiaryRetardance(_OfMirror):
@@ -182,6 +188,7 @@ class TertiaryRetardance(_OfMirror):
     def applies_to(self, roles):
         """Return whether a star that may be polarized is behind a mirror of fixed retardance."""
         telescope = _Telescope(roles)
+        # a retarder does nothing to unpolarized light: such stars cannot tell it
         open_ = not telescope.unpolarized and telescope.mirror_leaves("theta", "diattenuation")
         return open_ and super().applies_to(roles)
 
@@ -191,7 +198,7 @@ class TertiaryRetardance(_OfMirror):
         return optics.LinearRetarder(retardance=zero, **_along(telescope.mirror))
 
 
-class TertiaryRecoating(_OfMirror):
+class TertiaryRecoating(_MirrorDiattenuation):
     """
     Diattenuation of the tertiary mirror that changes from one dataset to the next.
 
@@ -217,11 +224,8 @@ class TertiaryRecoating(_OfMirror):
 
     def applies(self, chains):
         """Return whether there are two datasets of stars; see `Effect.applies`."""
+        # the first night is the reference: a change needs two
         return sum(self.applies_to(self.roles(chain)) for chain in chains) > 1
-
-    def build(self, size, telescope, context):
-        """Return a diattenuator in the plane of the mirror."""
-        return optics.Diattenuator(diattenuation=np.zeros(size), **_along(telescope.mirror))
 
     def edit(self, chains, context):
         """Return the chains with a diattenuator in all but the first; see `Effect.edit`."""
@@ -229,6 +233,7 @@ class TertiaryRecoating(_OfMirror):
         for chain in chains:
             roles = self.roles(chain)
             if self.applies_to(roles):
+                # the first dataset keeps the nominal mirror
                 if seen:
                     name = f"{self.label}_{seen}"
                     chain = self._with(chain, _Telescope(roles), name, context)
@@ -265,7 +270,11 @@ class SkyBackground(_OnSky):
     def build(self, size, telescope, context):
         """Return polarized light that is added at a constant flux."""
         return optics.PolarizedBackground(
-            q=np.zeros(size), u=np.zeros(size), reference=2 * context.flux, mount="total_flux"
+            # constant in flux, so that bright frames are polarized less by it
+            q=np.zeros(size),
+            u=np.zeros(size),
+            reference=2 * context.flux,
+            mount="total_flux",
         )
 
 
@@ -285,7 +294,7 @@ class SkyMotion(_OnSky):
     shows = "polarization of stars turned by the rate of the parallactic angle, most near transit"
     reference = "van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
     degree = None
-    free = {"rate": _LAG}
+    free = {"rate": LAG}
 
     def applies_to(self, roles):
         """Return whether a star that may be polarized is behind a telescope."""
@@ -294,20 +303,13 @@ class SkyMotion(_OnSky):
 
     def build(self, size, telescope, context):
         """Return a rotator by the lag times the rate."""
-        return _lagging("parallactic", self.label)
-
-
-def _lagging(stage, name):
-    """Return a rotator by the change of an angle, times a lag in frames (1 rad is one frame)."""
-    turn = optics.DriftRotator(mount=f"{stage}_rate", name=name)
-    turn.rate.bounds = (-360, 360)
-    return turn
+        return lagging("parallactic", self.label)
 
 
 # ---- signs -----------------------------------------------------------------------------------
 
 
-class ParallacticSign(_Discrete):
+class ParallacticSign(Discrete):
     """
     Parallactic angle that counts the other way, as the star sees it.
 
@@ -350,7 +352,7 @@ class AltitudeSign(ParallacticSign):
     shows = "everywhere on sky: the polarization turns with twice the altitude"
 
 
-class PlateTrackingParallacticSign(_Discrete):
+class PlateTrackingParallacticSign(Discrete):
     """
     Half-wave plate that follows the parallactic angle the other way.
 
@@ -377,6 +379,7 @@ class PlateTrackingParallacticSign(_Discrete):
 
     def edit(self, chains, context):
         """Return the chains with the plate following another law; see `Effect.edit`."""
+        # tables hold true angles; the law tells which part of them came from the sky
         laws = () if context is None else context.tracking
         laws = laws if len(laws) == len(chains) else [TRACKING] * len(chains)
         edited = []
@@ -390,7 +393,9 @@ class PlateTrackingParallacticSign(_Discrete):
         """Return the chain with the plate turned by the difference of the laws."""
         plate, label = roles.plate.name, label_of(self.name)
         for stage, factor, old in zip(("parallactic", "altitude"), self.factors, law, strict=True):
+            # a law without this angle cannot have its sign wrong
             if factor * old != old:
+                # rotators before and behind turn the plate without turning the light
                 for side, sign in {"before": 1, "after": -1}.items():
                     turn = _follower(sign * (factor - 1) * old, stage, f"{label}_{stage}_{side}")
                     chain = insert_optic(chain, turn, **{side: plate})

@@ -1,0 +1,454 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What effects are made of: contexts, parameters, edits, roles, held values, bounds, pairs."""
+
+import astropy.units as u
+import gap_data as data
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from astropolcal import instruments, optics
+from astropolcal.chain import leaves
+from astropolcal.exceptions import GapError
+from astropolcal.gap.effects import (
+    EFFECTS,
+    Context,
+    Edit,
+    EffectParameter,
+    Roles,
+    adapted,
+    get_effect,
+    held,
+    tracking_laws,
+)
+from astropolcal.gap.effects._shared import lagging, retardance_slopes
+from astropolcal.gap.effects.base import label_of
+from astropolcal.gap.effects.source import _able_to_hold, _held_star
+from astropolcal.observations import Observations, example_table
+
+GRID = np.array([1.2, 1.4, 1.7, 2.0, 2.2])
+
+
+# ---- context -------------------------------------------------------------------------------
+
+
+def test_degree_of_the_context_stands_above_that_of_the_effect():
+    assert Context(GRID).basis(2).shape == (5, 3)
+    assert Context(GRID, degree=1).basis(2).shape == (5, 2)
+    np.testing.assert_array_equal(Context(GRID, degree=None).basis(2), np.eye(5))
+
+
+@pytest.mark.parametrize(("degree", "columns"), [(1, 1), (2, 2), (None, 4)])
+def test_a_basis_without_a_constant_cannot_make_one(degree, columns):
+    basis = Context(GRID, degree=degree).basis(2, constant=False)
+    assert basis.shape == (5, columns)
+    with_it = np.column_stack([basis, np.ones(5)])
+    assert np.linalg.matrix_rank(with_it) == columns + 1
+    # together they hold what the whole basis does
+    whole = Context(GRID, degree=degree).basis(2)
+    both = np.column_stack([with_it, whole])
+    assert np.linalg.matrix_rank(both, tol=1e-9) == columns + 1
+
+
+def test_values_less_their_mean_are_orthonormal():
+    basis = Context(GRID, degree=None).basis(2, constant=False)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(basis.sum(axis=0), 0, atol=1e-12)
+
+
+def test_flux_of_the_context_is_that_of_a_beam():
+    one, two = data.observed(flux=1e5), data.observed(flux=3e5, seed=2)
+    context = Context.of(data.WAVELENGTH.to_value(u.um), [one, two])
+    middle = [np.median(o.flux_right + o.flux_left) / 2 for o in (one, two)]
+    assert context.flux == pytest.approx(np.mean(middle))
+    assert context.tracking == ((0.5, 1.0),) * 2
+
+
+def test_law_of_the_plate_where_the_instrument_is_not_known():
+    table = example_table()
+    table.meta["instrument"] = "an instrument of my own"
+    assert tracking_laws([Observations.from_table(table)]) == ((0.5, 1.0),)
+
+
+# ---- parameters and edits ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("scale", "limit", "expected"),
+    [
+        (1 * u.deg, 30 * u.deg, (np.pi / 180, np.pi / 6)),
+        (0.02 * u.mm, 0.5 * u.mm, (20.0, 500.0)),
+        (0.003, 0.1, (0.003, 0.1)),
+        (0.3 * u.percent, 10 * u.percent, (0.003, 0.1)),
+    ],
+)
+def test_sizes_are_canonical_inside(scale, limit, expected):
+    one = EffectParameter("a.b", scale, limit)
+    assert (one.canonical_scale, one.canonical_limit) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "neutral", "expected"),
+    [
+        ("a.theta", None, 0.0),
+        ("a.retained_q", None, 1.0),
+        ("a.theta", 90 * u.deg, np.pi / 2),
+        ("a.retained_q", 0.9, 0.9),
+        ("retained.theta", None, 0.0),
+    ],
+)
+def test_where_an_effect_is_absent(name, neutral, expected):
+    one = EffectParameter(name, 1, 1, neutral=neutral)
+    assert one.canonical_neutral == pytest.approx(expected)
+    assert one.is_retained == ("retained" in name.partition(".")[2])
+
+
+def test_neutral_values_per_wavelength_stay_an_array():
+    one = EffectParameter("a.w", 1, 1, neutral=[1, 2] * u.mm)
+    np.testing.assert_allclose(one.canonical_neutral, [1000.0, 2000.0])
+
+
+def test_laws_limits_and_priors_of_an_edit():
+    basis = np.ones((5, 1))
+    first = EffectParameter("a.b", 1 * u.deg, 20 * u.deg, basis)
+    second = EffectParameter("a.c", 0.1, 0.5)
+    edit = Edit([], [first, second])
+    assert list(edit.laws) == ["a.b"]
+    assert edit.laws["a.b"] is basis
+    assert edit.limits == pytest.approx({"a.b": np.pi / 9, "a.c": 0.5})
+    assert edit.priors == pytest.approx({"a.b": np.pi / 18, "a.c": 0.25})
+
+
+@given(st.text(min_size=1, max_size=12))
+def test_label_is_a_name_that_an_optic_may_have(name):
+    label = label_of(name)
+    assert label.startswith("gap_")
+    assert "." not in label
+    assert " " not in label
+    assert label_of("fringes:a") == "gap_fringes_a"
+
+
+# ---- names ---------------------------------------------------------------------------------
+
+
+def test_an_unknown_effect_gets_near_names_and_the_way_to_all():
+    with pytest.raises(GapError) as caught:
+        get_effect("derotator_diatenuation")
+    message = str(caught.value)
+    assert message.startswith("no effect 'derotator_diatenuation'; did you mean ")
+    assert "'derotator_diattenuation' or '" in message
+    assert f"All {len(EFFECTS)} are listed by 'astropolcal diagnose --effects help'" in message
+    # one line that a terminal can show
+    assert len(message) < 260
+    assert "\n" not in message
+
+
+def test_without_a_near_name_all_are_pointed_to():
+    with pytest.raises(GapError, match=rf"^no effect 'zzz'; all {len(EFFECTS)} are listed by "):
+        get_effect("zzz")
+
+
+def test_an_effect_of_one_optic_has_a_name_of_its_own():
+    one = get_effect("m3_diattenuation:m4")
+    assert (one.optic, one.name) == ("m4", "m3_diattenuation:m4")
+    assert one.title.endswith("(m4)")
+    assert get_effect(one) is one
+    # the library's own is left as it is
+    assert get_effect("m3_diattenuation").optic is None
+    assert repr(one).startswith("<Effect m3_diattenuation:m4: ")
+
+
+def test_what_acts_on_one_optic_is_not_divided_again():
+    one = get_effect("m3_diattenuation:m4")
+    assert one.per_optic([]) == [one]
+    gain = get_effect("beam_gain")
+    assert gain.per_optic([data.chain()]) == [gain]
+
+
+# ---- roles ---------------------------------------------------------------------------------
+
+
+def plate(name="hwp", mount="hwp"):
+    return optics.LinearRetarder(retardance=180 * u.deg, mount=mount, name=name)
+
+
+def turned(name="k", mount="derotator"):
+    return optics.LinearRetarder(retardance=90 * u.deg, mount=mount, name=name)
+
+
+WOLLASTON = optics.WollastonPrism(name="wollaston")
+
+
+def test_roles_of_a_bare_chain():
+    roles = Roles(plate() | WOLLASTON)
+    assert roles.plate.name == roles.relay.name == roles.entrance.name == "hwp"
+    assert roles.splitter.name == "wollaston"
+    assert roles.derotator is roles.polarizer is roles.mirror is roles.telescope_mirror is None
+    assert roles.all("derotator") == []
+    assert roles.all("no such role") == []
+
+
+def test_a_retarder_in_front_of_the_plate_is_a_plate_and_behind_a_derotator():
+    chain = plate("quarter", "qwp") | plate() | turned() | turned("second", "k2") | WOLLASTON
+    roles = Roles(chain)
+    assert [o.name for o in roles.all("plate")] == ["hwp", "quarter"]
+    assert [o.name for o in roles.all("derotator")] == ["k", "second"]
+    # the stage called derotator comes first, wherever it stands
+    other = Roles(plate() | turned("second", "k2") | turned() | WOLLASTON)
+    assert [o.name for o in other.all("derotator")] == ["k", "second"]
+
+
+def test_a_polarizer_in_front_leaves_no_entrance():
+    chain = optics.LinearPolarizer(name="pol") | plate() | WOLLASTON
+    roles = Roles(chain)
+    assert roles.polarizer.name == "pol"
+    assert roles.entrance is None
+    assert Roles(turned() | WOLLASTON).entrance is None
+
+
+def test_the_mirror_of_an_unpolarized_source_stands_still_and_first():
+    mirror = optics.Diattenuator(diattenuation=0.01, name="fold")
+    assert Roles(mirror | plate() | WOLLASTON).mirror.name == "fold"
+    assert Roles(plate() | mirror | WOLLASTON).mirror is None
+    moving = optics.Diattenuator(diattenuation=0.01, mount="hwp", name="fold")
+    assert Roles(moving | plate() | WOLLASTON).mirror is None
+
+
+def test_an_optic_may_be_chosen_for_a_role():
+    chain = plate() | turned() | turned("second", "k2") | WOLLASTON
+    assert Roles(chain, derotator="second").derotator.name == "second"
+    assert Roles(chain, derotator="absent").derotator is None
+
+
+def test_what_an_effect_has_added_has_no_role():
+    added = optics.LinearRetarder(retardance=0 * u.deg, mount="hwp", name="gap_hwp_retardance")
+    roles = Roles(added | plate() | WOLLASTON)
+    assert [o.name for o in roles.all("plate")] == ["hwp"]
+    assert roles.entrance.name == "hwp"
+
+
+def test_a_modulator_is_no_derotator():
+    chain = instruments.get("vampires").chain(derotator="linear")
+    assert {o.stage for o in Roles(chain).all("derotator")} == {"derotator"}
+
+
+def test_words_name_the_plate_where_there_is_no_derotator():
+    chain = plate() | WOLLASTON
+    (one,) = adapted([get_effect("static_diattenuator")], [chain])
+    assert one.title == "diattenuator that stands still behind the half-wave plate"
+    assert one.place == "relay behind the half-wave plate"
+    with_it = plate() | turned() | WOLLASTON
+    (same,) = adapted([get_effect("static_diattenuator")], [with_it])
+    assert same is get_effect("static_diattenuator")
+    # what says nothing of it stays itself
+    assert adapted([get_effect("beam_gain")], [chain]) == [get_effect("beam_gain")]
+
+
+# ---- held parameters and bounds ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bounds", "value", "limit", "expected"),
+    [
+        ((-5, 5), 4.0, 10 * u.deg, (-6.0, 14.0)),
+        # never tighter than before
+        ((-50, 50), 4.0, 10 * u.deg, (-50.0, 50.0)),
+        ((None, 5), 4.0, 10 * u.deg, (None, 14.0)),
+        ((-5, None), 4.0, (10 * u.deg).to(u.rad), (-6.0, None)),
+    ],
+)
+def test_bounds_leave_room_about_the_value(bounds, value, limit, expected):
+    optic = turned()
+    optic.theta.bounds, optic.theta = bounds, value * u.deg
+    optic.theta.bounds = bounds
+    found = held._around(optic.theta, limit)
+    assert [None if x is None else pytest.approx(x) for x in found] == list(expected)
+
+
+@pytest.mark.parametrize(
+    ("value", "is_at_bound"), [(5.0, True), (-5.0, True), (4.9995, True), (4.99, False), (0, False)]
+)
+def test_a_parameter_at_its_bound(value, is_at_bound):
+    effect, optic = get_effect("derotator_angle_bound"), turned()
+    optic.theta.bounds = (-5, 5)
+    optic.theta = value * u.deg
+    # nearer than a ten thousandth of the limit of ten degrees
+    assert effect.is_open(optic.theta, 10 * u.deg) == is_at_bound
+
+
+def test_a_parameter_without_bounds_is_at_none():
+    optic = turned()
+    optic.theta.bounds = (None, None)
+    assert not get_effect("derotator_angle_bound").is_open(optic.theta, 10 * u.deg)
+
+
+def test_releasing_frees_the_parameter_and_remembers_its_value():
+    chain = plate() | turned() | WOLLASTON
+    chain["k"].theta.fixed = True
+    chain["k"].theta = 7 * u.deg
+    effect = get_effect("derotator_misalignment")
+    assert effect.applies([chain])
+    edit = effect.edit([chain], Context(GRID))
+    assert not edit.chains[0]["k"].theta.fixed
+    assert chain["k"].theta.fixed
+    (parameter,) = edit.parameters
+    assert parameter.name == "k.theta"
+    assert parameter.canonical_neutral == pytest.approx(np.deg2rad(7))
+
+
+def test_of_two_datasets_a_common_parameter_is_freed_once():
+    chain = plate() | turned() | WOLLASTON
+    chain["k"].theta.fixed = True
+    edit = get_effect("derotator_misalignment").edit([chain, chain], Context(GRID))
+    assert [p.name for p in edit.parameters] == ["k.theta"]
+    assert all(not one["k"].theta.fixed for one in edit.chains)
+
+
+# ---- pairs, lags, slopes -------------------------------------------------------------------
+
+
+def test_what_stands_behind_undoes_what_stands_in_front():
+    chain = data.chain()
+    edit = get_effect("hwp_encoder_eccentricity").edit([chain], Context(GRID))
+    order = [leaf.name for leaf in leaves(edit.chains[0])]
+    label = "gap_hwp_encoder_eccentricity"
+    at = order.index("hwp")
+    assert order[at - 1 : at + 2] == [label, "hwp", f"{label}_back"]
+    for key in ("cosine", "sine"):
+        tie = edit.ties[f"{label}_back.{key}"]
+        assert (tie.source, tie.factor) == (f"{label}.{key}", -1.0)
+
+
+def test_a_lag_is_a_rotator_by_the_rate():
+    turn = lagging("-parallactic", "late")
+    assert (turn.stage, turn.stage_sign) == ("parallactic_rate", -1)
+    assert turn.rate.bounds == (-360, 360)
+
+
+def test_slopes_of_a_retardance_are_its_differences_from_bin_to_bin():
+    # degrees per bin: 10 inside; a wrap at 180 deg is none
+    values = np.mod(np.arange(6) * 10.0 + 150 + 180, 360) - 180
+    retarder = optics.LinearRetarder(retardance=values * u.deg, name="r")
+    found = retardance_slopes(retarder)
+    np.testing.assert_allclose(found, np.deg2rad([[10.0, 0.0]] * 6), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "retarder",
+    [
+        None,
+        optics.LinearRetarder(retardance=90 * u.deg, name="r"),
+        optics.LinearRetarder(retardance=[90, 90, 90] * u.deg, name="r"),
+        optics.LinearRetarder(retardance=[90, 95] * u.deg, name="r"),
+        optics.Diattenuator(diattenuation=[0.1, 0.2, 0.3], name="d"),
+    ],
+)
+def test_what_has_no_slopes(retarder):
+    assert retardance_slopes(retarder) is None
+
+
+# ---- stars ---------------------------------------------------------------------------------
+
+
+def test_only_a_star_whose_polarization_is_held_is_held():
+    star = optics.PolarizedSource(name="star")
+    star.q.fixed = star.u.fixed = True
+    assert _held_star([plate(), star]) is star
+    star.u.fixed = False
+    assert _held_star([star]) is None
+
+
+def test_a_basis_is_widened_only_if_it_cannot_hold_the_values():
+    basis = Context(GRID).basis(1)
+    assert _able_to_hold(3 - 2 * GRID, basis) is basis
+    bent = np.array([0.0, 0.01, 0.05, 0.01, 0.0])
+    wide = _able_to_hold(bent, basis)
+    assert wide.shape == (5, 3)
+    solution = np.linalg.lstsq(wide, bent, rcond=None)[0]
+    np.testing.assert_allclose(wide @ solution, bent, atol=1e-12)
+    assert np.abs(wide[:, 2]).max() == pytest.approx(1)
+
+
+# ---- laws of special effects ---------------------------------------------------------------
+
+
+def test_fringes_have_a_sine_and_a_cosine_in_the_wavenumber():
+    law = get_effect("fringes_12_um").law("horizontal", Context(GRID))
+    phase = 2 * np.pi * 12 / GRID
+    np.testing.assert_allclose(law, np.stack([np.cos(phase), np.sin(phase)], axis=1))
+    assert get_effect("fringes_12_um").law("horizontal", Context(GRID[:4])) is None
+    assert get_effect("fringes").variants(Context(GRID[:4])) == [get_effect("fringes")]
+
+
+def test_law_of_a_shifted_wavelength_scale_is_the_slope_of_the_plate():
+    chain = data.chain()
+    context = Context(data.WAVELENGTH.to_value(u.um))
+    (parameter,) = get_effect("wavelength_scale").edit([chain], context).parameters
+    # retardance over d ln(wavelength), by differences of another step
+    step = 1e-3
+    up, down = (
+        chain["hwp"].retardance(context.wavelength * s * u.um).to_value(u.rad)
+        for s in (1 + step, 1 - step)
+    )
+    slope = (up - down) / (2 * step)
+    expected = slope / np.abs(slope).max()
+    np.testing.assert_allclose(parameter.basis[:, 0], expected, rtol=1e-4, atol=1e-5)
+    x = np.linspace(-1, 1, 2)
+    assert parameter.basis.shape == (7, x.size)
+    assert np.abs(parameter.basis).max() <= 1 + 1e-9
+
+
+def test_a_single_wavelength_has_no_law():
+    context = Context(np.array([1.6]))
+    assert get_effect("beam_gain").law("imbalance", context) is None
+    assert get_effect("dichroic_j_band").law("horizontal", context) is None
+
+
+def test_both_beams_share_the_gain_of_a_detector():
+    edit = get_effect("detector_nonlinearity").edit([data.chain()], Context(GRID, flux=500.0))
+    assert [p.name for p in edit.parameters] == ["gap_detector_nonlinearity.right"]
+    tie = edit.ties["gap_detector_nonlinearity.left"]
+    assert tie.source == "gap_detector_nonlinearity.right"
+    assert edit.chains[0]["gap_detector_nonlinearity"].reference == 500.0
+
+
+# ---- alternatives --------------------------------------------------------------------------
+
+
+def test_a_flip_that_the_model_has_is_taken_out():
+    flip = get_effect("mirror_flip")
+    (once,) = flip.edit([data.chain()], None).chains
+    names = [leaf.name for leaf in leaves(once)]
+    assert names.index("gap_mirror_flip") == names.index("wollaston") - 1
+    own = plate() | turned() | optics.ParityFlip(name="odd") | WOLLASTON
+    (without,) = flip.edit([own], None).chains
+    assert [leaf.name for leaf in leaves(without)] == ["hwp", "k", "wollaston"]
+
+
+@pytest.mark.parametrize("name", ["hwp_sign", "derotator_sign"])
+def test_two_signs_are_none(name):
+    effect = get_effect(name)
+    chain = plate() | turned() | WOLLASTON
+    key = "hwp" if name == "hwp_sign" else "k"
+    (once,) = effect.edit([chain], None).chains
+    assert once[key].stage_sign == -1
+    (twice,) = effect.edit([once], None).chains
+    assert twice[key].mount == chain[key].mount
+    assert chain[key].stage_sign == 1
+
+
+def test_another_zero_takes_the_bounds_along():
+    chain = plate() | turned() | WOLLASTON
+    chain["k"].theta.bounds = (-5, None)
+    (moved,) = get_effect("derotator_offset").edit([chain], None).chains
+    assert moved["k"].theta.value == pytest.approx(45)
+    assert moved["k"].theta.bounds == (40, None)
+
+
+def test_chains_without_the_place_are_left_alone():
+    chains = [plate() | WOLLASTON, plate() | turned() | WOLLASTON]
+    edit = get_effect("derotator_sign").edit(chains, None)
+    assert edit.chains[0] is chains[0]
+    assert edit.chains[1]["k"].stage_sign == -1
+    assert edit.parameters == []

@@ -1,0 +1,253 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Fits of a gap problem: bounds, priors, held coefficients, left-out rows, errors."""
+
+import gap_data as data
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+
+from astropolcal.gap.effects import get_effect
+from astropolcal.gap.problem import Fit, GapProblem, _positions, _triangle, law_basis
+
+EFFICIENCY, RETARDANCE = "wollaston.efficiency", "derotator.retardance"
+DEGREE = np.pi / 180
+
+
+def problem_of(observations=None, chain=None, like=None, **options):
+    observations = data.observed() if observations is None else observations
+    found = GapProblem([chain or data.chain()], [observations], like=like, **options)
+    if like is None:
+        found.settle_noise()
+    return found
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return problem_of()
+
+
+@pytest.fixture(scope="module")
+def fitted(plain):
+    return plain.fit()
+
+
+# ---- the minimum ---------------------------------------------------------------------------
+
+
+def test_the_gradient_vanishes_where_the_fit_ends(plain, fitted):
+    slopes, left = plain.jacobian(fitted.coefficients), plain.residual(fitted.coefficients)
+    inside = (fitted.coefficients < plain.high - 1e-6) & (fitted.coefficients > plain.low + 1e-6)
+    steepest = (slopes.T @ left) / np.linalg.norm(slopes, axis=0)
+    assert fitted.converged
+    # in units of the noise
+    assert np.abs(steepest[inside]).max() < 0.05
+
+
+def test_chi_square_is_that_of_the_residuals(plain, fitted):
+    left = plain.residual(fitted.coefficients)
+    assert fitted.chi2 == pytest.approx(left @ left)
+    # of data that were simulated with this noise
+    assert fitted.chi2 == pytest.approx(plain.n_data - plain.size, rel=0.2)
+
+
+def test_the_same_minimum_is_found_from_elsewhere(plain, fitted):
+    rng = np.random.default_rng(7)
+    start = fitted.coefficients + 0.03 * rng.normal(size=plain.size)
+    again = plain.fit(start)
+    assert again.chi2 == pytest.approx(fitted.chi2, abs=0.05)
+
+
+def test_no_step_is_no_convergence(plain):
+    found = plain.fit(steps=0)
+    assert not found.converged
+    np.testing.assert_array_equal(found.coefficients, np.clip(plain.start, plain.low, plain.high))
+
+
+def test_held_coefficients_stay(plain):
+    held = np.zeros(plain.size, dtype=bool)
+    held[plain.slices[RETARDANCE]] = True
+    start = plain.start + 0.02
+    found = plain.fit(start, held=held)
+    clipped = np.clip(start, plain.low, plain.high)
+    np.testing.assert_array_equal(found.coefficients[held], clipped[held])
+    assert np.all(found.coefficients[~held] != clipped[~held])
+    everything = plain.fit(start, held=np.ones(plain.size, dtype=bool))
+    assert everything.converged
+    np.testing.assert_array_equal(everything.coefficients, clipped)
+
+
+def test_rows_that_are_left_out_have_no_say(plain, fitted):
+    spoiled = data.with_flux(data.observed(), np.where(np.arange(32) < 8, 1.5, 1.0))
+    other = problem_of(spoiled, like=plain)
+    # the noise is that of the clean data, the data are the spoiled ones
+    other.channels = [type(c)(d) for c, d in zip(other.channels, other.datasets, strict=True)]
+    for mine, theirs in zip(other.channels, plain.channels, strict=True):
+        mine.sigma, mine.lamp = theirs.sigma, theirs.lamp
+        mine._whitening, mine.nuisance = theirs._whitening, theirs.nuisance
+    kept = np.broadcast_to(np.arange(32) >= 8, plain.channels[0].shape).ravel()
+    found, expected = other.fit(rows=kept), plain.fit(rows=kept)
+    differences = [p.differences(f.coefficients)[0][0][:, 8:] for p, f in
+                   ((other, found), (plain, expected))]  # fmt: skip
+    # the sums share the lamp with the frames that are left out, the differences nothing
+    noise = plain.channels[0].sigma[0].mean()
+    assert np.abs(differences[0] - differences[1]).max() < 0.6 * noise
+
+
+# ---- bounds, limits and priors -------------------------------------------------------------
+
+
+def test_a_fit_stops_at_its_bound():
+    chain = data.chain()
+    chain["wollaston"].efficiency.bounds = (0, 0.9)
+    found = problem_of(chain=chain)
+    fit = found.fit()
+    values = fit.coefficients[found.slices[EFFICIENCY]]
+    np.testing.assert_allclose(values, 0.9, atol=1e-8)
+    # what is at its bound takes nothing up
+    assert found.tangent(fit.coefficients).shape[1] == found.size - len(data.WAVELENGTH)
+
+
+def test_limits_narrow_the_bounds_about_the_neutral_value():
+    options = {"neutral": {EFFICIENCY: 0.8}, "limits": {EFFICIENCY: 0.05, RETARDANCE: 1.0}}
+    found = problem_of(**options)
+    where = found.slices[EFFICIENCY]
+    np.testing.assert_allclose(found.low[where], 0.75)
+    np.testing.assert_allclose(found.high[where], 0.85)
+    np.testing.assert_allclose(found.high[found.slices[RETARDANCE]], 1.0)
+    # never wider than the chain's own
+    wide = problem_of(limits={EFFICIENCY: 50.0})
+    assert wide.high[wide.slices[EFFICIENCY]].max() <= 1.0
+
+
+def test_a_law_has_no_bounds():
+    found = problem_of(laws={EFFICIENCY: law_basis(data.WAVELENGTH.to_value("um"), 1)})
+    assert np.all(np.isinf(found.high[found.slices[EFFICIENCY]]))
+    assert found.names[found.slices[EFFICIENCY].start] == f"{EFFICIENCY}[0]"
+
+
+@pytest.mark.parametrize("sigma", [1e-5, 1e3])
+def test_a_prior_holds_only_if_it_is_narrower_than_the_data(plain, fitted, sigma):
+    held = problem_of(like=plain, priors={EFFICIENCY: sigma}, neutral={EFFICIENCY: 0.9})
+    found = held.fit()
+    where = plain.slices[EFFICIENCY]
+    expected = 0.9 if sigma < 1 else fitted.coefficients[where]
+    np.testing.assert_allclose(found.coefficients[where], expected, atol=2e-3)
+    # chi-square is of the data alone
+    left = held.residual(found.coefficients)
+    assert found.chi2 == pytest.approx(left @ left)
+
+
+def test_a_prior_as_wide_as_the_data_meets_them_half_way(plain, fitted):
+    where = plain.slices[EFFICIENCY]
+    errors = plain.errors(fitted.coefficients)[where]
+    target = fitted.coefficients[where][3] - 0.01
+    one = problem_of(like=plain, priors={EFFICIENCY: errors[3]}, neutral={EFFICIENCY: target})
+    moved = one.fit().coefficients[where][3]
+    assert moved == pytest.approx(target + 0.005, abs=0.001)
+
+
+# ---- steps ---------------------------------------------------------------------------------
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 6))
+def test_the_triangle_is_the_same_least_squares_problem(seed, k):
+    rng = np.random.default_rng(seed)
+    matrix, target = rng.normal(size=(15, k)), rng.normal(size=15)
+    small, wanted = _triangle(matrix.copy(), target.copy())
+    assert small.shape == (k, k)
+    assert np.all(np.tril(small, -1) == 0)
+    np.testing.assert_allclose(small.T @ small, matrix.T @ matrix, atol=1e-9)
+    np.testing.assert_allclose(small.T @ wanted, matrix.T @ target, atol=1e-9)
+
+
+def test_a_step_within_bounds_is_that_of_bounded_least_squares(plain):
+    rng = np.random.default_rng(3)
+    n = plain.size
+    matrix, target = rng.normal(size=(2 * n, n)), 3 * rng.normal(size=2 * n)
+    narrow = problem_of(like=plain)
+    narrow.low, narrow.high = plain.start - 0.3, plain.start + 0.3
+    live = np.ones(n, dtype=bool)
+    step, promised = narrow._step(plain.start, live, np.ones(n), matrix, target, 0.0)
+    expected = lsq_linear(matrix, target, (-0.3, 0.3), tol=1e-12).x
+    np.testing.assert_allclose(step, expected, atol=1e-4)
+    left = matrix @ step - target
+    assert promised == pytest.approx(target @ target - left @ left)
+
+
+# ---- what follows --------------------------------------------------------------------------
+
+
+def test_errors_are_those_of_the_normal_equations(plain, fitted):
+    slopes = plain.jacobian(fitted.coefficients)
+    scale = np.linalg.norm(slopes, axis=0)
+    inverse = np.linalg.inv((slopes / scale).T @ (slopes / scale))
+    expected = np.sqrt(np.diag(inverse)) / scale
+    np.testing.assert_allclose(plain.errors(fitted.coefficients), expected, rtol=1e-5)
+
+
+def test_an_open_coefficient_is_known_as_well_as_its_prior(plain):
+    chain = data.chain()
+    chain["wollaston"].theta.fixed = False
+    chain["wollaston"].theta.bounds = (-5, 5)
+    found = problem_of(chain=chain, like=plain, priors={"wollaston.theta": 2 * DEGREE})
+    (error,) = found.errors(found.start)[found.slices["wollaston.theta"]]
+    assert error <= 2 * DEGREE * (1 + 1e-9)
+
+
+def test_decomposition_gives_the_table_back(plain):
+    singular, right, scale = plain.decomposed(plain.start)
+    gram = plain.jacobian(plain.start).T @ plain.jacobian(plain.start)
+    found = (right.T * singular**2) @ right * np.outer(scale, scale)
+    np.testing.assert_allclose(found, gram, rtol=1e-8, atol=1e-8 * gram.max())
+    np.testing.assert_allclose(np.sum(singular**2), plain.size, rtol=1e-9)
+
+
+def test_coefficients_and_values_are_inverse_to_each_other():
+    wavelength = data.WAVELENGTH.to_value("um")
+    found = problem_of(laws={RETARDANCE: law_basis(wavelength, 2)})
+    some = np.random.default_rng(2).normal(size=found.size)
+    np.testing.assert_allclose(found.coefficients(found.vector(some)), some, atol=1e-10)
+    values = found.vector(some)
+    slot = found.free.by_name[RETARDANCE]
+    expected = law_basis(wavelength, 2) @ some[found.slices[RETARDANCE]]
+    np.testing.assert_allclose(values[slot.slice], expected)
+
+
+def test_data_count_without_the_lamp(plain):
+    (channel,) = plain.channels
+    assert plain.n_rows == channel.observed.size == 2 * 32 * len(data.WAVELENGTH)
+    assert plain.n_data == plain.n_rows - channel.n_nuisance
+
+
+def test_residuals_of_the_data_are_zero_for_what_they_predict():
+    exact = problem_of(data.observed(noise=False))
+    (gap,) = exact.differences(exact.start)
+    np.testing.assert_allclose(gap[0], 0, atol=1e-9)
+
+
+def test_an_effect_of_the_flux_sees_the_expected_fluxes():
+    model = data.clean_model()
+    problem, _ = model.edited(get_effect("persistence"))
+    flux = model.problem.fluxes[0]
+    chain = problem.measurement.chains[0]
+    previous = _positions(chain, model.observations[0], flux)["previous_flux"]
+    np.testing.assert_allclose(previous[..., 1:], flux[..., 1:] / flux[..., :-1])
+    # the first frame has none before it and refers to itself
+    np.testing.assert_allclose(previous[..., 0], 1.0)
+
+
+def test_a_problem_that_nothing_is_free_in():
+    chain = data.chain()
+    for optic in ("hwp", "derotator", "wollaston", "calibration_polarizer"):
+        for key in chain[optic].param_names:
+            getattr(chain[optic], key).fixed = True
+    found = problem_of(chain=chain)
+    assert found.size == 0
+    assert found.vector(found.start).shape == (0,)
+    fit = found.fit()
+    assert isinstance(fit, Fit)
+    assert fit.converged
+    assert found.tangent(fit.coefficients).shape == (found.n_rows, 0)

@@ -1,0 +1,198 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Patterns over the frames: which there are, and which the angles cannot tell apart."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from astropolcal.gap.patterns import (
+    SAME_ANGLE,
+    _condition,
+    _harmonics,
+    _legendre,
+    _order,
+    _products,
+    badly_separated,
+    frame_blocks,
+    frame_patterns,
+)
+
+PLATE = np.arange(8) * 11.25
+ORDER = "the order of frames within a block at one derotator angle"
+
+
+def run(**degrees):
+    """A dataset with the angles (degree) of its frames."""
+    angles = {name: np.deg2rad(np.asarray(values, float)) for name, values in degrees.items()}
+    n = len(next(iter(angles.values())))
+    positions = angles | {"sequence": np.linspace(0, 1, n) if n > 1 else np.zeros(1)}
+    return SimpleNamespace(
+        n_frames=n, frames=SimpleNamespace(colnames=list(angles)), position=positions.__getitem__
+    )
+
+
+def cycles(derotator, plate=PLATE):
+    return run(hwp=np.tile(plate, len(derotator)), derotator=np.repeat(derotator, len(plate)))
+
+
+def words(observations, axis):
+    return [text for which, text in frame_patterns(observations) if which == axis]
+
+
+# ---- harmonics -----------------------------------------------------------------------------
+
+
+def test_harmonic_is_a_cosine_and_a_sine():
+    found = frame_patterns(cycles([45, 70, 95]))
+    angle = np.deg2rad(np.tile(PLATE, 3))
+    columns = found["hwp", "harmonic 4 of the half-wave-plate angle"]
+    np.testing.assert_allclose(columns, [np.cos(4 * angle), np.sin(4 * angle)], atol=1e-12)
+    constant = found["hwp", "what is constant in the half-wave-plate angle"]
+    np.testing.assert_array_equal(constant, np.ones((1, 24)))
+
+
+def test_a_wave_that_vanishes_at_all_angles_is_left_out():
+    # the sine of four times 0, 45 and 90 deg
+    found = _harmonics(np.deg2rad([0.0, 45.0, 90.0, 22.5]), "hwp", "plate", (8,))
+    ((_, columns),) = found.items()
+    np.testing.assert_allclose(columns, [[1, 1, 1, -1]], atol=1e-12)
+
+
+def test_harmonics_that_the_angles_cannot_tell_have_the_simpler_name():
+    # at steps of 45 deg harmonic 8 is constant, and harmonics 1 and 7 are the same
+    angle = np.deg2rad(np.arange(8) * 45.0)
+    found = _harmonics(angle, "hwp", "plate", (0, 4, 2, 8, 1, 3, 5, 6, 7, 12))
+    assert [text for _, text in found] == [
+        "what is constant in the plate angle",
+        *(f"harmonic {k} of the plate angle" for k in (4, 2, 1, 3)),
+    ]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6))
+def test_no_harmonic_lies_in_the_span_of_an_earlier_one(seed):
+    angle = np.random.default_rng(seed).integers(0, 16, 20) * np.deg2rad(22.5)
+    spans = [c for (_, _), c in _harmonics(angle, "hwp", "plate", (0, 4, 2, 8, 1, 3)).items()]
+    for i, columns in enumerate(spans):
+        for other in spans[:i]:
+            left = columns - columns @ np.linalg.pinv(other) @ other
+            assert np.abs(left).max() > 1e-6
+
+
+# ---- other patterns ------------------------------------------------------------------------
+
+
+def test_trend_is_orthogonal_to_a_constant_and_of_two_degrees():
+    found = frame_patterns(cycles([45, 70]))["time", "a trend through the run"]
+    x = np.linspace(-1, 1, 16)
+    np.testing.assert_allclose(found, [x, (3 * x**2 - 1) / 2], atol=1e-12)
+    np.testing.assert_allclose(_legendre(np.array([0.5])), [[0.5], [-0.125]])
+
+
+def test_products_are_of_plate_and_another_angle():
+    observations = cycles([10, 20, 40, 70])
+    found = frame_patterns(observations)
+    plate, turn = observations.position("hwp"), observations.position("derotator")
+    title = "harmonic 4 of the half-wave-plate angle times harmonic 2 of the derotator angle"
+    expected = [
+        one(4 * plate) * two(2 * turn) for one in (np.cos, np.sin) for two in (np.cos, np.sin)
+    ]
+    np.testing.assert_allclose(found["hwp x derotator", title], expected, atol=1e-12)
+    # the first harmonic of the derotator has no optics behind it
+    assert not [text for _, text in found if "times harmonic 1 " in text]
+
+
+def test_products_need_a_harmonic_of_the_plate():
+    assert _products({("derotator", "harmonic 2 of the derotator angle"): np.ones((1, 3))}) == {}
+
+
+def test_a_plate_that_stands_still_leaves_its_constant():
+    found = frame_patterns(run(hwp=[10.0] * 6, derotator=[1, 2, 3, 4, 5, 60]))
+    assert words(run(hwp=[10.0] * 6), "hwp") == ["what is constant in the half-wave-plate angle"]
+    assert all(np.ptp(c) > 0 for (axis, _), c in found.items() if axis == "derotator")
+
+
+def test_a_pattern_that_grows_through_the_run():
+    observations = cycles([10, 20])
+    title = "harmonic 4 of the half-wave-plate angle with a trend through the run"
+    found = frame_patterns(observations)["time x hwp", title]
+    expected = np.cos(4 * observations.position("hwp")) * np.linspace(-1, 1, 16)
+    np.testing.assert_allclose(found[0], expected, atol=1e-12)
+    assert ("time x hwp", title) not in frame_patterns(run(derotator=[10, 20, 30]))
+
+
+def test_sky_angles_have_their_harmonics():
+    observations = run(altitude=[30, 40, 55, 60], parallactic=[-40, -10, 20, 60])
+    assert words(observations, "altitude") == [
+        "harmonic 2 of the altitude angle",
+        "harmonic 4 of the altitude angle",
+    ]
+    assert len(words(observations, "parallactic")) == 2
+
+
+# ---- order of the frames -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("derotator", "blocks"),
+    [
+        ([45, 45, 60, 60, 60], [0, 0, 1, 1, 1]),
+        # the same angle again is another run
+        ([45, 60, 45], [0, 1, 2]),
+        # less than half a degree is none
+        ([45, 45.4, 45.8, 50], [0, 0, 0, 1]),
+        ([7], [0]),
+    ],
+)
+def test_blocks(derotator, blocks):
+    assert frame_blocks(run(derotator=derotator)).tolist() == blocks
+
+
+def test_frames_without_a_derotator_are_their_own_blocks():
+    assert frame_blocks(run(hwp=[0, 45, 0])).tolist() == [0, 1, 2]
+
+
+def test_order_counts_from_minus_one_to_one_in_each_block():
+    found = _order(run(derotator=[1] * 3 + [20] * 5 + [40]))
+    x = np.array([-1, 0, 1, -1, -0.5, 0, 0.5, 1, 0])
+    single = np.arange(9) == 8
+    np.testing.assert_allclose(found[0], x)
+    np.testing.assert_allclose(found[1], np.where(single, 0, (3 * x**2 - 1) / 2))
+
+
+def test_blocks_of_two_frames_have_no_order():
+    assert _order(run(derotator=[1, 1, 20, 20])) is None
+    assert ("time", ORDER) not in frame_patterns(run(hwp=[0, 45], derotator=[1, 20]))
+
+
+# ---- what is badly separated ---------------------------------------------------------------
+
+
+def test_condition_is_the_ratio_of_singular_values():
+    angle = np.deg2rad([0.0, 22.5, 45.0, 67.5])
+    # a constant and harmonic 4 at these angles are orthogonal: norms 2, sqrt(2), sqrt(2)
+    assert _condition(angle, (0, 4)) == pytest.approx(np.sqrt(2))
+    # five columns and four rows cannot be independent, nor can the same angle twice
+    assert _condition(np.zeros(6), (0, 4)) > 1e11
+
+
+def test_the_dataset_with_the_better_angles_counts():
+    short, full = run(hwp=PLATE), run(hwp=np.arange(32) * 11.25)
+    assert "harmonic 1 of the half-wave-plate angle" in badly_separated([short])
+    assert "harmonic 1 of the half-wave-plate angle" not in badly_separated([short, full])
+
+
+def test_without_a_plate_nothing_is_badly_separated():
+    assert badly_separated([run(derotator=[10, 20, 30])]) == {}
+
+
+@pytest.mark.parametrize(("jitter", "same"), [(0.3, True), (2.0, False)])
+def test_the_same_order_of_the_angles(jitter, same):
+    """Angles half a turn apart are the same; a little jitter does not matter."""
+    plate = np.concatenate([PLATE, PLATE + 180 + jitter * (np.arange(8) == 3)])
+    observations = run(hwp=plate, derotator=np.repeat([10, 40], 8))
+    assert (ORDER in badly_separated([observations])) == same
+    assert np.rad2deg(SAME_ANGLE) == pytest.approx(0.5)
