@@ -6,7 +6,6 @@ A chain is what astropy's ``|`` makes of optics, written in the order the
 light travels. Nothing here depends on which optics they are.
 """
 
-import difflib
 import math
 
 import numpy as np
@@ -15,7 +14,8 @@ from astropy.modeling import CompoundModel
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.mueller._light import act, turned
 from astropolcal.optics import Optic
-from astropolcal.optics.core import FLUXES, finite_position
+from astropolcal.optics.positions import FLUXES, finite_position
+from astropolcal.words import did_you_mean
 
 __all__ = [
     "at_positions",
@@ -153,8 +153,7 @@ def find_optic(chain, name):
         if optic.name == name:
             return optic
     names = [optic.name for optic in found if optic.name]
-    near = difflib.get_close_matches(str(name), names, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(name, names)
     known = ", ".join(names) or "no optic with a name"
     raise ChainError(f"no optic {name!r} in the chain; it has {known}{hint}")
 

@@ -10,15 +10,16 @@ from astropy.table import QTable
 from astropolcal.chain import stages
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
-from astropolcal.optics.core import finite_position
+from astropolcal.optics.positions import finite_position
 from astropolcal.propagation import Propagator
 from astropolcal.units import length_to_um
 
-__all__ = ["half_wave_plate_cycles", "simulate"]
+__all__ = ["entering_flux", "expected_fluxes", "half_wave_plate_cycles", "simulate"]
 
 #: The angles of a calibration run of CHARIS (paper, Sec. 5.1).
 _CYCLE = np.array([0, 45, 11.25, 56.25, 22.5, 67.5, 33.75, 78.75])
 
+# of unit flux: products of a dozen Mueller matrices in doubles stay far below
 _ROUNDING = 1e-12
 
 
@@ -122,24 +123,69 @@ def simulate(
     16
     """
     wavelength = np.atleast_1d(u.Quantity(wavelength))
-    right, left = _expected(chain, wavelength, frames, source)
-    scale = _scale(flux, lamp, len(frames), len(wavelength))
+    # for unit source, (n_wavelengths, n_frames)
+    right, left = expected_fluxes(chain, wavelength, frames, source)
+    scale = entering_flux(flux, lamp, len(frames), len(wavelength))
+    # photons arrive in electrons, whatever a camera counts in
     electrons = np.stack([right.T * scale, left.T * scale]) * _positive("gain", gain)
+    # of the expectation: an error from the drawn flux would be too small where that is low
     variance = electrons + _positive("read_noise", read_noise, zero=True) ** 2
     if noise:
         rng = np.random.default_rng(seed)
+        # one read noise a beam and frame, not a pixel
         drawn = rng.poisson(electrons) + rng.normal(0.0, 1.0, electrons.shape) * read_noise
         electrons = drawn.astype(float)
     table = _table(wavelength, frames, electrons / gain, np.sqrt(variance) / gain)
+    # meta that are given go before it
     table.meta = {"simulated": True, **(meta or {})}
     return Observations.from_table(table, name=name)
 
 
-def _expected(chain, wavelength, frames, source):
-    """Return the noiseless fluxes of both beams for unit source, (n_wavelengths, n_frames)."""
+def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
+    """
+    Return the noiseless fluxes of both beams for a source of unit flux.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        With a beam splitter.
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_wavelengths,).
+    frames : `~astropy.table.QTable`
+        One row a frame: the position of every stage. A column such as ``hwp_true`` goes
+        before ``hwp``.
+    source : sequence of float
+        Stokes vector of the light that enters.
+
+    Returns
+    -------
+    right, left : `~numpy.ndarray`
+        Each of shape (n_wavelengths, n_frames), not negative.
+
+    Raises
+    ------
+    ParameterError
+        If a flux is negative, which no physical chain gives.
+    ChainError
+        If the position of a stage is missing.
+
+    Examples
+    --------
+    A half-wave plate at 0 and 45 deg turns light that is polarized along +Q into -Q:
+
+    >>> import astropy.units as u
+    >>> from astropolcal import optics
+    >>> from astropolcal.simulation import expected_fluxes, half_wave_plate_cycles
+    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp") | optics.WollastonPrism()
+    >>> frames = half_wave_plate_cycles(hwp=[0, 45] * u.deg)
+    >>> right, left = expected_fluxes(chain, [1.6] * u.um, frames, source=(1, 1, 0, 0))
+    >>> (right - left).round(12).tolist()
+    [[1.0, -1.0]]
+    """
     # where the true angle of a stage is known, it is that at which it stands
     known = {stage: f"{stage}_true" for stage in stages(chain)}
     columns = {s: true if true in frames.colnames else s for s, true in known.items()}
+    # a stage without a column is refused by the propagator, which knows whether it is needed
     positions = {
         stage: finite_position(frames[column], column)
         for stage, column in columns.items()
@@ -163,8 +209,35 @@ def _positive(name, value, zero=False):
     return value
 
 
-def _scale(flux, lamp, n_frames, n_wavelengths):
-    """Return the flux that enters, (n_frames, n_wavelengths)."""
+def entering_flux(flux, lamp, n_frames, n_wavelengths):
+    """
+    Return the flux that enters a chain in every frame.
+
+    Parameters
+    ----------
+    flux : float or array_like
+        Scalar or one value a wavelength.
+    lamp : array_like or None
+        Relative brightness in each frame; None if it is constant.
+    n_frames, n_wavelengths : int
+        Numbers of them.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (n_frames, n_wavelengths).
+
+    Raises
+    ------
+    ParameterError
+        If one is not positive, or of another shape.
+
+    Examples
+    --------
+    >>> from astropolcal.simulation import entering_flux
+    >>> entering_flux([10, 20], [1.0, 0.5], 2, 2).tolist()
+    [[10.0, 20.0], [5.0, 10.0]]
+    """
     flux = _positive("flux", flux)
     lamp = _positive("lamp", np.ones(n_frames) if lamp is None else lamp)
     if flux.shape not in ((), (n_wavelengths,)) or lamp.shape != (n_frames,):
@@ -172,6 +245,7 @@ def _scale(flux, lamp, n_frames, n_wavelengths):
             f"flux has shape {flux.shape} and lamp {lamp.shape}; allowed are a scalar or "
             f"({n_wavelengths},), and ({n_frames},)"
         )
+    # (n_frames, 1) times (n_wavelengths,)
     return lamp[:, None] * np.broadcast_to(flux, (n_wavelengths,))
 
 

@@ -11,7 +11,12 @@ from astropolcal import instruments, optics
 from astropolcal.chain import with_beam
 from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
 from astropolcal.propagation import Propagator
-from astropolcal.simulation import half_wave_plate_cycles, simulate
+from astropolcal.simulation import (
+    entering_flux,
+    expected_fluxes,
+    half_wave_plate_cycles,
+    simulate,
+)
 
 CHARIS = instruments.get("charis")
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um
@@ -196,3 +201,63 @@ def test_stage_without_position_is_refused(chain, frames):
 def test_chain_without_beam_splitter_is_refused(frames):
     with pytest.raises(ChainError, match="beam splitter"):
         simulate(optics.LinearPolarizer(), 1.6 * u.um, frames)
+
+
+# ---- parts -------------------------------------------------------------------------------
+
+
+def test_expected_fluxes_of_an_ideal_polarimeter():
+    """R, L = (1 +- q cos 4 hwp) / 2 of half a wave and an ideal splitter, at all wavelengths."""
+    chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp") | optics.WollastonPrism()
+    hwp = np.linspace(0, 90, 9) * u.deg
+    table = half_wave_plate_cycles(hwp=hwp)
+    right, left = expected_fluxes(chain, [1.2, 1.6] * u.um, table, (1.0, 0.3, 0.0, 0.0))
+    modulation = 0.3 * np.cos(4 * hwp)
+    np.testing.assert_allclose(right, np.broadcast_to((1 + modulation) / 2, (2, 9)), atol=1e-12)
+    np.testing.assert_allclose(left, np.broadcast_to((1 - modulation) / 2, (2, 9)), atol=1e-12)
+
+
+def test_expected_fluxes_are_linear_in_the_source(chain, frames):
+    sources = np.array([1.0, 0.0, 0.0, 0.0]) + np.random.default_rng(3).uniform(-0.3, 0.3, (2, 4))
+    summed = (*sources, sources.sum(axis=0))
+    one, two, both = (expected_fluxes(chain, WAVELENGTH, frames, source) for source in summed)
+    for a, b, total in zip(one, two, both, strict=True):
+        np.testing.assert_allclose(a + b, total, rtol=1e-12)
+
+
+def test_true_angle_goes_before_the_commanded_one():
+    chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp") | optics.WollastonPrism()
+    table = half_wave_plate_cycles(hwp=[0.0] * u.deg)
+    table["hwp_true"] = [45.0] * u.deg
+    right, left = expected_fluxes(chain, [1.6] * u.um, table, (1.0, 1.0, 0.0, 0.0))
+    assert (right[0, 0], left[0, 0]) == pytest.approx((0.0, 1.0), abs=1e-12)
+    # rounding below zero is cut off, so that a Poisson draw is possible
+    assert right.min() >= 0.0
+
+
+@pytest.mark.parametrize(
+    ("flux", "lamp", "expected"),
+    [
+        (10.0, None, [[10, 10], [10, 10], [10, 10]]),
+        ([10.0, 20.0], None, [[10, 20], [10, 20], [10, 20]]),
+        (10.0, [1.0, 0.5, 2.0], [[10, 10], [5, 5], [20, 20]]),
+        ([10.0, 20.0], [1.0, 0.5, 2.0], [[10, 20], [5, 10], [20, 40]]),
+    ],
+)
+def test_flux_that_enters_is_lamp_times_flux(flux, lamp, expected):
+    assert entering_flux(flux, lamp, 3, 2).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("flux", "lamp", "words"),
+    [
+        ([1.0, 2.0, 3.0], None, r"flux has shape \(3,\) and lamp \(3,\); allowed are a scalar or"),
+        (1.0, [1.0, 2.0], r"lamp \(2,\)"),
+        (0.0, None, "flux = 0.0 must be finite and positive"),
+        (np.inf, None, "flux = inf must be finite"),
+        (1.0, [1.0, -1.0, 1.0], "lamp = .* must be finite and positive"),
+    ],
+)
+def test_flux_of_another_shape_or_sign_is_refused(flux, lamp, words):
+    with pytest.raises(ParameterError, match=words):
+        entering_flux(flux, lamp, 3, 2)

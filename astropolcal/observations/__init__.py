@@ -8,6 +8,12 @@ degrees of half-wave plate apart, and an `Observable` turns their fluxes into
 the quantity that is fitted, with its derivative and its error.
 """
 
+from astropolcal.observations.differences import (
+    double_difference,
+    double_sum,
+    single_difference,
+    single_sum,
+)
 from astropolcal.observations.example import example_table
 from astropolcal.observations.observables import (
     OBSERVABLES,
@@ -17,11 +23,7 @@ from astropolcal.observations.observables import (
     Observable,
     PerFrameDoubleDifference,
     RatioMethod,
-    double_difference,
-    double_sum,
     get_observable,
-    single_difference,
-    single_sum,
 )
 from astropolcal.observations.pairing import pair_frames
 from astropolcal.observations.pointing import (

@@ -9,6 +9,7 @@ from astropolcal.optics import COORDINATES
 
 __all__ = ["angle_change", "clock", "frame_coordinate"]
 
+# tables of others number the states, and a reader may have turned the numbers into floats
 _STATES = {"A": 0.0, "B": 1.0, "0": 0.0, "1": 1.0, "0.0": 0.0, "1.0": 1.0}
 
 
@@ -75,17 +76,22 @@ def frame_coordinate(observations, name):
         return _modulator_state(observations)
     time = _time_or_order(observations)
     if name == "sequence":
+        # affine in time, so that a drift has the same parameter whatever the unit of the clock
         passed = time - time.min()
         return passed / passed.max() if passed.max() > 0 else passed
     if name.endswith("_rate"):
         return angle_change(observations, observations.position(name.removesuffix("_rate")))
+    # (2, B, F): beam, wavelength, frame, as the optics of a chain want them
     fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
     if name == "flux":
         return np.where(observations.mask.T, 0.0, fluxes)
     if name == "total_flux":
+        # both entries alike: what depends on all of the light acts on both beams alike
         total = np.where(observations.mask.T, 0.0, fluxes.sum(axis=0))
         return np.stack([total, total])
+    # stable: frames of one time stay in the order of the table
     order = np.argsort(time, kind="stable")
+    # what the frame before leaves behind; the first one has none, and 1 changes nothing there
     ratio = np.ones_like(fluxes)
     ratio[..., order[1:]] = fluxes[..., order[1:]] / fluxes[..., order[:-1]]
     return np.where(np.isnan(ratio), 1.0, ratio)
@@ -119,6 +125,7 @@ def angle_change(observations, angle):
     order = np.argsort(_time_or_order(observations), kind="stable")
     out = np.zeros_like(angle)
     if len(angle) > 1:
+        # a turn through 180 deg is a small change; central differences, one-sided at both ends
         out[order] = np.gradient(np.unwrap(angle[order]))
     return out
 
@@ -149,9 +156,11 @@ def clock(frames):
     True
     """
     column = frames["time"] if "time" in frames.colnames else None
+    # a double resolves a microsecond of a modified Julian date
     column = column.mjd if isinstance(column, Time) else column
     if getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
         return None
+    # one unknown time makes the order of all frames doubtful, so none is used then
     known = ~np.asarray(getattr(column, "mask", False))
     plain = getattr(column, "unmasked", column)
     times = np.asarray(getattr(plain, "value", plain), dtype=float)
@@ -164,6 +173,7 @@ def _modulator_state(observations):
         raise ObservationError(
             f"{observations.name}: no column flc_state; it is needed, with A or B in each frame"
         )
+    # strings, bytes and numbers alike become text here
     found = [_STATES.get(str(value).strip().upper()) for value in frames["flc_state"]]
     if None in found:
         i = found.index(None)

@@ -40,9 +40,12 @@ def example_table(
     >>> example_table().colnames[:5]
     ['frame', 'bin', 'wavelength', 'hwp', 'derotator']
     """
+    # "ij": the wavelength runs fastest, then the plate, then the derotator
     stages, plates, bins = np.meshgrid(derotator, hwp, np.arange(len(wavelength)), indexing="ij")
     frame = np.repeat(np.arange(len(hwp) * len(derotator)), len(wavelength))
+    # each half-wave plate turns polarization by twice its angle, and both act in turn
     signal = polarization * np.cos(4 * np.deg2rad(plates - stages)).ravel()
+    # photons, so that the errors of a few percent can be seen in a plot
     intensity = 1000.0
     right, left = intensity * (1 + signal) / 2, intensity * (1 - signal) / 2
     return QTable(

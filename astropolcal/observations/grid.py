@@ -17,6 +17,7 @@ from astropolcal.exceptions import ObservationError
 from astropolcal.observations.masking import mask_missing, mask_rows
 from astropolcal.observations.reading import check_table, first_bad_row, numeric_column
 from astropolcal.observations.variances import BEAM_ERRORS, SINGLE_ERRORS
+from astropolcal.words import counted
 
 __all__ = ["CELL_COLUMNS", "REQUIRED", "Grid", "build_grid"]
 
@@ -31,8 +32,11 @@ CELL_COLUMNS = (
     "mask_reason",
 )
 _ANGLES = ("hwp", "derotator", "parallactic", "altitude")
+# relative; beyond what files round away, far below what is between two bins
 _SAME_WAVELENGTH = 1e-6
+# um; far beyond any polarimeter, so that only wrong units are refused
 _WAVELENGTHS = (1e-6, 1e6)
+# a few wild frame numbers must not ask for an array of gigabytes
 _MAX_EMPTY = 10**6
 # in degree; beyond this the fraction of a turn loses its digits
 _MAX_ANGLE = 1e6
@@ -124,6 +128,7 @@ def build_grid(table, label):
     wavelength = _wavelengths(table, label)
     angles = {name: _angle(table, name, label) for name in _ANGLES if name in table.colnames}
 
+    # first: row in which a frame appears first, for its own columns and for messages
     frame_numbers, first, frame_index = np.unique(frame, return_index=True, return_inverse=True)
     bin_numbers, bin_index = np.unique(bins, return_inverse=True)
     shape = (len(frame_numbers), len(bin_numbers))
@@ -134,6 +139,7 @@ def build_grid(table, label):
 
     flux_unit, values = _measured(table, label)
     code, reasons = mask_rows(table, values, label)
+    # -1: no row has spoken for this cell yet
     reason = np.full(shape, -1)
     reason[frame_index, bin_index] = code
     mask_missing(reason, reasons, frame_numbers, bin_numbers, label)
@@ -145,6 +151,7 @@ def build_grid(table, label):
     arrays = {}
     for name, column in values.items():
         arrays[name] = np.full(shape, np.nan)
+        # NaN also where a number is there but not usable, so that it cannot slip into a sum
         arrays[name][frame_index, bin_index] = np.where(code > 0, np.nan, column)
     return Grid(
         frames=frames,
@@ -162,6 +169,7 @@ def build_grid(table, label):
 
 def _integers(table, name, label):
     values = numeric_column(table, name, label)
+    # beyond 2^53 floats have no ones digit, and two frames could become one
     whole = np.isfinite(values) & (np.abs(values) < 2.0**53) & (values == np.rint(values))
     first_bad_row(~whole, name, values, label, "whole numbers")
     return values.astype(np.int64)
@@ -170,6 +178,7 @@ def _integers(table, name, label):
 def _angle(table, name, label):
     values = numeric_column(table, name, label, u.deg)
     allowed = f"finite angles up to {_MAX_ANGLE:g} deg"
+    # written so that NaN, which compares as false, is bad
     first_bad_row(~(np.abs(values) <= _MAX_ANGLE), name, values, label, allowed)
     if name == "altitude":
         first_bad_row(np.abs(values) > 90, name, values, label, "-90 to 90 deg")
@@ -178,6 +187,7 @@ def _angle(table, name, label):
 
 def _wavelengths(table, label):
     values = numeric_column(table, "wavelength", label, u.um)
+    # in the unit of the limits, whatever that of the table
     shown = np.char.mod("%.9g um", values)
     low, high = _WAVELENGTHS
     allowed = f"lengths above zero ({low:g} to {high:g} um)"
@@ -187,6 +197,7 @@ def _wavelengths(table, label):
 
 def _check_cells(cell, frame, bins, shape, label):
     """Refuse a cell given twice, and a grid that is nearly all holes."""
+    # stable: among equal cells the first row stays the first
     order = np.argsort(cell, kind="stable")
     again = order[1:][cell[order[1:]] == cell[order[:-1]]]
     if again.size:
@@ -198,13 +209,15 @@ def _check_cells(cell, frame, bins, shape, label):
         )
     if shape[0] * shape[1] > max(_MAX_EMPTY, 20 * len(cell)):
         raise ObservationError(
-            f"{label}: {len(cell)} rows for {shape[0]} frames and {shape[1]} bins; "
+            f"{label}: {len(cell)} rows for {counted(shape[0], 'frame')} and "
+            f"{counted(shape[1], 'bin')}; "
             "at least one in 20 of their combinations is needed"
         )
 
 
 def _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label):
     by_bin = np.full(len(bin_numbers), np.inf)
+    # the least of each bin as its reference; plain indexing would keep one at random
     np.minimum.at(by_bin, bin_index, wavelength)
     differs = np.abs(wavelength / by_bin[bin_index] - 1.0) > _SAME_WAVELENGTH
     if differs.any():
@@ -215,6 +228,7 @@ def _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label):
             "one a bin is allowed"
         )
     order = np.argsort(by_bin)
+    # two bins of one wavelength would count every photon twice in a fit
     same = np.diff(by_bin[order]) <= _SAME_WAVELENGTH * by_bin[order[1:]]
     if same.any():
         one, two = sorted(order[np.argmax(same) : np.argmax(same) + 2])
@@ -236,6 +250,7 @@ def _frame_table(table, frame_numbers, first, frame_index, angles, label):
         column = angles.get(name, table[name])
         _check_constant(column, name, first[frame_index], frame_numbers[frame_index], label)
         frames[name] = column[first]
+        # a format of the file would round what is written again
         frames[name].info.format = None
     return frames
 
@@ -245,6 +260,7 @@ def _check_constant(column, name, reference, frame, label):
         equal = _filled(column == column[reference])
         # NaN stands for "unknown" and agrees with itself
         equal |= _filled(column != column) & _filled(column[reference] != column[reference])
+        # a masked value agrees with a masked one only
         mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), equal.shape)
         equal = np.where(mask | mask[reference], mask & mask[reference], equal)
     except (TypeError, ValueError, AttributeError, NotImplementedError):
@@ -276,6 +292,7 @@ def _measured(table, label):
         raise ObservationError(
             f"{label}: column flux_right has unit {flux_unit}, a linear unit such as adu is needed"
         )
+    # the right beam sets the unit; the left one and the errors are converted
     names = ["flux_right", "flux_left", *_error_columns(table, label)]
     values = {name: numeric_column(table, name, label, flux_unit) for name in names}
     for name in names[2:]:

@@ -8,6 +8,7 @@ from astropolcal.exceptions import ObservationError
 from astropolcal.observations.coordinates import clock
 from astropolcal.observations.pairing import pair_frames, pair_states, quadruples
 from astropolcal.units import angle_to_rad
+from astropolcal.words import counted
 
 __all__ = ["FrameGroups"]
 
@@ -86,10 +87,12 @@ class FrameGroups:
 
     def _kept(self, find, tolerance, derotator_tolerance, share):
         angles = (tolerance, derotator_tolerance)
+        # in radian, so that 30 arcmin and 0.5 deg are one entry
         key = (find.__name__, *(float(angle_to_rad(a, "tolerance")) for a in angles), bool(share))
         if key not in self._found:
             limits = dict(zip(("tolerance", "derotator_tolerance"), key[1:3] * u.rad, strict=True))
             found = find(share=key[3], **limits)
+            # everybody gets the same array
             found.flags.writeable = False
             self._found[key] = found
         return self._found[key]
@@ -103,6 +106,7 @@ class FrameGroups:
 
     def _find_pairs(self, **limits):
         frames = self._observations.frames
+        # the plate cancels what stands still: both frames must be in one state
         state = np.asarray(frames["flc_state"]) if "flc_state" in frames.colnames else None
         names = self._names | {"labels": self._labels()}
         return self._some(pair_frames(*self._angles, state, clock(frames), **names, **limits))
@@ -115,6 +119,7 @@ class FrameGroups:
     def _find_quadruples(self, **limits):
         time = clock(self._observations.frames)
         names = self._names | {"labels": self._labels()}
+        # states first: they alternate within an exposure and so share its atmosphere
         states = self._find_states(**limits)
         return self._some(quadruples(states, *self._angles, time, **names, **limits))
 
@@ -122,7 +127,7 @@ class FrameGroups:
         if not len(groups):
             n = self._observations.n_frames
             raise ObservationError(
-                f"{self._names['name']}: none of its {n} frame{'s' * (n != 1)} can be paired; two "
+                f"{self._names['name']}: none of its {counted(n, 'frame')} can be paired; two "
                 "frames 45 deg of half-wave plate apart at the same derotator angle are needed"
             )
         return groups

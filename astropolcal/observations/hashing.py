@@ -40,7 +40,9 @@ def hash_columns(columns, header=""):
     True
     """
     digest = hashlib.sha256(header.encode())
+    # the order of columns in a file says nothing
     for name in sorted(columns):
+        # the name separates columns, or moving a value to the next one would go unnoticed
         unit, text = _canonical(columns[name])
         digest.update(f"\n{name}|{unit}|{text}".encode())
     return digest.hexdigest()
@@ -55,6 +57,7 @@ def _canonical(column):
         try:
             unit = canonical_unit(unit)
             column = column.to_value(unit)
+        # units that are neither angles nor lengths, such as adu, stay as they are
         except ParameterError:
             column = column.value
     if not isinstance(column, np.ndarray):
@@ -63,6 +66,12 @@ def _canonical(column):
     values = np.ma.getdata(getattr(column, "unmasked", column))
     if values.dtype.kind in "iuf":
         # adding zero turns -0 into 0
+        # 12 digits: what conversions between units leave of a double
         values = np.char.mod("%.11e", np.asarray(values, dtype=float) + 0.0)
+    elif values.dtype.kind in "US":
+        # a file of text has no blanks about a word, and a word that is empty is masked in it
+        values = np.char.strip(values.astype(str))
+        mask = mask | (values == "")
+    # what lies below a mask is not content
     values = np.where(mask, "masked", np.asarray(values).astype(str))
     return unit, "\x1f".join(values.ravel().tolist())

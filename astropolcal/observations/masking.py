@@ -11,6 +11,7 @@ import warnings
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.words import counted
 
 __all__ = ["mask_missing", "mask_rows"]
 
@@ -59,8 +60,10 @@ def mask_rows(table, values, label):
     >>> code.tolist(), reasons
     ([0, 1], ['saturated'])
     """
+    # what the file declares was warned of when it was made
     code, reasons = _declared_reasons(table, label)
     for names, bad, reason in _complaints(values):
+        # the first reason stays
         bad &= code == 0
         if bad.any():
             code[bad] = _number(reason, reasons)
@@ -77,6 +80,7 @@ def _complaints(values):
     for kind, pair in (("flux", names[:2]), ("error", names[2:])):
         if pair:
             both = np.array([values[name] for name in pair])
+            # NaN compares as false and is lost too
             lost = ~(np.abs(both) < _HUGE).all(axis=0)
             yield pair, lost.copy(), f"{kind} not finite"
             yield pair, ~lost & (both < 1.0 / _HUGE).any(axis=0), f"{kind} not positive"
@@ -93,6 +97,7 @@ def _declared_reasons(table, label):
             f"{label}: column mask_reason has type {column.dtype}, strings are needed"
         )
     # an empty string in ECSV may come back as a masked value
+    # code 0 means usable
     text = np.where(getattr(column, "mask", False), "", np.ma.getdata(column).astype(str))
     reasons = [str(reason) for reason in np.unique(text) if reason]
     for number, reason in enumerate(reasons):
@@ -129,6 +134,7 @@ def mask_missing(code, reasons, frame_numbers, bin_numbers, label):
     >>> reasons
     []
     """
+    # a hole in the grid is masked like a bad value: a pair that needs it drops out
     missing = code < 0
     if missing.any():
         code[missing] = _number("missing", reasons)
@@ -145,6 +151,5 @@ def _number(reason, reasons):
 
 
 def _warn(label, count, reason, first):
-    cells = "1 cell" if count == 1 else f"{count} cells"
-    message = f"{label}: {cells} masked, {reason} (first: {first})"
+    message = f"{label}: {counted(count, 'cell')} masked, {reason} (first: {first})"
     warnings.warn(message, AstropolcalWarning, stacklevel=2)

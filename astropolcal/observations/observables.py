@@ -10,12 +10,12 @@ are analytic, because a fit evaluates them at every step. The names X and I
 follow Sec. 2.2 of the CHARIS recalibration paper.
 """
 
-import difflib
 from abc import ABC, abstractmethod
 
 import numpy as np
 
 from astropolcal.exceptions import ObservationError
+from astropolcal.words import did_you_mean
 
 __all__ = [
     "OBSERVABLES",
@@ -25,108 +25,8 @@ __all__ = [
     "Observable",
     "PerFrameDoubleDifference",
     "RatioMethod",
-    "double_difference",
-    "double_sum",
     "get_observable",
-    "single_difference",
-    "single_sum",
 ]
-
-
-def single_difference(right, left):
-    """
-    Return the single difference, X = R - L.
-
-    Parameters
-    ----------
-    right, left : `~numpy.ndarray`
-        Fluxes of the ordinary (right) and extraordinary (left) beam, any shape.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Of the common shape, in the unit of the fluxes.
-
-    Examples
-    --------
-    >>> from astropolcal.observations import single_difference
-    >>> single_difference(3.0, 1.0)
-    2.0
-    """
-    return right - left
-
-
-def single_sum(right, left):
-    """
-    Return the single sum, I = R + L.
-
-    Parameters
-    ----------
-    right, left : `~numpy.ndarray`
-        Fluxes of the ordinary (right) and extraordinary (left) beam, any shape.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Of the common shape, in the unit of the fluxes.
-
-    Examples
-    --------
-    >>> from astropolcal.observations import single_sum
-    >>> single_sum(3.0, 1.0)
-    4.0
-    """
-    return right + left
-
-
-def double_difference(right, left):
-    """
-    Return the double difference, (X+ - X-) / 2.
-
-    Parameters
-    ----------
-    right, left : `~numpy.ndarray`
-        Fluxes of shape (2, ...): the plus frame, then the minus frame.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Of shape (...), in the unit of the fluxes.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.observations import double_difference
-    >>> float(double_difference(np.array([3.0, 1.0]), np.array([1.0, 3.0])))
-    2.0
-    """
-    difference = right - left
-    return 0.5 * (difference[0] - difference[1])
-
-
-def double_sum(right, left):
-    """
-    Return the double sum, (I+ + I-) / 2.
-
-    Parameters
-    ----------
-    right, left : `~numpy.ndarray`
-        Fluxes of shape (2, ...): the plus frame, then the minus frame.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Of shape (...), in the unit of the fluxes.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.observations import double_sum
-    >>> float(double_sum(np.array([3.0, 1.0]), np.array([1.0, 3.0])))
-    4.0
-    """
-    total = right + left
-    return 0.5 * (total[0] + total[1])
 
 
 class Observable(ABC):
@@ -229,6 +129,7 @@ class Observable(ABC):
         0.0025
         """
         d_right, d_left = self.derivative(right, left)
+        # g^T C g for each frame; frames are independent of each other
         terms = d_right**2 * var_right + d_left**2 * var_left + 2.0 * cov * d_right * d_left
         return terms.sum(axis=0)
 
@@ -275,7 +176,9 @@ class Observable(ABC):
         # the flux covariance matrix of a frame times the derivative vector
         to_right = d_right * var_right + d_left * cov
         to_left = d_left * var_left + d_right * cov
+        # (W, P, P)
         total = np.zeros((right.shape[1], len(frames), len(frames)))
+        # datum p uses a frame as its i-th, datum q as its j-th
         for i, j in np.ndindex(len(right), len(right)):
             p, q = np.nonzero(frames[:, i, None] == frames[None, :, j])
             total[:, p, q] += to_right[i][:, p] * d_right[j][:, q]
@@ -319,6 +222,7 @@ class NormalizedDoubleDifference(Observable):
         difference = right - left
         total = right + left
         inverse = 1.0 / (total[0] + total[1])
+        # x / (I+ + I-)
         x_inverse = (difference[0] - difference[1]) * (inverse * inverse)
         d_right = np.stack([inverse - x_inverse, -inverse - x_inverse])
         # exchanging beams and exchanging frames are the same thing here
@@ -357,6 +261,7 @@ class PerFrameDoubleDifference(Observable):
         """Return dx/dR and dx/dL; see `Observable.derivative`."""
         total = right + left
         scale = 1.0 / (total * total)
+        # d x/dR = 2 L / I^2 for one frame; half of it, with the sign of the frame
         scale[1] *= -1.0
         return left * scale, -right * scale
 
@@ -394,6 +299,7 @@ class RatioMethod(Observable):
     def derivative(self, right, left):
         """Return dx/dR and dx/dL; see `Observable.derivative`."""
         x = self.evaluate(right, left)
+        # dx/dln(rho) = (1 - x^2) / 2, and ln(rho) holds each ln(flux) with weight 1/2
         slope = 0.25 * (1.0 - x * x)
         signed = np.stack([slope, -slope])
         return signed / right, -signed / left
@@ -475,6 +381,7 @@ class NormalizedTripleDifference(Observable):
         difference, total = self._parts(right, left)
         inverse = 1.0 / total
         x_inverse = difference * (inverse * inverse)
+        # by the sign that a flux has in the numerator
         up, down = inverse - x_inverse, -inverse - x_inverse
         return np.stack([up, down, down, up]), np.stack([down, up, up, down])
 
@@ -519,11 +426,11 @@ def get_observable(name):
     """
     if isinstance(name, Observable):
         return name
+    # "Double-Difference" and "double difference" are one name
     key = "_".join(str(name).lower().replace("-", " ").replace("_", " ").split())
     if key in OBSERVABLES:
         return OBSERVABLES[key]
-    near = difflib.get_close_matches(key, OBSERVABLES, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(key, OBSERVABLES)
     raise ObservationError(
         f"unknown observable {name!r}; allowed are {', '.join(OBSERVABLES)}{hint}"
     )

@@ -20,7 +20,9 @@ __all__ = ["PAIRINGS", "pair_frames", "pair_states", "quadruples"]
 #: By what frames may be paired: the half-wave plate, or the state of a modulator.
 PAIRINGS = ("hwp", "flc_state")
 
+# a half-wave plate at 45 deg exchanges +Q and -Q, and at 180 deg is the same again
 _QUARTER, _HALF, _TURN = np.deg2rad([45.0, 90.0, 180.0])
+# a message of a thousand numbers helps nobody
 _MAX_NAMED = 10
 # tables up to this length are searched as a whole, longer ones within so many frames first
 _SMALL, _WINDOW = 1000, 64
@@ -161,11 +163,14 @@ def pair_states(
     first, second = np.flatnonzero(state == 0), np.flatnonzero(state == 1)
     alike = np.ones((first.size, second.size), dtype=bool)
     for angle, limit in zip(angles, limits, strict=True):
+        # (frames in state 0, frames in state 1)
         alike &= _apart(angle[first][:, None], angle[second]) <= limit
+    # of no partner at all, not only of none that is free: that is a table with a hole
     lonely = [*first[~alike.any(axis=1)], *second[~alike.any(axis=0)]]
     if lonely:
         _refuse_lonely(min(lonely), state, angles, rows, name)
     i, j = (frames[k] for frames, k in zip((first, second), np.nonzero(alike), strict=True))
+    # the last key counts most: nearest in time, then in the file, then the earliest
     order = np.lexsort((np.minimum(i, j), np.abs(i - j), np.abs(steps[i] - steps[j])))
     chosen, used = _choose(i[order], j[order], len(state), share)
     if not used.all():
@@ -221,6 +226,7 @@ def quadruples(
     >>> quadruples(pairs, [0, 0, 45, 45] * u.deg, [90] * 4 * u.deg).tolist()
     [[0, 1, 2, 3]]
     """
+    # both frames of a pair stand at the same angles, so that one speaks for both
     first = np.asarray(states)[:, 0]
     found = pair_frames(
         hwp[first],
@@ -231,6 +237,7 @@ def quadruples(
         name=name,
         **limits,
     )
+    # (Q, 2, 2): plus and minus, then states; flat it is A+, B+, A-, B-
     return np.asarray(states)[found].reshape(-1, 4)
 
 
@@ -254,6 +261,7 @@ class _Setting:
 
     def __init__(self, hwp, derotator, flc_state, steps, tolerance, derotator_tolerance):
         self.hwp, self.steps, self.tolerance = hwp, steps, tolerance
+        # shifted, so that an angle slightly below 0 counts as 0 and not as 90 deg
         self.phase = np.mod(hwp + tolerance, _HALF)
         self.derotator_tolerance = derotator_tolerance
         self.derotator = None
@@ -280,6 +288,7 @@ class _Setting:
             distance = _apart(self.derotator[first], self.derotator[second])
             close = distance <= self.derotator_tolerance
             first, second = first[close], second[close]
+            # a derotator that drifts pairs neighbours; one that stands still is better
             drift = distance[close] > 0.5 * self.derotator_tolerance
         forward = self.phase[first] < self.phase[second]
         plus, minus = np.where(forward, (first, second), (second, first))
@@ -302,6 +311,7 @@ class _Setting:
 
 def _neighbours(frames, width):
     """Return all pairs of frames that are at most ``width`` places apart."""
+    # a band of the matrix of all pairs, (frames, width)
     ahead = np.arange(1, min(width, frames.size - 1) + 1)
     place = np.arange(frames.size)[:, None] + ahead
     here, there = np.nonzero(place < frames.size)
@@ -331,6 +341,7 @@ def _paired(setting, share):
 
 def _check_partners(hwp, tolerance, rows, name):
     there = np.sort(np.mod(hwp, _HALF))
+    # the neighbours across 0 and 90 deg
     there = np.concatenate([there - _HALF, there, there + _HALF])
     wanted = np.mod(hwp + _QUARTER, _HALF)
     place = np.searchsorted(there, wanted)

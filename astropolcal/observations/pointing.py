@@ -29,7 +29,9 @@ __all__ = ["motion", "pointing", "sky_angles", "sky_positions", "smeared", "trac
 #: and altitude.
 TRACKING = (0.5, 1.0)
 
+# how far the middle of the exposure is from the moment of the angle, in exposures
 _WHEN = {"start": 0.5, "middle": 0.0, "end": -0.5}
+# exact for degree 63: no angle of the sky is that wild within an exposure
 _MOST_NODES = 32
 
 
@@ -37,6 +39,7 @@ _MOST_NODES = 32
 def offline():
     """Use the Earth orientation that astropy brings along; never the network."""
     with (
+        # a calibration must not depend on a server, nor wait for one
         iers.conf.set_temp("auto_download", False),
         iers.conf.set_temp("auto_max_age", None),
         iers.conf.set_temp("iers_degraded_accuracy", "warn"),
@@ -87,7 +90,9 @@ def pointing(coord, time, location):
         seen = coord.transform_to(HADec(obstime=time, location=location))
     hour, dec = seen.ha.rad, seen.dec.rad
     latitude = location.to_geodetic().lat.rad
+    # spherical triangle of pole, zenith and star
     sine = np.sin(latitude) * np.sin(dec) + np.cos(latitude) * np.cos(dec) * np.cos(hour)
+    # not tan, which is infinite at the poles; atan2 knows the quadrant
     across = np.sin(hour) * np.cos(latitude)
     along = np.sin(latitude) * np.cos(dec) - np.cos(latitude) * np.sin(dec) * np.cos(hour)
     angles = np.arcsin(np.clip(sine, -1, 1)), np.arctan2(across, along)
@@ -251,6 +256,7 @@ def motion(observations, angle, duty=None):
     >>> motion(Observations.from_table(example_table()), [0.0, 0.1, 0.2, 0.3], duty=0.5).round(3)
     array([0.05, 0.05, 0.05, 0.05])
     """
+    # the parallactic angle jumps by 360 deg north of the zenith
     steady = np.unwrap(np.asarray(angle, dtype=float))
     if len(steady) < 2:
         return np.zeros_like(steady)
@@ -261,6 +267,7 @@ def motion(observations, angle, duty=None):
     seconds, exposure = _seconds(observations)
     if np.any(np.diff(seconds) <= 0):
         raise ObservationError(f"{observations.name}: the times of the frames do not increase")
+    # second order also where the frames are not evenly spaced
     return np.gradient(steady, seconds) * exposure
 
 
@@ -274,6 +281,7 @@ def _seconds(observations):
         )
     exposure = numeric_column(frames, "exposure_time", observations.name, u.s)
     if times is not None:
+        # differences before the factor, which would cost five digits
         return (times.mjd - times.mjd[0]) * 86400.0, exposure
     return (numbers * (getattr(frames["time"], "unit", None) or u.s)).to_value(u.s), exposure
 
@@ -317,6 +325,7 @@ def smeared(angle, change, nodes=3, when="middle"):
         raise ObservationError(f"when = {when!r}; allowed are {', '.join(_WHEN)}")
     if not 1 <= nodes <= _MOST_NODES:
         raise ObservationError(f"nodes = {nodes}; allowed are 1 to {_MOST_NODES}")
+    # on [-1, 1]; the weights are those that a measurement applies
     points, _ = np.polynomial.legendre.leggauss(nodes)
     share = 0.5 * points[:, None] + _WHEN[when]
     return np.asarray(angle, dtype=float) + share * np.asarray(change, dtype=float)
@@ -369,6 +378,7 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
     follows = tracked(0.0, parallactic, altitude, law)
     offset = hwp
     if "hwp_true" in observations.frames.colnames:
+        # what the plate really did differs from the law by a constant offset in each frame
         offset = observations.position("hwp_true") - follows
     if nodes > 1:
         found = {
@@ -395,6 +405,7 @@ def horizontal(altitude, parallactic):
         angle_to_rad(angle, name)
         for name, angle in (("altitude", altitude), ("parallactic", parallactic))
     )
+    # beyond the zenith by a rounding error is allowed
     bad = ~((altitude > 0) & (altitude <= np.pi / 2 + 1e-9))
     if np.any(bad):
         shown = np.rad2deg(np.ravel(altitude)[np.ravel(bad)][0])

@@ -14,20 +14,25 @@ import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.units import angle_to_rad
+from astropolcal.words import counted
 
 __all__ = [
+    "MAD_TO_SIGMA",
     "brightness",
     "cycle_numbers",
     "is_star",
     "mask_incomplete_cycles",
     "mask_saturated",
     "mask_unstable_lamp",
+    "robust_curve",
 ]
 
 # derotator angles that differ by less belong to one run
 _SAME_ANGLE = np.deg2rad(0.5)
+# angles closer than this are one step, as for pairs
 _PLATE_STEPS = np.deg2rad(0.3)
-_MAD = 1.4826
+#: Median absolute deviation to standard deviation, for normal noise.
+MAD_TO_SIGMA = 1.4826
 _MOST_NAMED = 8
 
 
@@ -85,6 +90,7 @@ def cycle_numbers(observations, start=None):
     """
     frames = observations.frames
     if "cycle" in frames.colnames:
+        # numbers of cycles need not be consecutive
         return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
     plate = _step_of(observations.position("hwp"))
     state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
@@ -92,6 +98,7 @@ def cycle_numbers(observations, start=None):
     first = None if start is None else _step_of(angle_to_rad(start, "start"))
     cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
     for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
+        # with its first angle, unless nothing but that angle was seen: both states share it
         begins = key[0] == first and any(angle != first for angle, _ in seen)
         if i and (moved[i] or begins or key in seen):
             number, seen = number + 1, set()
@@ -143,6 +150,7 @@ def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
     wanted = np.mod(np.atleast_1d(angle_to_rad(angles, "angles")), np.pi)
     plate, cycle = observations.position("hwp"), cycle_numbers(observations, wanted[0] * u.rad)
     lost = observations.mask.all(axis=1)
+    # (frames, wanted angles)
     apart = np.abs(np.mod(plate[:, None] - wanted + np.pi / 2, np.pi) - np.pi / 2)
     there = (apart < _PLATE_STEPS) & ~lost[:, None]
     complete = np.array([there[cycle == c].any(axis=0).all() for c in range(cycle.max() + 1)])
@@ -225,6 +233,7 @@ def brightness(observations):
     total = np.where(observations.mask, np.nan, observations.flux_right + observations.flux_left)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # frames and bins without any cell
+        # each bin by its own median, so that faint wavelengths count as bright ones do
         relative = total / np.nanmedian(total, axis=0)
         return np.nanmedian(relative, axis=1)
 
@@ -282,25 +291,58 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
     """
     if not (limit > 0 and sigma > 0):
         raise ObservationError(f"limit = {limit}, sigma = {sigma}; both must be above zero")
+    # a lamp changes by factors
     logarithm = np.log(brightness(observations))
     off = np.abs(logarithm - _drift(logarithm))
-    spread = _MAD * np.nanmedian(off)
+    spread = MAD_TO_SIGMA * np.nanmedian(off)
+    # NaN, a frame masked already, is not far
     far = np.nan_to_num(off) > max(limit, sigma * spread)
     moved = np.abs(np.diff(observations.position("derotator"))) > _SAME_ANGLE
+    # number of the derotator angle in the order of the frames
     run = np.concatenate([[0], np.cumsum(moved)])
     far |= (np.bincount(run, far) >= 0.5 * np.bincount(run))[run]
     return _masked(observations, far, "unstable lamp")
 
 
 def _drift(values):
-    """Return the parabola of least absolute deviations, by iterated weights."""
+    """Return the parabola of least absolute deviations through values in the order of time."""
+    degree = min(2, max(int(np.isfinite(values).sum()) - 4, 0))
+    return robust_curve(np.linspace(-1, 1, len(values)), values, degree)
+
+
+def robust_curve(x, values, degree):
+    """
+    Return a polynomial by least absolute deviations, which a bad run of values does not bend.
+
+    Parameters
+    ----------
+    x : `~numpy.ndarray`
+        Where the values are, from -1 to 1.
+    values : `~numpy.ndarray`
+        NaN where there is none.
+    degree : int
+        Degree of the polynomial.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        The polynomial at all x.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.observations.quality import robust_curve
+    >>> x = np.linspace(-1, 1, 9)
+    >>> bad = np.where(np.arange(9) == 4, 50.0, 2 + x)
+    >>> robust_curve(x, bad, 1).round(3).tolist()
+    [1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0]
+    """
     known = np.isfinite(values)
-    degree = min(2, max(int(known.sum()) - 4, 0))
-    curve = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(values)), degree)
-    weight = np.ones(int(known.sum()))
+    curve = np.polynomial.legendre.legvander(x, degree)
     # the median is where the least deviations of a constant are
     solution = np.zeros(degree + 1)
     solution[0] = np.nanmedian(values)
+    # iterated weights: squares over the last deviation are absolute values where they converge
     for _ in range(50):
         off = np.abs(values - curve @ solution)[known]
         weight = 1 / np.sqrt(np.maximum(off, 1e-3 * max(np.median(off), 1e-12)))
@@ -318,7 +360,8 @@ def _masked(observations, frames, reason):
     numbers = np.asarray(observations.frames["frame"])[new].tolist()
     more = f" and {len(numbers) - _MOST_NAMED} more" if len(numbers) > _MOST_NAMED else ""
     warnings.warn(
-        f"{observations.name}: {len(numbers)} of {observations.n_frames} frames masked, {reason}: "
+        f"{observations.name}: {len(numbers)} of {counted(observations.n_frames, 'frame')} masked, "
+        f"{reason}: "
         f"frame {', '.join(map(str, numbers[:_MOST_NAMED]))}{more}",
         AstropolcalWarning,
         stacklevel=3,

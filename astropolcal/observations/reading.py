@@ -54,7 +54,9 @@ def read_ecsv(path):
     ...
     astropolcal.exceptions.ObservationError: nowhere.ecsv: no such file
     """
+    # read once: what is checked is what is loaded, even if the file changes meanwhile
     text = _read_text(path)
+    # astropy would guess another format, and make one column of it
     if not text.startswith("# %ECSV"):
         raise ObservationError(
             f"{path}: not an ECSV table; its first line must start with '# %ECSV'"
@@ -89,6 +91,7 @@ def _check_header(path, text):
             raise ObservationError(
                 f"{path}: the header is longer than the {_MAX_HEADER} characters allowed"
             )
+        # astropy splits at more characters than newline: there could be text we did not check
         if len(line.splitlines()) > 1:
             raise ObservationError(f"{path}: a line of the header has an end within it")
         lines += [line[1:]] if line[1:] else []
@@ -135,7 +138,7 @@ def check_table(table, label, required):
     missing = [name for name in required if name not in table.colnames]
     if missing:
         raise ObservationError(
-            f"{label}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
+            f"{label}: missing column{'s' if len(missing) > 1 else ''} {', '.join(missing)}; "
             f"it has {', '.join(table.colnames) or 'none'}"
         )
     if len(table) == 0:
@@ -147,6 +150,7 @@ def check_table(table, label, required):
 
 def _check_plain(column, name, label):
     dtype = getattr(column, "dtype", None)
+    # objects and structures hold anything: there is no value that could be checked
     if dtype is not None and dtype.kind in "OV":
         raise ObservationError(
             f"{label}: column {name} has type {dtype}; allowed are numbers, strings and times"
@@ -266,9 +270,11 @@ def numeric_column(table, name, label, unit=None):
     if dtype is None or dtype.kind not in "iuf":
         kind = type(column).__name__ if dtype is None else dtype
         raise ObservationError(f"{label}: column {name} has type {kind}, numbers are needed")
+    # MaskedColumn, Masked quantities and plain columns in one way
     mask = np.asarray(getattr(column, "mask", False))
     plain = getattr(column, "unmasked", column)
     data = plain.value if isinstance(plain, u.Quantity) else np.ma.getdata(plain)
+    # a copy, which the caller may change
     values = np.array(data, dtype=float)
     if unit is not None:
         values = _convert(values, getattr(plain, "unit", None), unit, name, label)

@@ -3,7 +3,6 @@
 `Observations`, the table of beam fluxes from which everything is calibrated.
 """
 
-import dataclasses
 from pathlib import Path
 
 import astropy.units as u
@@ -11,15 +10,17 @@ import numpy as np
 from astropy.table import Table
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, check_new
 from astropolcal.observations.coordinates import frame_coordinate
 from astropolcal.observations.grid import build_grid
 from astropolcal.observations.groups import FrameGroups
 from astropolcal.observations.hashing import hash_columns
 from astropolcal.observations.pairing import PAIRINGS
 from astropolcal.observations.reading import complete_table, numeric_column, read_ecsv
+from astropolcal.observations.selection import masked_grid, some_bins, some_frames
 from astropolcal.observations.variances import beam_variances
 from astropolcal.optics import COORDINATES
+from astropolcal.words import counted
 
 __all__ = ["Observations"]
 
@@ -76,8 +77,10 @@ class Observations:
         self.meta = dict(meta)
         self.name = str(name)
         self.path = None if path is None else Path(path)
+        # from the grid and not from the file: a mask set later holds for them as well
         self._variances = beam_variances(grid.flux_right, grid.flux_left, grid.errors)
         self._groups = FrameGroups(self, grid.rows.tolist(), self._label)
+        # found when it is first asked for, and kept
         self._hash = None
         self._mask = grid.reason > 0
         self._freeze()
@@ -85,6 +88,7 @@ class Observations:
     def _freeze(self):
         grid = self._grid
         arrays = (grid.bin, grid.rows, grid.reason, self._mask)
+        # groups and hash are kept, so that what they were made of must not change
         for array in (*arrays, *self._variances, *self._measured().values()):
             array.flags.writeable = False
 
@@ -271,8 +275,8 @@ class Observations:
         return f"<Observations {self.name!r}: {self._headline()}>"
 
     def _headline(self):
-        counts = [f"{_count(self.n_frames, 'frame')} x {_count(self.n_bins, 'bin')}"]
-        counts.append(f"{_count(int(self.mask.sum()), 'cell')} masked")
+        counts = [f"{counted(self.n_frames, 'frame')} x {counted(self.n_bins, 'bin')}"]
+        counts.append(f"{counted(int(self.mask.sum()), 'cell')} masked")
         return ", ".join([text for text in (self.instrument, self.source) if text] + counts)
 
     def summary(self):
@@ -300,7 +304,7 @@ class Observations:
             if column in self._grid.frames.colnames:
                 lines.append(f"{column}: {_span(np.rad2deg(self.position(column)))} deg")
         lines.append(f"errors: {' and '.join(self._grid.errors) or 'none'}")
-        lines += [f"masked, {why}: {_count(n, 'cell')}" for why, n in self.mask_reasons.items()]
+        lines += [f"masked, {why}: {counted(n, 'cell')}" for why, n in self.mask_reasons.items()]
         return "\n".join(lines)
 
     def position(self, column):
@@ -508,34 +512,7 @@ class Observations:
         >>> obs.with_mask(obs.flux_right < 400, "faint").mask_reasons
         {'faint': 3}
         """
-        mask = np.asarray(mask)
-        shapes = (self.mask.shape, self.mask.shape[:1])
-        if mask.dtype != bool or mask.shape not in shapes:
-            raise ObservationError(
-                f"{self._label}: mask of type {mask.dtype} and shape {mask.shape}; allowed are "
-                f"booleans of shape {shapes[0]} or {shapes[1]}"
-            )
-        if not isinstance(reason, str) or not reason.strip():
-            raise ObservationError(f"{self._label}: reason = {reason!r}, some words are needed")
-        new = (mask if mask.ndim == 2 else mask[:, None]) & ~self.mask
-        if (new | self.mask).all():
-            raise ObservationError(
-                f"{self._label}: masking {reason!r} would leave no usable cell of {new.size}"
-            )
-        return self._masked(new, reason.strip())
-
-    def _masked(self, new, reason):
-        grid = self._grid
-        reasons = grid.reasons if reason in grid.reasons else (*grid.reasons, reason)
-        changed = dataclasses.replace(
-            grid,
-            flux_right=np.where(new, np.nan, grid.flux_right),
-            flux_left=np.where(new, np.nan, grid.flux_left),
-            errors={name: np.where(new, np.nan, err) for name, err in grid.errors.items()},
-            reason=np.where(new, reasons.index(reason) + 1, grid.reason),
-            reasons=reasons,
-        )
-        return Observations(changed, self.meta, self.name, self.path)
+        return self._with(masked_grid(self._grid, mask, reason, self._label))
 
     def select(self, frames):
         """
@@ -562,22 +539,7 @@ class Observations:
         >>> obs.select(obs.pairs()[0]).frames["hwp"].value.tolist()
         [0.0, 45.0]
         """
-        index = self._frame_index(np.asarray(frames))
-        grid = self._grid
-        if grid.reason[index].all():
-            raise ObservationError(
-                f"{self._label}: the {_count(len(index), 'frame')} selected have no usable cell"
-            )
-        chosen = dataclasses.replace(
-            grid,
-            frames=grid.frames[index],
-            rows=grid.rows[index],
-            flux_right=grid.flux_right[index],
-            flux_left=grid.flux_left[index],
-            errors={name: error[index] for name, error in grid.errors.items()},
-            reason=grid.reason[index],
-        )
-        return Observations(chosen, self.meta, self.name, self.path)
+        return self._with(some_frames(self._grid, frames, self._label))
 
     def select_bins(self, bins):
         """
@@ -605,45 +567,11 @@ class Observations:
         >>> obs.select_bins(obs.wavelength < 1.5 * u.um).n_bins
         1
         """
-        chosen, grid = np.asarray(bins), self._grid
-        if chosen.dtype != bool or chosen.shape != (self.n_bins,):
-            raise ObservationError(
-                f"{self._label}: bins of type {chosen.dtype} and shape {chosen.shape}; allowed "
-                f"are {self.n_bins} booleans"
-            )
-        if grid.reason[:, chosen].all():
-            raise ObservationError(f"{self._label}: the bins selected have no usable cell")
-        fewer = dataclasses.replace(
-            grid,
-            bin=grid.bin[chosen],
-            wavelength=grid.wavelength[chosen],
-            flux_right=grid.flux_right[:, chosen],
-            flux_left=grid.flux_left[:, chosen],
-            errors={name: error[:, chosen] for name, error in grid.errors.items()},
-            reason=grid.reason[:, chosen],
-        )
-        return Observations(fewer, self.meta, self.name, self.path)
+        return self._with(some_bins(self._grid, bins, self._label))
 
-    def _frame_index(self, frames):
-        if frames.dtype == bool and frames.shape == (self.n_frames,):
-            return np.flatnonzero(frames)
-        if frames.dtype.kind not in "iu" or frames.ndim != 1:
-            raise ObservationError(
-                f"{self._label}: frames of type {frames.dtype} and shape {frames.shape}; allowed "
-                f"are {self.n_frames} booleans or a list of indices"
-            )
-        outside = frames[(frames < -self.n_frames) | (frames >= self.n_frames)]
-        if outside.size:
-            raise ObservationError(
-                f"{self._label}: frame index {outside[0]}, allowed are 0 to {self.n_frames - 1}"
-            )
-        index, counts = np.unique(frames % self.n_frames, return_counts=True)
-        if (counts > 1).any():
-            raise ObservationError(
-                f"{self._label}: frame index {index[counts > 1][0]} is given twice, "
-                "each frame is allowed once"
-            )
-        return index
+    def _with(self, grid):
+        """Return observations of another grid, with the same meta, name and file."""
+        return Observations(grid, self.meta, self.name, self.path)
 
     def to_table(self):
         """
@@ -662,6 +590,7 @@ class Observations:
         12
         """
         grid = self._grid
+        # wavelengths run fastest, (F * W,) rows
         table = grid.frames[np.repeat(np.arange(self.n_frames), self.n_bins)]
         table["bin"] = np.tile(grid.bin, self.n_frames)
         table["wavelength"] = np.tile(grid.wavelength, self.n_frames)
@@ -702,9 +631,7 @@ class Observations:
         >>> again.content_hash == obs.content_hash
         True
         """
-        path = Path(path)
-        if path.exists() and not overwrite:
-            raise ObservationError(f"{path}: exists already; overwrite=True replaces it")
+        path = check_new(path, overwrite, ObservationError)
         try:
             with atomic_path(path, ObservationError) as temporary:
                 # a plain Table gives a header that people can read, unlike a QTable
@@ -715,10 +642,6 @@ class Observations:
             raise ObservationError(
                 f"{path}: cannot be written: {' '.join(str(error).split())}"
             ) from error
-
-
-def _count(number, noun):
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _span(angles):

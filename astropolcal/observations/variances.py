@@ -51,7 +51,9 @@ def beam_variances(flux_right, flux_left, errors):
         right, left = (errors[name] ** 2 for name in BEAM_ERRORS)
         return right, left, np.where(np.isnan(right), np.nan, 0.0)
     difference, total = (errors[name] ** 2 for name in SINGLE_ERRORS)
+    # both at once: var(S) - var(D) = 4 cov
     covariance = 0.25 * (total - difference)
+    # var(R) + var(L)
     both = 0.5 * (total + difference)
     # var(R) var(L) >= cov^2 bounds the share of the right beam around one half
     reach = np.sqrt(np.maximum(0.25 - (covariance / both) ** 2, 0.0))

@@ -43,6 +43,7 @@ def common_wavelengths(observations, wavelength=None):
     """
     if wavelength is not None:
         return np.atleast_1d(u.Quantity(wavelength).to_value(u.um))
+    # compared with the next lower one, so that a chain of near values keeps its first
     merged = np.sort(np.concatenate([obs.wavelength.to_value(u.um) for obs in observations]))
     return merged[np.diff(merged, prepend=-np.inf) > SAME_WAVELENGTH * merged]
 
@@ -75,6 +76,7 @@ def filter_wavelength(instrument, name):
     """
     own = _filters().get(_plain(str(instrument).split("/")[-1]), {})
     known = {_plain(label): wavelength for label, wavelength in own.items()}
+    # headers write 625-50, people 625 50
     if _plain(name) not in known:
         allowed = ", ".join(own) or "none; give the wavelength"
         raise ObservationError(
@@ -139,5 +141,6 @@ def _filters():
     """Return instrument to name of filter to wavelength."""
     found = {}
     for row in QTable.read(_FILTERS, format="ascii.ecsv"):
+        # by the instrument first: a name such as H means another wavelength elsewhere
         found.setdefault(_plain(row["instrument"]), {})[str(row["filter"])] = row["wavelength"]
     return found

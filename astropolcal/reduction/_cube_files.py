@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, check_new
 from astropolcal.instruments._keywords import TEXTS, unit_of
 
 
@@ -20,25 +20,33 @@ def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):
     if directory.exists() and not directory.is_dir():
         raise ObservationError(f"{directory}: is a file, not a folder")
     prefix = layout.prefix if prefix is None else prefix
+    # eight digits, as the frame numbers of the Subaru archive have
     numbers = [f"{prefix}{first + i:08d}" for i in range(n_frames)]
     if first < 0 or re.search(layout.frame_pattern, f"{numbers[-1]}_cube.fits") is None:
         raise ParameterError(
             f"{numbers[-1]}: the number of the frame must match {layout.frame_pattern}"
         )
+    # the right beam names a frame; that of the left one follows from it
     mark = layout.beam_files[0] if layout.beam_files else "cube"
     names = [
         (directory / f"{n}_{mark}.fits", directory / "raw" / f"{n}.fits" if raw else None)
         for n in numbers
     ]
     every = [(cube, layout.left_file(cube), header) for cube, header in names]
-    present = [path for group in every for path in group if path is not None and path.exists()]
-    if present and not overwrite:
-        raise ObservationError(f"{present[0]}: exists; overwriting it was not asked for")
-    (directory / "raw" if raw else directory).mkdir(exist_ok=True, parents=True)
+    # all names before the first file is written: a run is replaced whole or not at all
+    for path in (path for group in every for path in group if path is not None):
+        if path.exists():
+            check_new(path, overwrite, ObservationError)
+    folder = directory / "raw" if raw else directory
+    try:
+        folder.mkdir(exist_ok=True, parents=True)
+    except OSError as error:
+        raise ObservationError(f"{folder}: cannot be made: {error.strerror}") from error
     return names
 
 
 def write_cube(cube, raw_header, image, weight, header, layout):
+    # as real extraction leaves it: some keywords stay behind in the raw frame
     in_raw = {layout.keywords[c] for c in layout.raw_columns if c in layout.keywords}
     in_cube = {k: v for k, v in header.items() if raw_header is None or k not in in_raw}
     left, camera = layout.left_file(cube), layout.keywords.get("camera")
@@ -48,6 +56,7 @@ def write_cube(cube, raw_header, image, weight, header, layout):
         # the left image is the first half
         parts = [np.split(array, 2, axis=-1) for array in (image, weight)]
         for number, (path, side) in enumerate([(cube, 1), (left, 0)], start=1):
+            # cameras are numbered 1 (right) and 2 (left)
             own = in_cube | ({} if camera is None else {camera: number})
             _save(_hdus(own, *(part[side] for part in parts), layout), path)
     if raw_header is not None:
@@ -62,6 +71,7 @@ def _hdus(header, image, weight, layout):
             weight = np.where(weight > 0, 1 / np.sqrt(weight), 0.0).astype(np.float32)
         second = ("ERR", "adu")
     if layout.cube_extension == 0:
+        # without it the unit would have to be guessed
         header["BUNIT"] = "adu"
         hdus = [fits.PrimaryHDU(image, header=header)]
     else:
@@ -84,6 +94,7 @@ def header_of(frame, layout):
     header = {}
     time = Time(frame["time"])
     date, clock = time.isot.split("T")
+    # a column of the frames goes before these, so that a test may give an odd one
     known = {"date": date, "time": clock, "mjd": time.mjd * u.day}
     if layout.identities:
         known["instrument"] = layout.identities[0]
@@ -101,5 +112,6 @@ def _value(column, value, layout):
     if column in TEXTS and not isinstance(value, u.Quantity):
         return str(value)
     number = u.Quantity(value).to_value(unit_of(column, layout))
+    # value = factor * header + offset, turned round
     factor, offset = layout.transforms.get(column, (1.0, 0.0))
     return float((number - offset) / factor)

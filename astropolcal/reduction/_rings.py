@@ -35,6 +35,7 @@ class Star:
     def of(cls, cube, good, photometry, level_variance, layout):
         """Return the slices that have not failed."""
         usable = np.flatnonzero(~photometry.failed)
+        # one map for all slices; without a stop, by the mean place of each image
         lit, stopped = _lit(photometry, layout, cube.shape[1:], usable)
         return cls(cube, good, photometry, level_variance[:, usable], usable, lit, stopped)
 
@@ -57,6 +58,7 @@ class Star:
     @cached_property
     def width(self):
         """Of the Gaussians, smooth over the slices, (K,)."""
+        # of both beams, which see one atmosphere
         width = self.photometry.fwhm[:, self.usable].mean(axis=0)
         return legval(self.x, legfit(self.x, width, min(2, len(width) - 1)))
 
@@ -86,10 +88,12 @@ def _lit(photometry, layout, shape, usable):
         maps = np.zeros((2, *shape), dtype=bool)
         beams = rectangles(layout.internal_apertures, shape)
         for lit, (rows, columns, weights) in zip(maps, beams, strict=True):
+            # pixels wholly inside; those on the edge are dark in part
             lit[rows, columns] = weights > 0.999
         return maps, True
     rows, columns = np.ogrid[: shape[0], : shape[1]]
     middle = [(photometry.x[b, usable].mean(), photometry.y[b, usable].mean()) for b in range(2)]
+    # without a stop a pixel belongs to the nearer image
     right, left = (np.hypot(columns - x, rows - y) for x, y in middle)
     return np.stack([right < left, left < right]), False
 
@@ -99,6 +103,7 @@ def _unlit(star):
 
     for beam, lit in enumerate(star.lit):
         for k, (place, radius) in enumerate(zip(star.places[beam].T, star.radius, strict=True)):
+            # quick look first: few apertures reach out of the field
             mask = CircularAperture(place, radius).to_mask(method="center")
             if lit[mask.get_overlap_slices(lit.shape)[0]].all():
                 continue
@@ -109,6 +114,7 @@ def _unlit(star):
                 continue
             rows, columns = np.nonzero(dark)
             r = np.hypot(columns + inside[1].start - place[0], rows + inside[0].start - place[1])
+            # (pixels in the dark part,) of the slice
             values, known = (
                 array[star.usable[k]][inside][dark] for array in (star.cube, star.good)
             )
@@ -134,13 +140,16 @@ class Rings:
     @classmethod
     def of(cls, star, outer):
         """Return the rings that are seen in all slices; None if there are too few."""
+        # from the innermost place at which all slices are in their wings
         edges = np.arange(np.floor(np.minimum(_FROM * star.width, star.radius).max()), outer + 1)
         if len(edges) <= _FEWEST_RINGS:
             return None
         found = np.array([_means(star, beam, edges) for beam in range(2)]).transpose(2, 0, 1, 3)
+        # one set of rings for all slices and beams, or the profile could not be common
         full = (found[0] >= _FEWEST_PIXELS).all(axis=(0, 1))
         if full.sum() < _FEWEST_RINGS:
             return None
+        # (quantity, beam, slice, ring)
         counts, values, *moments = found[..., full]
         other = None if star.stopped else _interval(*moments[2:])
         return cls(values, counts, _interval(*moments[:2]), other)
@@ -159,7 +168,9 @@ def _means(star, beam, edges):
         if not star.stopped:
             x, y = star.places[1 - beam, :, k]
             other = np.hypot(x_used - x, y_used - y)
+            # mean and mean square, for the two points that stand for a ring
             moments += [other, other**2]
+        # rings are a pixel wide
         ring = (own - edges[0]).astype(int)
         number = np.bincount(ring, minlength=len(edges) - 1)
         sums = [np.bincount(ring, m, len(edges) - 1) for m in moments]
@@ -168,5 +179,6 @@ def _means(star, beam, edges):
 
 
 def _interval(mean, square):
+    # rounding may leave a variance below zero
     spread = np.sqrt(np.maximum(square - mean**2, 0.0))
     return np.stack([mean - spread, mean + spread])

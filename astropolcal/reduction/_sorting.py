@@ -21,6 +21,7 @@ def set_aside(frames, reduction):
         if not frame.usable:
             reduction.problems[frame.path] = frame.errors
             continue
+        # a copy under another name has the same fluxes to the last bit
         keys = [f"data {frame.digest}"]
         keys += [f"number {frame.number}"] if frame.number is not None else []
         first = next((seen[key] for key in keys if key in seen), None)
@@ -31,6 +32,7 @@ def set_aside(frames, reduction):
             continue
         seen.update(dict.fromkeys(keys, frame))
         kept.append(frame)
+    # before the rest: fluxes in other units cannot be compared at all
     kept = _of_one_kind(kept, "unit", lambda frame: frame.unit, reduction)
     for name in _KINDS[reduction.source]:
         kept = _of_one_kind(kept, name, lambda frame, name=name: frame.values.get(name), reduction)
@@ -43,10 +45,12 @@ def _of_one_kind(frames, what, value, reduction):
     counts = Counter(kind for kind in kinds if kind is not None)
     if len(counts) < 2:
         return frames
+    # whose frames are fewer is the intruder, even if it came first
     usual = counts.most_common(1)[0][0]
     words = value(frames[kinds.index(usual)])
     kept = []
     for frame, kind in zip(frames, kinds, strict=True):
+        # a header that says nothing contradicts nothing
         if kind in (usual, None):
             kept.append(frame)
             continue
@@ -58,6 +62,7 @@ def _of_one_kind(frames, what, value, reduction):
 
 def _plain(text):
     """Return a name without what is written now so, now so: case, blanks, signs."""
+    # but BD+12 and BD-12 are two stars
     return re.sub(r"[^\w+-]|_", "", text).casefold()
 
 
@@ -79,6 +84,7 @@ def replace_angles(frames, sequence):
         )
     for i, frame in enumerate(frames):
         stated, frame.values["hwp"] = frame.values["hwp"], sequence[i % len(sequence)]
+        # degree; what a header rounds
         if abs(stated - frame.values["hwp"]) > 1e-3:
             frame.doubts.append(
                 f"half-wave plate at {stated:g} deg in the header, replaced by "
@@ -113,4 +119,5 @@ def without_repeats(frames, reduction):
 
 def _repeats(frame, other):
     hwp, derotator = (frame.values[k] - other.values[k] for k in ("hwp", "derotator"))
+    # a half-wave plate at 90 deg has the Mueller matrix of one at 0
     return abs(abs(hwp) - 90.0) < 0.3 and abs(derotator) < 0.5

@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from astropolcal.exceptions import InstrumentError, ParameterError
+from astropolcal.observations.quality import MAD_TO_SIGMA
 from astropolcal.reduction.errors import flux_variance, shared_background
 from astropolcal.reduction.photometry import BEAMS, Photometry
 
@@ -61,6 +62,7 @@ def rectangles(apertures, shape):
     left, right, width, height, angle = apertures
     found = []
     for x, y in (right, left):
+        # exact: weights are the parts of pixels inside, and their sum is the area
         mask = RectangularAperture((x, y), width, height, theta=angle).to_mask(method="exact")
         box = mask.bbox
         inside = box.iymin >= 0 and box.ixmin >= 0 and box.iymax <= shape[0]
@@ -77,10 +79,12 @@ def rectangles(apertures, shape):
 def _outside(apertures, shape):
     """Return the pixels that are clear of both rectangles."""
     left, right, width, height, angle = apertures
+    # the wings of the beams reach farther than the rectangles
     grown = (left, right, width + 2 * _CLEAR, height + 2 * _CLEAR, angle)
     y, x = np.indices(shape)
     clear = np.ones(shape, dtype=bool)
     for cx, cy in grown[:2]:
+        # into the axes of the rectangle
         along = (x - cx) * np.cos(angle) + (y - cy) * np.sin(angle)
         across = (y - cy) * np.cos(angle) - (x - cx) * np.sin(angle)
         clear &= (np.abs(along) > grown[2] / 2) | (np.abs(across) > grown[3] / 2)
@@ -199,16 +203,19 @@ def evenly_lit(cube, good, layout):
             known = good[inside]
             values = np.where(known, values, 0.0)
             whole = whole & known.any(axis=0)
-            pixels = values.sum(axis=0)[whole] / known.sum(axis=0)[whole]
+            pixels = values.sum(axis=0, dtype=float)[whole] / known.sum(axis=0)[whole]
         else:
-            pixels = values.mean(axis=0)[whole]
+            # in the precision of the cube a damaged pixel would overflow
+            pixels = values.mean(axis=0, dtype=float)[whole]
         beams.append((pixels.mean(), np.median(pixels)) if pixels.size else (0.0, 0.0))
+    # the brighter one: of light that is all in one polarization the other is dark
     mean, median = max(beams)
     return bool(median >= _EVEN * mean)
 
 
 def _weighted(cut, known, weights):
     """Return the weighted sum of each slice, the area, and the area that has values."""
+    # (W, pixels) @ (pixels,): one product for all slices
     flat, w = cut.reshape(len(cut), -1), weights.ravel()
     area = w.sum()
     if known is None:
@@ -218,6 +225,7 @@ def _weighted(cut, known, weights):
 
 
 def _peak(cut, known, weights):
+    # -inf never is the brightest
     values = cut if known is None else np.where(known, cut, -np.inf)
     return values[:, weights > 0].max(axis=1)
 
@@ -233,6 +241,8 @@ def _level(cube, good, detector, layout):
     pixels[unknown] = np.nan
     number = (~unknown).sum(axis=1)
     pixels[number == 0] = 0.0
+    # a median, which stray light of the beams hardly moves
     level = np.nanmedian(pixels, axis=1)
-    spread = (1.4826 * np.nanmedian(np.abs(pixels - level[:, None]), axis=1)) ** 2
+    # never below the detector's own noise, as a slice of constants would have
+    spread = (MAD_TO_SIGMA * np.nanmedian(np.abs(pixels - level[:, None]), axis=1)) ** 2
     return level, np.maximum(spread, detector.variance(level)), np.maximum(number, 1)

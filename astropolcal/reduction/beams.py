@@ -58,12 +58,16 @@ def match_beams(frame, layout, cube, detector):
     path = layout.left_file(frame.path)
     other = read_header(path, layout)
     frame.errors += [f"{path.name}: {error}" for error in other.errors]
+    # what the plate did while the cameras were exposed must be one thing
     frame.errors += _contradictions(frame.values, other.values, path.name)
     frame.errors += _wrong_cameras(frame, other, layout)
     unit = detector.unit.to_string()
+    # each camera is read out in its own way
     left = detector_of(layout, unit, other.values.get("exposure_time"), other.values)
+    # to the electrons of the right one: single differences compare both beams
     if left.gain != detector.gain:
         width = cube.shape[-1] // 2
+        # the left image is the first half of the columns
         factor = np.where(np.arange(cube.shape[-1]) < width, left.gain / detector.gain, 1.0)
         cube = cube * factor
     return replace(detector, left=left.in_units_of(detector)), cube
@@ -106,6 +110,7 @@ def beam_scale(path, layout, values, unit=None):
         return 1.0
     other = read_header(path, layout).values
     gains = [detector_of(layout, unit, v.get("exposure_time"), v).gain for v in (other, values)]
+    # electrons per adu on the left over those on the right
     return gains[0] / gains[1]
 
 

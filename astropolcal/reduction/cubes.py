@@ -25,10 +25,10 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.observations import Observations, tracked
+from astropolcal.reduction._checks import choice, number, per_wavelength, pixels
 from astropolcal.reduction._cube_files import file_names, header_of, write_cube
 from astropolcal.reduction._images import Detector, Scene
-from astropolcal.simulation import _expected, _scale, simulate
-from astropolcal.units import angle_to_rad
+from astropolcal.simulation import entering_flux, expected_fluxes, simulate
 
 __all__ = ["both_states", "simulate_cubes", "true_observations"]
 
@@ -191,10 +191,11 @@ def simulate_cubes(
     (22, 201, 201)
     """
     instrument, wavelength, more = _of_mode(instrument, wavelength)
+    # what is given goes before what the mode says
     more |= headers or {}
     layout = _layout(instrument)
-    _choice("source", source, _SOURCES)
-    _choice("psf", psf, _PROFILES)
+    choice("source", source, _SOURCES)
+    choice("psf", psf, _PROFILES)
     frames = _with_headers(frames, layout, source, exposure_time, start)
     n_wavelengths, n_frames = _count(layout, wavelength), len(frames)
     beams = _beam_fluxes(chain, wavelength, frames, source, flux=flux, lamp=lamp, stokes=stokes)
@@ -202,37 +203,44 @@ def simulate_cubes(
         layout,
         source=source,
         psf=psf,
-        fwhm=_pixels("fwhm", fwhm, layout, n_wavelengths),
-        beta=_number("beta", beta, above=1.0),
-        halo=_number("halo", halo, most=1.0),
-        halo_fwhm=_pixels("halo_fwhm", halo_fwhm, layout, n_wavelengths),
-        margin=_number("margin", margin),
+        fwhm=pixels("fwhm", fwhm, layout, n_wavelengths),
+        beta=number("beta", beta, above=1.0),
+        halo=number("halo", halo, most=1.0),
+        halo_fwhm=pixels("halo_fwhm", halo_fwhm, layout, n_wavelengths),
+        margin=number("margin", margin),
     )
     how = _read_out(frames, layout)
     detector = Detector(
-        gain=_number("gain", how.gain if gain is None else gain, above=0.0),
-        read_noise=_number("read_noise", how.read_noise if read_noise is None else read_noise),
+        gain=number("gain", how.gain if gain is None else gain, above=0.0),
+        read_noise=number("read_noise", how.read_noise if read_noise is None else read_noise),
         excess_noise=how.excess_noise,
-        background=_per_wavelength("background", background, n_wavelengths)[:, None, None],
+        background=per_wavelength("background", background, n_wavelengths)[:, None, None],
         saturation=how.saturation if saturate else np.inf,
         noise=noise,
     )
-    seeds = np.random.SeedSequence(seed).spawn(n_frames + 2)
+    # a generator for each frame, so that a frame is the same however many are simulated
+    *seeds, of_pixels, of_star = map(
+        np.random.default_rng, np.random.SeedSequence(seed).spawn(n_frames + 2)
+    )
     centres, widths = _variations(
-        np.random.default_rng(seeds[-1]),
+        of_star,
         scene.centre if centre is None else centre,
-        float(_pixels("motion", motion, layout, 1, least=0.0)[0]),
-        _number("seeing", seeing),
+        float(pixels("motion", motion, layout, 1, least=0.0)[0]),
+        number("seeing", seeing),
         n_frames,
     )
-    response, bad = _defects(np.random.default_rng(seeds[-2]), layout, flat_error, bad_pixels)
+    # before the first file: a star beside the image would leave dark cubes
+    scene.check_places(centres)
+    response, bad = _defects(of_pixels, layout, flat_error, bad_pixels)
+    # the layout may have nothing to look up in raw headers, and then there are none
     raw = raw and bool(layout.raw_columns or not layout.beam_files)
     names = file_names(Path(directory), layout, prefix, first, n_frames, raw, overwrite)
     brightest = 0.0
     for i in tqdm(range(n_frames), desc="cubes", disable=None if progress else True):
         light = scene.light(beams[:, i], centres[i], widths[i])
         brightest = max(brightest, float((light + detector.background).max()))
-        image, weight = detector.expose(light, response, np.random.default_rng(seeds[i]))
+        image, weight = detector.expose(light, response, seeds[i])
+        # as extraction marks pixels without a value
         image[bad], weight[bad] = np.nan, 0.0
         write_cube(*names[i], image, weight, header_of(frames[i], layout) | more, layout)
     if brightest > how.saturation and not saturate:
@@ -293,12 +301,13 @@ def true_observations(
     >>> true_observations(charis.published(), charis, half_wave_plate_cycles()).n_frames
     8
     """
-    _choice("source", source, _SOURCES)
+    choice("source", source, _SOURCES)
     wavelength = instrument.wavelength if wavelength is None else wavelength
     known = _with_headers(frames, _layout(instrument), source, 1 * u.s, "2025-01-01")
     kept = [c for c in QTable(frames).colnames if not isinstance(known[c], Time)]
     table = known[kept]
     if source == "star":
+        # the light meets the plate where it stands; the table tells where it was sent
         table["hwp"] = known["hwp_true"]
     true = simulate(chain, wavelength, table, source=stokes, noise=noise, **options)
     if source != "star":
@@ -309,11 +318,6 @@ def true_observations(
 
 
 # --- what is checked -------------------------------------------------------------
-
-
-def _choice(name, value, allowed):
-    if value not in allowed:
-        raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
 
 
 def _layout(instrument):
@@ -332,36 +336,6 @@ def _count(layout, wavelength):
             f"wavelength has shape {np.shape(wavelength)}; the cubes have {layout.shape[0]} slices"
         )
     return layout.shape[0]
-
-
-def _number(name, value, *, least=0.0, above=-np.inf, most=np.inf):
-    value = float(value)
-    if not (np.isfinite(value) and least <= value <= most and value > above):
-        bounds = f"above {above:g}" if above > least or above == least else f"{least:g} and above"
-        raise ParameterError(f"{name} = {value:g}; allowed is {bounds}, up to {most:g}")
-    return value
-
-
-def _per_wavelength(name, value, n_wavelengths):
-    value = np.asarray(value, dtype=float)
-    if value.shape not in ((), (n_wavelengths,)) or not np.all(np.isfinite(value) & (value >= 0)):
-        raise ParameterError(
-            f"{name} = {value}; allowed are numbers not negative, of shape () or ({n_wavelengths},)"
-        )
-    return np.broadcast_to(value, (n_wavelengths,))
-
-
-def _pixels(name, value, layout, n_wavelengths, least=0.5):
-    """Return a length on the detector in pixels, one a wavelength."""
-    if isinstance(value, u.Quantity) and value.unit is not u.dimensionless_unscaled:
-        if value.unit.is_equivalent(u.pix):
-            value = value.to_value(u.pix)
-        else:
-            value = np.rad2deg(angle_to_rad(value, name)) * 3.6e6 / layout.pixel_scale
-    value = _per_wavelength(name, value, n_wavelengths)
-    if value.min() < least:
-        raise ParameterError(f"{name} = {value.min():g} pixels; allowed are {least:g} and above")
-    return value
 
 
 # --- what is true ----------------------------------------------------------------
@@ -417,8 +391,9 @@ def _with_headers(frames, layout, source, exposure_time, start):
         frames["hwp_true"] = _tracked(frames, layout) if source == "star" else frames["hwp"]
     if "exposure_time" not in frames.colnames:
         frames["exposure_time"] = u.Quantity(exposure_time) * np.ones(len(frames))
-    _number("exposure_time", frames["exposure_time"].to_value(u.s).min(), above=0.0)
+    number("exposure_time", frames["exposure_time"].to_value(u.s).min(), above=0.0)
     if "time" not in frames.colnames:
+        # start of each frame: one follows the other
         before = np.cumsum(frames["exposure_time"]) - frames["exposure_time"]
         frames["time"] = Time(start) + before
     return frames
@@ -431,6 +406,7 @@ def _tracked(frames, layout):
             f"frames: {' and '.join(sorted(missing))} missing, which a star needs"
         )
     angle = tracked(frames["hwp"], frames["parallactic"], frames["altitude"], layout.tracking)
+    # encoders count within one turn
     return angle % (360 * u.deg)
 
 
@@ -439,8 +415,9 @@ def _beam_fluxes(chain, wavelength, frames, source, *, flux, lamp, stokes):
     table = frames[sorted({"hwp", *stages(chain)} & set(frames.colnames))]
     if source == "star":
         table["hwp"] = frames["hwp_true"]
-    right_left = _expected(chain, wavelength, table, stokes)
-    scale = _scale(flux, lamp, len(frames), len(wavelength))
+    right_left = expected_fluxes(chain, wavelength, table, stokes)
+    scale = entering_flux(flux, lamp, len(frames), len(wavelength))
+    # (beam, frame, wavelength)
     return np.stack([fluxes.T * scale for fluxes in right_left])
 
 
@@ -450,13 +427,15 @@ def _variations(rng, centre, motion, seeing, n_frames):
     if centre.shape != (2,) or not np.all(np.isfinite(centre)):
         raise ParameterError(f"centre = {centre}; two numbers are needed, x and y")
     centres = centre + motion * rng.standard_normal((n_frames, 2))
+    # log-normal: a width cannot become negative
     return centres, np.exp(seeing * rng.standard_normal(n_frames))
 
 
 def _defects(rng, layout, flat_error, bad_pixels):
     """Return the response of the pixels, and which of them have no value."""
-    spread = _number("flat_error", flat_error, most=0.5)
-    share = _number("bad_pixels", bad_pixels, most=0.9)
+    spread = number("flat_error", flat_error, most=0.5)
+    share = number("bad_pixels", bad_pixels, most=0.9)
+    # negative responses do not exist; beyond 2 sigma at the most allowed spread
     response = (1 + spread * rng.standard_normal(layout.shape)).clip(0.0) if spread else 1.0
     return response, rng.random(layout.shape) < share
 

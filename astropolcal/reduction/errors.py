@@ -53,6 +53,7 @@ class Detector:
 
     def variance(self, pixels):
         """Return the variance of pixels: photon noise of what is above zero, and read noise."""
+        # below zero is noise of the read-out, not light
         return self.photon_noise(np.maximum(pixels, 0.0)) + self.read_noise**2
 
     def photon_noise(self, signal):
@@ -65,6 +66,7 @@ class Detector:
 
     def in_units_of(self, other):
         """Return the same detector where its electrons count as another one's do."""
+        # one own unit is so many of the other
         factor = self.gain / other.gain
         return replace(
             self,
@@ -108,6 +110,7 @@ def detector_of(layout, unit=None, exposure_time=None, values=None):
     1.0
     """
     own = _unit(unit)
+    # of a rate the photon noise depends on how long it was collected
     rate = own.is_equivalent(u.adu / u.s) or own.is_equivalent(u.electron / u.s)
     if rate and exposure_time is None:
         raise ObservationError(f"BUNIT = {unit!r} is a rate, and the exposure time is unknown")
@@ -117,6 +120,7 @@ def detector_of(layout, unit=None, exposure_time=None, values=None):
         electrons = float(how.gain * counts.to_value(u.adu))
     else:
         electrons = float(counts.to_value(u.electron))
+    # both in electrons, which no unit of the file changes
     full = how.saturation * how.gain
     noise = how.read_noise / electrons
     return Detector(own, electrons, noise, full / electrons, how.excess_noise)
@@ -125,6 +129,7 @@ def detector_of(layout, unit=None, exposure_time=None, values=None):
 def _unit(text):
     """Return the unit that BUNIT names; counts and DN are adu."""
     words = str(text or "adu").strip()
+    # the longer name first: "count" would leave an s behind
     for name in ("counts", "count", "Counts", "DN", "ADU", "dn"):
         words = words.replace(name, "adu")
     words = words.replace("e-", "electron").replace("electrons", "electron")
@@ -163,6 +168,7 @@ def flux_variance(photons, area, background_variance, n_background=np.inf):
     >>> float(flux_variance(500.0, 100.0, 4.0))
     900.0
     """
+    # the same error of the level in every pixel: it grows as the area
     median = _MEDIAN * np.square(area) / np.asarray(n_background, dtype=float)
     return np.asarray(photons) + (area + median) * np.asarray(background_variance)
 
@@ -215,6 +221,8 @@ def shared_pixels(centre_distance, radius, background_variance):
     >>> float(shared_pixels(71.6, 30.0, 4.0))
     0.0
     """
+    # cosine of half the angle that the overlap spans; beyond 1 there is none
     half = np.clip(np.asarray(centre_distance) / (2.0 * np.asarray(radius)), 0.0, 1.0)
+    # area common to two circles of one radius
     lens = 2.0 * np.square(radius) * (np.arccos(half) - half * np.sqrt(1.0 - half**2))
     return lens * background_variance

@@ -4,13 +4,15 @@
 from dataclasses import dataclass
 
 import numpy as np
-from astropy.stats import mad_std
+from astropy.stats import gaussian_fwhm_to_sigma, mad_std
 from scipy import ndimage
 
 __all__ = ["Pair", "find_pair"]
 
-_SIGMA = 1.0 / np.sqrt(8.0 * np.log(2.0))
+# all pairs of peaks are compared; a star and its ghosts are among the brightest
 _MAX_PEAKS = 25
+# relative error that a sum over a smoothing kernel may have
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -101,18 +103,24 @@ def find_pair(image, good, offset, *, fwhm=4.0, significance=6.0, tolerance=4.0,
 
 def _smoothed(image, good, fwhm):
     """Return the image smoothed over what is known, its level and its noise."""
-    sigma = 0.5 * fwhm * _SIGMA
+    sigma = 0.5 * fwhm * gaussian_fwhm_to_sigma
+    # smoothed as well, so that light over weight is the mean of what is known
     known = good.astype(float)
     weight = ndimage.gaussian_filter(known, sigma, mode="constant")
     light = ndimage.gaussian_filter(np.where(good, image, 0.0), sigma, mode="constant")
+    # below that too little is known around a pixel
     smooth = np.where(weight > 0.3, light / np.maximum(weight, 0.3), np.nan)
     values = smooth[np.isfinite(smooth)]
     if not values.size:
         return smooth, 0.0, 0.0
     level = float(np.median(values))
-    noise = float(mad_std(values))
-    # an image without noise, as simulations have
-    noise = noise if noise > 0 else 1e-6 * float(np.ptp(values))
+    noise, span = float(mad_std(values)), float(np.ptp(values))
+    # smoothing an even image leaves rounding errors, which must not pass for peaks
+    rounding = _ROUNDING * float(np.abs(values).max())
+    if span <= rounding:
+        return smooth, level, 0.0
+    # an image without noise, as simulations have: any peak that can be seen counts
+    noise = noise if noise > rounding else 1e-6 * span
     return np.where(np.isfinite(smooth), smooth, level), level, noise
 
 
@@ -120,6 +128,7 @@ def _peaks(smooth, threshold, fwhm):
     """Return (x, y) and the heights of the peaks, the brightest first."""
     from photutils.detection import find_peaks
 
+    # odd, about a full width: one peak a star
     size = 2 * int(np.ceil(fwhm / 2)) + 1
     if not (smooth > threshold).any():
         return np.empty((0, 2), dtype=int), np.empty(0)
@@ -134,6 +143,7 @@ def _peaks(smooth, threshold, fwhm):
 
 def _matches(peaks, offset, tolerance):
     """Return the indices of all right and left images at the offset from each other."""
+    # (right, left, xy)
     deviation = peaks[:, None, :] - peaks[None, :, :] - np.asarray(offset, dtype=float)
     return np.nonzero(np.hypot(deviation[..., 0], deviation[..., 1]) <= tolerance)
 
@@ -142,6 +152,7 @@ def _width(light, positions):
     """Return the diameter of the area above half maximum, the mean of both images."""
     diameters = []
     for x, y in positions.astype(int):
+        # only the area connected with the peak, not that of the other image
         labels, _ = ndimage.label(light > 0.5 * light[y, x])
         diameters.append(2.0 * np.sqrt((labels == labels[y, x]).sum() / np.pi))
     return float(np.mean(diameters))
@@ -149,6 +160,7 @@ def _width(light, positions):
 
 def _ambiguous(places, strength, best, companion, apart):
     """Return whether another pair is nearly as bright and not part of the same image."""
+    # in the right beam; the left one has the same distances
     distance = np.hypot(*(places - places[best]).T)
     others = (distance > apart) & (strength > companion * strength[best])
     return bool(others.any())

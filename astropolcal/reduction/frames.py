@@ -10,11 +10,18 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.exceptions import ObservationError
+from astropolcal.fitscheck import open_fits, readable_fits
 from astropolcal.reduction.apertures import evenly_lit, measure_internal
 from astropolcal.reduction.beams import match_beams
 from astropolcal.reduction.errors import detector_of
-from astropolcal.reduction.headers import observation_time, pointing, read_header, tracking_error
+from astropolcal.reduction.headers import (
+    not_of_instrument,
+    observation_time,
+    pointing,
+    read_header,
+    tracking_error,
+)
 from astropolcal.reduction.photometry import Photometry
 from astropolcal.reduction.stars import measure_stars
 
@@ -132,11 +139,13 @@ def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
     frame = Frame(str(path))
     try:
         with open_cube(path, layout) as (primary, header, cube, good):
+            # the header that is open already
             known = read_header(path, layout, header=primary, raw=raw)
             frame.number, frame.values = known.number, known.values
             frame.errors, frame.doubts = known.errors, known.doubts
             _check_header(frame, layout, source)
             unit = header.get("BUNIT", primary.get("BUNIT"))
+            # per file: gain and exposure time may change within a night
             detector = detector_of(layout, unit, frame.values.get("exposure_time"), frame.values)
             if layout.beam_files:
                 detector, cube = match_beams(frame, layout, cube, detector)
@@ -198,20 +207,14 @@ def open_cube(path, layout):
     astropolcal.exceptions.ObservationError: nowhere.fits: no such file
     """
     with ExitStack() as stack:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                # astropy only warns of it, and fails later in other words
-                warnings.filterwarnings("error", message=".*truncated.*")
-                hdus = stack.enter_context(fits.open(path, memmap=True))
-                opened = _read(path, hdus, layout)
-        except FileNotFoundError:
-            raise ObservationError(f"{path}: no such file") from None
-        except AstropolcalError:
-            raise
-        except Exception as error:  # damaged files raise errors of every kind
-            words = " ".join(str(error).split())[:160] or type(error).__name__
-            raise ObservationError(f"{path}: not a readable FITS file: {words}") from error
+        with readable_fits(path), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # astropy only warns of it, and fails later in other words
+            warnings.filterwarnings("error", message=".*truncated.*")
+            stream = stack.enter_context(open_fits(path))
+            hdus = stack.enter_context(fits.open(stream, memmap=True))
+            opened = _read(path, hdus, layout)
+        # behind the door: what fails in the caller's block is not the file's fault
         yield opened
 
 
@@ -223,7 +226,11 @@ def _read(path, hdus, layout):
     if not left.is_file():
         raise ObservationError(f"{path}: no file {left.name} of the left beam beside it")
     # what is joined is in memory, so that this file need not stay open
-    with fits.open(left, memmap=False) as others:
+    with (
+        readable_fits(left),
+        open_fits(left) as stream,
+        fits.open(stream, memmap=False) as others,
+    ):
         _, _, other, known = _read_beams(left, others, layout)
     joined = np.concatenate([other, cube], axis=-1)
     if good is not None or known is not None:
@@ -249,8 +256,10 @@ def _read_beams(path, hdus, layout):
         raise ObservationError(f"{path}: {shape} in extension {number}, {wanted} is needed")
     if data.dtype.kind not in "fiu":
         raise ObservationError(f"{path}: pixels of type {data.dtype}, numbers are needed")
+    # FITS is big-endian, which slows down all that follows
     native = data.dtype.newbyteorder("=") if data.dtype.kind == "f" else float
     cube = np.asarray(data, dtype=native)
+    # NaN marks what extraction could not reach
     good = np.isfinite(cube)
     weight = hdus[number + 1].data if len(hdus) > number + 1 else None
     if weight is not None and weight.size == cube.size:
@@ -264,11 +273,8 @@ def _read_beams(path, hdus, layout):
 def _check_header(frame, layout, source):
     """Add what is missing or contradictory to the errors of a frame."""
     values = frame.values
-    own = values.get("instrument")
-    if own is not None and layout.identities and own not in layout.identities:
-        frame.errors.append(
-            f"{layout.keywords['instrument']} = {own!r}, allowed are {', '.join(layout.identities)}"
-        )
+    foreign = not_of_instrument(values, layout)
+    frame.errors += [foreign] if foreign else []
     frame.errors += [
         f"no keyword {layout.keywords[column]} in its header"
         for column in _NEEDED[source]
@@ -305,8 +311,10 @@ def _check_star(frame, layout):
             names = " and ".join(layout.keywords[name] for name in missing)
             frame.errors.append(f"no keyword {names} in its header, and {error}")
             return
+        # a header value goes before a computed one
         values.update({name: found[name] for name in missing})
         frame.doubts.append(f"{' and '.join(missing)} computed from the coordinates and the time")
+    # a plate that did not follow the sky spoils a frame without any other sign
     off = tracking_error(values, layout)
     if off is None:
         frame.doubts.append(

@@ -11,12 +11,13 @@ would take most of the time of a reduction.
 from dataclasses import dataclass
 
 import numpy as np
+from astropy.stats import gaussian_sigma_to_fwhm
 
 from astropolcal.exceptions import ParameterError
 
 __all__ = ["GaussianFits", "fit_gaussians"]
 
-_FWHM = np.sqrt(8.0 * np.log(2.0))
+# at the start, least and most
 _DAMPING = (1e-3, 1e-9, 1e9)
 
 
@@ -111,12 +112,15 @@ def fit_gaussians(images, good=None, *, x, y, fwhm, max_iterations=40, tolerance
             "(K, rows, columns)"
         )
     count, rows, columns = images.shape
+    # 0 or 1: a pixel counts or does not
     weight = np.ones_like(images) if good is None else np.asarray(good, dtype=float)
+    # NaN times a weight of zero would still be NaN
     data = np.where(weight > 0, images, 0.0).reshape(count, -1)
     weight = weight.reshape(count, -1)
     grid = tuple(axis.ravel().astype(float) for axis in np.indices((rows, columns))[::-1])
     p = _start(data, weight, *np.broadcast_arrays(x, y, fwhm, np.zeros(count))[:3])
     p, cost, done = _minimize(p, data, weight, grid, max_iterations, tolerance)
+    # seven numbers are fitted
     freedom = np.maximum(weight.sum(axis=1) - p.shape[1], 1.0)
     return _result(p, np.sqrt(cost / freedom), done)
 
@@ -128,7 +132,8 @@ def _start(data, weight, x, y, fwhm):
     known[empty] = 0.0
     background = np.nanmedian(known, axis=1)
     amplitude = np.nanmax(known, axis=1) - background
-    curvature = (_FWHM / fwhm) ** 2
+    # 1 / sigma^2, the same along both axes
+    curvature = (gaussian_sigma_to_fwhm / fwhm) ** 2
     zero = np.zeros_like(background)
     return np.stack([amplitude, x, y, curvature, zero, curvature, background], axis=1)
 
@@ -138,6 +143,7 @@ def _minimize(p, data, weight, grid, max_iterations, tolerance):
     cost = _cost(data, model, weight)
     damping = np.full(len(p), _DAMPING[0])
     done = np.zeros(len(p), dtype=bool)
+    # images still moving; model and jacobian have rows for these only
     todo = np.arange(len(p))
     for _ in range(max_iterations):
         if not todo.size:
@@ -152,8 +158,10 @@ def _minimize(p, data, weight, grid, max_iterations, tolerance):
         small = better & (cost[todo] - trial_cost <= tolerance * cost[todo])
         p[todo[better]], cost[todo[better]] = trial[better], trial_cost[better]
         model[better], jacobian[better] = trial_model[better], trial_jacobian[better]
+        # towards Gauss-Newton after a good step, towards steepest descent after a bad one
         damping[todo] = np.clip(damping[todo] * np.where(better, 0.1, 10.0), *_DAMPING[1:])
         done[todo[small]] = True
+        # no step of any length helps: not done, and given up
         stuck = small | (damping[todo] >= _DAMPING[2])
         todo, model, jacobian = todo[~stuck], model[~stuck], jacobian[~stuck]
     return p, cost, done
@@ -185,6 +193,7 @@ def _step(residual, jacobian, weight, damping):
     weighted = jacobian * weight[:, None, :]
     normal = weighted @ jacobian.transpose(0, 2, 1)
     gradient = weighted @ residual[:, :, None]
+    # (K, 7)
     diagonal = np.einsum("kii->ki", normal)
     scale = np.sqrt(np.maximum(diagonal, 1e-300))
     # scaled to a unit diagonal, so that fluxes and pixels are solved for alike
@@ -195,19 +204,22 @@ def _step(residual, jacobian, weight, damping):
 
 def _sane(p):
     xx, xy, yy = p[:, 3], p[:, 4], p[:, 5]
+    # a positive definite matrix: an ellipse, and no saddle
     return np.isfinite(p).all(axis=1) & (xx > 0) & (yy > 0) & (xx * yy > xy**2)
 
 
 def _result(p, noise, done):
     amplitude, x, y, xx, xy, yy, background = p.T
     determinant = xx * yy - xy**2
+    # eigenvalues of the inverse covariance are mean +- half
     mean, half = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
     return GaussianFits(
         amplitude=amplitude,
         x=x,
         y=y,
         background=background,
-        fwhm=_FWHM * determinant**-0.25,
+        # sqrt(sigma_1 sigma_2) = det^(-1/4)
+        fwhm=gaussian_sigma_to_fwhm * determinant**-0.25,
         elongation=np.sqrt((mean + half) / np.maximum(mean - half, 1e-300)),
         noise=noise,
         converged=done,

@@ -14,18 +14,28 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import FK5, SkyCoord
-from astropy.io import fits
 from astropy.time import Time
 from erfa import ErfaError
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import understood
-from astropolcal.instruments._keywords import ANGLES, RANGES, TEXTS, convert, look_up, unit_of
+from astropolcal.files import one_line
+from astropolcal.fitscheck import primary_header
+from astropolcal.instruments._keywords import (
+    ANGLES,
+    RANGES,
+    TEXTS,
+    convert,
+    in_calendar,
+    look_up,
+    unit_of,
+)
 
 __all__ = [
     "FrameHeader",
     "check_sequence",
     "frame_number",
+    "not_of_instrument",
+    "observation_time",
     "pointing",
     "raw_frames",
     "read_header",
@@ -183,11 +193,13 @@ def read_header(path, layout, *, header=None, raw=None):
     >>> read_header("CRSA00170808_cube.fits", instruments.get("charis").files, header=header).values
     {'hwp': 22.5, 'derotator': 45.0}
     """
-    header = _primary(path) if header is None else header
+    header = primary_header(path) if header is None else header
     frame = FrameHeader(str(path), frame_number(path, layout, header))
     headers = [header]
+    # only for these is a raw header opened
     missing = [c for c in layout.raw_columns if look_up(headers, c, layout)[1] is None]
     if raw is not None and missing:
+        # behind the cube: its own keywords come first
         headers += _raw_header(frame, raw)
     for column in layout.keywords:
         keyword, value = look_up(headers, column, layout)
@@ -196,14 +208,34 @@ def read_header(path, layout, *, header=None, raw=None):
     return frame
 
 
-def _primary(path):
-    # astropy does not close a file that it cannot read
-    with understood(path, ObservationError, "not a readable FITS file"), open(path, "rb") as stream:
-        return fits.getheader(stream, 0)
+def not_of_instrument(values, layout):
+    """
+    Return why a frame is none of a layout's instrument.
 
+    Parameters
+    ----------
+    values : dict
+        Of its header, see `read_header`.
+    layout : FileLayout
+        With the ``identities`` of the instrument.
 
-def _short(error):
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    Returns
+    -------
+    str
+        Empty if it is, or if either of them does not say.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.headers import not_of_instrument
+    >>> not_of_instrument({"instrument": "GPI"}, instruments.get("charis").files)
+    "INSTRUME = 'GPI', allowed are CHARIS"
+    """
+    own = values.get("instrument")
+    if own is None or not layout.identities or own in layout.identities:
+        return ""
+    keyword = layout.keywords["instrument"]
+    return f"{keyword} = {own!r}, allowed are {', '.join(layout.identities)}"
 
 
 def _raw_header(frame, raw):
@@ -213,7 +245,7 @@ def _raw_header(frame, raw):
         frame.errors.append(f"no raw frame of number {frame.number}")
     else:
         try:
-            return [_primary(raw[frame.number])]
+            return [primary_header(raw[frame.number])]
         except ObservationError as error:
             frame.errors.append(f"raw frame: {error}")
     return []
@@ -236,6 +268,7 @@ def _convert(frame, column, keyword, value, layout):
         return
     low, high = RANGES.get(column, (-np.inf, np.inf))
     if column == "exposure_time":
+        # an exposure of zero seconds has no rate
         low = np.nextafter(0, 1)
     if not (np.isfinite(number) and low <= number <= high):
         frame.errors.append(f"{keyword} = {value}, allowed are {_allowed(low, high, target)}")
@@ -302,11 +335,14 @@ def pointing(values, site):
     except KeyError as error:
         raise ObservationError(f"no {error.args[0]} to compute the pointing from") from None
     except (ValueError, TypeError, u.UnitsError) as error:
-        raise ObservationError(f"right ascension and declination: {_short(error)}") from None
+        raise ObservationError(f"right ascension and declination: {one_line(error)}") from None
+    # not by observations.pointing: that is good to arcseconds, but takes seconds at its first call,
+    # which every process of a reduction would wait for
     here = coordinate.transform_to(FK5(equinox=time))
     longitude, latitude = np.deg2rad(site[:2])
     time.delta_ut1_utc = 0.0
     hour = time.sidereal_time("mean", longitude * u.rad).rad - here.ra.rad
+    # spherical triangle of pole, zenith and star, all of the equator of date
     sin_alt = np.sin(latitude) * np.sin(here.dec.rad)
     sin_alt += np.cos(latitude) * np.cos(here.dec.rad) * np.cos(hour)
     parallactic = np.arctan2(
@@ -325,16 +361,39 @@ def _is_number(text):
 
 
 def observation_time(values):
-    """Return the time that ``mjd``, or ``date`` and ``time``, say."""
+    """
+    Return the time that a header states.
+
+    Parameters
+    ----------
+    values : dict
+        ``mjd``, or ``date`` and ``time`` (the latter may stand in the former, behind a T), UTC.
+
+    Returns
+    -------
+    `~astropy.time.Time`
+
+    Raises
+    ------
+    ObservationError
+        If something is missing or cannot be understood.
+
+    Examples
+    --------
+    >>> from astropolcal.reduction.headers import observation_time
+    >>> observation_time({"date": "2025-11-03", "time": "12:00:00"}).mjd
+    np.float64(60982.5)
+    """
     try:
         if "mjd" in values:
-            return Time(values["mjd"], format="mjd", scale="utc")
+            return in_calendar(Time(values["mjd"], format="mjd", scale="utc"))
         date = values["date"]
-        return Time(date if "T" in date else f"{date[:10]}T{values['time']}", scale="utc")
+        date = date if "T" in date else f"{date[:10]}T{values['time']}"
+        return in_calendar(Time(date, scale="utc"))
     except KeyError as error:
         raise ObservationError(f"no {error.args[0]} to compute the time from") from None
     except (ValueError, ErfaError) as error:
-        raise ObservationError(f"time: {_short(error)}") from None
+        raise ObservationError(f"time: {one_line(error)}") from None
 
 
 def tracking_error(values, layout):
@@ -408,6 +467,7 @@ def check_sequence(hwp, derotator, layout, tolerance=0.5):
     if not hwp.size:
         return {}
     steps = np.rint(hwp / layout.hwp_step)
+    # an angle that no command of this instrument gives
     uneven = np.abs(hwp - layout.hwp_step * steps) > tolerance
     # an uneven angle is a step of its own, which no sequence has
     steps[uneven] = 1e6 + np.flatnonzero(uneven)

@@ -71,7 +71,10 @@ def read_pypolcal(files, meta=None, *, name=None):
     if not rows:
         raise ObservationError(f"{paths[0]}: no rows")
     wavelength = _numbers(rows, "wavelength_bin")
-    _, bins = np.unique(wavelength.round(4), return_inverse=True)
+    # wavelengths that differ by less than 0.1 pm are one, spelled by two programs; what is too
+    # large to be rounded is refused with the other lengths that cannot be
+    with np.errstate(over="ignore"):
+        _, bins = np.unique(wavelength.round(4), return_inverse=True)
     frames = _frame_numbers(rows, bins)
     table = QTable({"file": [Path(row["filepath"]).name for _, _, row in rows]})
     table["frame"], table["bin"], table["wavelength"] = frames, bins, wavelength * u.nm

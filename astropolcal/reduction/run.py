@@ -3,6 +3,7 @@
 
 import os
 import re
+import warnings
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -10,9 +11,9 @@ from dataclasses import dataclass, field
 from multiprocessing import get_all_start_methods, get_context
 
 import numpy as np
-from astropy.io import fits
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
+from astropolcal.fitscheck import primary_header
 from astropolcal.observations import Observations, is_star
 from astropolcal.reduction._sorting import (
     consistent,
@@ -29,6 +30,7 @@ __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
 
 # below this number of files a process, its start costs more than it saves
 _FILES_A_WORKER = 100
+# modulation between these may be of a half-polarized lamp or a bad derotator angle: not guessed
 _AMBIGUOUS = (0.15, 0.4)
 
 
@@ -156,7 +158,7 @@ def reduce_cubes(files, instrument, **options):
     >>> reduce_cubes(["nowhere_00000001.fits"], "charis")
     Traceback (most recent call last):
     ...
-    astropolcal.exceptions.ObservationError: none of the 1 files can be used: nowhere_00000001.fits: no such file
+    astropolcal.exceptions.ObservationError: the file cannot be used: nowhere_00000001.fits: no such file
     """  # noqa: E501
     return reduce_run(files, instrument, **options).observations
 
@@ -246,6 +248,7 @@ def reduce_run(
     }
     frames = _measure_all(files, task, workers, resume, progress)
     reduction = Reduction(instrument, photometry, options=options)
+    # copies before sequences: a copy would look like an angle too often
     frames = _with_state(set_aside(frames, reduction), reduction)
     replace_angles(frames, hwp_sequence)
     frames = consistent(frames, reduction, instrument.files, hwp_sequence is None)
@@ -264,6 +267,7 @@ def _instrument(instrument, files=()):
     from astropolcal import instruments
 
     instrument = instruments.get(instrument) if isinstance(instrument, str) else instrument
+    # one run, one mode: what differs is left out later
     header = _first_header(files)
     if header is not None:
         instrument = instrument.configured(header)
@@ -283,7 +287,9 @@ def _first_header(files):
     """Return the primary header of the first file that has one, None without."""
     for path in files:
         try:
-            return fits.getheader(path, 0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return primary_header(path)
         except Exception:  # damaged files raise errors of every kind, and are reported later
             continue
     return None
@@ -315,7 +321,8 @@ def _photometry(source, instrument):
 def _nothing(count, problems):
     first, *rest = (f"{path}: {'; '.join(why)}" for path, why in problems.items())
     more = f" (and {len(rest)} more)" if rest else ""
-    return f"none of the {count} files can be used: {first}{more}"
+    none = "the file cannot be used" if count == 1 else f"none of the {count} files can be used"
+    return f"{none}: {first}{more}"
 
 
 # --- all files -------------------------------------------------------------------
@@ -327,11 +334,13 @@ def _measure_all(files, task, workers, resume, progress):
     journal = Journal(resume, settings | {"raw": task["raw"] is not None})
     found = {path: journal.done(path) for path in files}
     found = {path: frame for path, frame in found.items() if frame is not None}
+    # a file that is named twice is measured once
     todo = [path for path in dict.fromkeys(files) if path not in found]
     done = len(found)
     try:
         for frame in _results(todo, task, _count(workers, len(todo))):
             found[frame.path] = frame
+            # at once: a run that is killed keeps what is done
             journal.add(frame)
             done += 1
             if progress is not None:
@@ -356,6 +365,7 @@ def _results(files, task, workers):
         return
     lost = []
     with _pool(workers) as pool:
+        # in the order in which they end
         futures = {pool.submit(reduce_frame, path, **task): path for path in files}
         for future in as_completed(futures):
             try:

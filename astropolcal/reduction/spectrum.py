@@ -9,15 +9,13 @@ and ``mask`` (true where a row must not be used) are optional. The table that a
 correction writes, with ``I`` and ``q_statistical``, is understood as well.
 """
 
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 from astropy.nddata import StdDevUncertainty
 from astropy.table import QTable
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, check_new
 from astropolcal.observations.reading import read_ecsv
 
 __all__ = ["read_spectra", "spectra_from_table", "table_from_spectra", "write_spectra"]
@@ -73,6 +71,7 @@ def spectra_from_table(table):
     axis = table["wavelength"]
     spectra = {}
     for key in _present(table):
+        # each spectrum its own: a user may change one
         meta = dict(table.meta)
         if key in ("q", "u") and _COVARIANCE in table.colnames:
             meta[_COVARIANCE] = _plain(table[_COVARIANCE])
@@ -170,9 +169,8 @@ def write_spectra(spectra, path, *, overwrite=False):
     ...
     astropolcal.exceptions.ObservationError: spectra: missing I, q, u, ...
     """
-    path, table = Path(path), table_from_spectra(spectra)
-    if path.exists() and not overwrite:
-        raise ObservationError(f"{path}: exists; overwriting it was not asked for")
+    table = table_from_spectra(spectra)
+    path = check_new(path, overwrite, ObservationError)
     with atomic_path(path, ObservationError) as temporary:
         table.write(temporary, format="ascii.ecsv", overwrite=True)
 
@@ -279,11 +277,14 @@ def _in_our_names(table):
 def _with_unit(table, column, unit):
     """Return a column as a Quantity of the kind of the unit, NaN where it is masked."""
     values = table[column]
-    if hasattr(values, "unmasked"):
-        values = values.filled(np.nan)
-    elif np.ma.isMaskedArray(values):
-        values = values.astype(float).filled(np.nan)
     try:
+        # numpy would drop the imaginary part, and only warn of it
+        if np.iscomplexobj(values):
+            raise TypeError("complex")
+        if hasattr(values, "unmasked"):
+            values = values.filled(np.nan)
+        elif np.ma.isMaskedArray(values):
+            values = values.astype(float).filled(np.nan)
         values = u.Quantity(values, dtype=float)
         values.to(unit)
     except (TypeError, ValueError, u.UnitConversionError):
@@ -296,6 +297,7 @@ def _with_unit(table, column, unit):
 def _check_wavelength(wavelength):
     if not np.all(np.isfinite(wavelength) & (wavelength > 0)):
         raise ObservationError("target: a wavelength is not positive")
+    # sorted already: equal ones are neighbours
     twice = wavelength[1:][np.diff(wavelength) == 0]
     if twice.size:
         raise ObservationError(f"target: wavelength {twice[0]} is given twice")
@@ -323,6 +325,7 @@ def _common_axis(spectra):
         if np.ndim(spectrum.flux) != 1:
             raise ObservationError(f"spectrum {key}: {np.ndim(spectrum.flux)} axes; 1 is needed")
         axis = u.Quantity(spectrum.spectral_axis)
+        # frequencies and energies run the other way; the table is sorted later
         if not axis.unit.is_equivalent(u.um):
             axis = axis.to(u.um, u.spectral())
         axes[key] = axis

@@ -16,6 +16,7 @@ from numpy.polynomial.legendre import legvander
 from scipy import ndimage
 
 from astropolcal.exceptions import ParameterError
+from astropolcal.observations.quality import MAD_TO_SIGMA
 from astropolcal.reduction.errors import flux_variance, shared_pixels
 from astropolcal.reduction.finding import find_pair
 from astropolcal.reduction.gaussians import fit_gaussians
@@ -28,7 +29,9 @@ __all__ = ["choose_radius", "curve_of_growth", "measure_stars"]
 _OFF_TRACK = (1.5, 0.5)
 # a width may differ from the median by this factor
 _WIDTHS = 2.5
+# standard deviations of the light under a Gaussian of the width of the star
 _SIGNIFICANT = 5.0
+# pixels of a ring whose median is a background
 _FEWEST = 20
 # of the polynomial over wavelength that smoothes an aperture correction
 _CORRECTION_DEGREE = 2
@@ -135,6 +138,7 @@ def measure_stars(
     run = _Cube(cube, good, fits, origin, detector, layout.edge, annulus, max_masked)
     level_variance = _measure(result, run)
     usable = ~result.failed
+    # between both images of a slice
     distance = np.hypot(*(np.diff(axis[:, usable], axis=0)[0] for axis in (result.x, result.y)))
     pixel = detector.variance(result.background[:, usable].mean(axis=0))
     result.covariance[usable] = shared_pixels(distance, result.radius[0, usable], pixel)
@@ -173,6 +177,7 @@ def _mean(cube, good):
 
 def _cutouts(cube, good, pair):
     """Return the surroundings of the star in all slices of both beams, and their corners."""
+    # room for the wings of the core, not for other stars; odd sizes keep it in the middle
     half = int(np.clip(np.ceil(1.5 * pair.fwhm) + 3, 6, 30))
     size = np.array(cube.shape[:0:-1])
     if (size <= 2 * half).any():
@@ -192,10 +197,11 @@ def _check_light(result, images, there, starts, fwhm, detector):
     n = len(result.reasons)
     values = np.where(there, images, np.nan).reshape(2 * n, -1)
     values[~there.any(axis=(1, 2))] = 0.0
+    # before the fit: a saturated core has no centre
     bright = np.nanmax(values, axis=1).reshape(2, n) >= detector.saturation
     result.flag(bright.any(axis=0), "saturated")
     level = np.nanmedian(values, axis=1)[:, None]
-    noise = 1.4826 * np.nanmedian(np.abs(values - level), axis=1)
+    noise = MAD_TO_SIGMA * np.nanmedian(np.abs(values - level), axis=1)
     rows, columns = np.indices(images.shape[1:])
     distance = (columns.ravel() - starts[:, :1]) ** 2 + (rows.ravel() - starts[:, 1:]) ** 2
     shape = np.exp(-4.0 * np.log(2.0) * distance / fwhm**2) * there.reshape(2 * n, -1)
@@ -215,6 +221,7 @@ def _judge(result, fits, origin, pair):
     result.fwhm[:] = fits.fwhm.reshape(2, n)
     wild = ~fits.converged | (fits.elongation > 3.0) | (fits.amplitude <= 0)
     wild = wild.reshape(2, n)
+    # a blurred image is found less precisely
     limit = max(_OFF_TRACK[0], _OFF_TRACK[1] * pair.fwhm)
     usable = ~result.failed & ~wild.any(axis=0)
     for values in (result.x, result.y):
@@ -327,7 +334,7 @@ def _flux(inside, weights, ring, detector):
     flux = float((weights * inside).sum() - level * area)
     if flux <= 0:
         return "lost star"
-    spread = 1.4826 * np.median(np.abs(ring - level))
+    spread = MAD_TO_SIGMA * np.median(np.abs(ring - level))
     # what the ring shows, but never less than the detector's own noise
     pixel = max(spread**2, float(detector.variance(level)))
     photons = detector.photon_noise(float((weights**2 * np.maximum(inside - level, 0.0)).sum()))
@@ -338,6 +345,7 @@ def _flux(inside, weights, ring, detector):
 
 def _beyond_edge(place, radius, shape, edge):
     x, y = place
+    # pixel 0 begins at -0.5
     inside = min(x - radius, y - radius, shape[1] - 1 - x - radius, shape[0] - 1 - y - radius)
     return inside + 0.5 < edge
 

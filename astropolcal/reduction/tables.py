@@ -1,14 +1,12 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Tables of reduced frames."""
 
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 from astropy.table import MaskedColumn, Table
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, check_new
 from astropolcal.reduction.photometry import BEAMS
 
 __all__ = ["photometry_table", "reduced_table", "write_table"]
@@ -53,7 +51,9 @@ def reduced_table(frames, instrument, meta):
     variance = _stack(frames, "variance")
     covariance = np.concatenate([frame.photometry.covariance for frame in frames])
     columns = {f"flux_{beam}": values for beam, values in zip(BEAMS, flux, strict=True)}
+    # errors of the beams alone cannot say what they share
     if (covariance[~failed] != 0).any():
+        # var(R -+ L) = var(R) + var(L) -+ 2 cov
         both = variance.sum(axis=0)
         columns["single_difference_err"] = np.sqrt(np.maximum(both - 2 * covariance, 0.0))
         columns["single_sum_err"] = np.sqrt(np.maximum(both + 2 * covariance, 0.0))
@@ -83,6 +83,7 @@ def _frame_columns(frames, instrument):
     """Return the columns that belong to frames, and those of the wavelengths."""
     n = len(instrument.wavelength)
     table = Table()
+    # frames one after the other, wavelengths fastest
     table["file"] = np.repeat([frame.name for frame in frames], n)
     table["frame"] = np.repeat(np.arange(len(frames)), n)
     table["bin"] = np.tile(np.arange(n), len(frames))
@@ -92,6 +93,7 @@ def _frame_columns(frames, instrument):
     units = dict.fromkeys(_ANGLES, u.deg) | {"exposure_time": u.s, "mjd": u.day}
     for name, unit in units.items():
         values = [frame.values.get(name) for frame in frames]
+        # a column is there for all frames or not at all
         if frames and None not in values:
             column = "time" if name == "mjd" else name
             table[column] = np.repeat(np.array(values, dtype=float), n) * unit
@@ -161,15 +163,11 @@ def write_table(table, path, overwrite=False):
     --------
     >>> from astropy.table import Table
     >>> from astropolcal.reduction.tables import write_table
-    >>> write_table(Table({"bin": [0]}), "/nowhere/run.ecsv")
+    >>> write_table(Table({"bin": [0]}), "no/run.ecsv")
     Traceback (most recent call last):
     ...
-    astropolcal.exceptions.ObservationError: /nowhere/run.ecsv: there is no folder /nowhere
+    astropolcal.exceptions.ObservationError: no/run.ecsv: cannot be written: there is no folder no
     """
-    path = Path(path)
-    if path.exists() and not overwrite:
-        raise ObservationError(f"{path}: exists already; overwriting it was not asked for")
-    if not path.parent.is_dir():
-        raise ObservationError(f"{path}: there is no folder {path.parent}")
+    path = check_new(path, overwrite, ObservationError)
     with atomic_path(path, ObservationError) as temporary:
         table.write(temporary, format="ascii.ecsv")

@@ -21,12 +21,14 @@ from scipy.optimize import least_squares
 
 from astropolcal.reduction._rings import Rings, Star
 
-__all__ = ["Shares", "wing_shares"]
+__all__ = ["HALO_BETA", "Shares", "wing_shares"]
 
-_HALO_BETA = 11 / 6
+#: Exponent of the halo: that of a seeing-limited image, whose wings fall as r^-11/3.
+HALO_BETA = 11 / 6
 # full width of the halo: that of the seeing, milliarcsecond, and its relative uncertainty
 _SEEING, _SEEING_SPREAD = 500.0, 0.35
-_HALO_WIDTH = 2 * np.sqrt(2 ** (1 / _HALO_BETA) - 1)
+# full width at half maximum over alpha
+_HALO_WIDTH = 2 * np.sqrt(2 ** (1 / HALO_BETA) - 1)
 # rings up to this multiple of the given radius
 _TO = 1.5
 # part of an aperture that may lie outside of the lit field
@@ -35,6 +37,7 @@ _UNLIT = 0.2
 _START = np.array([np.log(0.6), 0.3, 0.0, 0.0])
 _LOW, _HIGH = np.array([-2.0, 1e-3, -1.2, -0.5]), np.array([1.0, 0.7, 1.2, 0.5])
 _SCALE = np.array([0.05, 0.05, 0.2, 0.05])
+# in each of the four numbers, which are of order one: central differences good to 1e-8
 _STEP = 1e-4
 
 
@@ -147,12 +150,12 @@ def _core_beyond(r, radius, t):
 
 
 def _halo(r, radius):
-    scale = (_HALO_BETA - 1) / (np.pi * radius**2)
-    return scale * (1 + (r / radius) ** 2) ** -_HALO_BETA
+    scale = (HALO_BETA - 1) / (np.pi * radius**2)
+    return scale * (1 + (r / radius) ** 2) ** -HALO_BETA
 
 
 def _halo_beyond(r, radius):
-    return (1 + (r / radius) ** 2) ** (1 - _HALO_BETA)
+    return (1 + (r / radius) ** 2) ** (1 - HALO_BETA)
 
 
 class _Profile:
@@ -181,6 +184,7 @@ class _Profile:
         halo = total * _halo_beyond(star.radius, halo_radius)
         if not star.stopped:
             apart = np.hypot(*(star.places[0] - star.places[1]))
+            # the light of the other image in the aperture, nearly constant over it
             core = core - total * self.area * _core(apart, radius, p[1])
             halo = halo - total * self.area * _halo(apart, halo_radius)
         for beam, k, r, weights, _ in self.star.unlit:
@@ -225,6 +229,7 @@ class _Profile:
 def _fit(star, rings, detector, halo_radius):
     profile = _Profile(star, rings, halo_radius)
     # weights from data that are the mean of all slices, then from the profile
+    # without a model yet; the mean of the slices is less noisy than each of them
     expected = np.broadcast_to(rings.values.mean(axis=1, keepdims=True), rings.values.shape)
     p = _START
     for _ in range(2):
@@ -257,6 +262,7 @@ def _least_squares(profile, weights, start):
         return c, columns, matrix @ c - known
 
     def residuals(p):
+        # the seeing as one more datum: a normal prior on ln of the radius
         return np.append(solve(p)[2], p[2] / _SEEING_SPREAD)
 
     bounds = (_LOW, _HIGH)

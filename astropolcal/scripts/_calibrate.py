@@ -178,17 +178,22 @@ def run(arguments):
     check_outputs(arguments.output, arguments.json)
     check_folders(arguments.plots)
     _check_start(arguments)
+    # raises before any table is read
     get_observable(arguments.observable)
     targets = [_target(text) for text in arguments.target] or TARGETS
+    # so that a first call without any data shows what comes out
     files = arguments.files or [_example(say)]
     datasets, standards = read_datasets(files), read_datasets(arguments.standard)
     _check_standards(arguments.standard, standards, files, datasets)
+    # standards follow them in the lists below, and are not fitted
     n = len(datasets)
     instrument = instrument_of(arguments, datasets)
+    # the instrument knows which of its frames cannot be trusted
     if not arguments.keep_all:
         datasets = [instrument.prepare(table) for table in datasets]
         standards = [instrument.prepare(table) for table in standards]
     tables = [*datasets, *standards]
+    # only what was typed: an instrument need not know all options
     stated = {key: getattr(arguments, key) for key in ("derotator", "bounds", "m3")}
     options = {key: value for key, value in stated.items() if value is not None}
     chains = instrument.chains_for(datasets, nuisance=arguments.nuisance, **options)
@@ -201,10 +206,12 @@ def run(arguments):
     positions = [instrument.positions(*pair) for pair in zip(tables, chains, strict=True)]
     calibration = _fitted(arguments, chains[:n], datasets, positions[:n], instrument)
     if arguments.groups:
+        # the fit leaves cross-validation to this line where groups are named
         calibration.cross_validate(arguments.groups)
         calibration.fit["groups"] = arguments.groups
     for item in list(zip(chains, tables, positions, strict=True))[n:]:
         add_standard(calibration, *item)
+        # then its true polarization is a better judge than its scatter
         if _is_known(item[1]):
             add_star_check(calibration, *item)
     # written first: whoever reads the summary may go away
@@ -254,6 +261,7 @@ def _fitted(arguments, chains, datasets, positions, instrument):
 
 def _check_start(arguments):
     """Refuse what a calibration to start from settles already."""
+    # they would contradict what the old calibration holds
     others = ("fix", "prior", "without")
     given = [f"--{key}" for key in others if getattr(arguments, key)]
     if arguments.start and (given or arguments.strategy != "joint"):
@@ -267,6 +275,7 @@ def _check_standards(paths, standards, files, datasets):
     """Refuse a standard that is fitted, before it is."""
     for path, standard in zip(paths, standards, strict=True):
         for file, dataset in zip(files, datasets, strict=True):
+            # a prediction of what was fitted proves nothing
             if standard.content_hash == dataset.content_hash:
                 raise AstropolcalError(
                     f"--standard {path} is no independent standard: it is fitted as {file}"
@@ -277,6 +286,7 @@ def _held(arguments, chains):
     """Return the parameters that were fixed by name, as the gauge is to name them."""
     from astropolcal.measurement import parameter_table
 
+    # a later --prior frees again what --fix held
     names = {text.partition("=")[0] for text in arguments.fix}
     loose = {text.partition("=")[0] for text in arguments.prior}
     known = parameter_table(chains)
@@ -301,6 +311,7 @@ def _quantity(text, part, unit, low, high):
     """Return a number with or without unit, in this one."""
     try:
         value = u.Quantity(part)
+        # a plain number is in the unit of the option
         value = value.value * unit if value.unit == u.one else value.to(unit)
     except (TypeError, ValueError, u.UnitsError):
         value = np.nan * unit

@@ -78,6 +78,7 @@ def run(arguments):
     from astropolcal.gap.challenge import KINDS, Setup, run_challenge
 
     check_outputs(arguments.json, arguments.figure, arguments.checkpoint)
+    # processes are started once for all challenges
     with _workers(arguments.workers) as client:
         result = run_challenge(
             arguments.n,
@@ -118,6 +119,7 @@ def _report(result):
     """Return the rates, and the wrong answers one by one."""
     lines = [result.words(), "(in brackets: interval of each rate at 68 %; number it is from)"]
     for record in result.failures:
+        # only what went wrong is listed; the rates hold the rest
         truth = " + ".join(record["effects"]) or "nothing"
         said = " + ".join("/".join(group) for group in record["causes"])
         strength = f" (SNR {min(record['snr']):.0f})" if record["snr"] else ""

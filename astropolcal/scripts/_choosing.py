@@ -18,42 +18,46 @@ class Night:
 
 def read_night(files, instrument, raw=None):
     """Return what headers tell; refuse frames that differ in their mode or optics."""
-    from astropy.io import fits
-
     from astropolcal.calibration._beam import told_beam
+    from astropolcal.fitscheck import primary_header
     from astropolcal.reduction.headers import observation_time, read_header
 
     layout = instrument.files
     if layout is None:
         raise AstropolcalError(f"{instrument.name}: it is not known how its files look")
+    # which keywords there are may depend on the mode
     layout = configured(instrument, files).files
     dates, modes, headers = [], {}, []
     for file in files:
         frame = read_header(file, layout, raw=raw)
         if frame.values.get("filter"):
+            # the first file of each mode, to be named
             modes.setdefault(frame.values["filter"], file)
         try:
             dates.append(observation_time(frame.values).isot)
         except ObservationError:
             # only a choice by date needs it
             pass
-        headers.append(fits.getheader(file))
+        headers.append(primary_header(file))
     if len(modes) > 1:
         (one, first), (other, second) = list(modes.items())[:2]
         raise ObservationError(f"{first} is in mode {one!r}, {second} in {other!r}: correct apart")
+    # ISO dates sort as text
     dates.sort()
+    # a calibration that holds at both ends holds between them
     ends = list(dict.fromkeys((dates[0], dates[-1]))) if dates else []
     return Night(ends, next(iter(modes), None), told_beam(headers, instrument, files))
 
 
 def configured(instrument, files):
     """Return the instrument as the first file's header says; as it is if that cannot be read."""
-    from astropy.io import fits
+    from astropolcal.fitscheck import primary_header
 
     try:
-        header = fits.getheader(files[0])
-    except (OSError, ValueError, IndexError):
+        header = primary_header(files[0])
+    except (ObservationError, IndexError):
         return instrument
+    # wavelengths and shape of the cubes may depend on it
     return instrument.configured(header)
 
 
@@ -69,9 +73,11 @@ def choose_calibration(arguments, files, raw=None):
     from astropolcal.correction import sky_chain
 
     path = Path(arguments.calibration)
+    # a folder is searched when it is known what the frames need
     calibration = None if path.is_dir() else Calibration.read(path)
     name = arguments.instrument or getattr(calibration, "instrument", None) or "charis"
     night = read_night(files, instruments.get(name), raw)
+    # what the user says goes before what headers tell
     beam = night.beam if arguments.optics_in is None else {}
     if calibration is None:
         entry = _of_library(path, arguments, night, beam, files)
@@ -101,6 +107,7 @@ def _check_validity(calibration, path, arguments, night):
             raise AstropolcalError(
                 f"{path} does not hold for {date}: {held}; --any-date takes it all the same"
             )
+    # --filter says that the mode is right, whatever it is called
     mode = None if arguments.filter else night.mode
     if mode and held.mode and mode.casefold().split() != held.mode.casefold().split():
         raise AstropolcalError(
@@ -113,6 +120,7 @@ def _of_library(path, arguments, night, beam, files):
     """Return the calibration that holds for the first and the last frame."""
     from astropolcal.calibration.library import Library
 
+    # None: the library chooses without a date
     dates = [None] if arguments.any_date else night.dates
     if not dates:
         raise ObservationError(f"{files[0]}: no date in its header to choose a calibration by")
@@ -123,6 +131,7 @@ def _of_library(path, arguments, night, beam, files):
         )
         for date in dates
     ]
+    # a night across the change of a calibration
     if len({str(entry.path) for entry in found}) > 1:
         raise AstropolcalError(
             f"{path}: the frames from {dates[0]} to {dates[-1]} need two calibrations, "

@@ -16,7 +16,17 @@ from astropolcal.chain import find_optic, leaves, remove_optic
 from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
 from astropolcal.files import atomic_path
 
+# what a terminal has that nobody made wider
 _COLUMNS = 80
+
+# the first bytes of files that may be taken for tables, and where they belong instead
+_NO_TABLES = {
+    b"#ASDF": "an ASDF file, such as a calibration, where an observation table (ECSV) is wanted; "
+    "a calibration goes to info, diagnose, sample, efficiency, correct --calibration or "
+    "calibrate --start",
+    b"SIMPLE  =": "a FITS file, where an observation table (ECSV) is wanted; reduce makes one of "
+    "cubes",
+}
 
 # options that edit the model, for edit_chains
 _EDITS = {
@@ -89,6 +99,7 @@ def printer(arguments):
 def check_outputs(*paths):
     """Raise before any work is done if a file cannot be written there."""
     for path in paths:
+        # not asked for, or the standard output
         if path is None or str(path) == "-":
             continue
         path = Path(path)
@@ -104,6 +115,7 @@ def check_folders(*paths):
     for path in paths:
         if path is None:
             continue
+        # the folder is made later, inside the nearest one that exists
         there = next(p for p in [Path(path), *Path(path).absolute().parents] if p.exists())
         if not there.is_dir():
             raise AstropolcalError(f"{there}: is a file, not a folder")
@@ -111,6 +123,7 @@ def check_folders(*paths):
 
 
 def _check_writable(path, folder):
+    # hours of fitting must not end with a file that cannot be written
     if not os.access(folder, os.W_OK | os.X_OK):
         raise AstropolcalError(
             f"{path}: no permission to write to {folder}; name a folder that you may write to"
@@ -130,6 +143,7 @@ def wrapped(line, indent=0):
 
 def write_json(content, path):
     """Write a dictionary as JSON, atomically; ``-`` is the standard output."""
+    # NaN and infinity are no JSON: what makes the content has to write null
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
     if str(path) == "-":
         sys.stdout.write(text)
@@ -178,12 +192,20 @@ def instrument_of(arguments, datasets):
     """Return the instrument that is asked for, or the one that the first table names."""
     from astropolcal import instruments
 
-    name = arguments.instrument or datasets[0].instrument
-    if name is None:
+    first = datasets[0]
+    if arguments.instrument:
+        return instruments.get(arguments.instrument)
+    if first.instrument is None:
         raise InstrumentError(
-            f"{datasets[0].name}: the table names no instrument; give --instrument NAME"
+            f"{first.name}: the table names no instrument; give --instrument NAME"
         )
-    return instruments.get(name)
+    try:
+        return instruments.get(first.instrument)
+    except InstrumentError as error:
+        # the name was not typed by the user, who must know where it stands
+        raise InstrumentError(
+            f"{first.path or first.name}: {error}; --instrument NAME takes another one"
+        ) from None
 
 
 def read_datasets(paths):
@@ -192,12 +214,27 @@ def read_datasets(paths):
 
     datasets = []
     for path in paths:
+        _check_table(path)
         dataset = Observations.read(path)
         for other, known in zip(paths, datasets, strict=False):
+            # by content: the same frames under two names would count twice in a fit
             if known.content_hash == dataset.content_hash:
                 raise AstropolcalError(f"{path}: holds the same frames as {other}")
         datasets.append(dataset)
     return datasets
+
+
+def _check_table(path):
+    """Refuse a file of ours that is no observation table, and say which command wants it."""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(max(map(len, _NO_TABLES)))
+    except OSError:
+        # whoever reads the table says what is wrong
+        return
+    for mark, words in _NO_TABLES.items():
+        if start.startswith(mark):
+            raise AstropolcalError(f"{path}: is {words}")
 
 
 # ---- the model ------------------------------------------------------------------------------
@@ -230,8 +267,10 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
     ChainError, ParameterError
         If a name or a value does not fit.
     """
+    # before the rest: what is out of the model has no parameters to edit
     for name in without:
         present = [name in {leaf.name for leaf in leaves(chain)} for chain in chains]
+        # raises, with near matches
         if not any(present):
             find_optic(chains[0], name)
         chains = [
@@ -258,6 +297,7 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
 def _parameters(chains, name):
     """Return the parameters that ``optic.parameter`` or ``optic`` names, in all chains."""
     optic, _, key = name.partition(".")
+    # optics of one name are one optic to the fit, so that all get the same
     carriers = [leaf for chain in chains for leaf in leaves(chain) if leaf.name == optic]
     if not carriers:
         find_optic(chains[0], optic)
@@ -277,16 +317,19 @@ def _normal(name, parameter, text):
     mean, separator, std = text.partition("+-")
     if not separator:
         raise ParameterError(f"prior {name}={text}: write it as MEAN+-STD, such as 0+-0.1deg")
+    # a Normal wants a quantity where the parameter has a unit
     unit = 1 if parameter.unit is None else parameter.unit
     # "0+-0.1deg" gives its unit once
     bare = re.fullmatch(r"\s*[-+.\deE]+\s*", mean)
     own = re.sub(r"^\s*[-+.\d]+(?:[eE][-+]?\d+)?\s*", "", std)
+    # both in the unit of the parameter, whatever was typed
     values = (_value(name, parameter, t) for t in ((mean + own if bare else mean), std))
     return Normal(*(value * unit for value in values))
 
 
 def _value(name, parameter, text):
     """Return the number that a text with or without unit means, in the parameter's unit."""
+    # a number, and perhaps a unit; no expression is evaluated
     match = re.fullmatch(r"\s*([-+.\d]+(?:[eE][-+]?\d+)?)\s*([A-Za-z%].*)?", text)
     number, unit = match.groups() if match else ("", None)
     try:
@@ -313,4 +356,5 @@ def _set(name, parameter, text):
         raise ParameterError(
             f"{name}={text}: allowed is {low} to {high} {parameter.unit or ''}".rstrip()
         )
+    # the same at all wavelengths
     parameter.value = np.full(np.shape(parameter.value), value)

@@ -13,10 +13,12 @@ from astropolcal.scripts._common import (
     add_quiet,
     check_outputs,
     cube_files,
+    is_quiet,
     number_or,
     wrapped,
     write_json,
 )
+from astropolcal.words import counted
 
 _EPILOG = """\
 examples:
@@ -26,6 +28,7 @@ examples:
       --rotation pupil --camera-angle 113 --open-directions ignore
 """
 
+# what a chain may ask of a frame
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 
 
@@ -62,7 +65,7 @@ def add_parser(commands):
     parser.add_argument("--workers", metavar="N", type=int, help="threads of dask")
     parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of dask.distributed")
     add_json(parser)
-    add_quiet(parser, "no progress bar")
+    add_quiet(parser)
     parser.set_defaults(run=run)
 
 
@@ -201,9 +204,11 @@ def run(arguments):
 
     check_outputs(arguments.output, arguments.json, arguments.spectrum, arguments.plot)
     files = cube_files(arguments.cubes)
+    # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
+    # one a frame: files of left beams follow those of the right ones
     files = instrument.files.frame_files(files)
     table, centres, scale, left_scale = _headers(files, instrument, arguments)
     frames = ScienceFrames.from_files(
@@ -220,12 +225,13 @@ def run(arguments):
     )
     result = _corrected(calibration, frames, chain, arguments, provenance)
     result.write(arguments.output, overwrite=True)
+    # for the report, too, not only for --spectrum
     star = result.aperture(arguments.radius)
     _write_others(result, star, arguments)
     summary = _summary(result, star, arguments, len(files))
     if arguments.json:
         write_json(summary, arguments.json)
-    if arguments.json != "-":
+    if not is_quiet(arguments):
         _report(summary)
 
 
@@ -233,6 +239,7 @@ def _corrected(calibration, frames, chain, arguments, provenance):
     """Return the solution, after the brightness of the frames if that is measured."""
     from astropolcal.correction import correct, measurement_rows
 
+    # the measured brightness must come from the same model as the solution
     how = {"chain": chain, "interpolate": arguments.interpolate}
     if arguments.brightness == "measured":
         rows = measurement_rows(calibration, frames.positions, frames.wavelength, **how)
@@ -268,6 +275,7 @@ def _headers(files, instrument, arguments):
     found = [_frame(file, layout, raw, arguments.centre) for file in files]
     table = QTable()
     for name in _ANGLES:
+        # an angle that no header has is no column at all
         values = [frame.values.get(name, np.nan) for frame in found]
         if np.isfinite(values).any():
             table[name] = values * u.deg
@@ -279,11 +287,13 @@ def _headers(files, instrument, arguments):
         table.remove_column("hwp_true")
     centres = arguments.centre
     if centres is None:
+        # (beam, x and y): the star stands still over the slices within a fraction of a pixel
         centres = [np.median([f.photometry.x, f.photometry.y], axis=2).T for f in found]
         first = np.asarray(centres)
         if not np.isfinite(first).all():
             bad = files[int(np.argmin(np.isfinite(first).all(axis=(1, 2))))]
             raise ObservationError(f"{bad}: the star was not found; give its place with --centre")
+    # frames of equal exposures need no scale, known or not
     exposure = np.array([frame.values.get("exposure_time", np.nan) for frame in found])
     differ = np.isfinite(exposure).all() and np.ptp(exposure) > 1e-6 * exposure.max()
     left = [beam_scale(file, layout, f.values) for file, f in zip(files, found, strict=True)]
@@ -293,9 +303,10 @@ def _headers(files, instrument, arguments):
 def _frame(file, layout, raw, centre):
     """Return what is known of a file; refuse one that cannot be used."""
     from astropolcal.reduction.frames import reduce_frame
-    from astropolcal.reduction.headers import pointing, read_header
+    from astropolcal.reduction.headers import not_of_instrument, pointing, read_header
 
     if centre is None:
+        # finds the star, which takes the time of this step
         frame = reduce_frame(file, layout, source="star", raw=raw)
     else:
         frame = read_header(file, layout, raw=raw)
@@ -306,12 +317,9 @@ def _frame(file, layout, raw, centre):
             except ObservationError:
                 # whether they are needed depends on the calibration
                 pass
-    own = frame.values.get("instrument")
-    if own is not None and layout.identities and own not in layout.identities:
-        raise ObservationError(
-            f"{file}: {layout.keywords['instrument']} = {own!r}, allowed are "
-            f"{', '.join(layout.identities)}"
-        )
+    foreign = not_of_instrument(frame.values, layout)
+    if foreign:
+        raise ObservationError(f"{file}: {foreign}")
     if frame.errors:
         hint = "; --raw names a folder of raw frames" if raw is None and layout.raw_columns else ""
         raise ObservationError(f"{file}: {'; '.join(frame.errors)}{hint}")
@@ -321,6 +329,7 @@ def _frame(file, layout, raw, centre):
 def _position_angles(table, arguments):
     if arguments.rotation == "none":
         return None
+    # from north through east
     angle = np.full(len(table), arguments.camera_angle) * u.deg
     if arguments.rotation == "pupil":
         if "parallactic" not in table.colnames:
@@ -370,12 +379,15 @@ def _summary(result, star, arguments, n_frames):
 
 def _plain(values):
     """Return numbers for JSON, None where there is none."""
+    # JSON has no NaN
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _report(summary):
+    # None where nothing was determined
     condition = [value for value in summary["condition"] if value is not None]
-    print(f"Written: {summary['output']} ({summary['n_frames']} frames, mode {summary['mode']})")
+    frames = counted(summary["n_frames"], "frame")
+    print(f"Written: {summary['output']} ({frames}, mode {summary['mode']})")
     print(f"  calibration: {summary['calibration']}")
     if condition:
         print(f"  condition: {min(condition):.3g} to {max(condition):.3g}")
@@ -400,7 +412,9 @@ def _middle(values, form, unit, turns=False):
     if known.size == 0:
         return "not known"
     if turns:
+        # mean direction of doubled angles, from which the median is counted
         centre = np.degrees(np.angle(np.exp(2j * np.radians(known)).sum())) / 2
         known = centre + (known - centre + 90) % 180 - 90
-        return f"{np.median(known) % 180:{form}}{unit}"
+        # rounded before the modulus, or 179.97 would be shown as 180.0
+        return f"{float(f'{np.median(known):{form}}') % 180:{form}}{unit}"
     return f"{np.median(known):{form}}{unit}"

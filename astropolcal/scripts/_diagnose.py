@@ -91,6 +91,7 @@ def run(arguments):
     from astropolcal.gap import diagnose
     from astropolcal.gap.report import summary, to_dict
 
+    # needs no table
     if arguments.effects == "help":
         print(_list_of_effects())
         return
@@ -99,6 +100,7 @@ def run(arguments):
     effects = _effects(arguments.effects)
     nominal, datasets, instrument = _nominal(arguments)
     diagnosis = diagnose(nominal, datasets, effects=effects, progress=progress)
+    # once: page, JSON and summary say the same
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
     written = _write(diagnosis, content, arguments, instrument)
@@ -140,6 +142,7 @@ def _list_of_effects():
 def _nominal(arguments):
     """Return the nominal calibration or chains, the datasets, and the instrument's name."""
     first, *rest = arguments.files or [""]
+    # by the name: a table is never called that
     known = first if Path(first).suffix == ".asdf" else None
     files = rest if known else arguments.files
     if not files:
@@ -166,6 +169,7 @@ def _of_calibration(path, files, datasets, edits, arguments):
         _record(calibration, path, file, dataset)
         for file, dataset in zip(files, datasets, strict=True)
     ]
+    # the very tables of the calibration: its fit need not be repeated
     hashes = [dataset.content_hash for dataset in datasets]
     if hashes == [r.content_hash for r in calibration.datasets] and not any(edits.values()):
         return calibration.with_observations(datasets), datasets, calibration.instrument
@@ -176,6 +180,7 @@ def _of_calibration(path, files, datasets, edits, arguments):
 def _record(calibration, path, file, dataset):
     """Return which dataset of a calibration has the chain for a table."""
     known = calibration.datasets
+    # its own chain if the table was calibrated, else one of the same kind of source
     same = [i for i, r in enumerate(known) if r.content_hash == dataset.content_hash]
     alike = [i for i, r in enumerate(known) if r.source == dataset.source]
     if same or alike:
@@ -237,6 +242,7 @@ def _size_figures(diagnosis, content):
 
 def _varies(size):
     value = size["value"]
+    # a figure of a constant shows nothing
     return isinstance(value, list) and max(value) - min(value) > 1e-6 * max(map(abs, value))
 
 
@@ -245,6 +251,7 @@ def _improved(diagnosis, instrument):
     from astropolcal.calibration import calibrate
 
     model = diagnosis.improved
+    # their sizes are what was found; fitting them again could move them
     held = [p.name for parameters in model.added.values() for p in parameters]
     observations = model.observations
     return calibrate(

@@ -51,8 +51,9 @@ def add_parser(commands):
 
 def _add_observation(parser):
     """Add what says of which observations the efficiency is."""
-    parser.add_argument("--altitude", type=float, default=60.0, metavar="DEG", help="default: 60")
-    parser.add_argument("--parallactic", type=float, default=0.0, metavar="DEG", help="default: 0")
+    # without a default, so that it is known whether the table was asked for
+    parser.add_argument("--altitude", type=float, metavar="DEG", help="default: 60")
+    parser.add_argument("--parallactic", type=float, metavar="DEG", help="default: 0")
     parser.add_argument(
         "--derotator",
         type=float,
@@ -86,6 +87,9 @@ def _add_observation(parser):
 def run(arguments):
     """Print the table, draw the figure and write what was asked for."""
     check_outputs(arguments.output, arguments.json)
+    tabulated = _is_table_wanted(arguments)
+    arguments.altitude = _or(arguments.altitude, 60.0)
+    arguments.parallactic = _or(arguments.parallactic, 0.0)
     instrument, chain, grid = _chain(arguments)
     content = _table(arguments, instrument, chain, grid)
     if arguments.target or arguments.night:
@@ -95,8 +99,18 @@ def run(arguments):
     if arguments.json:
         write_json(content, arguments.json)
     if not is_quiet(arguments):
-        print(_text(content))
+        print(_text(content, tabulated))
         say_written(print, [path for path in (arguments.output, arguments.json) if path])
+
+
+def _is_table_wanted(arguments):
+    """Return whether the table is printed: a target has its own pointing, not that of the table."""
+    asked = (arguments.altitude, arguments.parallactic, arguments.derotator, arguments.wavelength)
+    return not (arguments.target or arguments.night) or any(a is not None for a in asked)
+
+
+def _or(value, default):
+    return default if value is None else value
 
 
 def _chain(arguments):
@@ -120,7 +134,7 @@ def _chain(arguments):
 
 def _on_sky(instrument, chain, grid, arguments):
     """Return the chain behind the telescope; as it is where no telescope is known."""
-    if type(instrument).on_sky is instruments.Instrument.on_sky or "parallactic" in stages(chain):
+    if not instrument.has_telescope or "parallactic" in stages(chain):
         return chain
     known = {"wavelength": grid, "date": arguments.date}
     if arguments.date is not None and "date" not in instrument.sky_options:
@@ -146,6 +160,7 @@ def _table(arguments, instrument, chain, grid):
     )
     content = {"instrument": instrument.name}
     content |= {f"{key}_deg": a.value for key, a in _pointing(arguments, chain).items()}
+    # absent where there is none, not empty
     content |= {"derotator_deg": derotator.tolist()} if turns else {}
     return content | {
         "wavelength_nm": grid.to_value(u.nm)[rows].tolist(),
@@ -167,6 +182,7 @@ def _mode(arguments, instrument):
         raise ParameterError(
             f"--law {arguments.law}: allowed of {instrument.name} are {', '.join(modes)}"
         )
+    # high-contrast imaging keeps the pupil still
     usual = "pupil" if "pupil" in modes else next(iter(modes), None)
     return arguments.law or usual
 
@@ -174,8 +190,10 @@ def _mode(arguments, instrument):
 def _rows(wanted, grid):
     lam = grid.to_value(u.um)
     if wanted is None:
+        # eight columns fit a terminal
         return np.unique(np.linspace(0, lam.size - 1, min(8, lam.size)).astype(int))
     wanted = np.array(wanted)
+    # 2 %: a rounded wavelength of the first or last bin is meant
     outside = (wanted < 0.98 * lam.min()) | (wanted > 1.02 * lam.max())
     if outside.any():
         raise ParameterError(
@@ -191,6 +209,9 @@ def _best(arguments, instrument, chain, grid):
     altitude, parallactic = _track(arguments, instrument)
     mode = _mode(arguments, instrument)
     best = best_derotator(chain, grid, altitude, parallactic, law=mode, instrument=instrument)
+    # north of the zenith the angle passes 180 deg, and goes on at -180 deg
+    turned = np.unwrap(parallactic.to_value(u.deg), period=360)
+    # the offset whose worst moment is the best
     row = int(np.argmax(best.table["least"]))
     return {
         "law": best.law,
@@ -199,7 +220,7 @@ def _best(arguments, instrument, chain, grid):
         "mean": float(best.table["mean"][row]),
         "least_of_any_offset": float(np.min(best.table["least"])),
         "altitude_deg": [float(f(altitude.value)) for f in (np.min, np.max)],
-        "parallactic_deg": [float(f(parallactic.value)) for f in (np.min, np.max)],
+        "parallactic_deg": [float(f(turned)) for f in (np.min, np.max)],
     }
 
 
@@ -216,6 +237,7 @@ def _track(arguments, instrument):
     if location is None:
         raise InstrumentError(f"{instrument.name}: its site is not known")
     try:
+        # degrees only: names would ask a server
         coord = SkyCoord(*(float(x) for x in arguments.target.split(",")), unit=u.deg)
         start, end = (Time(text, scale="utc") for text in arguments.night.split("/"))
     except (TypeError, ValueError) as error:
@@ -235,6 +257,7 @@ def _draw(arguments, instrument, chain, grid):
         grid,
         altitude=arguments.altitude * u.deg,
         parallactic=arguments.parallactic * u.deg,
+        # one angle a figure, the last that was asked for
         derotator=(arguments.derotator or [90.0])[-1] * u.deg,
         shown=None if arguments.wavelength is None else arguments.wavelength * u.um,
         instrument=instrument,
@@ -253,7 +276,14 @@ def _where(content):
     )
 
 
-def _text(content):
+def _text(content, tabulated=True):
+    parts = [_table_text(content)] if tabulated else []
+    if "best_derotator" in content:
+        parts.append(_best_text(content["best_derotator"], content["instrument"]))
+    return "\n\n".join(parts)
+
+
+def _table_text(content):
     turns = "derotator_deg" in content
     lines = [
         f"Polarimetric efficiency of {content['instrument']} {_where(content)}",
@@ -262,18 +292,19 @@ def _text(content):
     ]
     for i, row in enumerate(content["efficiency"]):
         angle = f"{content['derotator_deg'][i]:8.2f} " if turns else ""
-        lines.append(angle + "".join(f"{value:8.3f}" for value in row))
-    best = content.get("best_derotator")
-    if best:
-        (low, high), (east, west) = best["altitude_deg"], best["parallactic_deg"]
-        lines += [
-            "",
-            f"Target at altitude {low:.1f} to {high:.1f} deg, parallactic angle {east:.1f} to "
-            f"{west:.1f} deg",
-            f"Best derotator offset, {best['law']} still: {best['offset_deg']:g} deg",
-            f"  efficiency over times, wavelengths and angles of polarization: least "
-            f"{best['least']:.3f},",
-            f"  mean {best['mean']:.3f}; with the worst offset the least is "
-            f"{best['least_of_any_offset']:.3f}",
-        ]
+        lines.append(angle + "".join(f"{value:z8.3f}" for value in row))
+    return "\n".join(lines)
+
+
+def _best_text(best, instrument):
+    (low, high), (east, west) = best["altitude_deg"], best["parallactic_deg"]
+    lines = [
+        f"Target at altitude {low:z.1f} to {high:z.1f} deg, parallactic angle {east:z.1f} to "
+        f"{west:z.1f} deg",
+        f"Best derotator offset of {instrument}, {best['law']} still: {best['offset_deg']:zg} deg",
+        f"  efficiency over times, wavelengths and angles of polarization: least "
+        f"{best['least']:z.3f},",
+        f"  mean {best['mean']:z.3f}; with the worst offset the least is "
+        f"{best['least_of_any_offset']:z.3f}",
+    ]
     return "\n".join(lines)

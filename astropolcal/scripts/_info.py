@@ -4,22 +4,24 @@
 from pathlib import Path
 
 from astropolcal.scripts._common import add_json, wrapped, write_json
+from astropolcal.scripts._describing import describe_fits, describe_table, is_observation
+from astropolcal.words import counted
 
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
     parser = commands.add_parser(
         "info",
-        help="say what a calibration, a folder of them or an observation table holds",
-        description="Say what a calibration file, a folder of calibrations or an observation "
-        "table holds, how good it is and for what it is valid; without a file, what this "
-        "installation knows.",
+        help="say what a calibration, a folder of them, a table, cube or product holds",
+        description="Say what a calibration file, a folder of calibrations, an observation "
+        "table, an image cube or a corrected product holds; of a calibration also how good it is "
+        "and for what it is valid. Without a file, what this installation knows.",
     )
     parser.add_argument(
         "file",
         nargs="?",
         metavar="FILE|DIR",
-        help="ASDF calibration, folder of calibrations, or ECSV table",
+        help="ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product",
     )
     parser.add_argument("--instruments", action="store_true", help="list the instruments only")
     add_json(parser, "write it")
@@ -39,8 +41,10 @@ def run(arguments):
         text, content = _library(arguments.file)
     elif Path(arguments.file).suffix.lower() == ".asdf":
         text, content = _calibration(arguments.file)
+    elif _is_fits(arguments.file):
+        text, content = _lines(*describe_fits(arguments.file))
     else:
-        text, content = _observations(arguments.file)
+        text, content = _table(arguments.file)
     if arguments.json:
         write_json(content, arguments.json)
     if arguments.json != "-":
@@ -70,6 +74,7 @@ def _calibration(path):
     from astropolcal.calibration.validity import content_hash, validity_of
 
     calibration = Calibration.read(path)
+    # when it was made and for when it holds are two things
     made, held = calibration.provenance, validity_of(calibration)
     digest = content_hash(calibration)
     lines = [
@@ -92,10 +97,11 @@ def _library(folder):
 
     library = Library(folder)
     table = library.table()
-    lines = [f"{folder}: {len(library)} calibration{'s' * (len(library) != 1)}"]
+    lines = [f"{folder}: {counted(len(library), 'calibration')}"]
     files = []
     for entry, row in zip(library.entries, table, strict=True):
         good = f"s_res {_percent(row['s_res'])}, s_cv {_percent(row['s_cv'])}"
+        # loud: nobody should take it by accident
         state = "" if row["converged"] else ", NOT CONVERGED"
         lines += [
             f"{entry.name}",
@@ -127,10 +133,38 @@ def _plain(row):
 
 
 def _percent(value):
+    # NaN is not equal to itself
     return f"{value:.3f} %" if value == value else "-"
 
 
 _DULL = ("description", "comments", "reference")
+_FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
+
+
+def _is_fits(path):
+    """Return whether a file is, or by its name claims to be, a FITS file."""
+    if str(path).lower().endswith(_FITS_NAMES):
+        return True
+    try:
+        with open(path, "rb") as stream:
+            return stream.read(9) == b"SIMPLE  ="
+    except OSError:
+        # the reader of tables says what is wrong
+        return False
+
+
+def _lines(lines, content):
+    return "\n".join(wrapped(line, indent=4) for line in lines), content
+
+
+def _table(path):
+    """Return what an ECSV table holds: beam fluxes, or something else."""
+    from astropolcal.observations.reading import read_ecsv
+
+    table = read_ecsv(path)
+    if is_observation(table):
+        return _observations(path)
+    return _lines(*describe_table(path, table))
 
 
 def _observations(path):
@@ -138,7 +172,9 @@ def _observations(path):
 
     from astropolcal.observations import Observations
 
+    # again, with all checks; the first look was for the columns only
     observations = Observations.read(path)
+    # raises where a plate angle has no partner at all
     pairs = observations.pairs()
     content = {
         "file": str(path),

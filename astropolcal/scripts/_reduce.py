@@ -3,6 +3,7 @@
 
 import argparse
 import sys
+from collections import Counter
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
@@ -14,9 +15,12 @@ from astropolcal.scripts._common import (
     check_outputs,
     cube_files,
     number_or,
+    printer,
     write_json,
 )
+from astropolcal.words import counted
 
+# a folder of other files must not push the summary off the screen
 _MAX_LISTED = 20
 
 _EPILOG = """\
@@ -49,7 +53,7 @@ def add_parser(commands):
     )
     parser.add_argument("--quicklook", metavar="DIR", help="write figures to this folder")
     add_json(parser)
-    add_quiet(parser, "no progress bar")
+    add_quiet(parser)
     parser.set_defaults(run=run)
 
 
@@ -133,10 +137,12 @@ def run(arguments):
             workers=arguments.workers,
             resume=arguments.resume,
             hwp_sequence=arguments.hwp_sequence,
+            # tqdm counts steps, the reduction the total
             progress=lambda done, _: bar.update(done - bar.n),
             **_options(arguments),
         )
     reduction.write(arguments.output, overwrite=True)
+    # after the table, which is what the time went into
     figures = _quicklook(reduction, arguments.quicklook)
     if arguments.json:
         summary = {"output": str(arguments.output)} | reduction.summary()
@@ -151,6 +157,7 @@ def _options(arguments):
         for name in ("background", "radius", "aperture_correction")
         if (value := getattr(arguments, name)) is not None
     }
+    # options of one photometry do nothing in the other
     wrong = {"background"} & set(given) if star else set(given) - {"background"}
     if wrong:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(wrong))
@@ -171,27 +178,24 @@ def _report(reduction, arguments, figures):
     """Say what was done on stdout, and what was left out on stderr."""
     for path, why in list(reduction.problems.items())[:_MAX_LISTED]:
         print(f"astropolcal: left out: {Path(path).name}: {'; '.join(why)}", file=sys.stderr)
+    # on stderr also with -q: what was lost is a warning
     more = len(reduction.problems) - _MAX_LISTED
     if more > 0:
-        print(f"astropolcal: left out: {more} more files (--json lists all)", file=sys.stderr)
-    for why, paths in _by_reason(reduction.doubts).items():
-        print(f"astropolcal: doubtful: {paths} files: {why}", file=sys.stderr)
-    if arguments.json == "-":
-        return
-    summary = reduction.summary()
-    print(
-        f"Written: {arguments.output} ({summary['n_frames']} frames, "
-        f"{summary['n_masked']} of {summary['n_cells']} cells masked)"
+        words = f"{counted(more, 'more file')} (--json lists all)"
+        print(f"astropolcal: left out: {words}", file=sys.stderr)
+    for why, count in _by_reason(reduction.doubts).items():
+        print(f"astropolcal: doubtful: {counted(count, 'file')}: {why}", file=sys.stderr)
+    say, summary = printer(arguments), reduction.summary()
+    say(
+        f"Written: {arguments.output} ({counted(summary['n_frames'], 'frame')}, "
+        f"{summary['n_masked']} of {counted(summary['n_cells'], 'cell')} masked)"
     )
     for reason, count in summary["flags"].items():
-        print(f"  masked, {reason}: {count} cells")
+        say(f"  masked, {reason}: {counted(count, 'cell')}")
     if figures:
-        print(f"Figures: {arguments.quicklook} ({len(figures)} files)")
+        say(f"Figures: {arguments.quicklook} ({counted(len(figures), 'file')})")
 
 
 def _by_reason(doubts):
-    counts = {}
-    for reasons in doubts.values():
-        for reason in reasons:
-            counts[reason] = counts.get(reason, 0) + 1
-    return counts
+    """Return the number of files by what is odd about them, in the order of the files."""
+    return Counter(reason for reasons in doubts.values() for reason in reasons)

@@ -17,6 +17,7 @@ from astropolcal.scripts._common import (
     wrapped,
     write_calibration,
 )
+from astropolcal.words import counted
 
 _EPILOG = """\
 examples:
@@ -102,6 +103,7 @@ def run(arguments):
     check_outputs(arguments.output, arguments.json, arguments.checkpoint)
     _check_options(arguments)
     calibration = Calibration.read(arguments.calibration)
+    # recognized by content, so that their order does not matter
     calibration = calibration.with_observations(read_datasets(arguments.files))
     calibration.posterior = _sample(calibration, arguments)
     # first the files: a reader of our words may have gone in the meantime
@@ -117,6 +119,7 @@ def _check_options(arguments):
         raise AstropolcalError("--resume needs --checkpoint FILE.h5")
     if arguments.seed is not None and arguments.seed < 0:
         raise AstropolcalError(f"--seed {arguments.seed}: allowed are whole numbers from 0 up")
+    # a run of days must not be overwritten by a typo
     if arguments.checkpoint and Path(arguments.checkpoint).exists() and not arguments.resume:
         raise AstropolcalError(
             f"{arguments.checkpoint}: exists already; --resume goes on from it, or remove it"
@@ -150,16 +153,21 @@ def _sample(calibration, arguments):
 def _words(posterior):
     """Return the run in words, and what is common to all wavelengths as a table."""
     parameters = posterior.report()["parameters"]
+    # values of a wavelength end in [i]; hundreds of them do not fit a terminal
     common = {name: entry for name, entry in parameters.items() if not name.endswith("]")}
+    # if only such values varied, they are all there is
     shown = common or parameters
     width = max(map(len, shown)) + 2
     lines = [wrapped(line, indent=2) for line in posterior.words().splitlines()]
     lines += ["", "".join(f"{text:>13}" for text in _COLUMNS).rjust(width + 52)]
     for name, entry in shown.items():
-        numbers = "".join(f"{entry[key]:13.5f}" for key in _COLUMNS)
+        numbers = "".join(f"{entry[key]:z13.5f}" for key in _COLUMNS)
         lines.append(f"{name:<{width}}{numbers} {entry['unit']}".rstrip())
     lines.append("median, and the 68 % interval from lower to upper")
     rest = len(parameters) - len(shown)
     if rest:
-        lines.append(f"{rest} values given per wavelength are in the file and in the JSON")
+        are = "is" if rest == 1 else "are"
+        lines.append(
+            f"{counted(rest, 'value')} given per wavelength {are} in the file and in the JSON"
+        )
     return "\n".join(lines)

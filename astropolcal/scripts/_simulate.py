@@ -6,16 +6,20 @@ import argparse
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.scripts._common import (
     add_json,
+    add_quiet,
     angles,
     check_folders,
     check_outputs,
     edit_chains,
+    printer,
     write_json,
 )
+from astropolcal.words import counted
 
 #: What the packaged example was made with.
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 
+# double differences of Q, then of U: the order in which stars are observed
 _STAR_CYCLE = [0, 45, 22.5, 67.5]
 
 _EPILOG = """\
@@ -76,6 +80,7 @@ def add_parser(commands):
         help="take an optic out of the true chain",
     )
     add_json(parser)
+    add_quiet(parser)
     parser.set_defaults(run=run)
 
 
@@ -169,21 +174,21 @@ def run(arguments):
     check_outputs(arguments.output, arguments.json)
     check_folders(arguments.cubes)
     chain, wavelength, meta = _truth(arguments)
+    # free and prior mean nothing for what is true
     (chain,) = edit_chains([chain], without=arguments.without, fix=arguments.fix)
     frames = _frames(arguments, chain)
     observations = _table(arguments, chain, wavelength, frames, _meta(meta, arguments))
     written = []
     if arguments.cubes:
         paths = _write_cubes(arguments, chain, wavelength, frames)
-        written.append(f"{arguments.cubes} ({len(paths)} cubes)")
+        written.append(f"{arguments.cubes} ({counted(len(paths), 'cube')})")
     if arguments.output:
         observations.write(arguments.output, overwrite=True)
-        size = f"{observations.n_frames} frames x {observations.n_bins} wavelengths"
-        written.append(f"{arguments.output} ({size})")
+        size = counted(observations.n_frames, "frame"), counted(observations.n_bins, "wavelength")
+        written.append(f"{arguments.output} ({' x '.join(size)})")
     if arguments.json:
         write_json(_summary(observations, arguments), arguments.json)
-    if arguments.json != "-":
-        print(f"Written: {', '.join(written)}")
+    printer(arguments)(f"Written: {', '.join(written)}")
 
 
 def _frames(arguments, chain):
@@ -207,7 +212,9 @@ def _frames(arguments, chain):
         if ends and not star:
             raise AstropolcalError(f"--{name}: is for --source star")
         if star:
+            # linear in the frame: close to the sky over an hour or less
             frames[name] = np.linspace(ends[0], ends[-1], len(frames)) * u.deg
+    # a modulator alternates within each setting of the plate
     return both_states(frames) if "flc_state" in stages(chain) else frames
 
 
@@ -221,6 +228,7 @@ def _table(arguments, chain, wavelength, frames, meta):
         "flux": arguments.flux,
         "gain": arguments.gain,
         "read_noise": arguments.read_noise,
+        # beside cubes the table is the truth that a reduction must find again
         "noise": not (arguments.no_noise or arguments.cubes),
         "seed": arguments.seed,
         "meta": meta,
@@ -250,7 +258,7 @@ def _write_cubes(arguments, chain, wavelength, frames):
         noise=not arguments.no_noise,
         saturate=arguments.saturate,
         seed=arguments.seed,
-        progress=True,
+        progress=not arguments.quiet,
         **{name: getattr(arguments, name) for name in _IMAGES},
     )
 
@@ -268,6 +276,7 @@ def _truth(arguments):
         from astropolcal.calibration import Calibration
 
         calibration = Calibration.read(arguments.calibration)
+        # a copy: it is edited
         chain, wavelength = calibration.chain.copy(), calibration.wavelength
         meta = dict(calibration.datasets[0].meta)
     else:
@@ -283,10 +292,12 @@ def _behind_telescope(chain, instrument, wavelength):
     """Return the chain with star and telescope in the place of the internal source."""
     from astropolcal.chain import join, leaves, stages
 
+    # a calibration of stars has its telescope already
     if "parallactic" in stages(chain):
         return chain
     if not any(leaf.stage == "hwp" for leaf in leaves(chain)):
         raise AstropolcalError("a star needs a chain with an optic on the stage hwp")
+    # its first optic is the source
     star = leaves(instrument.chain(source="star", wavelength=wavelength))[0]
     # the telescope as published, behind a star of its own polarization
     return join([star, *leaves(instrument.on_sky(chain))])
@@ -294,13 +305,10 @@ def _behind_telescope(chain, instrument, wavelength):
 
 def _meta(meta, arguments):
     """Return the meta of the table: the set-up, less the optics taken out."""
-    absent = {
-        "nbs": {"nasmyth_beam_switcher": "not installed"},
-        "dichroic": {"yjh50_dichroic": "out"},
-    }
-    for optic in arguments.without:
-        meta = meta | absent.get(optic, {})
-    return meta | {"simulated": True}
+    from astropolcal import instruments
+
+    absent = instruments.get(arguments.instrument).meta_without(arguments.without)
+    return meta | absent | {"simulated": True}
 
 
 def _summary(observations, arguments):

@@ -5,9 +5,12 @@ import math
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.scripts._common import add_json, check_outputs, wrapped, write_json
+from astropolcal.words import counted
 
 # more stars than this make a figure unreadable
 _DRAWN = 5
+# of a night, whose list is ordered by how good a star is, so that its end is of no use
+_LISTED = 20
 
 
 def add_parser(commands):
@@ -35,6 +38,12 @@ def add_parser(commands):
         default=30.0,
         help="lowest altitude (default: 30)",
     )
+    add(
+        "--limit",
+        metavar="N",
+        type=int,
+        help=f"how many to list, the best first (default: {_LISTED} of a night, else all)",
+    )
     add_json(parser, "write it")
     add("--plot", metavar="FILE", help="draw altitude and parallactic angle over the night")
     parser.set_defaults(run=run)
@@ -44,6 +53,7 @@ def run(arguments):
     """Print the stars."""
     _check(arguments)
     check_outputs(arguments.json, arguments.plot)
+    # text for people, content for machines, nights for the figure
     text, content, seen = (_one if arguments.name else _many)(arguments)
     if arguments.plot:
         _plot(seen, arguments.plot)
@@ -61,7 +71,9 @@ def _check(arguments):
         raise ParameterError("--plot needs --site and --night")
     if arguments.radius is not None and arguments.near is None:
         raise ParameterError("--radius goes with --near RA,DEC")
-    for option in ("kind", "magnitude", "near"):
+    if arguments.limit is not None and arguments.limit < 1:
+        raise ParameterError(f"--limit {arguments.limit}: allowed are whole numbers from 1 up")
+    for option in ("kind", "magnitude", "near", "limit"):
         if arguments.name and getattr(arguments, option) is not None:
             raise ParameterError(f"--{option} selects among stars; it does not go with a NAME")
 
@@ -147,14 +159,16 @@ def _pair(value, error, form):
 
 
 def _night_lines(seen, content):
+    # hours and minutes of an ISO time
     start, end = (seen.table["time"][seen.table["observable"]][i].iso[11:16] for i in (0, -1))
     low, high = content["altitude_deg"]
     first, last = content["parallactic_deg"]
+    # the format z: what rounds to zero has no sign
     return [
         f"  observable   {start} to {end} UTC, {content['hours']:.1f} h",
         f"  highest      {seen.transit.iso[:16]} UTC",
-        f"  altitude     {low:.1f} to {high:.1f} deg",
-        f"  parallactic  {first:.1f} to {last:.1f} deg",
+        f"  altitude     {low:z.1f} to {high:z.1f} deg",
+        f"  parallactic  {first:z.1f} to {last:z.1f} deg",
         f"  M3 error     {_number(content['m3_error'], '.3f')} of one frame's error (32 frames)",
     ]
 
@@ -179,8 +193,14 @@ def _many(arguments):
         limit = f" above {arguments.min_altitude:g} deg" if arguments.night else ""
         raise ParameterError(f"no standard star{limit} fits what was asked")
     content = {"site": arguments.site, "night": arguments.night}
-    content["stars"] = [_row(row) for row in found]
-    lines = _night_table(found) if arguments.night else _table(found)
+    # a machine gets all unless it asks for fewer
+    content["stars"] = [_row(row) for row in found[: arguments.limit]]
+    shown = found[: arguments.limit or (_LISTED if arguments.night else None)]
+    lines = _night_table(shown) if arguments.night else _table(shown)
+    more = len(found) - len(shown)
+    if more:
+        lines += ["", f"{counted(more, 'more star')}; --limit {len(found)} lists all"]
+    # ordered by the score already
     best = found["name"][:_DRAWN] if arguments.plot else []
     return "\n".join(lines), content, [_observability(str(n), arguments) for n in best]
 
@@ -199,11 +219,12 @@ def _table(found):
     lines = ["name            kind         RA (ICRS)  dec     mag     p (%)"]
     lines[0] += "            deg" if near else ""
     for row in found:
+        # of right ascension
         hours = row["ra"].value / 15
         clock = f"{int(hours):02d} {60 * (hours % 1):04.1f}"
         away = f"  {row['separation'].value:5.1f}" if near else ""
         lines.append(
-            f"{row['name']:<15} {row['kind']:<11}  {clock}  {row['dec'].value:+6.1f}   "
+            f"{row['name']:<15} {row['kind']:<11}  {clock}  {row['dec'].value:+z6.1f}   "
             f"{_magnitude(row):<7} {_pair(row['p'].value, row['p_err'].value, '.3f'):<15}{away}"
         )
     return [line.rstrip() for line in lines]
@@ -218,8 +239,8 @@ def _night_table(found):
             for end in ("min", "max")
         )
         lines.append(
-            f"{row['name']:<15} {row['kind']:<11}  {_magnitude(row):<7} {low:2.0f} to "
-            f"{high:2.0f}  {first:4.0f} to {last:4.0f}  {row['hours'].value:4.1f} "
+            f"{row['name']:<15} {row['kind']:<11}  {_magnitude(row):<7} {low:z2.0f} to "
+            f"{high:z2.0f}  {first:z4.0f} to {last:z4.0f}  {row['hours'].value:4.1f} "
             f"{_number(row['m3_error'], '6.3f'):>6}  {_number(row['m3_score'], '6.3f'):>6}"
         )
     lines += [
@@ -276,6 +297,7 @@ def _row(row):
         value = row[name]
         unit = _UNITS.get(str(getattr(value, "unit", "")), "")
         value = getattr(value, "value", value)
+        # numpy scalars are no JSON
         value = value.item() if hasattr(value, "item") else value
         if isinstance(value, float) and not math.isfinite(value):
             value = None
@@ -284,6 +306,7 @@ def _row(row):
 
 
 def _angles(seen):
+    # of 32 frames, as in the table of a night
     error = seen.information(32).diattenuation
     return {
         "hours": float(seen.hours.value),
@@ -321,6 +344,7 @@ def _position(text):
 
     try:
         ra, dec = text.split(",")
+        # 05:26:06 are hours, 81.5 degrees
         unit = (u.hourangle if ":" in ra else u.deg, u.deg)
         return SkyCoord(ra, dec, unit=unit)
     except (ValueError, u.UnitsError):
@@ -331,6 +355,7 @@ def _position(text):
 
 def _site(text):
     """Return the place, by name or as LON,LAT,HEIGHT."""
+    # a name, which the catalogue of sites knows
     if "," not in text:
         return text
     import astropy.units as u

@@ -22,6 +22,7 @@ class _OneLineParser(argparse.ArgumentParser):
     """A parser whose complaint is one line, like every other error here."""
 
     def error(self, message):
+        # argparse prints the usage in several lines before its complaint
         self.exit(2, f"astropolcal: error: {message} (see {self.prog} --help)\n")
 
 
@@ -55,6 +56,7 @@ def build_parser():
     parser = _OneLineParser(prog="astropolcal", description=_DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"astropolcal {version}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    # in the order in which a night is worked through, as the help lists them
     for module in (
         _reduce,
         _calibrate,
@@ -96,6 +98,7 @@ def main(argv=None):
     """
     arguments = build_parser().parse_args(argv)
     with warnings.catch_warnings():
+        # a user has no use for file and line of our code
         warnings.showwarning = _show_warning
         try:
             arguments.run(arguments)
@@ -104,6 +107,7 @@ def main(argv=None):
             return 2
         except KeyboardInterrupt:
             print("astropolcal: interrupted", file=sys.stderr)
+            # 128 + SIGINT, as shells have it
             return 130
         except BrokenPipeError:
             # whoever read our output has gone; do not complain again at exit

@@ -241,3 +241,40 @@ def test_documentation_names_all():
     for name in COORDINATES:
         assert f'"{name}"' in Observations.position.__doc__
         assert f'"{name}"' in frame_coordinate.__doc__
+
+
+# ---- the state of a modulator ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "states", [["A", "B", "A", "B"], ["a", " b ", "A", "B"], [0, 1, 0, 1], [0.0, 1.0, 0.0, 1.0]]
+)
+def test_state_in_any_spelling_is_zero_or_one(states):
+    table = example_table()
+    table["flc_state"] = np.repeat(states, 3)
+    found = frame_coordinate(Observations.from_table(table), "flc_state")
+    assert found.tolist() == [0.0, 1.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("bad", ["C", "", "2", "on"])
+def test_state_that_is_neither_names_the_frame(bad):
+    table = example_table()
+    table["flc_state"] = np.repeat(["A", "B", bad, "B"], 3)
+    obs = Observations.from_table(table, name="night")
+    words = f"night: flc_state = '{bad}' in frame 2; allowed are A and B, or 0 and 1"
+    with pytest.raises(ObservationError, match=words):
+        frame_coordinate(obs, "flc_state")
+
+
+def test_state_needs_its_column():
+    obs = Observations.from_table(example_table(), name="night")
+    with pytest.raises(ObservationError, match="night: no column flc_state; it is needed, with A"):
+        frame_coordinate(obs, "flc_state")
+
+
+def test_total_flux_is_the_same_for_both_beams():
+    obs = Observations.from_table(example_table())
+    total = frame_coordinate(obs, "total_flux")
+    assert total.shape == (2, 3, 4)
+    np.testing.assert_array_equal(total[0], total[1])
+    np.testing.assert_allclose(total, 1000.0)

@@ -153,7 +153,7 @@ def bad_files(folder):
         "113": (write_cube(folder / "CRSA00000113_cube.fits", good, BUNIT="Jy"), "Jy"),
     }
     listed = dict(made.values())
-    listed |= {cut: "", noise: "not a readable FITS", folder / "CRSA00000114.fits": "no such file"}
+    listed |= {cut: "", noise: "is not a FITS file", folder / "CRSA00000114.fits": "no such file"}
     return listed
 
 

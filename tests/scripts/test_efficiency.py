@@ -3,6 +3,7 @@
 
 import argparse
 import json
+import re
 
 import astropy.units as u
 import numpy as np
@@ -55,8 +56,37 @@ def test_calibration_of_a_lamp_is_taken_to_the_sky(calibration, tmp_path):
 def test_best_offset_for_a_night(capsys):
     run("--target", "72.7,28.3", "--night", NIGHT)
     out = capsys.readouterr().out
-    assert "Best derotator offset, pupil still:" in out
-    assert "Target at altitude" in out
+    assert "Best derotator offset of charis, pupil still:" in out
+    # the table of another pointing was not asked for
+    assert out.startswith("Target at altitude")
+    # the star passes north of the zenith, where the angle goes on from -180 to 180 deg
+    first, last = map(float, re.search(r"parallactic angle (\S+) to (\S+) deg", out).groups())
+    assert first < -180 < last < first + 180
+
+
+@pytest.mark.parametrize(
+    "words", [["--altitude", "60"], ["--parallactic", "0"], ["--derotator", "90"]]
+)
+def test_table_is_printed_beside_a_target_if_it_is_asked_for(words, capsys):
+    run("--target", "72.7,28.3", "--night", NIGHT, *words)
+    table, best = capsys.readouterr().out.strip().split("\n\nTarget")
+    assert table.startswith("Polarimetric efficiency of charis at altitude 60 deg")
+    assert "Best derotator offset" in best
+
+
+def test_json_has_the_table_whatever_is_printed(capsys):
+    run("--target", "72.7,28.3", "--night", NIGHT, "--json", "-")
+    content = json.loads(capsys.readouterr().out)
+    assert content["altitude_deg"] == 60
+    assert content["parallactic_deg"] == 0
+    assert np.shape(content["efficiency"]) == (7, len(content["wavelength_nm"]))
+    assert content["best_derotator"]["least"] >= content["best_derotator"]["least_of_any_offset"]
+
+
+def test_instrument_without_telescope_is_seen_behind_its_source(capsys, monkeypatch):
+    monkeypatch.setattr(type(instruments.get("charis")), "has_telescope", False)
+    run("--derotator", 90)
+    assert "of charis behind the internal source" in capsys.readouterr().out
 
 
 def test_figure_is_written(tmp_path):

@@ -35,7 +35,7 @@ def test_cubes_to_table(cubes, tmp_path, capsys):
     (cubes / "CRSA00000077_cube.fits").write_text("no FITS")
     table, summary = tmp_path / "obs.ecsv", tmp_path / "summary.json"
     look = tmp_path / "look"
-    words = ["-o", table, "--json", summary, "--quicklook", look, "-q"]
+    words = ["-o", table, "--json", summary, "--quicklook", look]
     command(cubes, "--raw", cubes / "raw", "--meta", "yjh50_dichroic=in", *words)
     observations = Observations.read(table)
     assert (observations.n_frames, observations.n_bins) == (4, 22)

@@ -4,7 +4,9 @@
 import argparse
 import json
 
+import astropy.units as u
 import pytest
+from astropy.table import QTable
 
 from astropolcal import standards
 from astropolcal.exceptions import AstropolcalError, ParameterError
@@ -134,3 +136,72 @@ def test_an_unknown_format_or_folder_leaves_no_file(tmp_path):
     with pytest.raises(AstropolcalError, match="no folder"):
         call("HD 30675", "--json", str(tmp_path / "no" / "star.json"))
     assert list(tmp_path.iterdir()) == []
+
+
+# ---- how many are listed ---------------------------------------------------------------
+
+
+def stars_in(text):
+    """Return the names listed, and the lines behind the table."""
+    head, *lines = text.splitlines()
+    end = lines.index("") if "" in lines else len(lines)
+    assert head.startswith("name")
+    return [line[:15].strip() for line in lines[:end]], lines[end:]
+
+
+def test_a_night_lists_the_best_and_says_how_many_more(capsys):
+    names, rest = stars_in(printed(capsys, *NIGHT))
+    every = standards.search(site="subaru", night="2025-11-03")["name"]
+    assert names == list(every[:20])
+    assert rest[-1] == f"{len(every) - 20} more stars; --limit {len(every)} lists all"
+
+
+def test_limit_is_taken_by_lists_of_any_kind(capsys):
+    names, rest = stars_in(printed(capsys, *NIGHT, "--limit", "2"))
+    assert len(names) == 2
+    assert "more stars" in rest[-1]
+    names, rest = stars_in(printed(capsys, "--limit", "3"))
+    assert len(names) == 3
+    assert rest == [
+        "",
+        f"{len(standards.names()) - 3} more stars; --limit {len(standards.names())} lists all",
+    ]
+
+
+def test_one_more_is_one_star(capsys):
+    n = len(standards.search(kind="unpolarized", magnitude=(9, 10), band="H"))
+    words = ["--kind", "unpolarized", "--magnitude", "9,10", "--band", "H", "--limit", str(n - 1)]
+    assert printed(capsys, *words).splitlines()[-1] == f"1 more star; --limit {n} lists all"
+    assert "more star" not in printed(capsys, *words[:-1], str(n))
+
+
+def test_machines_get_all_unless_they_ask_for_fewer(capsys):
+    every = json.loads(printed(capsys, *NIGHT, "--json", "-"))["stars"]
+    few = json.loads(printed(capsys, *NIGHT, "--json", "-", "--limit", "3"))["stars"]
+    assert len(every) > 20
+    assert few == every[:3]
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--limit", "0"], "--limit 0: allowed are whole numbers from 1 up"),
+        (["--limit", "-2"], "--limit -2"),
+        (["HD 30675", "--limit", "2"], "--limit selects among stars; it does not go with a NAME"),
+    ],
+)
+def test_impossible_limits(argv, words):
+    with pytest.raises(ParameterError, match=words):
+        call(*argv)
+
+
+def test_a_column_of_zero_has_no_sign():
+    from astropolcal.scripts._standards import _night_table
+
+    columns = {"name": ["A"], "kind": ["polarized"], "magnitude": [4.0] * u.mag}
+    columns |= {"magnitude_band": ["V"], "hours": [2.0] * u.h, "m3_error": [0.1], "m3_score": [0.1]}
+    for end, value in (("min", -0.2), ("max", 0.2)):
+        columns[f"altitude_{end}"] = [30.0] * u.deg
+        columns[f"parallactic_{end}"] = [value] * u.deg
+    line = _night_table(QTable(columns))[1]
+    assert "   0 to    0" in line

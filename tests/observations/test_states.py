@@ -1,0 +1,178 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Frames in the two states of a modulator: pairs, quadruples, and the groups of a table."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.observations import Observations, example_table
+from astropolcal.observations.groups import FrameGroups
+from astropolcal.observations.pairing import pair_states, quadruples
+
+AB = [0, 1]
+
+
+def states(state, hwp=0.0, derotator=90.0, **options):
+    state = np.asarray(state)
+    angles = (np.broadcast_to(a, state.shape) * u.deg for a in (hwp, derotator))
+    return pair_states(state, *angles, **options).tolist()
+
+
+def modulated(hwp, state, **columns):
+    """Return observations of one bin with the column flc_state."""
+    table = example_table(hwp=hwp, wavelength=(0.625,))
+    table["flc_state"] = list(state)
+    for name, column in columns.items():
+        table[name] = column
+    return Observations.from_table(table, name="night")
+
+
+# ---- pairs of states -----------------------------------------------------------------
+
+
+def test_state_a_comes_first_whatever_the_order():
+    assert states([0, 1]) == [[0, 1]]
+    assert states([1, 0]) == [[1, 0]]
+    assert states([1, 0, 0, 1], hwp=[0, 0, 45, 45]) == [[1, 0], [2, 3]]
+
+
+def test_nearest_in_time_wins():
+    # the third frame is farther in number, yet nearer in time
+    assert states([0, 1, 1], time=[0.0, 10.0, 1.0], share=True) == [[0, 1], [0, 2]]
+    with pytest.warns(AstropolcalWarning, match="1 of 3 frames left out, their partner in the"):
+        assert states([0, 1, 1], time=[0.0, 10.0, 1.0]) == [[0, 2]]
+
+
+@pytest.mark.parametrize(
+    ("hwp", "derotator", "paired"),
+    [
+        ([0.0, 0.29], 90.0, True),
+        ([0.0, 0.31], 90.0, False),
+        ([0.0, 180.0], 90.0, True),
+        ([179.9, 0.1], 90.0, True),
+        ([0.0, 90.0], 90.0, False),
+        (0.0, [90.0, 90.49], True),
+        (0.0, [90.0, 90.51], False),
+        (0.0, [-90.0, 90.0], True),
+    ],
+)
+def test_both_angles_must_agree_modulo_half_a_turn(hwp, derotator, paired):
+    if paired:
+        assert states(AB, hwp, derotator) == [[0, 1]]
+        return
+    with pytest.raises(ObservationError, match="has no partner; a frame in state B at these"):
+        states(AB, hwp, derotator)
+
+
+def test_tolerances_are_options():
+    assert states(AB, [0, 2], tolerance=2.1 * u.deg) == [[0, 1]]
+    assert states(AB, 0, [90, 93], derotator_tolerance=3.1 * u.deg) == [[0, 1]]
+
+
+@pytest.mark.parametrize(("rows", "where"), [(None, "frame index 2"), ([1, 4, 7], "row 7")])
+def test_lonely_frame_is_named_with_state_and_angles(rows, where):
+    words = f"night, {where}: flc_state B at hwp = 22.5 deg and derotator = 90 deg has no partner"
+    with pytest.raises(ObservationError, match=words):
+        states([0, 1, 1], [0, 0, 22.5], rows=rows, name="night")
+
+
+@given(st.permutations(range(8)))
+def test_pairs_do_not_depend_on_the_order_of_the_rows(order):
+    """Four plate angles in both states: each datum keeps its angle, and A comes first."""
+    hwp, state = np.repeat([0, 45, 22.5, 67.5], 2)[order], np.tile(AB, 4)[order]
+    found = states(state, hwp)
+    assert sorted(np.ravel(found).tolist()) == list(range(8))
+    for a, b in found:
+        assert (state[a], state[b]) == (0, 1)
+        assert hwp[a] == hwp[b]
+
+
+# ---- both states at both plate angles ------------------------------------------------
+
+
+def test_quadruple_has_states_at_plus_then_minus():
+    pairs = np.array([[1, 0], [2, 3], [5, 4], [6, 7]])
+    hwp = np.repeat([0, 22.5, 45, 67.5], 2) * u.deg
+    found = quadruples(pairs, hwp, [90] * 8 * u.deg)
+    assert found.tolist() == [[1, 0, 5, 4], [2, 3, 6, 7]]
+
+
+def test_quadruple_by_time():
+    pairs = np.array([[0, 1], [2, 3], [4, 5]])
+    hwp = np.repeat([0, 45, 45], 2) * u.deg
+    with pytest.warns(AstropolcalWarning, match="frame 2 "):
+        found = quadruples(pairs, hwp, [90] * 6 * u.deg, time=[0, 0, 9, 9, 1, 1])
+    assert found.tolist() == [[0, 1, 4, 5]]
+
+
+def test_plate_without_partner_is_named_by_its_row():
+    pairs = np.array([[0, 1], [2, 3]])
+    hwp = np.repeat([0, 22.5], 2) * u.deg
+    with pytest.raises(ObservationError, match="night, row 11: hwp = 0 deg has no partner"):
+        quadruples(pairs, hwp, [90] * 4 * u.deg, rows=[11, 12, 13, 14], name="night")
+
+
+# ---- groups of a table ---------------------------------------------------------------
+
+
+def test_a_state_is_never_paired_with_the_other_by_the_plate():
+    obs = modulated((0, 0, 45, 45), "ABBA")
+    assert obs.pairs().tolist() == [[0, 3], [1, 2]]
+    assert obs.paired_by("flc_state").pairs().tolist() == [[0, 1], [3, 2]]
+    assert obs.groups(4).tolist() == [[0, 1, 3, 2]]
+    assert obs.groups(1).tolist() == [[0], [1], [2], [3]]
+    # the nearest frame 45 deg away is in the other state
+    assert modulated((0, 0, 45, 45), "ABAB").pairs().tolist() == [[0, 2], [1, 3]]
+
+
+@pytest.mark.parametrize("size", [0, 3, "2", None])
+def test_groups_of_other_sizes_are_refused(size):
+    with pytest.raises(ObservationError, match=f"groups of {size!r} frames; allowed are 1, 2 and"):
+        modulated((0, 0, 45, 45), "ABAB").groups(size)
+
+
+def test_groups_are_found_once_and_cannot_be_changed():
+    groups = FrameGroups(modulated((0, 0, 45, 45), "ABAB"))
+    first = groups.pairs()
+    assert groups.pairs(0.3 * u.deg, 30 * u.arcmin) is first
+    assert groups.pairs(0.2 * u.deg) is not first
+    assert groups.quadruples() is groups.quadruples()
+    with pytest.raises(ValueError, match="read-only"):
+        first[0, 0] = 3
+
+
+@pytest.mark.parametrize(("n_frames", "words"), [(1, "none of its 1 frame can"), (2, "2 frames")])
+def test_a_table_without_any_pair_is_an_error(n_frames, words):
+    """45 deg apart, but the derotator moved in between: no row is to blame."""
+    table = example_table(hwp=(0.0,), derotator=(90.0,) if n_frames == 1 else (90.0, 45.0))
+    table["hwp"] = np.where(table["frame"] == 1, 45.0, 0.0) * u.deg
+    obs = Observations.from_table(table, name="night")
+    if n_frames == 1:
+        with pytest.raises(ObservationError, match="night, row 1: hwp = 0 deg has no partner"):
+            obs.pairs()
+        return
+    with (
+        pytest.warns(AstropolcalWarning, match="2 of 2 frames left out"),
+        pytest.raises(ObservationError, match=f"night: none of its {words} can be paired; two"),
+    ):
+        obs.pairs()
+
+
+def test_unknown_pairing_is_refused():
+    obs = modulated((0, 0, 45, 45), "ABAB")
+    words = "night: pairing = 'time' in the meta; allowed are hwp, flc_state"
+    with pytest.raises(ObservationError, match=words):
+        obs.paired_by("time")
+    obs.meta["pairing"] = "time"
+    with pytest.raises(ObservationError, match=words):
+        obs.pairs()
+
+
+def test_time_of_the_table_decides():
+    # two cycles; the second A is nearer in time to the first B
+    obs = modulated((0, 0, 0, 0), "ABAB", time=[0.0, 50.0, 49.0, 100.0])
+    found = obs.paired_by("flc_state").pairs().tolist()
+    assert found == [[0, 3], [2, 1]]

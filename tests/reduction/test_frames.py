@@ -1,0 +1,245 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""One file: what cannot be opened, what its header lacks, and frames as plain numbers."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from reduction_lab import HEADER, expose, write_cube
+
+from astropolcal import instruments
+from astropolcal.exceptions import ObservationError
+from astropolcal.reduction import reduce_run
+from astropolcal.reduction.frames import Frame, _check_header, open_cube, reduce_frame
+from astropolcal.reduction.headers import not_of_instrument, observation_time
+
+LAYOUT = instruments.get("charis").files
+
+
+@pytest.fixture
+def flat(small, tmp_path, flat_cube):
+    """A good file."""
+    return write_cube(tmp_path / "CRSA00000001_cube.fits", flat_cube)
+
+
+def opened(path, layout):
+    with open_cube(path, layout) as (_, _, cube, good):
+        return np.array(cube), good
+
+
+# ---- files that cannot be opened -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"hello world\n", "is not a FITS file"),
+        (b"# %ECSV 1.0\n" * 400, "is not a FITS file"),
+        (b"", "not a readable FITS file: Empty or corrupt FITS file"),
+    ],
+)
+def test_other_files_are_called_that(tmp_path, small, content, words):
+    path = tmp_path / "night.fits"
+    path.write_bytes(content)
+    with (
+        pytest.raises(ObservationError, match=f"night.fits: {words}$"),
+        open_cube(path, small.files),
+    ):
+        pass
+    # what astropy would have tried does not help anybody here
+    with pytest.raises(ObservationError, match=f"^the file cannot be used: .*{words}$") as caught:
+        reduce_run([path], small)
+    assert "ignore_missing" not in str(caught.value)
+
+
+def test_many_bad_files_are_counted(tmp_path, small):
+    words = r"none of the 2 files can be used: .*a.fits: no such file \(and 1 more\)"
+    with pytest.raises(ObservationError, match=words):
+        reduce_run([tmp_path / "a.fits", tmp_path / "b.fits"], small)
+
+
+@pytest.mark.parametrize("size", [4000, 40_000])
+def test_truncated_files_are_refused_without_a_warning(flat, small, size):
+    flat.write_bytes(flat.read_bytes()[:size])
+    with pytest.raises(ObservationError, match="the file cannot be used: "):
+        reduce_run([flat], small)
+
+
+def test_what_fails_in_the_block_is_not_the_file(flat, small):
+    with pytest.raises(OSError, match="No SIMPLE card of the caller"), open_cube(flat, small.files):
+        raise OSError("No SIMPLE card of the caller")
+
+
+# ---- cubes -----------------------------------------------------------------------------
+
+
+def test_pixels_without_value_or_weight_are_not_good(small, tmp_path, flat_cube):
+    cube = flat_cube.copy()
+    cube[1, 5, 6] = np.nan
+    weight = np.ones_like(cube)
+    weight[2, 7, 8], weight[3, 9, 10] = 0.0, -1.0
+    path = write_cube(tmp_path / "a.fits", cube, extra_hdus=[fits.ImageHDU(weight)])
+    _, good = opened(path, small.files)
+    assert np.argwhere(~good).tolist() == [[1, 5, 6], [2, 7, 8], [3, 9, 10]]
+
+
+def test_extension_of_another_size_is_no_weight(small, tmp_path, flat_cube):
+    extra = [fits.ImageHDU(np.zeros((2, 2)))]
+    _, good = opened(write_cube(tmp_path / "a.fits", flat_cube, extra_hdus=extra), small.files)
+    assert good is None
+
+
+@pytest.mark.parametrize(("kind", "dtype"), [("f8", "f8"), (">f4", "f4"), ("i2", "f8")])
+def test_pixels_become_native_floats(small, tmp_path, flat_cube, kind, dtype):
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(flat_cube.astype(kind))]
+    fits.HDUList(hdus).writeto(tmp_path / "a.fits")
+    cube, _ = opened(tmp_path / "a.fits", small.files)
+    assert cube.dtype == np.dtype(dtype)
+    np.testing.assert_allclose(cube, flat_cube.astype(kind).astype(float), rtol=1e-6)
+
+
+def test_complex_shapes_are_refused(small, tmp_path):
+    path = write_cube(tmp_path / "a.fits", np.zeros((201, 201)))
+    words = r"shape \(201, 201\) in extension 1, \(4, 201, 201\) is needed"
+    with pytest.raises(ObservationError, match=words):
+        opened(path, small.files)
+
+
+# ---- headers ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "drop", "words"),
+    [
+        ({}, ["RET-ANG1"], ["no keyword RET-ANG1 in its header"]),
+        ({}, ["RET-ANG1", "D_IMRANG"], ["no keyword RET-ANG1", "no keyword D_IMRANG"]),
+        # a keyword that is wrong is not missing as well
+        ({"RET__ANG1": "x"}, [], ["RET-ANG1 = 'x', a number is needed"]),
+        ({"INSTRUME": "HICIAO"}, [], ["INSTRUME = 'HICIAO', allowed are CHARIS"]),
+    ],
+)
+def test_errors_of_a_header_are_listed_once(small, tmp_path, flat_cube, changes, drop, words):
+    path = write_cube(tmp_path / "CRSA00000001.fits", flat_cube, drop=drop, **changes)
+    errors = reduce_frame(path, small.files).errors
+    assert len(errors) == len(words)
+    assert all(error.startswith(word) for error, word in zip(errors, words, strict=True))
+
+
+def test_time_is_completed_from_date_or_mjd(small, tmp_path, flat_cube):
+    for name, drop in (("a", ["MJD"]), ("b", ["UTC-DATE", "UTC-TIME"])):
+        path = write_cube(tmp_path / f"{name}.fits", flat_cube, drop=drop)
+        values = reduce_frame(path, small.files).values
+        assert values["mjd"] == pytest.approx(60982.5)
+        assert values["date"] == "2025-11-03"
+
+
+@pytest.mark.parametrize(
+    ("values", "mjd"),
+    [
+        ({"mjd": 60982.25}, 60982.25),
+        ({"date": "2025-11-03", "time": "06:00:00"}, 60982.25),
+        ({"date": "2025-11-03T06:00:00"}, 60982.25),
+        ({"date": "2025-11-03 extra", "time": "06:00:00"}, 60982.25),
+        # the number goes before the words
+        ({"mjd": 1.0, "date": "2025-11-03T06:00:00"}, 1.0),
+    ],
+)
+def test_observation_time(values, mjd):
+    assert observation_time(values).mjd == pytest.approx(mjd)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({}, "no date to compute the time from"),
+        ({"date": "2025-11-03"}, "no time to compute the time from"),
+        ({"date": "yesterday", "time": "noon"}, "time: "),
+        ({"date": "2025-13-03", "time": "06:00:00"}, "time: "),
+    ],
+)
+def test_impossible_times(values, words):
+    with pytest.raises(ObservationError, match=words):
+        observation_time(values)
+
+
+@pytest.mark.parametrize("own", ["CHARIS", None])
+def test_own_and_silent_headers_belong_to_the_instrument(own):
+    values = {} if own is None else {"instrument": own}
+    assert not_of_instrument(values, LAYOUT) == ""
+
+
+# ---- frames as plain numbers -----------------------------------------------------------
+
+
+def test_frame_survives_as_plain_numbers(flat, small):
+    frame = reduce_frame(flat, small.files)
+    assert frame.usable
+    again = Frame.from_dict(frame.to_dict())
+    assert again.to_dict() == frame.to_dict()
+    assert (again.name, again.number, again.unit) == ("CRSA00000001_cube.fits", 1, "adu")
+    assert again.values["hwp"] == HEADER["RET-ANG1"]
+    np.testing.assert_array_equal(again.photometry.variance, frame.photometry.variance)
+
+
+def test_digest_knows_the_fluxes(small, tmp_path, flat_cube):
+    one = reduce_frame(write_cube(tmp_path / "a.fits", flat_cube), small.files)
+    same = reduce_frame(write_cube(tmp_path / "b.fits", flat_cube, RET__ANG1=45.0), small.files)
+    other = reduce_frame(write_cube(tmp_path / "c.fits", flat_cube * 1.001), small.files)
+    assert one.digest == same.digest != other.digest
+    assert len(one.digest) == 24
+
+
+def test_frame_without_any_good_slice_says_the_usual_reason(small, tmp_path):
+    cube = expose(np.full((201, 201), 0.0), small.files) - 1000.0
+    frame = reduce_frame(write_cube(tmp_path / "a.fits", cube), small.files)
+    assert frame.errors == ["no slice can be used: no light"]
+    assert not frame.usable
+
+
+# ---- stars -----------------------------------------------------------------------------
+
+SKY = {"hwp": 0.0, "derotator": 97.0, "parallactic": 20.0, "altitude": 70.0, "hwp_true": 80.0}
+TARGET = {"right_ascension": "05:05:05", "declination": "+10:00:00", "mjd": 60250.5}
+
+
+def starred(*, without=(), **changes):
+    """Return a frame whose header has been checked for a star."""
+    values = {k: v for k, v in (SKY | changes).items() if k not in without}
+    frame = Frame("CRSA00000001.fits", 1, values)
+    _check_header(frame, LAYOUT, "star")
+    return frame
+
+
+def test_plate_that_follows_the_sky_is_fine():
+    # 0 + 20 / 2 + 70
+    frame = starred()
+    assert (frame.errors, frame.doubts) == ([], [])
+
+
+@pytest.mark.parametrize(("hwp_true", "off"), [(80.9, None), (81.5, "+1.50"), (78.0, "-2.00")])
+def test_plate_off_the_tracking_law(hwp_true, off):
+    errors = starred(hwp_true=hwp_true).errors
+    words = f"RET-POS1 = {hwp_true:g} deg is {off} deg off the tracking law; up to 1 deg is allowed"
+    assert errors == ([] if off is None else [words])
+
+
+def test_unknown_plate_angle_is_a_doubt():
+    frame = starred(without=["hwp_true"])
+    assert frame.errors == []
+    assert frame.doubts == [
+        "no keyword RET-POS1: the tracking of the half-wave plate was not checked"
+    ]
+
+
+@pytest.mark.parametrize("missing", [["parallactic"], ["parallactic", "altitude"]])
+def test_pointing_follows_from_place_and_time_but_what_is_known_stays(missing):
+    frame = starred(without=[*missing, "hwp_true"], **TARGET)
+    assert frame.values["parallactic"] == pytest.approx(-44.9, abs=0.1)
+    assert frame.values["altitude"] == pytest.approx(75.9 if "altitude" in missing else 70, abs=0.1)
+    assert frame.doubts[0] == (
+        f"{' and '.join(missing)} computed from the coordinates and the time"
+    )
+
+
+def test_star_without_pointing_is_an_error_that_says_both():
+    (error,) = starred(without=["parallactic", "hwp_true"]).errors
+    assert error.startswith("no keyword PARANG in its header, and no ")

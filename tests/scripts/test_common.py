@@ -1,0 +1,354 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What the subcommands share: places to write to, inputs, edits of the model, outputs."""
+
+import argparse
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from astropolcal import Observations, instruments
+from astropolcal.chain import leaves
+from astropolcal.exceptions import (
+    AstropolcalError,
+    ChainError,
+    InstrumentError,
+    ObservationError,
+    ParameterError,
+)
+from astropolcal.observations import example_table
+from astropolcal.scripts._common import (
+    _normal,
+    _value,
+    angles,
+    check_folders,
+    check_outputs,
+    cube_files,
+    edit_chains,
+    instrument_of,
+    is_quiet,
+    number_or,
+    printer,
+    read_datasets,
+    say_written,
+    wrapped,
+    write_json,
+)
+
+
+@pytest.fixture
+def locked(tmp_path, monkeypatch):
+    """A folder that the system says may not be written to, as it says nothing to root."""
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    real = os.access
+
+    def access(path, mode):
+        return False if Path(path) == folder and mode & os.W_OK else real(path, mode)
+
+    monkeypatch.setattr(os, "access", access)
+    return folder
+
+
+@pytest.fixture
+def chains():
+    """Two chains of CHARIS that share no optic object."""
+    charis = instruments.get("charis")
+    return [charis.chain(source, ["nbs"]) for source in ("polarized", "unpolarized")]
+
+
+# ---- places to write to ----------------------------------------------------------------
+
+
+def test_good_places_for_files(tmp_path, monkeypatch):
+    (tmp_path / "old.json").write_text("old")
+    check_outputs(tmp_path / "new.json", tmp_path / "old.json", None, "-")
+    monkeypatch.chdir(tmp_path)
+    check_outputs("new.json", "./old.json")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["old.json"]
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("no/x.json", "no/x.json: there is no folder .*no"),
+        (".", "is a folder, not a file"),
+        ("note.txt/x.json", "there is no folder .*note.txt"),
+        ("locked/x.json", "locked/x.json: no permission to write to .*locked; name a folder that"),
+    ],
+)
+def test_bad_places_for_files(tmp_path, locked, place, words):
+    (tmp_path / "note.txt").write_text("")
+    with pytest.raises(AstropolcalError, match=words):
+        check_outputs(tmp_path / "good.json", tmp_path / place)
+
+
+def test_good_places_for_folders(tmp_path, monkeypatch):
+    (tmp_path / "old").mkdir()
+    check_folders(tmp_path / "old", tmp_path / "new", tmp_path / "a" / "b" / "c", None)
+    monkeypatch.chdir(tmp_path)
+    check_folders("new", "a/b")
+    # only looked at, not made
+    assert [p.name for p in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("note.txt", "note.txt: is a file, not a folder"),
+        ("note.txt/figures/all", "note.txt: is a file, not a folder"),
+        ("locked", "locked: no permission to write to .*locked"),
+        ("locked/figures", "locked/figures: no permission to write to .*locked; name a folder"),
+        ("locked/figures/all", "locked/figures/all: no permission"),
+    ],
+)
+def test_bad_places_for_folders(tmp_path, locked, place, words):
+    (tmp_path / "note.txt").write_text("")
+    with pytest.raises(AstropolcalError, match=words):
+        check_folders(tmp_path / place)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write to any folder")
+def test_what_the_system_forbids_is_found_before_the_work(tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    for check, place in ((check_outputs, "locked/x.json"), (check_folders, "locked/figures")):
+        with pytest.raises(AstropolcalError, match="no permission to write to"):
+            check(tmp_path / place)
+
+
+# ---- what is printed and written -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("quiet", "to", "silent"),
+    [(False, None, False), (True, None, True), (False, "-", True), (False, "x.json", False)],
+)
+def test_who_prints(quiet, to, silent, capsys):
+    arguments = SimpleNamespace(quiet=quiet, json=to)
+    assert is_quiet(arguments) == silent
+    printer(arguments)("words")
+    assert capsys.readouterr().out == ("" if silent else "words\n")
+
+
+def test_json_is_complete_or_not_there(tmp_path, capsys):
+    write_json({"a": [1.5, None]}, tmp_path / "x.json")
+    assert json.loads((tmp_path / "x.json").read_text()) == {"a": [1.5, None]}
+    write_json({"a": 1}, "-")
+    assert json.loads(capsys.readouterr().out) == {"a": 1}
+    # NaN is no JSON
+    with pytest.raises(ValueError, match="Out of range"):
+        write_json({"a": np.nan}, tmp_path / "y.json")
+    assert [p.name for p in tmp_path.iterdir()] == ["x.json"]
+
+
+def test_files_are_listed_a_line_each(capsys):
+    say_written(print, ["a.asdf", "b.json"])
+    say_written(print, [])
+    assert capsys.readouterr().out == "\nWritten: a.asdf\n         b.json\n"
+
+
+def test_lines_break_at_80_columns_and_words_stay_whole():
+    text = wrapped("  " + "word " * 30 + "x" * 90, indent=4)
+    lines = text.splitlines()
+    assert max(map(len, lines[:-1])) <= 80
+    assert all(line.startswith("    ") for line in lines[1:])
+    assert lines[-1].strip() == "x" * 90
+
+
+# ---- values of options -----------------------------------------------------------------
+
+
+def test_lists_of_angles():
+    assert angles("0,22.5,-45") == [0.0, 22.5, -45.0]
+    for text in ("", "0,", "a", "0;45"):
+        with pytest.raises(argparse.ArgumentTypeError, match="is not a list of angles in degree"):
+            angles(text)
+
+
+def test_words_or_a_number():
+    convert = number_or("fwhm", "growth")
+    assert [convert("growth"), convert("3e1")] == ["growth", 30.0]
+    with pytest.raises(argparse.ArgumentTypeError, match="'wide' is not fwhm, growth or a number"):
+        convert("wide")
+
+
+# ---- inputs ----------------------------------------------------------------------------
+
+
+def test_folders_stand_for_their_fits_files(tmp_path):
+    for name in ("b.fits", "a.fits.gz", "c.txt"):
+        (tmp_path / name).touch()
+    found = cube_files([tmp_path, tmp_path / "c.txt"])
+    assert [path.name for path in found] == ["a.fits.gz", "b.fits", "c.txt"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(AstropolcalError, match="empty: no FITS file in this folder"):
+        cube_files([tmp_path, tmp_path / "empty"])
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Function that writes a table of an instrument."""
+
+    def write(instrument="charis", name="run.ecsv", **options):
+        known = example_table(**options)
+        known.meta["instrument"] = instrument
+        if instrument is None:
+            del known.meta["instrument"]
+        known.write(tmp_path / name, format="ascii.ecsv", overwrite=True)
+        return tmp_path / name
+
+    return write
+
+
+def test_same_frames_under_another_name_are_refused(table):
+    files = table(), table(name="copy.ecsv"), table(name="other.ecsv", polarization=0.3)
+    assert [d.name for d in read_datasets([files[0], files[2]])] == ["run", "other"]
+    with pytest.raises(AstropolcalError, match=r"copy.ecsv: holds the same frames as .*run.ecsv"):
+        read_datasets(files)
+
+
+def test_calibration_in_the_place_of_a_table_is_sent_to_its_commands(tmp_path, table):
+    path = tmp_path / "cal.asdf"
+    path.write_bytes(b"#ASDF 1.0.0\n#ASDF_STANDARD 1.5.0\n")
+    words = (
+        r"cal.asdf: is an ASDF file, such as a calibration, where an observation table .*--start"
+    )
+    with pytest.raises(AstropolcalError, match=words) as caught:
+        read_datasets([table(), path])
+    for command in ("info", "diagnose", "sample", "efficiency", "correct --calibration"):
+        assert command in str(caught.value)
+
+
+def test_cube_in_the_place_of_a_table_is_sent_to_reduce(tmp_path):
+    fits.PrimaryHDU(np.zeros((2, 2))).writeto(tmp_path / "cube.fits")
+    with pytest.raises(AstropolcalError, match=r"cube.fits: is a FITS file, .*; reduce makes one"):
+        read_datasets([tmp_path / "cube.fits"])
+
+
+@pytest.mark.parametrize(("content", "words"), [(b"", "not an ECSV table"), (b"hello", "not an")])
+def test_other_files_are_judged_by_the_reader(tmp_path, content, words):
+    (tmp_path / "x.ecsv").write_bytes(content)
+    with pytest.raises(ObservationError, match=words):
+        read_datasets([tmp_path / "x.ecsv"])
+    with pytest.raises(ObservationError, match="no such file"):
+        read_datasets([tmp_path / "y.ecsv"])
+
+
+def instrument(path, given=None):
+    datasets = [Observations.read(path)]
+    return instrument_of(SimpleNamespace(instrument=given), datasets).name
+
+
+def test_instrument_that_is_given_goes_before_that_of_the_table(table):
+    assert instrument(table("charis")) == "charis"
+    assert instrument(table("SCExAO/CHARIS"), "irdis") == "irdis"
+
+
+def test_unknown_instrument_of_a_table_names_the_file(table):
+    words = r"run.ecsv: unknown instrument 'charix'; .*did you mean 'charis'\?; --instrument NAME"
+    with pytest.raises(InstrumentError, match=words):
+        instrument(table("charix"))
+
+
+def test_unknown_instrument_of_the_user_does_not(table):
+    with pytest.raises(InstrumentError, match=r"^unknown instrument 'irdi'"):
+        instrument(table("charis"), "irdi")
+
+
+def test_silent_table_asks_for_the_instrument(table):
+    with pytest.raises(InstrumentError, match="run: the table names no instrument; give --instr"):
+        instrument(table(None))
+
+
+# ---- edits of the model ----------------------------------------------------------------
+
+
+def parameter(chain, name):
+    optic, _, key = name.partition(".")
+    (leaf,) = (leaf for leaf in leaves(chain) if leaf.name == optic)
+    return getattr(leaf, key)
+
+
+def test_edits_reach_all_chains(chains):
+    edited = edit_chains(
+        chains, free=["wollaston.theta"], fix=["hwp.theta=6arcmin", "derotator"],
+        prior=["hwp.w_sio2=1.65+-0.01"],
+    )  # fmt: skip
+    for chain in edited:
+        assert not parameter(chain, "wollaston.theta").fixed
+        assert parameter(chain, "hwp.theta").fixed
+        assert parameter(chain, "hwp.theta").value == pytest.approx(0.1)
+        assert all(parameter(chain, f"derotator.{key}").fixed for key in ("theta", "horizontal"))
+        assert not parameter(chain, "hwp.w_sio2").fixed
+        prior = parameter(chain, "hwp.w_sio2").prior
+        assert prior.mean == 1.65 * u.mm
+        assert prior.std == 0.01 * u.mm
+
+
+def test_an_optic_that_only_one_chain_has_may_be_taken_out(chains):
+    names = [{leaf.name for leaf in leaves(chain)} for chain in chains]
+    (only,) = names[0] - names[1]
+    edited = edit_chains(chains, without=[only])
+    assert only not in {leaf.name for leaf in leaves(edited[0])}
+    assert edited[1] is chains[1]
+    with pytest.raises(ChainError, match="no optic 'nobody' in the chain"):
+        edit_chains(chains, without=["nobody"])
+
+
+@pytest.mark.parametrize(
+    ("edit", "error", "words"),
+    [
+        ({"fix": ["nobody.theta=0"]}, ChainError, "no optic 'nobody'"),
+        ({"free": ["hwp.phi"]}, ParameterError, "hwp has no parameter 'phi'; it has "),
+        ({"fix": ["hwp.theta=6"]}, ParameterError, r"hwp.theta=6: allowed is -5.0 to 5.0 deg"),
+        ({"fix": ["hwp.theta=nan"]}, ParameterError, "hwp.theta=nan: not a number"),
+        ({"prior": ["hwp.theta"]}, ParameterError, r"prior hwp.theta=: write it as MEAN\+-STD"),
+        ({"prior": ["hwp.theta=0+-1s"]}, ParameterError, "must be convertible to deg"),
+        ({"prior": ["hwp.theta=x+-1"]}, ParameterError, "hwp.theta=x: not a number"),
+    ],
+)
+def test_bad_edits(chains, edit, error, words):
+    with pytest.raises(error, match=words):
+        edit_chains(chains, **edit)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1.5", 1.5),
+        (" -2e-1 ", -0.2),
+        ("90arcmin", 1.5),
+        ("0.5 deg", 0.5),
+        ("1e-1deg", 0.1),
+        (f"{np.pi}rad", 180.0),
+    ],
+)
+def test_numbers_with_and_without_unit(chains, text, value):
+    assert _value("hwp.theta", parameter(chains[0], "hwp.theta"), text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("text", ["", "1,5", "deg", "1 2", "1..2", "--1", "1 nonsense", "1 s"])
+def test_what_is_no_number_of_that_unit(chains, text):
+    with pytest.raises(ParameterError, match=r"hwp\.theta="):
+        _value("hwp.theta", parameter(chains[0], "hwp.theta"), text)
+
+
+@pytest.mark.parametrize(
+    ("text", "mean", "std"),
+    [
+        ("0+-0.1deg", 0.0, 0.1),
+        ("1+-6arcmin", 1 / 60, 0.1),
+        ("1deg+-6arcmin", 1.0, 0.1),
+        ("-0.5+-0.1", -0.5, 0.1),
+        ("1e-1+-1e-2", 0.1, 0.01),
+    ],
+)
+def test_a_unit_given_once_holds_for_mean_and_std(chains, text, mean, std):
+    prior = _normal("hwp.theta", parameter(chains[0], "hwp.theta"), text)
+    assert prior.mean.to_value(u.deg) == pytest.approx(mean)
+    assert prior.std.to_value(u.deg) == pytest.approx(std)

@@ -1,0 +1,206 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The command itself: exit status, one line of complaint, and what -q leaves."""
+
+import argparse
+import sys
+import warnings
+from types import SimpleNamespace
+
+import pytest
+
+from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.scripts import main as module
+from astropolcal.scripts.main import build_parser, main
+
+(COMMANDS,) = (
+    action.choices
+    for action in build_parser()._actions
+    if isinstance(action, argparse._SubParsersAction)
+)
+QUIET = [name for name, parser in COMMANDS.items() if "--quiet" in parser._option_string_actions]
+
+
+@pytest.fixture
+def running(monkeypatch):
+    """Function that lets a command do something else, and returns the exit status."""
+
+    def run(act):
+        parsed = SimpleNamespace(run=lambda _: act())
+        monkeypatch.setattr(
+            module, "build_parser", lambda: SimpleNamespace(parse_args=lambda _: parsed)
+        )
+        return main([])
+
+    return run
+
+
+def fail(error):
+    raise error
+
+
+def test_good_work_is_status_zero(running, capsys):
+    assert running(lambda: print("done")) == 0
+    assert capsys.readouterr().out == "done\n"
+
+
+def test_bad_input_is_one_line_and_status_two(running, capsys):
+    assert running(lambda: fail(ObservationError("run.ecsv:\n  row 3\tis bad"))) == 2
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", "astropolcal: error: run.ecsv: row 3 is bad\n")
+
+
+def test_interruption_is_status_130(running, capsys):
+    assert running(lambda: fail(KeyboardInterrupt())) == 130
+    assert capsys.readouterr().err == "astropolcal: interrupted\n"
+
+
+def test_errors_that_are_bugs_are_not_hidden(running):
+    with pytest.raises(ZeroDivisionError):
+        running(lambda: 1 / 0)
+
+
+def test_warnings_go_to_standard_error_in_one_line(running, capsys):
+    def warn():
+        warnings.simplefilter("always")
+        warnings.warn("two\n  lines", AstropolcalWarning, stacklevel=2)
+
+    assert running(warn) == 0
+    assert capsys.readouterr() == ("", "astropolcal: warning: two lines\n")
+
+
+def test_how_warnings_are_shown_is_put_back(running):
+    before = warnings.showwarning
+    running(lambda: None)
+    assert warnings.showwarning is before
+
+
+def test_a_reader_that_has_gone_is_no_error(running, tmp_path, monkeypatch):
+    with open(tmp_path / "out", "w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        assert running(lambda: fail(BrokenPipeError())) == 0
+        # what is printed from here on goes nowhere
+        print("lost", file=stream, flush=True)
+    assert (tmp_path / "out").read_text() == ""
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], "the following arguments are required: COMMAND (see astropolcal --help)"),
+        (["calibrat"], "invalid choice: 'calibrat'"),
+        (["reduce", "x.fits"], "required: -o/--output (see astropolcal reduce --help)"),
+        (["correct", "--size", "wide"], "argument --size: invalid int value: 'wide'"),
+        (["challenge", "--snr", "8"], "argument --snr: '8' is not of the form LOW:HIGH"),
+        (["correct", "x", "--centre", "7"], "argument --centre: '7' is not X,Y"),
+        (["sample", "c", "t", "--burn", "x"], "argument --burn: 'x' is neither a number nor auto"),
+        (["reduce", "c", "-o", "x", "--meta", "=in"], "argument --meta: '=in' is not KEY=VALUE"),
+        (["simulate", "--source", "sun"], "argument --source: invalid choice: 'sun'"),
+    ],
+)
+def test_options_that_cannot_be_understood(argv, words, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(argv)
+    assert caught.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith("astropolcal: error: ")
+    assert err.count("\n") == 1
+    assert words in err
+
+
+# ---- quiet -------------------------------------------------------------------------------
+
+
+def test_commands_that_do_something_can_be_quiet():
+    assert set(COMMANDS) - set(QUIET) == {"info", "standards"}
+
+
+@pytest.mark.parametrize("command", QUIET)
+def test_quiet_means_the_same_everywhere(command):
+    action = COMMANDS[command]._option_string_actions["--quiet"]
+    assert action is COMMANDS[command]._option_string_actions["-q"]
+    assert action.help == "print nothing but warnings and errors"
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """Table, calibration and cubes of a star, all small."""
+    folder = tmp_path_factory.mktemp("desk")
+    star = "--source star --hwp 0,45,22.5,67.5 --derotator 60 --altitude 70 --parallactic 20"
+    for words in (
+        "simulate -q -o run.ecsv --derotator 45,70,95 --without dichroic",
+        "calibrate -q run.ecsv -o cal.asdf --derotator linear",
+        f"simulate -q --cubes cubes {star} --flux 2e6 --without dichroic",
+    ):
+        call(folder, words)
+    return folder
+
+
+def call(folder, words):
+    """Run a command in a folder; return its status."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        return main(words.split())
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "words",
+    [
+        "simulate -o again.ecsv --derotator 45",
+        "simulate --cubes few --derotator 45 --hwp 0,45",
+        "calibrate run.ecsv --derotator linear",
+        "reduce cubes --raw cubes/raw --source star -o star.ecsv --resume journal",
+        "correct cubes --raw cubes/raw --calibration cal.asdf -o out.fits --size 11 --any-date "
+        "--optics-in nbs",
+        "efficiency cal.asdf",
+        "challenge -n 1 --kinds none --wavelengths 5 --derotator-angles 3",
+        "diagnose run.ecsv --effects beam_gain --derotator linear",
+    ],
+)
+def test_quiet_commands_print_nothing(words, desk, capsys):
+    assert call(desk, f"{words} -q") == 0
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_quiet_reduction_still_says_what_is_left_out(desk, tmp_path, capsys):
+    (tmp_path / "CRSA00000099_cube.fits").write_text("no FITS")
+    words = f"reduce cubes {tmp_path} --raw cubes/raw --source star -o some.ecsv -q"
+    assert call(desk, words) == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "left out: CRSA00000099_cube.fits: is not a FITS file" in err
+
+
+def test_quiet_errors_are_printed(desk, capsys):
+    assert call(desk, "calibrate nowhere.ecsv -q") == 2
+    assert capsys.readouterr().err == "astropolcal: error: nowhere.ecsv: no such file\n"
+
+
+# ---- numbers and their nouns ---------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_one_frame_is_no_frames(desk, capsys):
+    call(desk, "simulate -o single.ecsv --derotator 45 --hwp 0 --without dichroic")
+    assert "(1 frame x 22 wavelengths)" in capsys.readouterr().out
+    call(desk, "simulate --cubes one --derotator 45 --hwp 0")
+    assert "one (1 cube)" in capsys.readouterr().out
+
+
+def test_summary_has_no_negative_zero(desk, capsys):
+    """Misalignments that are held at zero, and those that the data pull just below it."""
+    held = "--fix hwp.theta=-1e-9 --fix derotator.theta=0"
+    assert call(desk, f"calibrate run.ecsv --derotator linear {held}") == 0
+    out = capsys.readouterr().out
+    assert "24 frames x 22 wavelengths" in out
+    assert "-0.00000" not in out
+    assert "-0.000 " not in out
+
+
+def test_parameter_just_below_zero_is_printed_without_a_sign():
+    from astropolcal.calibration.summary import _number
+
+    entry = {"value": -1e-7, "std": 1e-3, "unit": "deg", "tied": None, "at_bound": False}
+    assert _number(entry).strip() == "0.00000 +- 0.00100 deg"
+    assert _number(entry | {"value": -0.1}).strip() == "-0.10000 +- 0.00100 deg"

@@ -1,0 +1,74 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""docs/command_line.rst against the parsers: every command and option, and nothing else."""
+
+import argparse
+import re
+
+import pytest
+
+from astropolcal.scripts.main import build_parser
+
+(COMMANDS,) = (
+    action.choices
+    for action in build_parser()._actions
+    if isinstance(action, argparse._SubParsersAction)
+)
+
+
+def options(parser):
+    """Return option strings, the long one where there is one, but for --help."""
+    found = [action.option_strings for action in parser._actions if action.option_strings]
+    return {max(names, key=len) for names in found} - {"--help"}
+
+
+@pytest.fixture(scope="module")
+def sections(repository):
+    """Text of the page by command."""
+    text = (repository / "docs" / "command_line.rst").read_text(encoding="utf-8")
+    parts = re.split(r"^([a-z]+)\n-{4,}\n", text, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def table_of(section):
+    """Return the first column of the first table of a section."""
+    tables = re.split(r"^=+ +=+\n", section, flags=re.MULTILINE)
+    return "\n".join(line[:25] for line in tables[1].splitlines()) if len(tables) > 1 else ""
+
+
+def test_every_command_has_a_section(sections):
+    assert set(sections) == set(COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_is_in_its_section(sections, command):
+    named = set(re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", sections[command]))
+    missing = options(COMMANDS[command]) - named
+    assert not missing, f"docs/command_line.rst, {command}: describe {', '.join(sorted(missing))}"
+
+
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"info"}))
+def test_the_table_has_no_option_that_is_gone(sections, command):
+    named = set(re.findall(r"--[a-z][a-z0-9-]*", table_of(sections[command])))
+    assert named
+    unknown = named - options(COMMANDS[command]) - {"--quiet"}
+    assert not unknown, f"docs/command_line.rst, {command}: {', '.join(sorted(unknown))} is gone"
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "stated"),
+    [
+        ("simulate", "--flux", "(4e6)"),
+        ("simulate", "--seed", "(20251005)"),
+        ("simulate", "--fwhm", "(5)"),
+        ("sample", "--steps", "by default 5000"),
+        ("standards", "--min-altitude", "by default 30"),
+        ("correct", "--size", "by default 51"),
+        ("correct", "--max-condition", "by default 30"),
+        ("challenge", "-n", "by default 20"),
+    ],
+)
+def test_stated_defaults_are_those_of_the_parser(sections, command, option, stated):
+    (row,) = re.findall(rf"^``{option} .*(?:\n {{27}}.*)*", sections[command], re.MULTILINE)
+    assert stated in " ".join(row.split())
+    default = COMMANDS[command].get_default(option.strip("-").replace("-", "_"))
+    assert float(re.search(r"\d[\d.e]*", stated).group()) == default
