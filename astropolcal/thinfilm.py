@@ -31,21 +31,25 @@ class _Medium:
     """A medium at a given tangential wave number alpha = n_0 sin(incidence)."""
 
     def __init__(self, index, alpha):
+        # Snell: alpha is the same in all layers; q = sqrt(n^2 - alpha^2) is the normal wave number
         self.index, self.alpha = index, alpha
         normal = np.sqrt(index * index - alpha * alpha)
         # the wave that decays, or that goes on, away from the light
         normal = np.where(normal.imag < 0, -normal, normal)
         self.normal = np.where(np.abs(normal) < _GRAZING, _GRAZING, normal)
+        # eta_s = q, eta_p = n^2 / q
         self.admittance = np.stack([self.normal, index * index / self.normal])
 
     def to_index(self):
         """Return the derivatives of the normal wave number and the admittance to the index."""
         slope = self.index / self.normal
+        # dq/dn = n / q, so that d(n^2 / q)/dn = 2 n / q - (n / q)^3
         return slope, np.stack([slope, 2 * slope - slope**3])
 
     def to_alpha(self):
         """Return the derivatives of the normal wave number and the admittance to alpha."""
         slope = -self.alpha / self.normal
+        # dq/d(alpha) = -alpha / q, and d(n^2 / q)/dq = -(n / q)^2
         return slope, np.stack([slope, -slope * (self.index / self.normal) ** 2])
 
 
@@ -102,6 +106,7 @@ class _Stack:
         self._solve()
 
     def _solve(self):
+        # no light comes back from the substrate: its tangential fields are (1, eta)
         fields = np.ones_like(self.substrate.admittance), self.substrate.admittance
         self.fields = [fields]
         for film in reversed(self.films):
@@ -109,16 +114,19 @@ class _Stack:
             self.fields.insert(0, fields)
         upper, lower = fields
         eta = self.ambient.admittance
+        # what comes in and what goes back are (eta E + H) / 2 and (eta E - H) / 2
         self.total = eta * upper + lower
         self.tangential = (eta * upper - lower) / self.total
 
     @property
     def amplitudes(self):
         """Reflection amplitudes r_s and r_p; the p field turns with the light."""
+        # the amplitudes are of tangential fields; that of p turns its direction in the reflection
         return self.tangential[0], -self.tangential[1]
 
     def transmittances(self):
         """Return T_s and T_p into the substrate."""
+        # the phase of one passage that the films left out, squared
         loss = np.prod([np.abs(film.echo) for film in self.films], axis=0)
         out = 4 * self.ambient.admittance.real * self.substrate.admittance.real
         return out * loss / np.abs(self.total) ** 2
@@ -140,6 +148,7 @@ class _Stack:
         indices, thicknesses = [], []
         for film, row, fields in zip(self.films, rows, self.fields[1:], strict=False):
             to_admittance, to_echo = film.slopes(row, fields)
+            # echo = exp(2i 2 pi / lambda d q)
             to_normal = to_echo * film.wave * film.thickness * film.echo
             thicknesses.append(to_echo * film.wave * film.normal * film.echo)
             indices.append(_chain(film.to_index(), to_normal, to_admittance))
@@ -148,6 +157,7 @@ class _Stack:
         right = rows[-1][1]
         indices.append(_chain(self.substrate.to_index(), 0.0, right))
         to_alpha = to_alpha + _chain(self.substrate.to_alpha(), 0.0, right)
+        # alpha = n_0 sin(incidence)
         to_incidence = to_alpha * self.ambient.index.real * np.cos(self.incidence)
         return (
             self._of_log(to_incidence),
@@ -158,6 +168,7 @@ class _Stack:
     def _rows(self):
         """Return the derivative of the amplitudes to the fields in front of each layer."""
         eta, r = self.ambient.admittance, self.tangential
+        # r = (eta E - H) / (eta E + H), by E and by H
         rows = [(eta * (1 - r) / self.total, -(1 + r) / self.total)]
         for film in self.films:
             rows.append(film.back(*rows[-1]))
@@ -168,6 +179,7 @@ class _Stack:
         return _chain(self.ambient.to_alpha(), 0.0, upper * (1 - self.tangential) / self.total)
 
     def _of_log(self, slope):
+        # d ln(r_p / r_s); the sign of r_p cancels
         return slope[1] / self.tangential[1] - slope[0] / self.tangential[0]
 
 

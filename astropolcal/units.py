@@ -13,6 +13,7 @@ from astropolcal.exceptions import ParameterError
 
 __all__ = ["angle_to_rad", "canonical_factor", "canonical_unit", "length_to_um", "to_unit"]
 
+# radian for numpy, micrometre because dispersion laws are written in it
 _CANONICAL = (u.rad, u.um, u.dimensionless_unscaled)
 
 
@@ -115,8 +116,10 @@ def to_unit(value, unit, name="value"):
     1200.0
     """
     unit = u.dimensionless_unscaled if unit is None else u.Unit(unit)
+    # numpy would drop the imaginary part with no more than a warning
     if np.iscomplexobj(value):
         raise ParameterError(f"{name} = {value!r} is complex; allowed are real numbers")
+    # parameters of astropy and columns of tables carry a unit without being quantities
     if isinstance(value, u.Quantity) or hasattr(value, "unit"):
         try:
             return np.asarray(u.Quantity(value).to_value(unit), dtype=float)

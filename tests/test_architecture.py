@@ -9,8 +9,11 @@ the cost of ``import astropolcal``. Every message says how to comply.
 import ast
 import importlib
 import inspect
+import io
+import re
 import subprocess
 import sys
+import tokenize
 from pathlib import Path
 from statistics import median
 
@@ -27,6 +30,9 @@ MAX_MEDIAN_MODULE_LINES = 250
 MAX_FUNCTION_LINES = 80
 MAX_FUNCTION_LINES_95 = 45
 MAX_MEDIAN_FUNCTION_LINES = 9
+# per 100 lines of code, which are those that are neither blank nor docstring
+MIN_COMMENTS, MAX_COMMENTS = 5, 15
+MIN_TEST_LINES = 0.8
 
 FORBIDDEN_IMPORTS = {"pickle", "cPickle", "dill", "marshal", "shelve"}
 FORBIDDEN_CALLS = {"eval", "exec", "yaml.load", "yaml.full_load", "yaml.unsafe_load"}
@@ -44,9 +50,17 @@ HEAVY = (
     "specutils",
 )
 
-WITHOUT_REFERENCE_PAGE = {"converters", "data", "extension", "resources", "scripts", "version"}
+WITHOUT_REFERENCE_PAGE = {
+    "conftest",
+    "converters",
+    "data",
+    "extension",
+    "resources",
+    "scripts",
+    "version",
+}
 
-FILES = sorted(p for p in PACKAGE.rglob("*.py") if p.name not in {"_version.py", "conftest.py"})
+FILES = sorted(p for p in PACKAGE.rglob("*.py") if p.name != "_version.py")
 assert FILES, f"no source found in {PACKAGE}"
 
 
@@ -163,6 +177,70 @@ def test_body_length_leaves_out_the_docstring():
     assert _body_length(ast.parse(source).body[0]) == 3
 
 
+def _docstring_lines(source):
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    lines = source.splitlines()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, kinds) and ast.get_docstring(node):
+            first = node.body[0]
+            yield "\n".join(lines[first.lineno - 1 : first.end_lineno])
+
+
+def _not_blank(source):
+    return sum(1 for line in source.splitlines() if line.strip())
+
+
+def _comments_and_code(source):
+    """Comments but for the license line, and lines that are neither blank nor docstring."""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    comments = [
+        token.string
+        for token in tokens
+        if token.type == tokenize.COMMENT and not token.string.startswith("# Licensed under")
+    ]
+    docstrings = sum(map(_not_blank, _docstring_lines(source)))
+    return len(comments), _not_blank(source) - docstrings
+
+
+def _share_of_comments(paths):
+    counts = [_comments_and_code(path.read_text(encoding="utf-8")) for path in paths]
+    comments, code = map(sum, zip(*counts, strict=True))
+    return 100 * comments / code
+
+
+def test_code_says_why():
+    share = _share_of_comments(FILES)
+    areas = {path.relative_to(PACKAGE).parts[0] for path in FILES}
+    poorest = sorted(
+        (_share_of_comments([p for p in FILES if p.relative_to(PACKAGE).parts[0] == area]), area)
+        for area in areas
+    )[:5]
+    assert MIN_COMMENTS <= share <= MAX_COMMENTS, (
+        f"{share:.1f} comments per 100 lines of code, the budget is {MIN_COMMENTS} to "
+        f"{MAX_COMMENTS}: where a reader would stop, say why it is so (equation, sign, unit, "
+        f"shape, tolerance), never what the line does; fewest have {poorest}"
+    )
+
+
+def test_tests_are_as_long_as_they_should_be():
+    tests, source = (
+        sum(_not_blank(path.read_text(encoding="utf-8")) for path in paths)
+        for paths in ((REPOSITORY / "tests").rglob("*.py"), FILES)
+    )
+    assert tests >= MIN_TEST_LINES * source, (
+        f"{tests} lines of tests for {source} of source, {tests / source:.2f}, the budget is "
+        f"{MIN_TEST_LINES}: ask of each function which plausible wrong result no test would "
+        "notice, and write that test"
+    )
+
+
+def test_comments_and_code_are_counted():
+    source = "# Licensed under a licence\n"
+    source += '"""Module.\n\nMore.\n"""\n\nx = "# none"  # why\n\n# how\ny = 1\n'
+    # the licence line and the two lines with code, and the comment between them
+    assert _comments_and_code(source) == (2, 4)
+
+
 # --- public names and docstrings ------------------------------------------------
 
 
@@ -237,6 +315,48 @@ def test_top_level_module_has_reference_page(name):
         f"add docs/reference/{name}.rst, like the others there, and name it in docs/api.rst"
     )
     assert f"automodapi:: astropolcal.{name}" in page.read_text(encoding="utf-8")
+
+
+def _documented_names():
+    """Module and name of what the reference shows."""
+    pattern = re.compile(r"automodapi:: (\S+)\n((?:[ ]+:.*\n)*)")
+    for page in (REPOSITORY / "docs" / "reference").glob("*.rst"):
+        for module, options in pattern.findall(page.read_text(encoding="utf-8")):
+            left_out = re.search(r":skip: (.*)", options)
+            left_out = set(re.split(r",\s*", left_out.group(1))) if left_out else set()
+            shown = importlib.import_module(module)
+            for name in set(shown.__all__) - left_out:
+                yield _definition(shown, name)
+
+
+def _definition(module, name):
+    thing = getattr(module, name)
+    if hasattr(thing, "__qualname__"):
+        return thing.__module__, thing.__qualname__
+    return (thing.__name__, "") if inspect.ismodule(thing) else (name, id(thing))
+
+
+@pytest.fixture(scope="module")
+def documented_names():
+    return set(_documented_names())
+
+
+@pytest.mark.parametrize("name", [n for n in TOP_LEVEL if n not in WITHOUT_REFERENCE_PAGE])
+def test_reference_shows_every_public_name(name, documented_names):
+    module = importlib.import_module(f"astropolcal.{name}")
+    hidden = [n for n in module.__all__ if _definition(module, n) not in documented_names]
+    assert not hidden, (
+        f"the reference does not show {hidden} of astropolcal.{name}: take them out of ':skip:' "
+        "or give their module an 'automodapi' on the page"
+    )
+
+
+@pytest.mark.parametrize("name", sorted(set(astropolcal.__all__) - {"__version__"}))
+def test_reference_introduces_the_names_to_start_with(name):
+    page = (REPOSITORY / "docs" / "api.rst").read_text(encoding="utf-8")
+    assert re.search(rf"`~?astropolcal\.([a-z_]+\.)*{name}`", page), (
+        f"docs/api.rst: say in one line what astropolcal.{name} is for"
+    )
 
 
 # --- what the package must not do -----------------------------------------------

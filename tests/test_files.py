@@ -1,10 +1,17 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Files appear complete or not at all."""
+"""Files appear complete or not at all, and what is read may be anything."""
+
+import errno
+import os
+import time
 
 import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from astropolcal.exceptions import AstropolcalError, CalibrationFileError
-from astropolcal.files import atomic_path
+from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ObservationError
+from astropolcal.files import atomic_path, check_new, check_yaml, one_line, understood
 
 
 def test_the_file_appears_when_the_block_ends(tmp_path):
@@ -44,3 +51,233 @@ def test_a_block_that_writes_nothing_is_an_error(tmp_path):
     with pytest.raises(AstropolcalError, match="cannot be written"), atomic_path(tmp_path / "x"):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+# ---- names and leftovers ---------------------------------------------------------------
+
+
+def test_the_temporary_file_is_hidden_and_of_the_same_kind(tmp_path):
+    """Astropy and others choose a format by the suffix."""
+    with atomic_path(tmp_path / "night.fits.gz") as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.name.startswith(".night")
+        assert temporary.suffix == ".gz"
+        assert not temporary.exists()
+        temporary.write_text("x")
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path):
+    path = tmp_path / "note.txt"
+    with atomic_path(path) as first, atomic_path(path) as second:
+        assert first != second
+        first.write_text("first")
+        second.write_text("second")
+    # the one that ends last has the name
+    assert path.read_text() == "first"
+    assert [other.name for other in tmp_path.iterdir()] == ["note.txt"]
+
+
+@pytest.mark.parametrize(
+    ("name", "age", "goes"),
+    [
+        (".note.123-0123abcd.tmp.txt", 25, True),
+        (".note.123.tmp.txt", 25, True),
+        (".note.123-0123abcd.tmp.txt", 23, False),
+        (".note.123-0123abcd.tmp.csv", 25, False),
+        (".other.123-0123abcd.tmp.txt", 25, False),
+        (".note.abc.tmp.txt", 25, False),
+        (".note.123-0123ABCD.tmp.txt", 25, False),
+        ("note.txt.bak", 25, False),
+    ],
+)
+def test_what_killed_runs_left_goes_after_a_day(tmp_path, name, age, goes):
+    """Only remains of the same file: nothing else in a folder is ours to remove."""
+    other = tmp_path / name
+    other.write_text("left")
+    then = time.time() - age * 3600
+    os.utime(other, (then, then))
+    with atomic_path(tmp_path / "note.txt") as temporary:
+        temporary.write_text("x")
+    assert other.exists() is not goes
+
+
+def test_remains_of_a_file_without_suffix(tmp_path):
+    other = tmp_path / ".note.7-0123abcd.tmp"
+    other.write_text("left")
+    os.utime(other, (0, 0))
+    with atomic_path(tmp_path / "note") as temporary:
+        temporary.write_text("x")
+    assert [path.name for path in tmp_path.iterdir()] == ["note"]
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (errno.ENOSPC, "No space left on device; free some space or name another folder"),
+        (errno.EROFS, "Read-only file system; name a folder that you may write to"),
+        (errno.EIO, "Input/output error"),
+        (None, "out of luck"),
+    ],
+)
+def test_refusals_say_what_to_do(tmp_path, number, words):
+    path = tmp_path / "note.txt"
+    with pytest.raises(AstropolcalError) as caught, atomic_path(path):
+        raise OSError("out of luck") if number is None else OSError(number, os.strerror(number))
+    assert str(caught.value) == f"{path}: cannot be written: {words}"
+
+
+# ---- a new file ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "overwrite", "words"),
+    [
+        ("there.txt", False, "exists already; overwrite=True replaces it"),
+        (".", True, "is a folder; name a file in it"),
+        ("nowhere/new.txt", True, "cannot be written: there is no folder"),
+    ],
+)
+def test_a_file_that_cannot_be_new(tmp_path, name, overwrite, words):
+    (tmp_path / "there.txt").write_text("x")
+    with pytest.raises(CalibrationFileError, match=words) as caught:
+        check_new(tmp_path / name, overwrite, CalibrationFileError)
+    assert str(caught.value).startswith(str(tmp_path / name))
+
+
+@pytest.mark.parametrize(("name", "overwrite"), [("there.txt", True), ("new.txt", False)])
+def test_a_file_that_can(tmp_path, name, overwrite):
+    (tmp_path / "there.txt").write_text("x")
+    assert check_new(str(tmp_path / name), overwrite) == tmp_path / name
+
+
+# ---- the door of readers ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("problem", "words"),
+    [
+        (FileNotFoundError(2, "No such file or directory"), "no such file"),
+        (IsADirectoryError(21, "Is a directory"), "is a folder, not a file"),
+        (PermissionError(13, "Permission denied"), "cannot be read: Permission denied"),
+        (PermissionError("locked"), "cannot be read: locked"),
+        (OSError(5, "Input/output error"), "no journal: [Errno 5] Input/output error"),
+        (ValueError("not\n a number"), "no journal: not a number"),
+        (KeyError("frame"), "no journal: KeyError: 'frame'"),
+        (RecursionError(), "no journal: RecursionError"),
+        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "bad"), "no journal: 'utf-8' codec can't"),
+    ],
+)
+def test_whatever_goes_wrong_is_one_line(problem, words):
+    with (
+        pytest.raises(ObservationError) as caught,
+        understood("a.json", ObservationError, "no journal"),
+    ):
+        raise problem
+    assert str(caught.value).startswith(f"a.json: {words}")
+
+
+def test_errors_of_ours_and_interrupts_pass():
+    with pytest.raises(CalibrationFileError, match=r"^as it is$"):
+        with understood("a.json", ObservationError, "no journal"):
+            raise CalibrationFileError("as it is")
+    for kind in (KeyboardInterrupt, SystemExit):
+        with pytest.raises(kind), understood("a.json", ObservationError, "no journal"):
+            raise kind
+
+
+def test_the_cause_is_kept_where_it_may_be_needed():
+    with pytest.raises(ObservationError) as caught, understood("a", ObservationError, "no journal"):
+        {}["frame"]
+    assert isinstance(caught.value.__cause__, KeyError)
+
+
+@pytest.mark.parametrize(
+    ("said", "longest", "line"),
+    [
+        ("  two\n\n words\t", 240, "two words"),
+        (ValueError(""), 240, "ValueError"),
+        (TypeError("of no\nuse"), 240, "TypeError: of no use"),
+        (OSError(2, "gone"), 240, "[Errno 2] gone"),
+        (7, 240, "7"),
+        ("\x1b[31mred\x07 \u202e", 240, "?[31mred? ?"),
+        ("é 💥", 240, "é 💥"),
+        ("abcdef", 6, "abcdef"),
+        ("abcdefg", 6, "abcdef..."),
+    ],
+)
+def test_one_line(said, longest, line):
+    assert one_line(said, longest) == line
+
+
+# ---- YAML ------------------------------------------------------------------------------
+
+
+def laughs(levels, width=9):
+    """Return lists of which each holds the one before it several times."""
+    lines = ["a0: &a0 [x]"]
+    for i in range(levels):
+        lines.append(f"a{i + 1}: &a{i + 1} [{', '.join([f'*a{i}'] * width)}]")
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("&a [*a]", "refers to itself"),
+        ("a: &a\n  b: {c: *a}", "refers to itself"),
+        ("- *unknown", "undefined alias|refers to itself"),
+        ("[" * 64 + "]" * 64, "nested deeper than the 64 levels"),
+        ("{a: " * 64 + "1" + "}" * 64, "nested deeper than the 64 levels"),
+        (laughs(6), "repeats itself so often"),
+        ("a: &a {x: 1}\nb: {<<: *a}", "merge keys"),
+        ("a: &a {x: 1}\nb: {!!merge <<: *a}", "merge keys"),
+        ("a: &a {x: 1}\nb: {? !<tag:yaml.org,2002:merge> z : *a}", "merge keys"),
+    ],
+)
+def test_yaml_that_must_not_be_loaded(text, words):
+    with pytest.raises(AstropolcalError, match=words):
+        check_yaml(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[" * 62 + "]" * 62,
+        "a: &a [1, 2]\nb: *a\nc: *a",
+        "a: '<<'",
+        laughs(3),
+        "--- {a: 1}\n...\n--- {b: 2}\n",
+        "\n".join(f"- {i}" for i in range(3000)),
+    ],
+    ids=lambda text: str(len(text)),
+)
+def test_yaml_that_may_be_loaded(text):
+    check_yaml(text)
+    check_yaml(text.encode())
+
+
+def test_an_anchor_may_be_given_anew():
+    """The second &a is of another list: what it was before does not count any more."""
+    check_yaml("- &a [x]\n- *a\n- &a [y]\n- *a")
+    with pytest.raises(AstropolcalError, match="refers to itself"):
+        check_yaml("- &a [x]\n- &a [*a]")
+
+
+def test_what_is_no_yaml():
+    with pytest.raises(yaml.YAMLError):
+        check_yaml("a: [1")
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.recursive(st.integers(), lambda x: st.lists(x, max_size=4), max_leaves=30))
+def test_what_was_written_from_a_tree_is_allowed(tree):
+    check_yaml(yaml.safe_dump(tree))
+
+
+def test_immense_yaml_is_refused_before_it_takes_time():
+    """Nothing is loaded: of forty levels the last would hold 9 ** 40 words."""
+    start = time.process_time()
+    with pytest.raises(AstropolcalError, match="repeats itself"):
+        check_yaml(laughs(40))
+    assert time.process_time() - start < 1

@@ -1,7 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Instruments: the registry, the chain of CHARIS, and its published values."""
 
+import ast
+import re
 from datetime import date
+from pathlib import Path
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -9,10 +12,10 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from astropolcal import instruments, optics
+from astropolcal import calibrate, diagnose, instruments, optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError
-from astropolcal.instruments import CHARIS, Instrument
+from astropolcal.instruments import CHARIS, Instrument, SkyLaw
 from astropolcal.measurement import FreeParameters, Measurement
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -230,7 +233,7 @@ def test_chain_follows_the_wavelength_grid():
         ({"source": "star", "m3": "glass"}, r"m3 = 'glass'; allowed are free, power law, metal"),
         ({"derotator": "round"}, r"derotator = 'round'; allowed are elliptical, linear"),
         ({"bounds": "none"}, r"bounds = 'none'; allowed are physical, paper"),
-        ({"optics_in": ["lens"]}, r"no \['lens'\]; allowed are 'nbs', 'dichroic'"),
+        ({"optics_in": ["lens"]}, r"charis: optics_in = 'lens'; allowed are nbs, dichroic"),
     ],
 )
 def test_unknown_choice_is_refused(options, words):
@@ -404,5 +407,184 @@ def test_published_chain_of_the_instrument_agrees_with_the_table(published):
 @pytest.mark.parametrize("name", ["charis", "irdis", "vampires"])
 def test_on_sky_needs_a_half_wave_plate(name):
     chain = optics.LinearPolarizer(name="polarizer") | optics.WollastonPrism(name="wollaston")
-    with pytest.raises((ChainError, InstrumentError), match="hwp"):
+    with pytest.raises(ChainError, match=f"{name}: the chain has no optic 'hwp' to put the tel"):
         instruments.get(name).on_sky(chain)
+
+
+# --- nothing outside of this folder knows an instrument -------------------------------------
+
+PACKAGE = Path(instruments.__file__).parents[1]
+SPELLINGS = re.compile("charis|scexao|vampires|irdis|sphere", re.IGNORECASE)
+# stages, roles and words of tables that any polarimeter has
+GENERAL = {
+    "hwp", "derotator", "wollaston", "parallactic", "altitude", "star", "lamp", "relay", "cameras",
+    "pairing",
+}  # fmt: skip
+DEFAULT = "instrument that a command takes where nothing names one"
+ALLOWED = {
+    ("gap/_bench.py", "charis"): "instrument on which a withheld check runs by default",
+    ("gap/effects/relay.py", "dichroic"): "place of an effect, in a chain with or without one",
+    ("reduction/pypolcal.py", "SCExAO/CHARIS"): "the software whose tables are read has only it",
+    ("scripts/_calibrate.py", "charis_example.ecsv"): "packaged data",
+    ("scripts/_calibrate.py", "No files given: calibrating the packaged example"): "packaged data",
+    ("scripts/_calibrate.py", "--m3"): "option of the command line, and of two chains",
+    ("scripts/_calibrate.py", "m3"): "option of the command line, and of two chains",
+    ("scripts/_choosing.py", "charis"): DEFAULT,
+    ("scripts/_correct.py", "charis"): DEFAULT,
+    ("scripts/_efficiency.py", "charis"): DEFAULT,
+    ("scripts/_efficiency.py", "examples:"): "help of the command line",
+    ("scripts/_reduce.py", "charis"): DEFAULT,
+    ("scripts/_simulate.py", "charis"): DEFAULT,
+}
+# arguments of argparse whose texts may cite an instrument
+HELP = {"help", "epilog", "description", "metavar"}
+
+
+def _private_names():
+    """Names of optics, and words in the meta, that only some instruments have."""
+    found = set()
+    for name in ("charis", "irdis", "vampires"):
+        instrument = instruments.get(name)
+        found |= {*instrument.optional_optics, *instrument.meta_without(instrument.optional_optics)}
+        for source in instrument.sources:
+            found |= set(instrument.chain(source).submodel_names)
+    return found - GENERAL
+
+
+def _not_code(tree):
+    """The constants of a module that are docstrings or texts of the command line's help."""
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    found = [n.body[0].value for n in ast.walk(tree) if isinstance(n, kinds) and
+             n.body and isinstance(n.body[0], ast.Expr)]  # fmt: skip
+    found += [n.value for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg in HELP]
+    return {id(inner) for node in found for inner in ast.walk(node)}
+
+
+def _named(source, private):
+    """Yield the texts and names in a module that tell of an instrument."""
+    tree = ast.parse(source)
+    ignored = _not_code(tree)
+    for node in ast.walk(tree):
+        text = isinstance(node, ast.Constant) and isinstance(node.value, str)
+        if text and id(node) not in ignored:
+            # a text of several words is prose, such as the title of an effect
+            words = set() if " " in node.value else set(re.split(r"\W+", node.value))
+            if SPELLINGS.search(node.value) or private & words:
+                yield node.value
+        for key in ("id", "attr", "name", "arg"):
+            word = getattr(node, key, None)
+            if isinstance(word, str) and id(node) not in ignored:
+                if SPELLINGS.search(word) or word in private:
+                    yield word
+
+
+def test_the_search_finds_what_it_should():
+    code = '''
+"""Docstring of charis."""
+parser.add_argument("--x", help="such as charis")
+a = "SCExAO/CHARIS"
+vampires_only = chain["nbs"]
+'''
+    assert set(_named(code, {"nbs"})) == {"SCExAO/CHARIS", "vampires_only", "nbs"}
+
+
+def test_no_code_outside_of_the_folder_names_an_instrument():
+    """What a new instrument needs is in its file: nothing else may tell one from another."""
+    private, found = _private_names(), {}
+    assert {"nbs", "m3", "m4", "flc", "yjh50_dichroic"} <= private
+    for path in sorted(PACKAGE.rglob("*.py")):
+        where = path.relative_to(PACKAGE).as_posix()
+        if not where.startswith("instruments/"):
+            found |= dict.fromkeys((where, text) for text in _named(path.read_text(), private))
+    excused = {
+        key: [a for a in ALLOWED if key[0] == a[0] and key[1].startswith(a[1])] for key in found
+    }
+    strange = [key for key, reasons in excused.items() if not reasons]
+    assert not strange, (
+        f"{strange}: move what is particular to an instrument into astropolcal/instruments, and "
+        "ask the Instrument for it"
+    )
+    needed = {reason for reasons in excused.values() for reason in reasons}
+    assert not set(ALLOWED) - needed, "an exception that is no longer needed"
+
+
+# --- the only instrument there is -----------------------------------------------------------
+
+
+class Lone(Instrument):
+    """A polarimeter with optics, stages and wavelengths of its own, and no derotator."""
+
+    name = "lone"
+    wavelength = [0.7, 0.8, 0.9] * u.um
+    keywords = {"hwp": "ROTOR"}
+    references = ("Nobody 2020",)
+    sources = ("polarized", "unpolarized")
+    sky_law = SkyLaw(plate=(0, 0), derotator={})
+
+    def chain(self, source="polarized", optics_in=(), *, wavelength=None):
+        self.check_choices(source, optics_in)
+        size = self.grid(wavelength).size
+        lights = {
+            "polarized": optics.LinearPolarizer(name="grid"),
+            "unpolarized": optics.Diattenuator(diattenuation=np.zeros(size), name="flat_mirror"),
+        }
+        plate = optics.LinearRetarder(
+            retardance=np.full(size, 170) * u.deg,
+            mount="hwp",
+            name="rotor",
+            fixed={"theta": False},
+            bounds={"theta": (-5, 5)},
+        )
+        # without a derotator, as good as the retardance
+        splitter = optics.WollastonPrism(efficiency=0.97, name="savart", fixed={"efficiency": True})
+        return lights[source] | plate | splitter
+
+    def setup(self, observations):
+        return self.source_of(observations), ()
+
+
+@pytest.fixture
+def lone(monkeypatch):
+    """An installation with one instrument only, which is none of ours."""
+    monkeypatch.setattr(instruments, "_REGISTRY", {})
+    monkeypatch.setattr(instruments, "entry_points", lambda group: [])
+    instruments.register(Lone)
+    assert instruments.names() == ["lone"]
+    return instruments.get("lone")
+
+
+def _lone_night(chain, source="polarized", seed=1, cycles=4):
+    frames = half_wave_plate_cycles(derotator=np.zeros(cycles) * u.deg)
+    meta = {"instrument": "lone", "source": source}
+    return simulate(chain, Lone.wavelength, frames, flux=3e7, seed=seed, meta=meta, name=source)
+
+
+def test_package_works_with_one_instrument_alone(lone):
+    """From simulated frames to a diagnosis that finds what the model lacks."""
+    truth = lone.chain()
+    truth["rotor"].retardance = [172.0, 175.0, 168.0] * u.deg
+    truth["rotor"].theta = 1.5 * u.deg
+    night = _lone_night(truth)
+    cal = calibrate(lone.chains_for([night]), [night], instrument="lone", cross_validate=False)
+    rotor = cal.chains[0]["rotor"]
+    np.testing.assert_allclose(rotor.retardance.value, [172, 175, 168], atol=0.3)
+    assert rotor.theta.value == pytest.approx(1.5, abs=0.01)
+    assert cal.instrument == "lone"
+    assert diagnose(cal, night).verdict == "none"
+
+
+def test_diagnosis_finds_a_cause_in_the_only_instrument(lone):
+    """The plate's encoder is not centred: an effect of any plate, whatever it is called."""
+    error = optics.HarmonicRotator(cosine=0.6 * u.deg, mount="hwp", name="error")
+    back = optics.HarmonicRotator(cosine=-0.6 * u.deg, mount="hwp", name="back")
+    first, plate, last = leaves(lone.chain())
+    night = _lone_night(join([first, error, plate, back, last]), cycles=8)
+    cal = calibrate(lone.chains_for([night]), [night], instrument="lone", cross_validate=False)
+    report = diagnose(cal, night)
+    assert report.verdict == "effect"
+    assert report.causes[0].effect.name == "hwp_encoder_eccentricity"
+
+
+def test_other_names_are_unknown_where_there_is_one_instrument(lone):
+    with pytest.raises(InstrumentError, match=r"unknown instrument 'charis'; known are lone$"):
+        instruments.get("charis")

@@ -19,6 +19,7 @@ from astropolcal.stokes import (
     degree_of_polarization,
     dolp_error,
     is_physical_stokes,
+    polarization_angle,
     stokes_from_dolp_aolp,
     transverse_error,
 )
@@ -340,3 +341,48 @@ def test_the_interval_at_the_ends():
 @given(st.floats(1e-4, 1), st.floats(1e-4, 1), st.floats(1.01, 3))
 def test_the_interval_shrinks_with_the_signal(dolp, sigma, factor):
     assert aolp_interval(dolp * factor, sigma) < aolp_interval(dolp, sigma)
+
+
+# --- angles of plain numbers ----------------------------------------------------------------
+
+
+@given(dolp=st.floats(1e-6, 1), degrees=st.floats(0, 179.999))
+def test_plain_angle_is_that_of_the_stokes_vector(dolp, degrees):
+    q, u_ = dolp * np.cos(2 * np.radians(degrees)), dolp * np.sin(2 * np.radians(degrees))
+    checked = angle_of_linear_polarization([1.0, q, u_, 0.0]).to_value(u.deg)
+    assert polarization_angle(q, u_) == checked
+    # on the circle of 180 deg
+    assert (polarization_angle(q, u_) - degrees + 90) % 180 - 90 == pytest.approx(0, abs=1e-9)
+
+
+def test_plain_angle_of_what_is_no_number_is_none():
+    """Tables of corrected frames have gaps, which neither warn nor stop the others."""
+    found = polarization_angle(np.array([0.1, np.nan, 0.0]), np.array([0.0, 0.1, np.nan]))
+    assert found[0] == 0.0
+    assert np.isnan(found[1:]).all()
+
+
+@pytest.mark.parametrize("u_", [-1e-300, -1e-17, -0.0])
+def test_plain_angle_never_reaches_180_deg(u_):
+    assert 0 <= polarization_angle(1.0, u_) < 180
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (
+            lambda: stokes_from_dolp_aolp([0.1, 1.2], 0 * u.deg),
+            r"dolp = 1\.2 at index \(1,\) must be",
+        ),
+        (lambda: stokes_from_dolp_aolp(0.1, 0 * u.deg, intensity=[[1.0, 0.0]]), r"index \(0, 1\)"),
+        (lambda: debias_dolp(-0.1, 0.1), r"^dolp = -0\.1 must be zero or positive$"),
+        (lambda: degree_of_linear_polarization(np.ones(3)), r"shape \(3,\); axis -1 must hold"),
+        (
+            lambda: degree_of_linear_polarization(np.ones((4, 2)), axis=2),
+            "axis 2 must hold the four",
+        ),
+    ],
+)
+def test_message_names_value_and_place(call, words):
+    with pytest.raises(ParameterError, match=words):
+        call()

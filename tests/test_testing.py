@@ -8,6 +8,7 @@ from astropy.modeling import Parameter
 from scipy.stats import norm
 
 from astropolcal import instruments, optics
+from astropolcal.chain import join, leaves
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.layout import FileLayout
@@ -40,6 +41,9 @@ class Sound(Instrument):
             )
             | optics.WollastonPrism(efficiency=np.full(size, self.efficiency), name="wollaston")
         )
+
+    def telescope_optics(self, behind):
+        return [optics.Rotator(mount="parallactic", name="sky")]
 
     def first(self, source):
         if source == "polarized":
@@ -105,6 +109,31 @@ def _out_of_bounds(self):
     return chain
 
 
+def _sky(*front, drop=1, last=None):
+    """Return an ``on_sky`` that puts optics before those of the internal chain."""
+
+    def on_sky(self, chain):
+        return join([*front, *leaves(chain)[drop:last]])
+
+    return {"on_sky": on_sky}
+
+
+def _again(self, chain):
+    """Return the chain behind one more mirror each time."""
+    found = leaves(chain)
+    more = optics.ParityFlip(name=f"flip{len(found)}")
+    return join([_turns("parallactic"), more, *found[1 if len(found) == 3 else 2 :]])
+
+
+def _without_splitter(self, source="polarized", optics_in=(), *, wavelength=None):
+    return join(leaves(Sound.chain(self, source, optics_in, wavelength=wavelength))[:-1])
+
+
+def _five_values(self, source="polarized", optics_in=(), *, wavelength=None):
+    flat = optics.Depolarizer(retained_q=np.full(5, 0.9), name="flat")
+    return Sound.chain(self, source, optics_in, wavelength=wavelength) | flat
+
+
 def _layout(**keywords):
     return FileLayout(keywords=keywords, shape=(2, 10, 10))
 
@@ -116,6 +145,10 @@ BROKEN = {
     "deaf": ({"answers_to": lambda self, name: False}, "class", "does not answer to 'sound'"),
     "docstring": ({"__doc__": None}, "documentation", "no docstring"),
     "references": ({"references": ()}, "documentation", "at least one"),
+    "one text": ({"references": "Author 2020"}, "documentation", "a tuple of at least one text"),
+    "empty text": ({"references": ("A", " ")}, "documentation", "one of its references is empty"),
+    "scalar": ({"wavelength": 0.6 * u.um}, "wavelengths", r"has shape \(\); \(n,\) is it"),
+    "not finite": ({"wavelength": [0.6, np.nan] * u.um}, "wavelengths", "must be positive and fin"),
     "no unit": ({"wavelength": np.array([0.6])}, "wavelengths", "a Quantity is needed"),
     "frequency": ({"wavelength": [1, 2] * u.Hz}, "wavelengths", "a length is needed"),
     "twice": ({"wavelength": [0.6, 0.6] * u.um}, "wavelengths", "occurs twice"),
@@ -127,17 +160,44 @@ BROKEN = {
     "two splitters": (
         {"chain": behind(optics.WollastonPrism(name="second"))}, "names", "one optic must split",
     ),
+    "no beams": ({"chain": _without_splitter}, "names", r"must split the light, not \[\]"),
+    "five values": ({"chain": _five_values}, "bounds", "flat.retained_q has 5 values; allowed"),
     "bounds": ({"efficiency": 1.2}, "bounds", "wollaston.efficiency = .* outside of its bounds"),
     "unphysical": ({"chain": behind(Amplifier(name="amp"))}, "physical", "amp is not physical"),
+    "polarizer on sky": (_sky(_turns("parallactic"), drop=0), "on sky", "polarizer of the source"),
+    "lamp on sky": (
+        _sky(_turns("parallactic"), optics.PolarizedSource(name="lamp")), "on sky", "would hide",
+    ),
+    "no telescope": (_sky(), "on sky", "no optic in front of hwp stands on the stage parallactic"),
+    "altitude only": (_sky(_turns("-altitude")), "on sky", "stands on the stage parallactic"),
+    "no plate": (_sky(_turns("parallactic"), drop=2), "on sky", "the last must be hwp, wollaston"),
+    "no splitter": (_sky(_turns("parallactic"), last=-1), "on sky", "there are turns, hwp; the"),
+    "twice on sky": ({"on_sky": _again}, "on sky", "a chain from the sky gets another telescope"),
     "stage": ({"chain": behind(_turns("rotator"))}, "mounts", "rotator is no column .* known are"),
     "no site": ({"location": None}, "mounts", "site of the telescope"),
     "lower case": ({"keywords": {"hwp": "hwpang"}}, "headers", "'hwpang' is no FITS keyword"),
     "long": ({"keywords": {"hwp": "HWPANGLEX"}}, "headers", "is no FITS keyword"),
     "shared": ({"keywords": {"hwp": "ANG", "derotator": "ANG"}}, "headers", "hwp and derotator"),
     "layout": ({"files": _layout(hwp="HWP")}, "headers", "HWPANG here, HWP in its file layout"),
+    "no keyword": ({"keywords": {"hwp": " "}}, "headers", "hwp: keyword ' '"),
+    "not in the chain": (
+        {"setup": lambda self, obs: (obs.source, ("window",))}, "setup", "the chain lacks it",
+    ),
+    "other optics": (
+        {"chains_for": lambda self, tables: [join(leaves(self.chain())[2:])]},
+        "setup", "its table's chain lacks hwp, polarizer",
+    ),
     "setup": ({"setup": lambda self, obs: ("star", ())}, "setup", "is set up as 'star'"),
     "greedy": ({"check": lambda self, obs: None}, "setup", "is not refused"),
     "published": ({"published": _out_of_bounds}, "published", "published: wollaston.efficiency"),
+    "other meta": (
+        {"published": lambda self: self.chain(), "published_meta": lambda self: {"source": "star"}},
+        "published", "published_meta lead to .*'star'.*, published to .*'polarizer'",
+    ),
+    "unphysical values": (
+        {"published": lambda self: self.chain() | Amplifier(name="amp")}, "published", "amp is not",
+    ),
+    "still": ({"efficiency": 0.0}, "predicts", "no source gives fluxes that change with the mod"),
     "file": ({"chain": behind(Leaky(name="leaky"))}, "round trip", "Leaky"),
     "angles": ({"positions": _off_by_45}, "predicts", "do stages stand where its positions say"),
 }  # fmt: skip
@@ -237,6 +297,25 @@ def test_instrument_without_keywords_has_no_headers_to_check():
 def test_what_is_no_instrument_is_refused(thing):
     with pytest.raises(InstrumentError, match=r"is not an Instrument|lacks the methods"):
         check_instrument(thing)
+
+
+def test_hierarchical_keywords_are_fits_keywords():
+    skip = [rule for rule in RULES if rule not in ("sources", "headers")]
+    keywords = {"hwp": "ESO INS4 DROT3 BEGIN", "altitude": "ESO TEL ALT"}
+    assert check_instrument(variant(keywords=keywords), skip=skip)
+
+
+def test_instrument_without_a_lamp_has_no_chain_to_take_to_the_sky():
+    skip = [rule for rule in RULES if rule not in ("sources", "on sky")]
+    report = check_instrument(variant(sources=("star",)), skip=skip)
+    assert report.skipped["on sky"] == "it has no internal source"
+    report = check_instrument(variant(telescope_optics=Instrument.telescope_optics), skip=skip)
+    assert report.skipped["on sky"] == "it has no telescope of known values"
+
+
+def test_seed_of_the_positions_does_not_decide():
+    skip = [rule for rule in RULES if rule not in ("sources", "physical", "predicts")]
+    assert all(check_instrument(Sound, seed=seed, skip=skip) for seed in range(3))
 
 
 def test_unknown_rule_is_refused():

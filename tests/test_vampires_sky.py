@@ -10,7 +10,7 @@ from astropolcal import instruments, optics
 from astropolcal.calibration import calibrate
 from astropolcal.chain import leaves, stages
 from astropolcal.correction import ScienceFrames, correct, frame_positions, measurement_rows
-from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.exceptions import ChainError, InstrumentError, ObservationError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import get_observable
 from astropolcal.reduction.cubes import both_states, true_observations
@@ -154,7 +154,7 @@ def test_sky_before_an_internal_chain():
     sky = VAMPIRES.on_sky(internal())
     assert tuple(stages(sky)) == ("parallactic", "altitude", "hwp", "derotator", "flc_state")
     assert VAMPIRES.on_sky(sky) is sky
-    with pytest.raises(InstrumentError, match="no optic 'hwp' to put the telescope before"):
+    with pytest.raises(ChainError, match="no optic 'hwp' to put the telescope before"):
         VAMPIRES.on_sky(optics.LinearPolarizer(name="a") | optics.WollastonPrism(name="w"))
 
 

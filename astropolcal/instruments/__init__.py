@@ -6,16 +6,17 @@ An instrument is one file with a subclass of `Instrument`. Other packages add
 theirs through the entry-point group ``astropolcal.instruments``.
 """
 
-import difflib
 from importlib.metadata import entry_points
 
 from astropolcal.exceptions import InstrumentError
+from astropolcal.files import one_line
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.charis import CHARIS
 from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.irdis import IRDIS
 from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
 from astropolcal.instruments.vampires import VAMPIRES
+from astropolcal.words import did_you_mean
 
 __all__ = [
     "CHARIS",
@@ -113,16 +114,23 @@ def get(name):
     for point in entry_points(group="astropolcal.instruments"):
         try:
             instrument = register(point.load())()
-            asked = instrument.answers_to(str(name))
+            # `names` lists it by the name of its entry point, which may be another
+            asked = instrument.answers_to(str(name)) or point.name == name
         except Exception as error:  # whatever another package raises when it is imported
-            broken.append(f"; {point.name!r} cannot be loaded: {type(error).__name__}: {error}")
+            why = one_line(f"{type(error).__name__}: {error}", 100)
+            broken.append(f"; {one_line(repr(point.name), 40)} cannot be loaded: {why}")
             continue
         if asked:
             return instrument
-    near = difflib.get_close_matches(str(name).lower(), names(), n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    # one that cannot be loaded is no suggestion
+    near = [known for known in names() if known != str(name).lower()]
+    hint = did_you_mean(str(name).lower(), near)
+    # what other packages say of themselves has no bounds
+    first, *rest = [*dict.fromkeys(broken), ""]
+    more = f" (and {len(rest) - 1} more)" if len(rest) > 1 else ""
     raise InstrumentError(
-        f"unknown instrument {name!r}; known are {', '.join(names())}{hint}{''.join(broken)}"
+        f"unknown instrument {one_line(repr(name), 60)}; known are "
+        f"{one_line(', '.join(names()))}{hint}{first}{more}"
     )
 
 

@@ -12,6 +12,7 @@ from astropolcal.observations.pointing import pointing
 
 __all__ = ["frame_table"]
 
+# degrees: reading of the plate where theta = 0, and offset between pupil and derotator
 _PLATE_ZERO, _PUPIL_OFFSET = 152.15, 135.99
 # seconds: of the read-out of every DIT, and of the start of an exposure
 _READ_OUT, _START = 0.938, 2.4
@@ -54,6 +55,7 @@ class _Header:
         return value
 
     def mean_angle(self, first, last):
+        # on the circle: 359 and 3 deg have the mean 1, not 181
         ends = np.deg2rad([self.number_of(first), self.number_of(last)])
         return float(np.rad2deg(np.angle(np.exp(1j * ends).sum())))
 
@@ -133,8 +135,10 @@ def _row(frame, tracking, location):
         for column, keyword in _STAGES.items()
     }
     angles["hwp_true"] = (angles["hwp_true"] - _PLATE_ZERO) % 360
+    # the image turns by twice the derotator
     angles["derotator"] += 0.5 * _PUPIL_OFFSET if tracking == "pupil" else 0.0
     dit, ndit = frame.number_of("EXPTIME", 0.0), frame.number_of("ESO DET NDIT", 1.0)
+    # EXPTIME is the light of one DIT, without its read-out
     seconds = ndit * (dit + _READ_OUT) + _START
     start = Time(frame.number_of("MJD-OBS", 0.0), format="mjd", scale="utc")
     middle = start + 0.5 * seconds * u.s
@@ -150,5 +154,6 @@ def _row(frame, tracking, location):
 def _altitude(frame, times, location):
     """Return the altitude in the middle: that in the header and the change since the start."""
     target = SkyCoord(frame.number_of("RA"), frame.number_of("DEC", -90.0), unit=u.deg)
+    # an offset of the computed altitude from that of the header cancels in the difference
     start, middle = pointing(target, times, location)[0].to_value(u.deg)
     return frame.number_of("ESO TEL ALT", 0.0) + float(middle - start)

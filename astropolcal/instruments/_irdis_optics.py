@@ -12,6 +12,7 @@ from astropy.time import Time
 
 from astropolcal import optics
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError
+from astropolcal.instruments._choices import check_choice
 
 # van Holstein et al. 2020, as distributed with their pipeline; one row a filter
 _DATA = QTable.read(Path(__file__).parents[1] / "data" / "irdis.ecsv", format="ascii.ecsv")
@@ -27,16 +28,11 @@ COATINGS = ("before", "after")
 _SAME_FILTER = 0.01
 
 
-def choice(what, value, allowed):
-    """Raise if a value is not one of those allowed."""
-    if value not in allowed:
-        raise InstrumentError(f"{what} = {value!r}; allowed are {', '.join(allowed)}")
-
-
 def filters_at(wavelength):
     """Return the index of the filter of every wavelength."""
     centres, lam = CENTRES.to_value(u.um), u.Quantity(wavelength).to_value(u.um)
     index = np.abs(lam[:, None] / centres - 1).argmin(axis=1)
+    # written so that NaN is off, too
     off = ~(np.abs(lam / centres[index] - 1) <= _SAME_FILTER)
     if off.any():
         known = ", ".join(f"{n} ({c:g} um)" for n, c in zip(FILTERS, centres, strict=True))
@@ -69,7 +65,7 @@ def stated_coating(observations):
     """Return the coating that the meta of a table tell."""
     stated = observations.meta.get("coating")
     if stated is not None:
-        choice(f"{observations.name}: coating", stated, COATINGS)
+        check_choice(f"{observations.name}: coating", stated, COATINGS)
         return stated
     if observations.meta.get("date") is None:
         raise InstrumentError(
@@ -82,14 +78,15 @@ def stated_coating(observations):
 def coating_of(coating, date):
     """Return the coating of a telescope that is put before a chain, by name or date."""
     if coating is not None:
-        choice("coating", coating, COATINGS)
+        check_choice("coating", coating, COATINGS)
     if date is None:
         if coating is None:
             warnings.warn(
                 "irdis: neither date nor coating of the telescope was given; it is the one from "
                 f"{RECOATING} on; give the date of the frames, or coating='before' for older ones",
                 AstropolcalWarning,
-                stacklevel=3,
+                # coating_of, telescope_optics, on_sky: the line that asked for a chain from the sky
+                stacklevel=4,
             )
         return coating or "after"
     several = np.ndim(date) > 0
@@ -154,7 +151,7 @@ def calibration_polarizer():
 
 def telescope(index, coating):
     """Return the optics from the sky to the half-wave plate."""
-    choice("coating", coating, COATINGS)
+    check_choice("coating", coating, COATINGS)
     return [
         optics.Rotator(mount="parallactic", name="parallactic"),
         _mirror("ut", coating, index),
@@ -168,6 +165,7 @@ def _mirror(name, coating, index):
         diattenuation=_column(f"{name}_diattenuation_{coating}", index),
         retardance=_column("mirror_retardance", index),
         name=name,
+        # an unpolarized star shows the diattenuation of a mirror, never its retardance
         fixed={"retardance": True},
         bounds={"diattenuation": (-0.1, 0.1)},
     )

@@ -1,10 +1,13 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Values of header keywords in the units of a file layout."""
 
+import warnings
+
 import astropy.units as u
 from astropy.io.fits import VerifyError
 from astropy.io.fits.card import Undefined
 from astropy.time import Time
+from erfa import ErfaWarning
 
 #: Columns that are angles of a stage.
 ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
@@ -74,10 +77,23 @@ def frame_time(header, layout):
     """
     mjd, date, clock = (look_up([header], key, layout)[1] for key in ("mjd", "date", "time"))
     if mjd is not None:
-        return Time(float(mjd), format="mjd", scale="utc")
+        return in_calendar(Time(float(mjd), format="mjd", scale="utc"))
     if date is None:
         return None
     day = str(date).strip()
     if "T" not in day and clock is not None:
         day = f"{day}T{str(clock).strip()}"
-    return Time(day, scale="utc")
+    return in_calendar(Time(day, scale="utc"))
+
+
+def in_calendar(time):
+    """
+    Return a time as it is; ErfaError, a ValueError, if it is of a day that no calendar has.
+
+    Astropy takes any number as a day, and finds out in the first conversion only.
+    """
+    with warnings.catch_warnings():
+        # years long before UTC was made are doubtful, but are years
+        warnings.simplefilter("ignore", ErfaWarning)
+        time.tai, time.isot  # noqa: B018
+    return time

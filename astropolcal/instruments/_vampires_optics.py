@@ -5,6 +5,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
+from astropolcal.instruments._subaru_optics import misaligned
 from astropolcal.instruments.telescope import tertiary_mirror
 
 # where fits start: wavelength in nm, and retardances in deg
@@ -26,10 +27,6 @@ def mirror(model, grid):
     return mirror
 
 
-def _misaligned(about, most=5):
-    return {"fixed": {"theta": False}, "bounds": {"theta": (about - most, about + most)}}
-
-
 def _normal(mean, std):
     from scipy.stats import norm
 
@@ -40,23 +37,16 @@ def _starts(grid, values):
     return np.interp(grid.to_value(u.nm), _START_AT, values) * u.deg
 
 
-def polarizer():
-    return optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer", **_misaligned(90))
-
-
-def fold_mirror(size):
-    return optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror")
-
-
 def half_wave_plate(grid):
-    settings = _misaligned(0)
+    settings = misaligned(0)
+    # the branch of our sign: without it (H, 45, R) and (-H, -45, R) fit alike
     settings["bounds"] |= {"retardance": (-180, -90)}
     start = _starts(grid, _HALF_WAVE_PLATE)
     return optics.LinearRetarder(retardance=start, mount="hwp", name="hwp", **settings)
 
 
 def derotator(grid, kind):
-    settings, start = _misaligned(0), _starts(grid, _DEROTATOR)
+    settings, start = misaligned(0), _starts(grid, _DEROTATOR)
     main = "retardance" if kind == "linear" else "horizontal"
     settings["bounds"] |= {main: (0, 360)}
     settings |= {"mount": "derotator", "name": "derotator"}
@@ -80,12 +70,13 @@ def relay(size):
         name="relay",
         bounds={"diattenuation": (-0.6, 0.6), "retardance": (-180, 180)},
     )
+    # wide: a retarder here looks like one in the derotator, unless that turns far
     relay.retardance.prior = _normal(0, 45)
     return relay
 
 
 def liquid_crystal(size):
-    settings = _misaligned(0, most=20)
+    settings = misaligned(0, most=20)
     settings["bounds"] |= {"retardance": (90, 270), "switching_angle": (30, 60)}
     crystal = optics.FerroelectricLiquidCrystal(
         retardance=np.full(size, 180.0) * u.deg,
@@ -95,12 +86,14 @@ def liquid_crystal(size):
         **settings,
     )
     crystal.retardance.prior, crystal.theta.prior = _normal(180, 15), _normal(0, 2)
+    # a smaller switching angle looks like a lower efficiency of the splitter, hence the prior
     crystal.switching_angle.prior = _normal(43, 2)
     return crystal
 
 
 def cameras(size):
     cameras = optics.BeamGain(imbalance=np.zeros(size), name="cameras")
+    # pairs of both states see it in second order only, hence the prior
     cameras.imbalance.prior = _normal(0, 0.1)
     return cameras
 

@@ -5,11 +5,14 @@ import inspect
 from abc import ABC, abstractmethod
 
 import astropy.units as u
+import numpy as np
 
-from astropolcal.chain import stages
+from astropolcal.chain import join, stages
 from astropolcal.exceptions import InstrumentError
+from astropolcal.instruments._choices import check_choice
 from astropolcal.instruments.following import SkyLaw
-from astropolcal.instruments.nuisance import add_nuisance
+from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
+from astropolcal.instruments.telescope import behind_telescope, star_options
 from astropolcal.observations import (
     common_wavelengths,
     is_star,
@@ -39,6 +42,10 @@ class Instrument(ABC):
         Usual wavelengths, shape (n_wavelengths,).
     keywords : dict of str to str
         Column of the observation table to FITS header keyword.
+    sources : tuple of str
+        What may send the light; empty where the chain is the same for all.
+    optional_optics : tuple of str
+        Optics that are in the beam only now and then.
     files : FileLayout or None
         How the instrument's FITS files look; None if they cannot be reduced here.
     references : tuple of str
@@ -46,7 +53,7 @@ class Instrument(ABC):
     sky_law : SkyLaw
         How half-wave plate and derotator follow the sky.
     sky_options : tuple of str
-        Which of ``wavelength`` and ``date`` its `on_sky` takes.
+        Which of ``wavelength`` and ``date`` its ``telescope_optics`` take.
 
     Examples
     --------
@@ -70,6 +77,8 @@ class Instrument(ABC):
     aliases = ()
     wavelength = None
     keywords = {}
+    sources = ()
+    optional_optics = ()
     files = None
     references = ()
     sky_options = ()
@@ -105,6 +114,116 @@ class Instrument(ABC):
         InstrumentError
             If the table does not say.
         """
+
+    def check_choices(self, source, optics_in=(), **choices):
+        """
+        Raise if what `chain` is asked for is not known, the first thing that it does.
+
+        Parameters
+        ----------
+        source : str
+            One of ``sources``.
+        optics_in : sequence of str
+            Each one of ``optional_optics``.
+        **choices : (str, sequence of str)
+            Name of another choice to its value and what is allowed.
+
+        Raises
+        ------
+        InstrumentError
+            Naming the instrument, the value and what is allowed.
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> instruments.get("irdis").check_choices("moon")
+        Traceback (most recent call last):
+        ...
+        astropolcal.exceptions.InstrumentError: irdis: source = 'moon'; allowed are polarized, ...
+        """
+        check_choice(f"{self.name}: source", source, self.sources)
+        for name in optics_in:
+            check_choice(f"{self.name}: optics_in", name, self.optional_optics)
+        for what, (value, allowed) in choices.items():
+            check_choice(f"{self.name}: {what}", value, allowed)
+
+    def grid(self, wavelength=None):
+        """
+        Return the wavelengths of the parameters of a chain, a Quantity of shape (n_wavelengths,).
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`, optional
+            As given to `chain`; without it the usual ones.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal import instruments
+        >>> instruments.get("charis").grid(1.6 * u.um)
+        <Quantity [1.6] um>
+        """
+        return self.wavelength if wavelength is None else np.atleast_1d(u.Quantity(wavelength))
+
+    def source_of(self, observations, spellings=None):
+        """
+        Return the source that a table's meta state, for `setup`.
+
+        Parameters
+        ----------
+        observations : Observations
+            The dataset.
+        spellings : dict of str to str, optional
+            How tables may spell the sources, in lower case, which is then all the same; by
+            default as in ``sources``.
+
+        Returns
+        -------
+        str
+
+        Raises
+        ------
+        InstrumentError
+            If it is none of them.
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> from astropolcal.observations import Observations, example_table
+        >>> table = Observations.from_table(example_table())
+        >>> instruments.get("charis").source_of(table)
+        'polarized'
+        """
+        known = {name: name for name in self.sources} if spellings is None else spellings
+        stated = observations.source
+        word = stated if spellings is None else str(stated).strip().lower()
+        if word not in known:
+            raise InstrumentError(
+                f"{observations.name}: source {stated!r} in the table's meta; "
+                f"allowed are {', '.join(known) or 'none'}"
+            )
+        return known[word]
+
+    def meta_without(self, names):
+        """
+        Return what the meta of a table say when optional optics are out of the beam.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Optics that are taken out; others than the optional ones change nothing.
+
+        Returns
+        -------
+        dict
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> instruments.get("charis").meta_without(["nbs"])
+        {'nasmyth_beam_switcher': 'not installed'}
+        """
+        return {}
 
     def optics_of(self, header):
         """
@@ -210,6 +329,7 @@ class Instrument(ABC):
         self._check_options(options)
         for observations in datasets:
             self.check(observations)
+        # one grid for all: what datasets share has one value for each wavelength of any of them
         grid = (common_wavelengths(datasets) * u.um).to(u.nm)
         setups = [self.setup(observations) for observations in datasets]
         particulars = [self.particulars(observations) for observations in datasets]
@@ -219,19 +339,80 @@ class Instrument(ABC):
         ]
         return add_nuisance(chains, datasets, nuisance)
 
-    def on_sky(self, chain):
+    def telescope_optics(self, behind, **options):
         """
-        Return the chain of a star that has the optics of an internal chain.
+        Return what stands between sky and half-wave plate when a star is observed.
+
+        Parameters
+        ----------
+        behind : list of Optic
+            The optics from the half-wave plate on, whose wavelengths the telescope must have.
+        **options
+            Particular to the instrument, see ``sky_options``.
+
+        Returns
+        -------
+        list of Optic
+            With a rotator on the stage ``parallactic``.
 
         Raises
         ------
         InstrumentError
-            If the instrument has no telescope's chain.
+            If the instrument has no telescope of known values.
         """
         raise InstrumentError(f"{self.name}: no chain from the sky is known")
 
+    @property
+    def has_telescope(self):
+        """Whether `on_sky` can put a telescope before an internal chain."""
+        own, base = type(self), Instrument
+        # an instrument may build the whole chain itself
+        return own.on_sky is not base.on_sky or own.telescope_optics is not base.telescope_optics
+
+    def on_sky(self, chain, **options):
+        """
+        Return the chain of a star that has the optics of an internal chain.
+
+        The source goes, with what stands before the half-wave plate; ``telescope_optics``
+        come in their place.
+
+        Parameters
+        ----------
+        chain : `~astropy.modeling.CompoundModel`
+            A chain; one with the telescope already only loses the nuisance optics of its dataset.
+        **options
+            Passed to `~astropolcal.instruments.Instrument.telescope_optics`.
+
+        Returns
+        -------
+        `~astropy.modeling.CompoundModel`
+            Without a source, which is of each star.
+
+        Raises
+        ------
+        ChainError
+            If the chain has no half-wave plate.
+        InstrumentError
+            If the instrument has no telescope of known values.
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> charis = instruments.get("charis")
+        >>> [optic.name for optic in charis.on_sky(charis.published())][:4]
+        ['parallactic', 'm3', 'altitude', 'hwp']
+        """
+        if not self.has_telescope:
+            raise InstrumentError(f"{self.name}: no chain from the sky is known")
+        chain = without_nuisance(chain)
+        if "parallactic" in stages(chain):
+            return chain
+        behind = behind_telescope(chain, self.name)
+        return join([*self.telescope_optics(behind, **options), *behind])
+
     def _check_options(self, options):
         known = inspect.signature(self.chain).parameters
+        # before any table is read: a wrong word of the command line is the likelier mistake
         unknown = sorted(set(options) - set(known))
         if unknown and not any(p.kind is p.VAR_KEYWORD for p in known.values()):
             raise InstrumentError(f"{self.name}: its chain has no option {', '.join(unknown)}")
@@ -248,8 +429,11 @@ class Instrument(ABC):
         Returns
         -------
         dict
+            Here of a star ``star``, the name of its source optic, and ``target``, as far as
+            `chain` takes them.
         """
-        return {}
+        known = inspect.signature(self.chain).parameters
+        return {key: value for key, value in star_options(observations).items() if key in known}
 
     def prepare(self, observations):
         """
@@ -275,7 +459,9 @@ class Instrument(ABC):
         observations = mask_saturated(observations)
         if not is_star(observations.source):
             return mask_unstable_lamp(observations)
+        # raises here, with the name of the table, rather than in the middle of a fit
         sky_angles(observations, self.location)
+        # on sky seeing and transparency change within seconds: only whole cycles cancel them
         return mask_incomplete_cycles(observations)
 
     @property
@@ -339,6 +525,7 @@ class Instrument(ABC):
 
     def answers_to(self, name):
         """Return whether ``name`` is this instrument, ignoring case."""
+        # headers and observers write the same name in capitals or not
         return name.lower() in {self.name.lower(), *(alias.lower() for alias in self.aliases)}
 
     def positions(self, observations, chain, **exposure):
@@ -371,11 +558,13 @@ class Instrument(ABC):
         """
         wanted, sky = stages(chain), {}
         if {"parallactic", "altitude"} & set(wanted):
+            # the caller may know the law better, as a diagnosis that tries another sign
             exposure = {"law": self.plate_law(observations)} | exposure
             sky = sky_positions(observations, self.location, **exposure)
             # the table need not have the parallactic angle as a column
             steady = sky["parallactic"].reshape(-1, observations.n_frames).mean(axis=0)
             sky["parallactic_rate"] = angle_change(observations, steady)
+        # the pointing tells some of the stages, columns of the table the others
         return {s: sky[s] if s in sky else observations.position(s) for s in wanted}
 
     def __repr__(self):

@@ -18,16 +18,16 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join, stages
+from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments._keywords import frame_time
+from astropolcal.instruments._subaru_optics import SITE, fold_mirror, misaligned, polarizer
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.instruments.nuisance import without_nuisance
 from astropolcal.instruments.telescope import (
+    INTERNAL,
     M3_MODELS,
-    _behind_telescope,
-    _star_of,
+    STARS,
     k_mirror,
     published_mirror,
     star_source,
@@ -63,6 +63,11 @@ _BOUNDS = {
 
 # The Nasmyth beam switcher came between the two calibration runs of 2025
 _NBS_ABSENT_UNTIL, _NBS_PRESENT_FROM = "2025-07-31", "2025-10-01"
+# how the meta of a table say that an optional optic is out
+_ABSENT = {
+    "nbs": ("nasmyth_beam_switcher", "not installed"),
+    "dichroic": ("yjh50_dichroic", "out"),
+}
 
 
 class CHARIS(Instrument):
@@ -80,6 +85,7 @@ class CHARIS(Instrument):
 
     name = "charis"
     aliases = ("SCExAO/CHARIS", "Subaru/SCExAO/CHARIS")
+    # bins of equal resolving power, as the cubes of the extraction have them
     wavelength = np.geomspace(1159.5614, 2369.3441, 22) * u.nm
     keywords = {
         "hwp": "RET-ANG1",
@@ -120,21 +126,15 @@ class CHARIS(Instrument):
         star_offset=(63.5, 33.1),
         pixel_scale=16.2,
         edge=1.0,
-        # longitude, latitude (deg), height (m) of the Subaru Telescope
-        site=(-155.4761, 19.8255, 4139.0),
+        site=SITE,
     )
     references = (
         "McIntosh et al. 2026, recalibration after the Nasmyth beam switcher",
         "'t Hart et al. 2021, Proc. SPIE 11833",
         "van Holstein et al. 2020, Proc. SPIE 11447",
     )
-    sources = (
-        "polarized",
-        "unpolarized",
-        "unpolarized standard star",
-        "polarized standard star",
-        "star",
-    )
+    sources = (*INTERNAL, *STARS)
+    optional_optics = ("nbs", "dichroic")
 
     def chain(
         self,
@@ -202,69 +202,30 @@ class CHARIS(Instrument):
         >>> chain["derotator"].retardance.shape
         (22,)
         """
-        _choice("derotator", derotator, ("elliptical", "linear", "kmirror"))
-        _choice("bounds", bounds, tuple(_BOUNDS))
-        _choice("source", source, self.sources)
-        unknown = set(optics_in) - {"nbs", "dichroic"}
-        if unknown:
-            raise InstrumentError(f"optics_in: no {sorted(unknown)}; allowed are 'nbs', 'dichroic'")
-        grid = self.wavelength if wavelength is None else u.Quantity(wavelength)
-        _choice("m3", m3, M3_MODELS)
-        train = self._source_optics(source, grid, m3, star, target)
+        self.check_choices(
+            source,
+            optics_in,
+            derotator=(derotator, ("elliptical", "linear", "kmirror")),
+            bounds=(bounds, tuple(_BOUNDS)),
+            m3=(m3, M3_MODELS),
+        )
+        grid = self.grid(wavelength)
+        train = [polarizer() if source == "polarized" else fold_mirror(grid.size)]
+        if source in STARS:
+            light = star_source(source, grid, star, target)
+            train = [light, *telescope(tertiary_mirror(m3, grid))]
         train += [_half_wave_plate(), _derotator(grid, derotator, _BOUNDS[bounds])]
         if "dichroic" in optics_in:
+            # to be freed where several angles of the derotator tell the two apart
             train.append(optics.LinearRetarder(name="dichroic", fixed={"retardance": True}))
         if "nbs" in optics_in:
             train.append(optics.ParityFlip(name="nbs"))
         train.append(optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston"))
         return join(train)
 
-    @staticmethod
-    def _source_optics(source, grid, m3, star, target):
-        if source == "polarized":
-            return [_polarizer()]
-        if source == "unpolarized":
-            return [_fold_mirror(grid.size)]
-        return [
-            star_source(source, grid, star, target),
-            *telescope(tertiary_mirror(m3, grid)),
-        ]
-
-    def on_sky(self, chain):
-        """
-        Return the chain of a star that has the optics of an internal chain.
-
-        The source and what belongs to it go; the tertiary mirror is the published one.
-
-        Parameters
-        ----------
-        chain : `~astropy.modeling.CompoundModel`
-            A chain; one with the telescope already only loses the nuisance optics of its dataset.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Raises
-        ------
-        ChainError
-            If it has no half-wave plate.
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> charis = instruments.get("charis")
-        >>> [optic.name for optic in charis.on_sky(charis.published())][:4]
-        ['parallactic', 'm3', 'altitude', 'hwp']
-        """
-        chain = without_nuisance(chain)
-        if "parallactic" in stages(chain):
-            return chain
-        return join([*telescope(published_mirror()), *_behind_telescope(chain, self.name)])
-
-    def particulars(self, observations):
-        """Return name of the source optic and target of a star: ``star_`` and the object's name."""
-        return _star_of(observations)
+    def telescope_optics(self, behind):
+        """Return the telescope with the tertiary mirror that is published."""
+        return telescope(published_mirror())
 
     def published(self):
         """
@@ -285,6 +246,7 @@ class CHARIS(Instrument):
         """
         chain = self.chain("polarized", ["dichroic", "nbs"])
         hwp, derotator = chain["hwp"], chain["derotator"]
+        # (H, 45) with the other sign, see the signs at the top
         hwp.w_sio2, hwp.w_mgf2 = _PUBLISHED_SIO2 * u.mm, _PUBLISHED_MGF2 * u.mm
         derotator.horizontal = -np.array(_DEROTATOR_HORIZONTAL) * u.deg
         derotator.diagonal = -np.array(_DEROTATOR_DIAGONAL) * u.deg
@@ -330,18 +292,17 @@ class CHARIS(Instrument):
             If the meta do not say, or name a source that is unknown.
         """
         meta, name = observations.meta, observations.name
-        source = observations.source
-        if source not in self.sources:
-            raise InstrumentError(
-                f"{name}: source {source!r} in the table's meta; allowed are "
-                f"{', '.join(self.sources)}"
-            )
+        source = self.source_of(observations)
         present = []
         if _stated(meta, name, "yjh50_dichroic", {"in": True, "out": False}):
             present.append("dichroic")
         if _beam_switcher(meta, name):
             present.append("nbs")
         return source, tuple(present)
+
+    def meta_without(self, names):
+        """Return what `setup` reads of optics that are out of the beam."""
+        return {key: word for name, (key, word) in _ABSENT.items() if name in names}
 
     def optics_of(self, header):
         """Return whether the beam switcher was in the beam, where the date tells."""
@@ -351,11 +312,6 @@ class CHARIS(Instrument):
             return {}
         present = None if time is None else _switcher_by(time.utc.isot[:10])
         return {} if present is None else {"nbs": present}
-
-
-def _choice(what, value, allowed):
-    if value not in allowed:
-        raise InstrumentError(f"{what} = {value!r}; allowed are {', '.join(allowed)}")
 
 
 def _stated(meta, name, key, words):
@@ -390,23 +346,12 @@ def _switcher_by(day):
     # ISO dates compare as strings
     if day <= _NBS_ABSENT_UNTIL:
         return False
+    # between the two runs it was installed on a day that no table tells
     return True if day >= _NBS_PRESENT_FROM else None
 
 
-def _misaligned(about):
-    return {"fixed": {"theta": False}, "bounds": {"theta": (about - 5, about + 5)}}
-
-
-def _polarizer():
-    return optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer", **_misaligned(90))
-
-
-def _fold_mirror(size):
-    return optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror")
-
-
 def _half_wave_plate():
-    settings = _misaligned(0)
+    settings = misaligned(0)
     settings["bounds"] |= {
         "w_sio2": (0.6 * _THART_SIO2, 1.4 * _THART_SIO2),
         "w_mgf2": (0.6 * _THART_MGF2, 1.4 * _THART_MGF2),
@@ -420,7 +365,7 @@ def _derotator(grid, kind, bounds):
     # the published retardances, in our sign, are where a fit starts
     nm = CHARIS.wavelength.to_value(u.nm)
     start = -np.interp(grid.to_value(u.nm), nm, _DEROTATOR_HORIZONTAL) * u.deg
-    settings = _misaligned(0) | {"mount": "derotator", "name": "derotator"}
+    settings = misaligned(0) | {"mount": "derotator", "name": "derotator"}
     if kind == "kmirror":
         return k_mirror(**settings)
     if kind == "linear":

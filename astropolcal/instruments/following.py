@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from astropolcal.exceptions import InstrumentError
+from astropolcal.instruments._choices import check_choice
 from astropolcal.observations.pointing import TRACKING
 
 __all__ = ["SkyLaw"]
@@ -57,6 +58,7 @@ class SkyLaw:
     derotator: dict = field(default_factory=lambda: dict(_NASMYTH))
 
     def __post_init__(self):
+        # one law for all modes has the name ""
         given = self.plate if isinstance(self.plate, dict) else {"": self.plate}
         plate = {mode: _pair(f"plate {mode}".strip(), law) for mode, law in given.items()}
         turns = {mode: _pair(f"derotator {mode}", law) for mode, law in self.derotator.items()}
@@ -65,6 +67,7 @@ class SkyLaw:
         # a frozen instance is set once, here
         object.__setattr__(self, "plate", plate)
         object.__setattr__(self, "derotator", turns)
+        # a mode of the plate that the derotator lacks could never be asked for
         lost = sorted(set(plate) - {""} - set(turns)) if turns else []
         if lost:
             raise InstrumentError(
@@ -79,6 +82,7 @@ class SkyLaw:
     @property
     def plate_depends_on_mode(self):
         """Whether the law of the plate is another one in another mode."""
+        # two modes with the same law need not be told apart
         return len(set(self.plate.values())) > 1
 
     def plate_law(self, mode=None):
@@ -100,11 +104,11 @@ class SkyLaw:
             If the mode is unknown, or not given where it is needed.
         """
         if mode is not None and self.modes:
-            _known("mode", mode, self.modes)
+            check_choice("mode", mode, self.modes)
         if mode in self.plate:
             return self.plate[mode]
         if self.plate_depends_on_mode:
-            _known("mode", mode, tuple(self.plate))
+            check_choice("mode", mode, tuple(self.plate))
         return next(iter(self.plate.values()))
 
     def derotator_law(self, mode):
@@ -127,7 +131,7 @@ class SkyLaw:
         """
         if not self.derotator:
             raise InstrumentError("there is no derotator that follows the sky")
-        _known("law", mode, tuple(self.derotator))
+        check_choice("law", mode, tuple(self.derotator))
         return self.derotator[mode]
 
 
@@ -141,8 +145,3 @@ def _pair(what, law):
             f"{what}: {law!r} must be two numbers, factors of parallactic angle and altitude"
         )
     return f, g
-
-
-def _known(what, value, allowed):
-    if value not in allowed:
-        raise InstrumentError(f"{what} = {value!r}; allowed are {', '.join(allowed)}")

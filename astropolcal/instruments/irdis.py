@@ -11,11 +11,10 @@ Beams have the names of the halves of the detector. The left one passes +Q, so s
 differences here, right minus left, have the opposite sign of the published ones.
 """
 
-import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join, stages
+from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments._irdis_headers import frame_table
 from astropolcal.instruments._irdis_optics import (
@@ -24,7 +23,6 @@ from astropolcal.instruments._irdis_optics import (
     RECOATING,
     calibration_polarizer,
     check_all_filters,
-    choice,
     coating_of,
     coating_on,
     derotator,
@@ -36,8 +34,7 @@ from astropolcal.instruments._irdis_optics import (
 )
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.following import SkyLaw
-from astropolcal.instruments.nuisance import without_nuisance
-from astropolcal.instruments.telescope import _behind_telescope, _star_of, star_source
+from astropolcal.instruments.telescope import INTERNAL, STARS, star_source
 from astropolcal.observations import is_star
 from astropolcal.observations.pointing import location_of
 
@@ -76,13 +73,7 @@ class IRDIS(Instrument):
         "van Holstein et al. 2020, A&A 633, A64, doi:10.1051/0004-6361/201834996",
         "de Boer et al. 2020, A&A 633, A63, doi:10.1051/0004-6361/201834989",
     )
-    sources = (
-        "polarized",
-        "unpolarized",
-        "unpolarized standard star",
-        "polarized standard star",
-        "star",
-    )
+    sources = (*INTERNAL, *STARS)
     sky_options = ("wavelength", "date")
     #: Names of the filters with coefficients, in the order of ``wavelength``.
     filters = FILTERS
@@ -147,16 +138,16 @@ class IRDIS(Instrument):
         >>> chain["derotator"].retardance.quantity.round(1)
         <Quantity 99.3 deg>
         """
-        choice("source", source, self.sources)
-        if tuple(optics_in):
-            raise InstrumentError(f"optics_in = {list(optics_in)}: no optic of irdis is optional")
-        grid = self.wavelength if wavelength is None else np.atleast_1d(u.Quantity(wavelength))
+        self.check_choices(source, optics_in)
+        grid = self.grid(wavelength)
+        # published coefficients are of filters: nothing is interpolated between them
         index = filters_at(grid)
         common = [half_wave_plate(index), derotator(index), polarizers(index)]
         if source == "polarized":
             return join([calibration_polarizer(), *common])
         if source == "unpolarized":
             zero = np.zeros(index.size)
+            # M4 and the lamp polarize together; only what reaches the plate can be measured
             return join([optics.PolarizedSource(q=zero, u=zero, name="lamp"), *common])
         light = star_source(source, grid, star, target)
         return join([light, *telescope(index, coating), *common])
@@ -181,14 +172,14 @@ class IRDIS(Instrument):
         """Return the meta of a table taken with the chain of `published`."""
         return {"instrument": "SPHERE/IRDIS", "source": "polarized"}
 
-    def on_sky(self, chain, *, wavelength=None, coating=None, date=None):
+    def telescope_optics(self, behind, *, wavelength=None, coating=None, date=None):
         """
-        Return the chain from the sky that has the optics of an internal chain.
+        Return the telescope as published, with M4, for ``on_sky``, which takes the same options.
 
         Parameters
         ----------
-        chain : `~astropy.modeling.CompoundModel`
-            A chain with a half-wave plate; one with the telescope already keeps it.
+        behind : list of Optic
+            The optics from the half-wave plate on.
         wavelength : `~astropy.units.Quantity`, optional
             Filters of the chain by their central wavelengths; needed if it is not of all four.
         coating : {"before", "after"}, optional
@@ -198,12 +189,12 @@ class IRDIS(Instrument):
 
         Returns
         -------
-        `~astropy.modeling.CompoundModel`
+        list of Optic
 
         Raises
         ------
         ChainError
-            If the chain has no half-wave plate, or does not tell its filters.
+            If the optics do not tell their filters.
         InstrumentError
             If the coating is unknown, is not that of the date, or the dates are of both.
 
@@ -219,15 +210,10 @@ class IRDIS(Instrument):
         >>> [optic.name for optic in irdis.on_sky(irdis.published(), date="2016-05-01")][:4]
         ['parallactic', 'ut', 'altitude', 'm4']
         """
-        chain = without_nuisance(chain)
-        if "parallactic" in stages(chain):
-            return chain
-        behind = _behind_telescope(chain, self.name)
         if wavelength is None:
             check_all_filters(behind)
-            wavelength = self.wavelength
-        index = filters_at(np.atleast_1d(wavelength))
-        return join([*telescope(index, coating_of(coating, date)), *behind])
+        index = filters_at(self.grid(wavelength))
+        return telescope(index, coating_of(coating, date))
 
     def setup(self, observations):
         """
@@ -249,13 +235,7 @@ class IRDIS(Instrument):
         InstrumentError
             If the source is not known.
         """
-        source = observations.source
-        if source not in self.sources:
-            raise InstrumentError(
-                f"{observations.name}: source {source!r} in the table's meta; allowed are "
-                f"{', '.join(self.sources)}"
-            )
-        return source, ()
+        return self.source_of(observations), ()
 
     def particulars(self, observations):
         """
@@ -278,7 +258,7 @@ class IRDIS(Instrument):
         """
         if not is_star(observations.source):
             return {}
-        return {"coating": stated_coating(observations)} | _star_of(observations)
+        return {"coating": stated_coating(observations)} | super().particulars(observations)
 
     @staticmethod
     def coating_on(date):

@@ -155,6 +155,7 @@ class FileLayout:
     @property
     def file_shape(self):
         """Shape of the cube in a file, which may be that of one beam only."""
+        # with a file for each camera the shape is that of both images side by side
         slices, rows, columns = self.shape
         return (slices, rows, columns // 2) if self.beam_files else tuple(self.shape)
 
@@ -192,6 +193,7 @@ class FileLayout:
                     f"{self.keywords['em_gain']} = {em_gain:g}; allowed are 0 (no multiplication) "
                     "and 1 and above"
                 )
+            # 0 and 1 both mean the conventional register, which has a noise of its own
             if em_gain <= 1:
                 return self.read_outs.get("conventional", own)
             multiplied = ReadOut(self.gain, self.read_noise, self.saturation, EM_EXCESS_NOISE)
@@ -199,6 +201,7 @@ class FileLayout:
         if mode is None or not self.read_outs:
             return own
         mode, camera = str(mode).strip().lower(), values.get("camera")
+        # two cameras of one kind need not have the same noise
         names = [mode] if camera is None else [f"{mode} {camera:g}", mode]
         found = next((name for name in names if name in self.read_outs), None)
         if found is None:
@@ -236,6 +239,7 @@ class FileLayout:
         if not self.beam_files:
             return None
         path, (right, left) = Path(path), self.beam_files
+        # the last one: a folder or target may have the mark in its name too
         head, found, tail = path.name.rpartition(right)
         if not found:
             raise ObservationError(
@@ -266,6 +270,7 @@ class FileLayout:
         files = [str(path) for path in files]
         if not self.beam_files:
             return files
+        # left files without a right one stay, so that the error names them
         rights = [path for path in files if self.beam_files[0] in Path(path).name]
         lefts = {str(self.left_file(path)) for path in rights}
         return [path for path in files if str(Path(path)) not in lefts]

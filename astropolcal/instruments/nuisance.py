@@ -65,6 +65,7 @@ def add_nuisance(chains, datasets, nuisance):
     ['background_night_1', 'wollaston']
     """
     chains, names = list(chains), [observations.name for observations in datasets]
+    # names of optics must do as optic.parameter
     labels = [re.sub(r"\W+", "_", name) for name in names]
     # two tables may have one name
     labels = [f"{t}_{i + 1}" if labels.count(t) > 1 else t for i, t in enumerate(labels)]
@@ -131,11 +132,13 @@ def _added(chain, observations, kind, name, size):
         source.q.prior = source.u.prior = prior
         return join([source, *found])
     if kind == "beam_gain":
+        # behind the splitter, where there are two beams
         gain = optics.BeamGain(imbalance=zero, name=name)
         gain.imbalance.prior = prior
         return join([*found[: split + 1], gain, *found[split + 1 :]])
     # the sum of both beams is 0 where it is masked
     flux = observations.position("total_flux")
+    # in front of the splitter: background falls on both beams alike
     light = optics.StrayLight(
         amount=zero, reference=float(np.median(flux[flux > 0])), mount="total_flux", name=name
     )

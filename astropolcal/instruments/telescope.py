@@ -18,13 +18,21 @@ from astropolcal.exceptions import (
 from astropolcal.observations import is_star
 
 __all__ = [
+    "INTERNAL",
     "M3_MODELS",
+    "STARS",
+    "behind_telescope",
     "k_mirror",
     "published_mirror",
+    "star_options",
     "star_source",
     "telescope",
     "tertiary_mirror",
 ]
+
+#: Sources of an internal calibration unit, and kinds of stars.
+INTERNAL = ("polarized", "unpolarized")
+STARS = ("unpolarized standard star", "polarized standard star", "star")
 
 #: How the tertiary mirror may be modelled.
 M3_MODELS = ("free", "power law", "metal")
@@ -73,6 +81,7 @@ def tertiary_mirror(model, wavelength, name="m3"):
     """
     if model == "power law":
         bounds = {key: (0.5 * start, 2 * start) for key, start in _START.items()}
+        # the bounds of the paper, half to twice its start
         return optics.PowerLawMirror(name=name, bounds=bounds, **_START)
     if model == "metal":
         free = dict.fromkeys(("film_thickness", "n_scale", "k_scale"), False)
@@ -272,19 +281,66 @@ def _catalogued(target, wavelength):
         return None
 
 
-def _behind_telescope(chain, name, error=ChainError):
-    """Return the optics of an instrument's chain from the half-wave plate on."""
+def behind_telescope(chain, name):
+    """
+    Return the optics of an instrument's chain from the half-wave plate on.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        The chain of an internal source.
+    name : str
+        Of the instrument, for the message.
+
+    Returns
+    -------
+    list of Optic
+
+    Raises
+    ------
+    ChainError
+        If there is no optic ``hwp``.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments.telescope import behind_telescope
+    >>> charis = instruments.get("charis")
+    >>> [optic.name for optic in behind_telescope(charis.chain(), "charis")]
+    ['hwp', 'derotator', 'wollaston']
+    """
     found = leaves(chain)
     start = next((i for i, leaf in enumerate(found) if leaf.name == "hwp"), None)
     if start is None:
-        raise error(f"{name}: the chain has no optic 'hwp' to put the telescope before")
+        raise ChainError(f"{name}: the chain has no optic 'hwp' to put the telescope before")
     return found[start:]
 
 
-def _star_of(observations):
-    """Return the options of a chain that name its star: ``star_`` and the object's name."""
+def star_options(observations):
+    """
+    Return the options of a chain that name its star.
+
+    Parameters
+    ----------
+    observations : Observations
+        A dataset, whose meta may have ``object``.
+
+    Returns
+    -------
+    dict
+        ``star``, the name of the source optic, which is the object's without blanks behind
+        ``star_``, and ``target``; empty for other sources, and for a star without a name.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> from astropolcal.instruments.telescope import star_options
+    >>> star_options(SimpleNamespace(source="star", meta={"object": "HD 30675"}))
+    {'star': 'star_HD30675', 'target': 'HD 30675'}
+    """
     target = str(observations.meta.get("object") or "")
     words = re.sub(r"\W+", "", target)
+    # a star without a name is the same optic in all datasets
     if not words or not is_star(observations.source):
         return {}
     return {"star": f"star_{words}", "target": target}

@@ -15,21 +15,14 @@ the half-wave plate exclude them, and those of the derotator exclude a further t
 """
 
 import astropy.units as u
-import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join, stages
-from astropolcal.exceptions import InstrumentError
+from astropolcal.chain import join
 from astropolcal.instruments import _vampires_optics as _optics
+from astropolcal.instruments._choices import check_choice
+from astropolcal.instruments._subaru_optics import fold_mirror, polarizer
 from astropolcal.instruments.base import Instrument
-from astropolcal.instruments.nuisance import without_nuisance
-from astropolcal.instruments.telescope import (
-    M3_MODELS,
-    _behind_telescope,
-    _star_of,
-    star_source,
-    telescope,
-)
+from astropolcal.instruments.telescope import INTERNAL, M3_MODELS, STARS, star_source, telescope
 from astropolcal.instruments.vampires_headers import (
     KEYWORDS,
     LAYOUT,
@@ -41,11 +34,9 @@ from astropolcal.observations import is_star, mask_saturated
 
 __all__ = ["VAMPIRES"]
 
-_INTERNAL = ("polarized", "unpolarized")
-_STARS = ("unpolarized standard star", "polarized standard star", "star")
 # as tables may call them
-_SOURCES = {name: name for name in (*_INTERNAL, *_STARS)}
-_SOURCES |= {f"{name} internal": name for name in _INTERNAL}
+_SOURCES = {name: name for name in (*INTERNAL, *STARS)}
+_SOURCES |= {f"{name} internal": name for name in INTERNAL}
 
 
 class VAMPIRES(Instrument):
@@ -73,7 +64,8 @@ class VAMPIRES(Instrument):
         "vampires_dpp, https://github.com/scexao-org/vampires_dpp (keywords and detectors)",
         "McIntosh et al. 2026, recalibration after the Nasmyth beam switcher, appendix on VAMPIRES",
     )
-    sources = (*_INTERNAL, *_STARS)
+    sources = (*INTERNAL, *STARS)
+    optional_optics = ("flc",)
 
     def chain(
         self,
@@ -138,16 +130,18 @@ class VAMPIRES(Instrument):
         >>> chain["derotator"].retardance.shape
         (4,)
         """
-        _choice("derotator", derotator, ("elliptical", "linear"))
-        _choice("bounds", bounds, ("physical",))
-        _choice("source", source, self.sources)
-        for name in optics_in:
-            _choice("optics_in", name, ("flc",))
-        _choice("m3", m3, M3_MODELS)
-        grid = self.wavelength if wavelength is None else np.atleast_1d(u.Quantity(wavelength))
-        train = [_optics.polarizer() if source == "polarized" else _optics.fold_mirror(grid.size)]
-        if source in _STARS:
-            train = [star_source(source, grid, star, target), *telescope(_optics.mirror(m3, grid))]
+        self.check_choices(
+            source,
+            optics_in,
+            derotator=(derotator, ("elliptical", "linear")),
+            bounds=(bounds, ("physical",)),
+            m3=(m3, M3_MODELS),
+        )
+        grid = self.grid(wavelength)
+        train = [polarizer() if source == "polarized" else fold_mirror(grid.size)]
+        if source in STARS:
+            light = star_source(source, grid, star, target)
+            train = [light, *telescope(_optics.mirror(m3, grid))]
         train += [
             _optics.half_wave_plate(grid),
             _optics.derotator(grid, derotator),
@@ -159,42 +153,9 @@ class VAMPIRES(Instrument):
         train.append(_optics.cameras(grid.size))
         return join(train)
 
-    def on_sky(self, chain):
-        """
-        Return the chain of a star that has the optics of an internal chain.
-
-        The source and what belongs to it go; the tertiary mirror is bare silver.
-
-        Parameters
-        ----------
-        chain : `~astropy.modeling.CompoundModel`
-            A chain; one with the telescope already only loses the nuisance optics of its dataset.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Raises
-        ------
-        InstrumentError
-            If it has no half-wave plate.
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> vampires = instruments.get("vampires")
-        >>> [optic.name for optic in vampires.on_sky(vampires.published())][:4]
-        ['parallactic', 'm3', 'altitude', 'hwp']
-        """
-        chain = without_nuisance(chain)
-        if "parallactic" in stages(chain):
-            return chain
-        behind = _behind_telescope(chain, self.name, InstrumentError)
-        return join([*telescope(_optics.silver("m3")), *behind])
-
-    def particulars(self, observations):
-        """Return name of the source optic and target of a star: ``star_`` and the object's name."""
-        return _star_of(observations)
+    def telescope_optics(self, behind):
+        """Return the telescope with a tertiary mirror of bare silver."""
+        return telescope(_optics.silver("m3"))
 
     def published(self):
         """
@@ -249,6 +210,7 @@ class VAMPIRES(Instrument):
         >>> instruments.get("vampires").configured({"FILTER01": "750-50"}).wavelength
         <Quantity [750.] nm>
         """
+        # a new one: the registry hands out instances that others may hold
         one = type(self)()
         one.wavelength, one.files = slices_of(header), layout_of(header)
         return one
@@ -260,6 +222,7 @@ class VAMPIRES(Instrument):
     def optics_of(self, header):
         """Return whether the liquid crystal was in the beam, where the header tells."""
         stated = str(header.get(KEYWORDS["flc"], "")).strip().upper()
+        # the header says such as "IN" or "Out of beam"
         known = {"IN": True, "OUT": False}
         found = [present for word, present in known.items() if stated.startswith(word)]
         return {"flc": found[0]} if found else {}
@@ -284,13 +247,12 @@ class VAMPIRES(Instrument):
         InstrumentError
             If the source is unknown, or ``flc`` is neither.
         """
-        source = str(observations.source).strip().lower()
-        if source not in _SOURCES:
-            raise InstrumentError(
-                f"{observations.name}: source {observations.source!r} in the table's meta; allowed "
-                f"are {', '.join(_SOURCES)}"
-            )
-        return _SOURCES[source], ("flc",) if _is_modulated(observations) else ()
+        source = self.source_of(observations, _SOURCES)
+        return source, ("flc",) if _is_modulated(observations) else ()
+
+    def meta_without(self, names):
+        """Return what a liquid crystal leaves behind: no states by which frames are paired."""
+        return {"flc": "out", "pairing": "hwp"} if "flc" in names else {}
 
     def prepare(self, observations):
         """
@@ -320,16 +282,12 @@ class VAMPIRES(Instrument):
 
 
 def _is_modulated(observations):
+    # what the table says goes before what its columns suggest
     stated = observations.meta.get("flc")
     if stated is not None:
-        _choice(f"{observations.name}: flc", str(stated).lower(), ("in", "out"))
+        check_choice(f"{observations.name}: flc", str(stated).lower(), ("in", "out"))
         return str(stated).lower() == "in"
     # what a calibration remembers of a dataset has no columns, but the meta say how it is paired
     frames = getattr(observations, "frames", None)
     columns = () if frames is None else frames.colnames
     return "flc_state" in columns or observations.meta.get("pairing") == "flc_state"
-
-
-def _choice(what, value, allowed):
-    if value not in allowed:
-        raise InstrumentError(f"vampires: {what} = {value!r}; allowed are {', '.join(allowed)}")

@@ -14,6 +14,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.instruments._subaru_optics import SITE
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.instruments.readout import EM_EXCESS_NOISE, ReadOut
 from astropolcal.observations.wavelengths import SAME_WAVELENGTH, filter_wavelength
@@ -95,8 +96,7 @@ LAYOUT = FileLayout(
     saturation=_FULL,
     pixel_scale=5.9,
     fwhm=3.5,
-    # longitude, latitude (deg), height (m) of the Subaru Telescope
-    site=(-155.4761, 19.8255, 4139.0),
+    site=SITE,
     beam_files=("cam1", "cam2"),
     states={"1": "A", "2": "B", "NA": ""},
     read_outs=_READ_OUTS,
@@ -167,6 +167,7 @@ def layout_of(header):
     (1, 128, 256)
     """
     multiband = "MBI" in str(header.get(_MODE, "")).upper()
+    # headers that are asked before any file is read have no size
     usual = _FIELD_SIDE if multiband else _WINDOW_SIDE
     side, rows = (int(header.get(key, usual)) for key in ("NAXIS1", "NAXIS2"))
     if side != rows or side < 16:

@@ -7,8 +7,6 @@ Each material knows the wavelengths at which it was measured
 (``valid_range``), and refuses any other.
 """
 
-import difflib
-
 import astropy.units as u
 
 from astropolcal.exceptions import ParameterError
@@ -22,6 +20,7 @@ from astropolcal.materials.metals import (
     Metal,
     TabulatedLaw,
 )
+from astropolcal.words import did_you_mean
 
 __all__ = [
     "AL2O3",
@@ -224,8 +223,7 @@ def get_material(name):
     key = str(name).strip().lower()
     if key in _BY_NAME:
         return _BY_NAME[key]
-    near = difflib.get_close_matches(key, _BY_NAME, n=1, cutoff=0.7)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(key, _BY_NAME, cutoff=0.7)
     raise ParameterError(
         f"no material is called {name!r}{hint} (available: {', '.join(material_names())}; "
         "register_material adds your own)"

@@ -27,6 +27,7 @@ class _DatabaseLaw:
         self._page, self._address = page, address
 
     def _index_um(self, wavelength_um):
+        # the principal root has k >= 0 in this sign of the phase
         index = np.sqrt(self._page.get_epsilon(wavelength_um, unit="um", exp_type="exp(-iwt)"))
         if not np.all(np.isfinite(index)):
             raise ParameterError(f"{self._address} has no index at some of these wavelengths")

@@ -45,6 +45,7 @@ class SellmeierLaw:
 
     def _index_um(self, wavelength_um):
         """Return the refractive index at a wavelength in micrometre, unchecked."""
+        # the published form, in micrometre: poles are squares of resonances
         square = wavelength_um * wavelength_um
         return (
             self.constant
@@ -125,6 +126,7 @@ class _Ranged:
         """Return the wavelengths, or raise if one is out of range or a NaN."""
         wavelength_um = np.asarray(wavelength_um, dtype=float)
         low, high = self._valid_um
+        # NaN compares as False and is refused with the others
         inside = (wavelength_um >= low * (1 - _EDGE)) & (wavelength_um <= high * (1 + _EDGE))
         if inside.all():
             return wavelength_um
@@ -345,4 +347,5 @@ class UniaxialMaterial(_Ranged):
         """Return the mean index at floats in micrometre, as complex numbers."""
         wavelength_um = self._checked_um(wavelength_um)
         ordinary = self.ordinary_law._index_um(wavelength_um)
+        # mean over directions: two of the three axes of the crystal are ordinary
         return (2 * ordinary + self.extraordinary_law._index_um(wavelength_um)) / 3 + 0j

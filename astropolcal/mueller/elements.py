@@ -26,6 +26,7 @@ __all__ = [
     "rotation_matrix",
 ]
 
+# sums of four factors, each known to a few 1e-16, lie on the limit to within this
 _ROUNDING = 1e-12
 
 
@@ -116,9 +117,11 @@ def _elliptical_retarder(horizontal, diagonal, circular):
     total = np.sqrt(sum(squares))
     # S / Delta and T / Delta^2 of the paper, which are smooth through zero
     sine, cosine = np.sinc(total / np.pi), np.cos(total)
+    # 1 - cos x = 2 sin^2(x / 2)
     versine = 0.5 * np.sinc(total / (2 * np.pi)) ** 2
     matrix = np.zeros((*np.shape(total), 16))
     matrix[..., 0] = 1.0
+    # cos Delta + T d_i^2 on the diagonal; T d_i d_j plus and minus S d_k on either side of it
     for i, square in zip((5, 10, 15), squares, strict=True):
         matrix[..., i] = cosine + versine * square
     for i, j, first, second, axis in ((6, 9, h, d, c), (11, 14, d, c, h), (13, 7, c, h, d)):
@@ -228,6 +231,7 @@ def compose(*matrices):
     if not matrices:
         raise ParameterError("compose needs at least one Mueller matrix")
     checked = [_mueller_array(m, f"matrix {i + 1}") for i, m in enumerate(matrices)]
+    # light meets the first matrix first, which stands rightmost
     return reduce(lambda so_far, optic: optic @ so_far, checked)
 
 
@@ -430,6 +434,7 @@ def depolarizer(q, u=None, v=None):
     """
     q = _fraction(q, "q")
     u, v = (q if x is None else _fraction(x, name) for x, name in ((u, "u"), (v, "v")))
+    # the coherency matrix of a diagonal matrix is diagonal, a quarter of these four sums
     factors = np.stack(np.broadcast_arrays(np.ones(()), q, u, v), axis=-1)
     signs = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [1, -1, 1, -1], [1, -1, -1, 1]])
     bad = ((factors @ signs) < -_ROUNDING).any(axis=-1)

@@ -114,6 +114,7 @@ def mueller_from_coherency(coherency):
         raise ParameterError(
             f"coherency of shape {coherency.shape} must be finite and of shape (..., 4, 4)"
         )
+    # products of measured matrices are Hermitian to rounding only, hence 1e-9 of the largest
     skew = np.abs(coherency - np.swapaxes(coherency, -1, -2).conj()).max(initial=0.0)
     if skew > 1e-9 * np.abs(coherency).max(initial=0.0):
         raise ParameterError(f"coherency differs from its adjoint by {skew}; it must be Hermitian")
@@ -198,6 +199,8 @@ def is_physical(matrix, tolerance=1e-9):
 
 def _nearest_eigenvalues(values, total):
     """Return the nearest values that are not negative and have the sum given."""
+    # projection onto the simplex: the largest eigenvalues are lowered alike until their sum is
+    # right, and those that fall below zero count as zero
     falling = values[..., ::-1]
     count = np.arange(1, 5)
     shift = (np.cumsum(falling, axis=-1) - total[..., None]) / count
@@ -252,6 +255,7 @@ def nearest_physical(matrix, tolerance=1e-12):
     matrix = _transmitting(matrix)
     values, vectors = np.linalg.eigh(coherency_matrix(matrix))
     kept = _nearest_eigenvalues(values, matrix[..., 0, 0])
+    # V diag(kept) V^H
     filtered = _mueller((vectors * kept[..., None, :]) @ np.swapaxes(vectors, -1, -2).conj())
     physical = values[..., 0] >= -_tolerance(tolerance) * matrix[..., 0, 0]
     return np.where(physical[..., None, None], matrix, filtered)
@@ -293,5 +297,6 @@ def is_passive(matrix, tolerance=1e-9):
     (True, False)
     """
     matrix = _transmitting(matrix)
+    # the state that passes best has 1 + D of the mean; backwards the polarizance takes its place
     best = matrix[..., 0, 0] * (1 + np.maximum(diattenuation(matrix), polarizance(matrix)))
     return best <= 1 + _tolerance(tolerance)

@@ -11,18 +11,16 @@ from astropolcal.optics.beamsplitters import BeamGain, WollastonPrism
 from astropolcal.optics.core import COORDINATES, Optic, rotation_generator
 from astropolcal.optics.depolarizers import Depolarizer
 from astropolcal.optics.derotators import KMirror
+from astropolcal.optics.fluxes import FluxGain, PolarizedBackground, StrayLight
 from astropolcal.optics.general import MuellerElement
 from astropolcal.optics.mirrors import MetalMirror, ParityFlip, PowerLawMirror
 from astropolcal.optics.modulated import (
     DriftRetarder,
     DriftRotator,
-    FluxGain,
     FrameOptic,
     HarmonicGain,
     HarmonicRetarder,
     HarmonicRotator,
-    PolarizedBackground,
-    StrayLight,
 )
 from astropolcal.optics.modulators import FerroelectricLiquidCrystal
 from astropolcal.optics.polarizers import (

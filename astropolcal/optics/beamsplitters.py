@@ -5,10 +5,12 @@ import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.optics.core import Optic, blank
+from astropolcal.optics._matrices import blank
+from astropolcal.optics.core import Optic
 
 __all__ = ["BeamGain", "WollastonPrism"]
 
+# sign of eta: the right beam is the ordinary one
 BEAMS = {"right": 1.0, "left": -1.0}
 
 
@@ -71,6 +73,7 @@ class WollastonPrism(_BeamOptic):
 
     def _matrix(self, dispersion, efficiency):
         out = blank(efficiency)
+        # half of unpolarized light goes into each beam
         out[..., 0, 0] = out[..., 1, 1] = 0.5
         out[..., 0, 1] = out[..., 1, 0] = 0.5 * BEAMS[self._beam] * efficiency
         return out
@@ -107,6 +110,7 @@ class WollastonPrism(_BeamOptic):
         return tuple(self._through(beam)(wavelength, I, Q, U, V) for beam in ("right", "left"))
 
     def _through(self, beam):
+        # the optic in the chain keeps its own beam
         copy = self.copy()
         copy.beam = beam
         return copy

@@ -11,7 +11,6 @@ header and is never a parameter.
 
 import inspect
 from abc import abstractmethod
-from copy import deepcopy
 
 import astropy.units as u
 import numpy as np
@@ -19,85 +18,17 @@ from astropy.modeling import FittableModel, InputParameterError, Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller.elements import _rotate, _rotation_matrix
-from astropolcal.units import angle_to_rad, canonical_factor, length_to_um, to_unit
+from astropolcal.optics._matrices import rotation_generator, turn
+from astropolcal.optics._modelling import KeywordOnly, copied_attributes
+from astropolcal.optics.positions import COORDINATES, FLUXES, check_broadcast, finite_position
+from astropolcal.units import canonical_factor, length_to_um, to_unit
 
-__all__ = ["COORDINATES", "Optic", "rotation_generator"]
+__all__ = ["COORDINATES", "FLUXES", "Optic", "rotation_generator"]
 
 LIGHT = ("wavelength", "I", "Q", "U", "V")
 
-#: Positions that differ between wavelengths and beams: the flux of the beam, and that flux
-#: over the one in the frame before.
-FLUXES = ("flux", "total_flux", "previous_flux")
 
-# what a copy of an optic may share with it
-_SHARED = (str, bool, int, float, type(None), u.UnitBase)
-
-#: By how much an angle changes from one frame to the next.
-RATES = ("parallactic_rate", "derotator_rate")
-
-#: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
-#: modulator (0 or 1), the change of an angle from frame to frame, and the fluxes.
-COORDINATES = ("sequence", "flc_state", *RATES, *FLUXES)
-
-
-def rotation_generator(matrix):
-    """
-    Return the derivative of ``T(-theta) M T(theta)`` to theta, at theta = 0.
-
-    With ``T(theta)`` the rotation of Sec. 2 of the CHARIS paper, the
-    derivative is the commutator ``2 (M G - G M)``, where G turns Q into U.
-
-    Parameters
-    ----------
-    matrix : `~numpy.ndarray`
-        Mueller matrices, shape (..., 4, 4).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Derivative per radian, shape (..., 4, 4).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.optics import rotation_generator
-    >>> bool(np.all(rotation_generator(np.eye(4)) == 0))
-    True
-    """
-    out = np.zeros_like(matrix)
-    out[..., :, 1] -= 2 * matrix[..., :, 2]
-    out[..., :, 2] += 2 * matrix[..., :, 1]
-    out[..., 1, :] -= 2 * matrix[..., 2, :]
-    out[..., 2, :] += 2 * matrix[..., 1, :]
-    return out
-
-
-class _KeywordOnly(type(FittableModel)):
-    """Keeps astropy from giving each optic an ``__init__`` with positional parameters."""
-
-    def __init__(cls, name, bases, members, **kwargs):
-        super().__init__(name, bases, {"__init__": cls.__init__} | members, **kwargs)
-        cls.__signature__ = inspect.Signature(
-            [
-                inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default)
-                for key, default in cls._keywords().items()
-            ]
-        )
-
-    def _keywords(cls):
-        """Return every keyword that the optic takes, with its default."""
-        found = {}
-        for key in (*cls.param_names[1:], "theta"):
-            parameter = inspect.getattr_static(cls, key)
-            unit = parameter.unit
-            found[key] = parameter.default if unit is None else parameter.default * unit
-        for base in cls.__mro__:
-            if isinstance(base, _KeywordOnly):
-                found |= getattr(base.__init__, "__kwdefaults__", None) or {}
-        return found
-
-
-class Optic(FittableModel, metaclass=_KeywordOnly):
+class Optic(FittableModel, metaclass=KeywordOnly):
     """
     Base of all optics: light in, light out, with a Mueller matrix.
 
@@ -149,6 +80,7 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
 
     n_inputs = 5
     n_outputs = 5
+    # one value a wavelength is not to be broadcast by astropy against light of another shape
     standard_broadcasting = False
     #: True for an optic that turns the frame of all that follows.
     rotates_frame = False
@@ -178,6 +110,7 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
             super().__init__(name=name, **values, **kwargs)
         except (TypeError, InputParameterError) as error:
             raise ParameterError(f"{type(self).__name__}: {error}") from None
+        # astropy would call the five channels x0 to x4
         self._inputs = self._outputs = LIGHT
         self._mount, self._position = None, 0.0
         self.mount = mount
@@ -189,6 +122,7 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
         number = to_unit(value, unit, f"{cls.__name__}.{key}")
         if not np.all(np.isfinite(number)):
             raise ParameterError(f"{cls.__name__}.{key} = {value} must be finite")
+        # the only axis that a parameter may have is that of the wavelengths
         if number.ndim > 1 or number.size == 0:
             raise ParameterError(
                 f"{cls.__name__}.{key} has shape {number.shape}; allowed are a "
@@ -213,16 +147,9 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
         super().__setattr__(attr, value)
 
     def __deepcopy__(self, memo):
-        # chains are copied often; this is five times faster than copying every attribute
         new = self.__class__.__new__(self.__class__)
         memo[id(self)] = new
-        for key, value in self.__dict__.items():
-            if isinstance(value, Parameter):
-                new.__dict__[key] = memo[id(value)] = _copied_parameter(value, new, memo)
-            elif isinstance(value, _SHARED):
-                new.__dict__[key] = value
-            else:
-                new.__dict__[key] = deepcopy(value, memo)
+        copied_attributes(self, new, memo)
         return new
 
     def __repr__(self):
@@ -400,6 +327,7 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
         """Bring wavelength, orientation and values to canonical floats."""
         lam, shift, values = self._read(wavelength, position, parameters)
         dispersion = None if lam is None else self._dispersion(lam)
+        # only a law needs the wavelength; a constant matrix is the same at all
         if lam is None and type(self)._dispersion is not Optic._dispersion:
             raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
         return (*self._moved(dispersion, values[0], shift), values[1:])
@@ -422,6 +350,7 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
 
     def _check_grid(self, lam, values):
         for key, value in zip(self.param_names, values, strict=True):
+            # wavelengths are the last axis; a single value holds at all of them
             if value.size > 1 and (lam is None or np.shape(lam)[-1:] != value.shape[-1:]):
                 count = 0 if lam is None else np.size(lam)
                 raise ParameterError(
@@ -435,6 +364,7 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
 
     def _oriented_derivatives(self, dispersion, angle, values):
         """Yield the derivative to theta, then to each other parameter."""
+        # a rotator of the frame is T(theta) alone, with no T(-theta) behind it
         matrix = self._oriented(dispersion, angle, values)
         yield turn(matrix) if self.rotates_frame else rotation_generator(matrix)
         for derivative in self._derivatives(dispersion, *values):
@@ -443,6 +373,7 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
     def evaluate(self, wavelength, I, Q, U, V, *parameters):  # noqa: E741
         """Return ``wavelength`` and the Stokes parameters behind the optic."""
         values = [self._strip(key, p) for key, p in zip(self.param_names, parameters, strict=True)]
+        # elements first, (4, 4, ...), so that rows multiply the channels of the light
         matrix = np.moveaxis(
             self._oriented(*self._resolve(wavelength, None, values)), (-2, -1), (0, 1)
         )
@@ -464,6 +395,7 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
         if isinstance(value, u.Quantity):
             self._check_unit(key, value.unit)
         number = np.asarray(getattr(value, "value", value))
+        # a model of astropy is a set of one model
         number = number[0] if number.ndim and number.shape[0] == 1 else number
         return np.asarray(number) * canonical_factor(unit)
 
@@ -493,6 +425,7 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
                 f"it has {self.param_names}"
             )
         current = {}
+        # astropy would take a value in another unit without its bounds
         for key in set(self.param_names) - set(values):
             self._check_unit(key, getattr(self, key).unit)
             current[key] = getattr(self, key).value * (self._declared(key).unit or 1)
@@ -523,44 +456,3 @@ class Optic(FittableModel, metaclass=_KeywordOnly):
     def _settings(self):
         """Return the keyword arguments, other than parameters, that rebuild the optic."""
         return {"name": self.name, "mount": self.mount}
-
-
-def _copied_parameter(parameter, model, memo):
-    new = parameter.__class__.__new__(parameter.__class__)
-    for key, value in parameter.__dict__.items():
-        plain = value is None or isinstance(value, _SHARED)
-        new.__dict__[key] = value if plain else model if key == "_model" else deepcopy(value, memo)
-    return new
-
-
-def finite_position(value, name, stage=None):
-    """Return the position of a stage in radian, or as a number; refuse what is not finite."""
-    number = (stage or name) in COORDINATES
-    position = to_unit(value, None, name) if number else angle_to_rad(value, name)
-    if not np.all(np.isfinite(position)):
-        raise ParameterError(f"{name} = {value} must be finite")
-    return position
-
-
-def check_broadcast(wavelength, position):
-    """Refuse positions and wavelengths that do not broadcast."""
-    try:
-        np.broadcast_shapes(np.shape(wavelength), np.shape(position))
-    except ValueError:
-        raise ParameterError(
-            f"positions of shape {np.shape(position)} do not broadcast against wavelengths of "
-            f"shape {np.shape(wavelength)}; give the positions the shape (n_frames, 1)"
-        ) from None
-
-
-def turn(matrix):
-    """Return 2 G M, the derivative of T(theta) M to theta at theta = 0."""
-    out = np.zeros_like(matrix)
-    out[..., 1, :] = 2 * matrix[..., 2, :]
-    out[..., 2, :] = -2 * matrix[..., 1, :]
-    return out
-
-
-def blank(*values):
-    """Return zeros of the values' broadcast shape + (4, 4)."""
-    return np.zeros((*np.broadcast_shapes(*(np.shape(v) for v in values)), 4, 4))

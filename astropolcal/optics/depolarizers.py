@@ -3,7 +3,8 @@
 
 from astropy.modeling import Parameter
 
-from astropolcal.optics.core import Optic, blank
+from astropolcal.optics._matrices import blank
+from astropolcal.optics.core import Optic
 
 __all__ = ["Depolarizer"]
 
@@ -35,6 +36,7 @@ class Depolarizer(Optic):
     def _matrix(self, dispersion, *retained):
         out = blank(*retained)
         out[..., 0, 0] = 1.0
+        # the first element is the intensity, which is kept
         for i, value in enumerate(retained, start=1):
             out[..., i, i] = value
         return out

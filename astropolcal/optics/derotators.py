@@ -77,4 +77,6 @@ class KMirror(_Metallic):
         # a smaller angle leaves the middle mirror no place
         good = incidence >= np.pi / 4
         self._check(good, "incidence", np.rad2deg(incidence), " deg", "45 deg to less than 90 deg")
+        # a mirror at the angle a bends the light by 180 deg - 2 a; the outer two undo what the
+        # middle one does: 2 (180 - 2 a) = 180 - 2 b
         return ((incidence, 1.0, 2), (2 * incidence - np.pi / 2, 2.0, 1))

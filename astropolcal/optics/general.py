@@ -5,16 +5,19 @@ import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.optics.core import Optic, blank
+from astropolcal.optics._matrices import blank
+from astropolcal.optics.core import Optic
 
 __all__ = ["MuellerElement"]
 
+# in the order in which the parameters are declared
 _ELEMENTS = [(row, column) for row in range(4) for column in range(4)]
 
 
 def _element(row, column):
     return Parameter(
         default=float(row == column),
+        # fluxes are compared up to a factor: a transmission needs no bound
         bounds=(None, None) if (row, column) == (0, 0) else (-1, 1),
         fixed=True,
         description=f"element in row {row}, column {column}",

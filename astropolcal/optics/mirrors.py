@@ -18,18 +18,19 @@ from astropy.modeling import Parameter
 from astropolcal.exceptions import ParameterError
 from astropolcal.materials import get_material
 from astropolcal.mueller.elements import _diattenuator_retarder
-from astropolcal.optics.core import Optic
-from astropolcal.optics.polarizers import (
-    DiattenuatorRetarder,
-    _phase_block,
-    _to_diattenuation,
-    _transverse,
+from astropolcal.optics._matrices import (
+    diattenuation_slope,
+    fill_phase_block,
+    transverse_share,
 )
+from astropolcal.optics.core import Optic
+from astropolcal.optics.polarizers import DiattenuatorRetarder
 from astropolcal.thinfilm import _Stack, _wrapped
 from astropolcal.units import canonical_factor
 
 __all__ = ["MetalMirror", "ParityFlip", "PowerLawMirror"]
 
+# powers of ten as exp, whose derivative is at hand
 _LN10 = np.log(10.0)
 _UM_IN_M = 1e-6
 
@@ -78,16 +79,20 @@ class _Mirror(Optic):
 
     def _matrix(self, dispersion, *values):
         ratio = self._log_ratio(dispersion, *values)
+        # ln(r_p / r_s) = x + i Delta, so that
+        # (R_s - R_p) / (R_s + R_p) = (1 - e^2x) / (1 + e^2x) = -tanh x
         return _diattenuator_retarder(-np.tanh(ratio.real), ratio.imag)
 
     def _derivatives(self, dispersion, *values):
         ratio, slopes = self._log_slopes(dispersion, *values)
         diattenuation, c, s = -np.tanh(ratio.real), np.cos(ratio.imag), np.sin(ratio.imag)
+        # 1 - tanh^2, without the cancellation near a polarizer
         steepness = (1 - diattenuation) * (1 + diattenuation)
-        to_diattenuation = -steepness[..., None, None] * _to_diattenuation(diattenuation, c, s)
+        to_diattenuation = -steepness[..., None, None] * diattenuation_slope(diattenuation, c, s)
         to_retardance = np.zeros_like(to_diattenuation)
-        root = _transverse(diattenuation)
-        _phase_block(to_retardance, -root * s, root * c)
+        root = transverse_share(diattenuation)
+        # the block of (U, V) is root * [[c, s], [-s, c]]
+        fill_phase_block(to_retardance, -root * s, root * c)
         return tuple(
             slope.real[..., None, None] * to_diattenuation
             + slope.imag[..., None, None] * to_retardance
@@ -97,6 +102,7 @@ class _Mirror(Optic):
     def _check(self, good, key, value, unit, words):
         """Refuse values that no mirror has; bounds may have been lifted."""
         if not np.all(good):
+            # argmin of booleans is the first that is False
             worst = np.ravel(value)[np.argmin(np.ravel(good))]
             raise ParameterError(
                 f"{self.name or type(self).__name__}.{key} = {worst:.6g}{unit}; allowed are {words}"
@@ -160,6 +166,7 @@ class _Mirror(Optic):
         """
         dispersion, _, values = self._resolve(wavelength, None)
         ratio, slopes = self._log_slopes(dispersion, *values)
+        # as in _derivatives: slopes of ln(r_p / r_s) are per canonical unit
         steepness = 1 - np.tanh(ratio.real) ** 2
         found = {"diattenuation": {}, "retardance": {}}
         for key, slope in zip(self.own_names, slopes, strict=True):
@@ -182,6 +189,7 @@ class _Mirror(Optic):
         DiattenuatorRetarder
             One free diattenuation and one free retardance a wavelength.
         """
+        # name and mount only: the free optic has neither metal nor film
         settings = Optic._settings(self)
         free = DiattenuatorRetarder(
             diattenuation=self.diattenuation(wavelength),
@@ -263,8 +271,10 @@ class PowerLawMirror(_Mirror):
     def _log_slopes(self, log, *values):
         real, imaginary = self._parts(log, *values[:4])
         stack = self._stack((real, imaginary), values[4])
+        # n = sqrt(epsilon), so that dn = d(epsilon) / 2n, for either part
         to_incidence, (to_index,), _ = stack.log_slopes()
         per_part = to_index / (2 * stack.substrate.index)
+        # a power 10^b lambda^m has the slopes ln 10 and ln(lambda) times itself
         to_b1, to_b2 = per_part * real * _LN10, per_part * imaginary * _LN10
         slopes = to_b1, to_b1 * log / _LN10, to_b2, to_b2 * log / _LN10, to_incidence
         return stack.log_ratio(), slopes
@@ -325,6 +335,7 @@ class _Metallic(_Mirror):
 
     def _dispersion(self, wavelength):
         wavelength = np.asarray(wavelength)
+        # once in a fit: the wavelengths stay, only factors and thickness change
         materials = (get_material(name) for name in (self._material, self._film))
         return wavelength, *(material._index_um(wavelength) for material in materials)
 
@@ -341,6 +352,7 @@ class _Metallic(_Mirror):
             ("k_scale", k_scale, ""),
         ):
             self._check(value >= 0, key, value, unit, "values that are not negative")
+        # from the air through the film into the metal; n and k are scaled apart
         indices = [1.0, film, n_scale * metal.real + 1j * k_scale * metal.imag]
         return [
             (_Stack(wavelength, angle, indices, [film_thickness]), slope, count)
@@ -357,6 +369,7 @@ class _Metallic(_Mirror):
         ratios, slopes = [], []
         for stack, slope, count in self._stacks(dispersion, *values):
             to_incidence, (_, to_metal), (to_thickness,) = stack.log_slopes()
+            # the ratio is holomorphic in the index: d/dk is i d/dn
             to_scales = to_metal * metal.real, 1j * to_metal * metal.imag
             ratios.append(count * stack.log_ratio())
             slopes.append(count * np.stack([slope * to_incidence, to_thickness, *to_scales]))
@@ -366,6 +379,11 @@ class _Metallic(_Mirror):
 class MetalMirror(_Metallic):
     r"""
     Metal mirror, bare or with a film.
+
+    .. math:: M = \begin{pmatrix}1&\epsilon&0&0\\ \epsilon&1&0&0\\
+              0&0&t\cos\Delta&t\sin\Delta\\0&0&-t\sin\Delta&t\cos\Delta\end{pmatrix},
+              \quad \epsilon = \frac{|r_s|^2 - |r_p|^2}{|r_s|^2 + |r_p|^2}, \quad
+              \Delta = \arg\frac{r_p}{r_s}, \quad t = \sqrt{1-\epsilon^2}
 
     Fresnel reflection by the complex index of the metal, through the
     characteristic matrix of the film. Metals differ from film to film: a

@@ -3,10 +3,10 @@
 Optics whose Mueller matrix changes from frame to frame.
 
 Their ``mount`` names what the matrix depends on: the angle of a stage
-(``"hwp"``), how far the run has come (``"sequence"``, 0 to 1), the flux of
-the beam (``"flux"``), or that flux over the one in the frame before
-(``"previous_flux"``). At zero parameters each is the identity, so that it adds
-to a chain one way in which a real instrument departs from an ideal one.
+(``"hwp"``), or how far the run has come (``"sequence"``, 0 to 1); those that
+follow the flux are in `astropolcal.optics.fluxes`. At zero parameters each is
+the identity, so that it adds to a chain one way in which a real instrument
+departs from an ideal one.
 """
 
 import astropy.units as u
@@ -19,21 +19,18 @@ from astropolcal.mueller.elements import (
     _linear_retarder,
     _rotation_matrix,
 )
+from astropolcal.optics._matrices import blank, retardance_slope
 from astropolcal.optics.beamsplitters import BEAMS, _BeamOptic
-from astropolcal.optics.core import Optic, blank
-from astropolcal.optics.retarders import EllipticalRetarder, _linear_slope
-from astropolcal.units import to_unit
+from astropolcal.optics.core import Optic
+from astropolcal.optics.retarders import EllipticalRetarder
 
 __all__ = [
     "DriftRetarder",
     "DriftRotator",
-    "FluxGain",
     "FrameOptic",
     "HarmonicGain",
     "HarmonicRetarder",
     "HarmonicRotator",
-    "PolarizedBackground",
-    "StrayLight",
 ]
 
 _IDENTITY = np.eye(4)
@@ -64,14 +61,16 @@ class FrameOptic(Optic):
     takes_numbers = True
 
     def _resolve(self, wavelength, position, parameters=None):
+        # no law in wavelength: the coordinate takes the place of the dispersion
         _, shift, values = self._read(wavelength, position, parameters)
         return (*self._moved(0.0, values[0], shift), values[1:])
 
     def _moved(self, coordinate, angle, shift):
+        # a rotator before the plate stays where it is while its amplitude follows the stage
         return coordinate + shift, angle + shift if self.turns else angle
 
 
-def _one_of(allowed, value, name):
+def one_of(allowed, value, name):
     """Return a whole number of those allowed, or raise."""
     if isinstance(value, bool | np.bool_) or not np.isscalar(value) or value not in allowed:
         raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(map(str, allowed))}")
@@ -94,7 +93,7 @@ class _Harmonic(FrameOptic):
 
     @harmonic.setter
     def harmonic(self, value):
-        self._harmonic = _one_of((1, 2, 4), value, f"{type(self).__name__}.harmonic")
+        self._harmonic = one_of((1, 2, 4), value, f"{type(self).__name__}.harmonic")
 
     def _settings(self):
         return super()._settings() | {"harmonic": self.harmonic}
@@ -230,6 +229,7 @@ class DriftRetarder(FrameOptic):
 
     def _derivatives(self, coordinate, *values):
         vector = self._vector(coordinate, *values)
+        # nothing moves the circular retardance, so that its slope is not needed
         to_horizontal, to_diagonal, _ = EllipticalRetarder()._derivatives(None, *vector)
         rates = (_times(coordinate, slope) for slope in (to_horizontal, to_diagonal))
         return to_horizontal, to_diagonal, *rates
@@ -269,7 +269,7 @@ class HarmonicRetarder(_Harmonic):
         return _linear_retarder(self._sum(coordinate, cosine, sine))
 
     def _derivatives(self, coordinate, cosine, sine):
-        slope = _linear_slope(self._sum(coordinate, cosine, sine))
+        slope = retardance_slope(self._sum(coordinate, cosine, sine))
         return tuple(_times(wave, slope) for wave in self._waves(coordinate))
 
 
@@ -334,214 +334,20 @@ class HarmonicGain(_BeamOptic, _Harmonic):
 
     @property
     def _sign(self):
+        # +1 for the right beam, -1 for the left
         return BEAMS[self._beam] if self._differential else 1.0
 
     def _matrix(self, coordinate, cosine, sine):
-        return _scaled(1.0 + self._sign * self._sum(coordinate, cosine, sine))
+        return scaled(1.0 + self._sign * self._sum(coordinate, cosine, sine))
 
     def _derivatives(self, coordinate, cosine, sine):
         shape = np.broadcast_shapes(*(np.shape(x) for x in (coordinate, cosine, sine)))
         return tuple(
-            _scaled(np.broadcast_to(self._sign * wave, shape)) for wave in self._waves(coordinate)
+            scaled(np.broadcast_to(self._sign * wave, shape)) for wave in self._waves(coordinate)
         )
 
 
-class FluxGain(_BeamOptic, FrameOptic):
-    r"""
-    Gain of each beam that depends on its flux.
-
-    :math:`1 + k (F/F_0)^m`, with the coefficient k of the beam and its flux F in
-    the table (``mount="flux"``). With m = 1 a detector that is not linear. With
-    ``mount="previous_flux"``, F is the flux over that of the frame before, and
-    m = -1 is persistence, a share :math:`k F_0` of it. Where F = 0 the gain is one.
-
-    Parameters
-    ----------
-    right, left : float or array_like
-        Coefficient k of each beam; scalars, or one value a wavelength.
-    power : {1, -1}
-        Exponent m.
-    reference : float
-        :math:`F_0`, in the unit of the tables.
-    beam : {"right", "left"}
-        The beam that goes on in a chain.
-    theta : `~astropy.units.Quantity`
-        Without consequence here.
-
-    Examples
-    --------
-    >>> from astropolcal.optics import FluxGain
-    >>> bend = FluxGain(right=-0.01, left=-0.01, reference=1e7, mount="flux", name="nonlinearity")
-    >>> float(bend.mueller(position=5e6)[0, 0])
-    0.995
-    """
-
-    right = Parameter(default=0.0, bounds=(-0.5, 0.5), description="coefficient of the right beam")
-    left = Parameter(default=0.0, bounds=(-0.5, 0.5), description="coefficient of the left beam")
-
-    def __init__(self, *args, power=1, reference=1.0, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.power = power
-        self.reference = reference
-
-    @property
-    def power(self):
-        """Exponent of the flux, 1 or -1."""
-        return self._power
-
-    @power.setter
-    def power(self, value):
-        self._power = _one_of((1, -1), value, "FluxGain.power")
-
-    @property
-    def reference(self):
-        """Flux at which the gain is one plus the coefficient."""
-        return self._reference
-
-    @reference.setter
-    def reference(self, value):
-        self._reference = _positive(value, "FluxGain.reference")
-
-    def _settings(self):
-        return super()._settings() | {"power": self.power, "reference": self.reference}
-
-    def _level(self, coordinate):
-        relative = np.asarray(coordinate) / self._reference
-        if self._power == 1:
-            return relative
-        # where there is no flux, there is none to add to
-        return np.divide(1.0, relative, out=np.zeros_like(relative), where=relative != 0)
-
-    def _matrix(self, coordinate, right, left):
-        own = right if self._beam == "right" else left
-        return _scaled(1.0 + own * self._level(coordinate))
-
-    def _derivatives(self, coordinate, right, left):
-        shape = np.broadcast_shapes(*(np.shape(x) for x in (coordinate, right, left)))
-        slope = _scaled(np.broadcast_to(self._level(coordinate), shape))
-        none = np.zeros_like(slope)
-        return (slope, none) if self._beam == "right" else (none, slope)
-
-
-class StrayLight(FrameOptic):
-    r"""
-    Unpolarized light that is added in front of the beam splitter, whatever the source does.
-
-    :math:`I' = I\,(1 + b F_0/F)` with F the sum of both beams in the table
-    (``mount="total_flux"``), so that a constant flux :math:`b F_0` is added to
-    each frame: background, stray light, ghosts (Patat & Romaniello 2006,
-    doi:10.1086/497581). Where F = 0 nothing is added.
-
-    Parameters
-    ----------
-    amount : float or array_like
-        Added flux b over :math:`F_0`; scalar, or one value a wavelength.
-    reference : float
-        :math:`F_0`, in the unit of the tables.
-    theta : `~astropy.units.Quantity`
-        Without consequence here.
-
-    Examples
-    --------
-    >>> from astropolcal.optics import StrayLight
-    >>> ghost = StrayLight(amount=0.01, reference=1e6, mount="total_flux", name="ghost")
-    >>> float(ghost.mueller(position=5e5)[0, 0])
-    1.02
-    """
-
-    amount = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added flux over the reference")
-
-    def __init__(self, *args, reference=1.0, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.reference = reference
-
-    @property
-    def reference(self):
-        """Flux of which the amount is a share."""
-        return self._reference
-
-    @reference.setter
-    def reference(self, value):
-        self._reference = _positive(value, "StrayLight.reference")
-
-    def _settings(self):
-        return super()._settings() | {"reference": self.reference}
-
-    def _share(self, coordinate):
-        flux = np.asarray(coordinate, dtype=float)
-        return np.divide(self._reference, flux, out=np.zeros_like(flux), where=flux != 0)
-
-    def _matrix(self, coordinate, amount):
-        out = blank(coordinate, amount)
-        out[...] = _IDENTITY
-        out[..., 0, 0] += amount * self._share(coordinate)
-        return out
-
-    def _derivatives(self, coordinate, amount):
-        out = blank(coordinate, amount)
-        out[..., 0, 0] = self._share(coordinate)
-        return (out,)
-
-
-class PolarizedBackground(StrayLight):
-    r"""
-    Polarized light that is added to that of the source, whatever the source does.
-
-    .. math:: I' = I\,(1 + b F_0/F),\quad Q' = Q + q F_0/F\,I,\quad U' = U + u F_0/F\,I
-
-    with F the sum of both beams in the table (``mount="total_flux"``), so that
-    the same Stokes vector :math:`(b, q, u) F_0` is added to each frame: moonlight,
-    twilight or a zodiacal background (Patat & Romaniello 2006,
-    doi:10.1086/497581). Where F = 0 nothing is added.
-
-    Parameters
-    ----------
-    amount : float or array_like
-        Added flux b over :math:`F_0`; 0 where the flux of the background was
-        subtracted, but not its polarization.
-    q, u : float or array_like
-        Added polarized flux over :math:`F_0`, in the frame of what follows;
-        scalars, or one value a wavelength.
-    reference : float
-        :math:`F_0`, in the unit of the tables.
-    theta : `~astropy.units.Quantity`
-        Orientation of the axes of q and u.
-
-    Examples
-    --------
-    >>> from astropolcal.optics import PolarizedBackground
-    >>> moon = PolarizedBackground(q=0.01, reference=1e6, mount="total_flux", name="moon")
-    >>> float(moon.mueller(position=5e5)[1, 0])
-    0.02
-    """
-
-    q = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added Q over the reference")
-    u = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added U over the reference")
-
-    def _matrix(self, coordinate, amount, q, u):
-        out = blank(coordinate, amount, q, u)
-        out[...] = _IDENTITY
-        for row, value in enumerate((amount, q, u)):
-            out[..., row, 0] += value * self._share(coordinate)
-        return out
-
-    def _derivatives(self, coordinate, amount, q, u):
-        slopes = []
-        for row in range(3):
-            out = blank(coordinate, amount, q, u)
-            out[..., row, 0] = self._share(coordinate)
-            slopes.append(out)
-        return tuple(slopes)
-
-
-def _positive(value, name):
-    number = to_unit(value, None, name)
-    if number.ndim or not (np.isfinite(number) and number > 0):
-        raise ParameterError(f"{name} = {value!r} must be one positive number")
-    return float(number)
-
-
-def _scaled(gain):
+def scaled(gain):
     return np.asarray(gain)[..., None, None] * _IDENTITY
 
 
@@ -552,6 +358,7 @@ def _times(factor, matrix):
 def _turned_slope(angle):
     """Return the derivative of T(angle)."""
     out = blank(angle)
+    # of cos 2 angle and sin 2 angle, see T in Rotator
     out[..., 1, 1] = out[..., 2, 2] = -2 * np.sin(2 * angle)
     out[..., 1, 2] = 2 * np.cos(2 * angle)
     out[..., 2, 1] = -out[..., 1, 2]

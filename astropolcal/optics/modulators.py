@@ -6,9 +6,8 @@ import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.mueller.elements import _linear_retarder, _rotate
-from astropolcal.optics.core import rotation_generator
+from astropolcal.optics._matrices import retardance_slope, rotation_generator
 from astropolcal.optics.modulated import FrameOptic
-from astropolcal.optics.retarders import _linear_slope
 
 __all__ = ["FerroelectricLiquidCrystal"]
 
@@ -58,6 +57,7 @@ class FerroelectricLiquidCrystal(FrameOptic):
     @staticmethod
     def _turned(matrix, coordinate, retardance, switching_angle):
         angle = np.asarray(coordinate * switching_angle)
+        # states are (n_frames, 1) where there are several wavelengths
         shape = np.broadcast_shapes(angle.shape, np.shape(retardance))
         return _rotate(np.broadcast_to(matrix, (*shape, 4, 4)), np.broadcast_to(angle, shape))
 
@@ -66,6 +66,7 @@ class FerroelectricLiquidCrystal(FrameOptic):
 
     def _derivatives(self, coordinate, retardance, switching_angle):
         values = (coordinate, retardance, switching_angle)
-        slope = self._turned(_linear_slope(retardance), *values)
+        slope = self._turned(retardance_slope(retardance), *values)
+        # the axis stands at s alpha: a turn of it, s times
         turning = rotation_generator(self._matrix(*values))
         return slope, np.asarray(coordinate)[..., None, None] * turning

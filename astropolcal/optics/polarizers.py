@@ -6,12 +6,15 @@ import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.mueller.elements import _diattenuator, _diattenuator_retarder
-from astropolcal.optics.core import Optic, blank
+from astropolcal.optics._matrices import (
+    blank,
+    diattenuation_slope,
+    fill_phase_block,
+    transverse_share,
+)
+from astropolcal.optics.core import Optic
 
 __all__ = ["Diattenuator", "DiattenuatorRetarder", "LinearPolarizer", "VectorDiattenuator"]
-
-# sqrt(1 - eps^2) has no derivative at |eps| = 1: a floor keeps it finite there
-_ROOT_FLOOR = 1e-8
 
 
 class LinearPolarizer(Optic):
@@ -51,6 +54,9 @@ class Diattenuator(Optic):
     r"""
     Linear diattenuator of unit transmission for unpolarized light.
 
+    .. math:: M = \begin{pmatrix}1&\epsilon&0&0\\ \epsilon&1&0&0\\
+              0&0&\sqrt{1-\epsilon^2}&0\\0&0&0&\sqrt{1-\epsilon^2}\end{pmatrix}
+
     The diattenuator-retarder of the CHARIS paper (Eq. for
     :math:`M_\mathrm{DR}`) with zero retardance.
 
@@ -77,12 +83,16 @@ class Diattenuator(Optic):
         return _diattenuator(diattenuation)
 
     def _derivatives(self, dispersion, diattenuation):
-        return (_to_diattenuation(diattenuation, 1.0, 0.0),)
+        return (diattenuation_slope(diattenuation, 1.0, 0.0),)
 
 
 class DiattenuatorRetarder(Optic):
     r"""
     Linear diattenuator and linear retarder with common axes.
+
+    .. math:: M = \begin{pmatrix}1&\epsilon&0&0\\ \epsilon&1&0&0\\
+              0&0&t\cos\Delta&t\sin\Delta\\0&0&-t\sin\Delta&t\cos\Delta\end{pmatrix},
+              \qquad t = \sqrt{1-\epsilon^2}
 
     :math:`M_\mathrm{DR}(\epsilon, \Delta)` of the CHARIS paper (Sec. 4.2):
     the model of a mirror at oblique incidence.
@@ -118,9 +128,9 @@ class DiattenuatorRetarder(Optic):
     def _derivatives(self, dispersion, diattenuation, retardance):
         c, s = np.cos(retardance), np.sin(retardance)
         to_retardance = blank(diattenuation, retardance)
-        root = _transverse(diattenuation)
-        _phase_block(to_retardance, -root * s, root * c)
-        return _to_diattenuation(diattenuation, c, s), to_retardance
+        root = transverse_share(diattenuation)
+        fill_phase_block(to_retardance, -root * s, root * c)
+        return diattenuation_slope(diattenuation, c, s), to_retardance
 
 
 class VectorDiattenuator(Optic):
@@ -146,12 +156,14 @@ class VectorDiattenuator(Optic):
     array([ 1.  ,  0.01, -0.02,  0.  ])
     """
 
+    # 0.7 sqrt(2) < 1: any pair within its bounds is physical
     horizontal = Parameter(default=0.0, bounds=(-0.7, 0.7), description="component along Q")
     diagonal = Parameter(default=0.0, bounds=(-0.7, 0.7), description="component along U")
 
     def _matrix(self, dispersion, horizontal, diagonal):
         out = blank(horizontal, diagonal)
         transverse = np.sqrt(1 - horizontal**2 - diagonal**2)
+        # (1 - t) / d^2, written so that nothing is divided by zero without diattenuation
         share = 1 / (1 + transverse)
         out[..., 0, 0] = 1.0
         out[..., 0, 1] = out[..., 1, 0] = horizontal
@@ -175,6 +187,7 @@ def _vector_slope(own, other, i):
     j = 1 - i
     transverse = np.sqrt(1 - own**2 - other**2)
     share = 1 / (1 + transverse)
+    # dt/dD_i; and of 1 / (1 + t)
     fall = -own / transverse
     rise = -(share**2) * fall
     out[..., 0, 1 + i] = out[..., 1 + i, 0] = 1.0
@@ -182,23 +195,4 @@ def _vector_slope(own, other, i):
     out[..., 1 + j, 1 + j] = fall + rise * other**2
     out[..., 1, 2] = out[..., 2, 1] = rise * own * other + share * other
     out[..., 3, 3] = fall
-    return out
-
-
-def _transverse(diattenuation):
-    return np.sqrt((1 - diattenuation) * (1 + diattenuation))
-
-
-def _phase_block(matrix, c, s):
-    """Fill the U, V block with [[c, s], [-s, c]], in place."""
-    matrix[..., 2, 2] = matrix[..., 3, 3] = c
-    matrix[..., 2, 3] = s
-    matrix[..., 3, 2] = -np.asarray(s)
-
-
-def _to_diattenuation(diattenuation, c, s):
-    out = blank(diattenuation, c)
-    out[..., 0, 1] = out[..., 1, 0] = 1.0
-    slope = -diattenuation / np.maximum(_transverse(diattenuation), _ROOT_FLOOR)
-    _phase_block(out, slope * c, slope * s)
     return out

@@ -7,7 +7,8 @@ from astropy.modeling import Parameter
 
 from astropolcal.materials import MGF2, QUARTZ
 from astropolcal.mueller.elements import _elliptical_retarder, _linear_retarder
-from astropolcal.optics.core import Optic, blank
+from astropolcal.optics._matrices import blank, retardance_slope
+from astropolcal.optics.core import Optic
 
 __all__ = ["EllipticalRetarder", "LinearRetarder", "TwoLayerWaveplate"]
 
@@ -15,6 +16,11 @@ __all__ = ["EllipticalRetarder", "LinearRetarder", "TwoLayerWaveplate"]
 class LinearRetarder(Optic):
     r"""
     Linear retarder (paper, :math:`M_\mathrm{R}`).
+
+    .. math:: M = \begin{pmatrix}1&0&0&0\\0&1&0&0\\0&0&\cos\Delta&\sin\Delta\\
+              0&0&-\sin\Delta&\cos\Delta\end{pmatrix}
+
+    with its axis along Q.
 
     Parameters
     ----------
@@ -41,7 +47,7 @@ class LinearRetarder(Optic):
         return _linear_retarder(retardance)
 
     def _derivatives(self, dispersion, retardance):
-        return (_linear_slope(retardance),)
+        return (retardance_slope(retardance),)
 
 
 class TwoLayerWaveplate(Optic):
@@ -84,6 +90,7 @@ class TwoLayerWaveplate(Optic):
     )
 
     def _dispersion(self, wavelength):
+        # retardance per micrometre of each layer, shape (2, n_wavelengths); crossed axes subtract
         phase = 2 * np.pi / np.asarray(wavelength)
         return np.stack(
             [
@@ -96,7 +103,7 @@ class TwoLayerWaveplate(Optic):
         return _linear_retarder(w_sio2 * dispersion[0] + w_mgf2 * dispersion[1])
 
     def _derivatives(self, dispersion, w_sio2, w_mgf2):
-        slope = _linear_slope(w_sio2 * dispersion[0] + w_mgf2 * dispersion[1])
+        slope = retardance_slope(w_sio2 * dispersion[0] + w_mgf2 * dispersion[1])
         return tuple(per_um[..., None, None] * slope for per_um in dispersion)
 
     def retardance(self, wavelength):
@@ -157,10 +164,20 @@ class EllipticalRetarder(Optic):
     r"""
     Elliptical retarder (paper, :math:`M_\mathrm{ER}`; Chipman et al. 2018).
 
-    The retardance vector :math:`d = (\Delta_H, \Delta_{45}, \Delta_R)` turns
-    (Q, U, V) by :math:`|d|` about its own direction. Written with
-    :math:`\sin\Delta/\Delta` and :math:`(1-\cos\Delta)/\Delta^2` it is exact
-    and smooth through zero retardance.
+    .. math:: M = \begin{pmatrix}1&0&0&0\\
+              0&C + T\Delta_H^2&T\Delta_H\Delta_{45} + S\Delta_R&
+              T\Delta_H\Delta_R - S\Delta_{45}\\
+              0&T\Delta_H\Delta_{45} - S\Delta_R&C + T\Delta_{45}^2&
+              T\Delta_{45}\Delta_R + S\Delta_H\\
+              0&T\Delta_H\Delta_R + S\Delta_{45}&T\Delta_{45}\Delta_R - S\Delta_H&
+              C + T\Delta_R^2\end{pmatrix}
+
+    with :math:`\Delta^2 = \Delta_H^2 + \Delta_{45}^2 + \Delta_R^2`,
+    :math:`C = \cos\Delta`, :math:`S = \sin\Delta/\Delta` and
+    :math:`T = (1 - \cos\Delta)/\Delta^2`. The retardance vector
+    :math:`d = (\Delta_H, \Delta_{45}, \Delta_R)` turns (Q, U, V) by :math:`|d|` about
+    its own direction. Written with S and T it is exact and smooth through zero
+    retardance.
 
     Parameters
     ----------
@@ -194,6 +211,8 @@ class EllipticalRetarder(Optic):
         return _elliptical_retarder(horizontal, diagonal, circular)
 
     def _derivatives(self, dispersion, horizontal, diagonal, circular):
+        # M = cos x 1 + sinc [d] + versine d d^T with x = |d|; by d_i that is d_i times the slope
+        # over x of each factor, plus what d_i itself does
         vector = _vector(horizontal, diagonal, circular)
         total = np.sqrt(np.sum(vector**2, axis=-1))
         sinc, versine, sinc_slope, versine_slope = (f[..., None, None] for f in _functions(total))
@@ -230,13 +249,18 @@ def _vector(horizontal, diagonal, circular):
 
 def _functions(x):
     """Return sin(x)/x, (1 - cos x)/x^2 and their derivatives over x, for any x >= 0."""
+    # below 0.3 rad the seven terms of the series are exact to rounding; above, the closed forms
+    # lose about two digits to cancellation
     small = x < 0.3
     safe = np.where(small, 1.0, x)
     x2, safe2 = x * x, safe * safe
     sine, cosine = np.sin(safe), np.cos(safe)
     sinc = np.where(small, _series(x2, 1, 6, 20, 42, 72, 110), sine / safe)
     versine = np.where(
-        small, _series(x2, 2, 12, 30, 56, 90, 132), 2 * np.sin(safe / 2) ** 2 / safe2
+        # 1 - cos x as 2 sin^2(x / 2), which keeps its digits
+        small,
+        _series(x2, 2, 12, 30, 56, 90, 132),
+        2 * np.sin(safe / 2) ** 2 / safe2,
     )
     sinc_slope = np.where(
         small, -_series(x2, 3, 10, 28, 54, 88, 130), (cosine - sine / safe) / safe2
@@ -255,12 +279,3 @@ def _series(x2, first, *ratios):
     for ratio in reversed(ratios):
         total = 1.0 - x2 / ratio * total
     return total / first
-
-
-def _linear_slope(retardance):
-    out = blank(retardance)
-    out[..., 2, 2] = out[..., 3, 3] = -np.sin(retardance)
-    cosine = np.cos(retardance)
-    out[..., 2, 3] = cosine
-    out[..., 3, 2] = -cosine
-    return out

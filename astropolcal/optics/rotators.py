@@ -35,6 +35,7 @@ class Rotator(Optic):
     rotates_frame = True
 
     def _matrix(self, dispersion):
+        # the turn by theta and mount is done in Optic, which knows `rotates_frame`
         return _rotation_matrix(0.0)
 
     def _derivatives(self, dispersion):

@@ -4,7 +4,8 @@
 import numpy as np
 from astropy.modeling import Parameter
 
-from astropolcal.optics.core import Optic, blank
+from astropolcal.optics._matrices import blank
+from astropolcal.optics.core import Optic
 
 __all__ = ["PolarizedSource"]
 
@@ -38,12 +39,14 @@ class PolarizedSource(Optic):
     [5.0, 0.05, -0.1, 0.0]
     """
 
+    # 0.7 sqrt(2) < 1, see the docstring
     q = Parameter(default=0.0, bounds=(-0.7, 0.7), description="Q over I of the source")
     u = Parameter(default=0.0, bounds=(-0.7, 0.7), description="U over I of the source")
 
     def _matrix(self, dispersion, q, u):
         out = blank(q, u)
         out[..., 0, 0] = 1.0
+        # only the first column: whatever polarization arrives is forgotten
         out[..., 1, 0] = q
         out[..., 2, 0] = u
         return out

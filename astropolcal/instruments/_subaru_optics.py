@@ -1,0 +1,25 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What the polarimeters at the Nasmyth focus of Subaru share: site and calibration unit."""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import optics
+
+#: Longitude, latitude (deg) and height (m) of the Subaru Telescope.
+SITE = (-155.4761, 19.8255, 4139.0)
+
+
+def misaligned(about, most=5):
+    """Return what frees an angle within some degrees of where the optic should stand."""
+    return {"fixed": {"theta": False}, "bounds": {"theta": (about - most, about + most)}}
+
+
+def polarizer():
+    """Return the polarizer of the calibration unit, which passes -Q."""
+    return optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer", **misaligned(90))
+
+
+def fold_mirror(size):
+    """Return the mirror that polarizes the lamp where the polarizer is out."""
+    return optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror")

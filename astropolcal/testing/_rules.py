@@ -1,0 +1,352 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The rules that instruments are held to, each a method that raises where it does not hold."""
+
+import inspect
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.chain import find_optic, leaves, stages, system_mueller, with_beam
+from astropolcal.exceptions import AstropolcalError, InstrumentError
+from astropolcal.mueller import is_physical
+from astropolcal.observations import is_star
+from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource
+from astropolcal.simulation import simulate
+from astropolcal.testing._values import (
+    Absent,
+    Broken,
+    check_keyword,
+    check_same,
+    check_values,
+    moved_value,
+    optic_names,
+    read_back,
+    require,
+)
+
+# optics behind which nothing is left of what polarization the light had
+_LIGHTS = (LinearPolarizer, PolarizedSource)
+# columns that every table may have
+_COLUMNS = ("hwp", "derotator", "parallactic", "altitude", "flc_state")
+_CYCLE = np.array([0, 45, 22.5, 67.5, 11.25, 56.25, 33.75, 78.75])
+# rms of the predicted double differences
+_LARGEST_ERROR = 1e-3
+
+
+class Probe:
+    """The rules, each a method that raises where it does not hold."""
+
+    def __init__(self, instrument, seed):
+        self.instrument, self.seed = instrument, seed
+        self.rng = np.random.default_rng(seed)
+        default = inspect.signature(instrument.chain).parameters.get("source")
+        own = None if default is None else default.default
+        # one that tells no sources has the one that its chain takes by default
+        self.sources = tuple(instrument.sources or (own,))
+
+    # ---- what it says of itself
+
+    def check_class(self):
+        instrument = self.instrument
+        name = instrument.name
+        require(isinstance(name, str) and name.strip(), "it has no name")
+        require(len(name.split()) == 1, f"name = {name!r} has blanks; the command line has none")
+        aliases = instrument.aliases
+        require(not isinstance(aliases, str), f"aliases = {aliases!r}; a tuple of texts is needed")
+        for spelled in (name, name.upper(), *aliases):
+            require(instrument.answers_to(spelled), f"it does not answer to {spelled!r}")
+
+    def check_documentation(self):
+        cls = type(self.instrument)
+        require((cls.__dict__.get("__doc__") or "").strip(), f"class {cls.__name__}: no docstring")
+        references = self.instrument.references
+        require(
+            not isinstance(references, str) and len(references) > 0,
+            f"references = {references!r}; a tuple of at least one text is needed",
+        )
+        require(all(str(text).strip() for text in references), "one of its references is empty")
+
+    def check_wavelengths(self):
+        grid = self.grid
+        require(grid.ndim == 1 and grid.size > 0, f"wavelength has shape {grid.shape}; (n,) is it")
+        values = grid.to_value(u.um)
+        good = np.isfinite(values) & (values > 0)
+        require(good.all(), f"wavelength = {grid[~good]} must be positive and finite")
+        require(len(set(values)) == values.size, "wavelength: one of them occurs twice")
+
+    @property
+    def grid(self):
+        grid = self.instrument.wavelength
+        require(isinstance(grid, u.Quantity), f"wavelength = {grid!r}; a Quantity is needed")
+        require(grid.unit.is_equivalent(u.m), f"wavelength is in {grid.unit}; a length is needed")
+        return grid
+
+    @property
+    def few(self):
+        """At most three of the wavelengths."""
+        return self.grid[np.unique(np.linspace(0, self.grid.size - 1, 3).round().astype(int))]
+
+    # ---- chains
+
+    def chains(self, grid=None):
+        """Yield source and chain."""
+        for source in self.sources:
+            yield source, self.instrument.chain(source, (), wavelength=grid)
+
+    def check_sources(self):
+        for source, chain in self.chains():
+            for leaf in leaves(chain):
+                require(isinstance(leaf, Optic), f"{source}: {leaf!r} is not an Optic")
+        try:
+            self.instrument.chain("no such source")
+        except AstropolcalError:
+            return
+        require(
+            len(self.sources) == 1 and not self.instrument.sources,
+            "its chain takes the source 'no such source'; InstrumentError is expected",
+        )
+
+    def check_names(self):
+        for source, chain in self.chains():
+            found = [leaf.name for leaf in leaves(chain)]
+            require(all(found), f"{source}: an optic has no name: {found}")
+            odd = [name for name in found if not name.replace("-", "_").isidentifier()]
+            require(not odd, f"{source}: {odd} cannot be used as optic.parameter")
+            splitters = [leaf.name for leaf in leaves(chain) if leaf.splits_light]
+            require(
+                len(splitters) == 1, f"{source}: one optic must split the light, not {splitters}"
+            )
+
+    def check_bounds(self):
+        for grid in (None, self.few):
+            size = self.grid.size if grid is None else grid.size
+            for source, chain in self.chains(grid):
+                check_values(source, chain, size)
+
+    def check_physical(self):
+        for source, chain in self.chains(self.few):
+            self._check_physical(source, chain, self.few)
+
+    def _check_physical(self, label, chain, grid):
+        for leaf in leaves(chain):
+            matrix = system_mueller(leaf, grid, self._positions(leaf))
+            require(np.all(is_physical(matrix)), f"{label}: {leaf.name} is not physical")
+        for beam in ("right", "left"):
+            whole = system_mueller(with_beam(chain, beam), grid, self._positions(chain))
+            require(np.all(is_physical(whole)), f"{label}: the {beam} beam is not physical")
+
+    def _positions(self, chain, n=16):
+        found = {}
+        for stage in stages(chain):
+            number = stage in COORDINATES
+            found[stage] = (
+                self.rng.uniform(0.1, 1, n) * (1 if number else 180) * (u.one if number else u.deg)
+            )
+        return found
+
+    def check_on_sky(self):
+        if not self.instrument.has_telescope:
+            raise Absent("it has no telescope of known values")
+        internal = [(s, chain) for s, chain in self.chains() if not is_star(s)]
+        if not internal:
+            raise Absent("it has no internal source")
+        for source, chain in internal:
+            self._check_on_sky(source, chain)
+
+    def _check_on_sky(self, source, chain):
+        sky = self.instrument.on_sky(chain)
+        found, inner, names = leaves(sky), leaves(chain), optic_names(sky)
+        # what a lamp meets before anything turns belongs to the lamp
+        first = next((i for i, leaf in enumerate(inner) if leaf.stage), len(inner))
+        left = [leaf.name for leaf in inner[:first] if leaf.name in names]
+        require(not left, f"{source}: {', '.join(left)} of the source would be in front of a star")
+        lights = [leaf.name for leaf in found if isinstance(leaf, _LIGHTS)]
+        require(not lights, f"{source}: {', '.join(lights)} would hide the polarization of a star")
+        kept = [leaf.name for leaf in inner[first:]]
+        require(
+            names[-len(kept) :] == kept,
+            f"{source}: on sky there are {', '.join(names)}; the last must be {', '.join(kept)}",
+        )
+        front = {leaf.stage for leaf in found[: len(found) - len(kept)]}
+        require(
+            "parallactic" in front,
+            f"{source}: no optic in front of {kept[0]} stands on the stage parallactic",
+        )
+        require(
+            optic_names(self.instrument.on_sky(sky)) == names,
+            f"{source}: a chain from the sky gets another telescope",
+        )
+
+    # ---- tables and headers
+
+    def check_mounts(self):
+        layout = self.instrument.files
+        known = {*_COLUMNS, *self.instrument.keywords, *(layout.keywords if layout else ())}
+        for source, chain in self.chains():
+            angles = [s for s in stages(chain) if s not in COORDINATES]
+            lost = [s for s in angles if s not in known]
+            require(
+                not lost,
+                f"{source}: the stage {', '.join(lost)} is no column of tables and in no keyword; "
+                f"known are {', '.join(sorted(known))}",
+            )
+            require(
+                not is_star(source) or self.instrument.location is not None or not angles,
+                f"{source}: a star needs the site of the telescope",
+            )
+
+    def check_headers(self):
+        keywords, layout = self.instrument.keywords, self.instrument.files
+        if not keywords and layout is None:
+            raise Absent("it has no keywords")
+        every = dict(keywords) | (dict(layout.keywords) if layout else {})
+        for column, keyword in keywords.items():
+            inside = every[column]
+            require(inside == keyword, f"{column} is {keyword} here, {inside} in its file layout")
+        seen = {}
+        for column, keyword in every.items():
+            check_keyword(column, keyword)
+            require(keyword not in seen, f"{seen.get(keyword)} and {column} are both {keyword}")
+            seen[keyword] = column
+
+    def check_setup(self):
+        for source, chain in self.chains(self.few):
+            observations = self._observe(chain, source)
+            told, present = self.instrument.setup(observations)
+            require(told == source, f"a table of source {source!r} is set up as {told!r}")
+            (built,) = self.instrument.chains_for([observations])
+            lost = set(optic_names(chain)) - set(optic_names(built))
+            # the source optic may have the name of the star
+            require(len(lost) <= 1, f"{source}: its table's chain lacks {', '.join(sorted(lost))}")
+            require(
+                all(name in optic_names(built) for name in present),
+                f"{source}: setup says {present} is in the beam, the chain lacks it",
+            )
+        # the table of the last source will do
+        observations.meta["instrument"] = "another polarimeter"
+        try:
+            self.instrument.check(observations)
+        except AstropolcalError:
+            return
+        raise Broken("a table of 'another polarimeter' is not refused")
+
+    def check_published(self):
+        try:
+            chain = self.instrument.published()
+        except InstrumentError as none:
+            raise Absent(str(none)) from None
+        check_values("published", chain, self.grid.size)
+        self._check_physical("published", chain, self.grid)
+        meta = self.instrument.published_meta()
+        observations = self._observe(chain, meta.get("source", self.sources[0]), self.grid)
+        (built,) = self.instrument.chains_for([observations])
+        require(
+            optic_names(built) == optic_names(chain),
+            f"published_meta lead to {optic_names(built)}, published to {optic_names(chain)}",
+        )
+
+    def check_round_trip(self):
+        for source, chain in self.chains():
+            read = read_back(chain)
+            names = optic_names(read)
+            require(names == optic_names(chain), f"{source}: read as {names}")
+            for old, new in zip(leaves(chain), leaves(read), strict=True):
+                require(type(old) is type(new), f"{source}: {old.name} is a {type(new).__name__}")
+                require(old.mount == new.mount, f"{source}: {old.name} is on {new.mount}")
+                for key in old.param_names:
+                    check_same(source, old, getattr(old, key), getattr(new, key))
+
+    # ---- observing
+
+    def check_predicts(self):
+        from astropolcal.measurement import Measurement
+
+        largest = 0.0
+        for source, chain in self.chains(self.few):
+            observations = self._observe(chain, source, noise=False)
+            measurement = Measurement(
+                chain, observations, positions=[self.instrument.positions(observations, chain)]
+            )
+            off = np.abs(measurement.residuals()).max()
+            require(
+                off < 1e-9,
+                f"{source}: double differences are off by {off:.2g} from those of the frames; "
+                "do stages stand where its positions say?",
+            )
+            change = np.ptp(observations.flux_right / observations.flux_left)
+            # an unpolarized lamp may give the same in all frames; one source that varies is enough
+            largest = max(largest, float(change))
+        require(largest > 1e-6, "no source gives fluxes that change with the modulator")
+
+    def check_calibrates(self):
+        from astropolcal.calibration import calibrate
+        from astropolcal.measurement import Measurement
+
+        # a lamp needs no pointing, so that less can go wrong that is not of the chain
+        internal = [source for source in self.sources if not is_star(source)]
+        source = (internal or self.sources)[0]
+        start = self.instrument.chain(source, (), wavelength=self.few)
+        if not any(not getattr(o, k).fixed for o in leaves(start) for k in o.param_names):
+            raise Absent("no parameter is free")
+        # the optics that the tables of its published chain say are in the beam
+        chains = self.instrument.chains_for([self._observe(start, source)])
+        truth = self._moved(chains[0])
+        seen = self._observe(truth, source)
+        positions = [self.instrument.positions(seen, chains[0])]
+        found = calibrate(chains, [seen], positions=positions, cross_validate=False)
+        # at angles of the derotator 7 deg from those of the fit, without noise of their own
+        unseen = self._observe(truth, source, shift=7.0, noise=False)
+        placed = [self.instrument.positions(unseen, truth)]
+        residuals = Measurement(found.chains, [unseen], positions=placed).residuals()
+        rms = np.sqrt(np.mean(residuals**2))
+        require(
+            rms < _LARGEST_ERROR,
+            f"{source}: calibrated with simulated frames, it predicts others to {rms:.2g} rms; "
+            f"up to {_LARGEST_ERROR:g} is allowed",
+        )
+
+    def _moved(self, chain):
+        """Return the chain with its free parameters moved a little, within their bounds."""
+        chain, rng = chain.copy(), np.random.default_rng(self.seed)
+        for leaf in leaves(chain):
+            for key in (k for k in leaf.param_names if not getattr(leaf, k).fixed):
+                value = moved_value(getattr(leaf, key), rng)
+                setattr(find_optic(chain, leaf.name), key, value)
+        return chain
+
+    def _observe(self, chain, source, grid=None, *, shift=0.0, noise=True):
+        """Return simulated frames of a source, with everything that stands on a stage."""
+        meta = {"instrument": self.instrument.name, "date": "2020-01-01"}
+        meta |= self.instrument.published_meta() | {"source": source}
+        frames = self._frames(chain, shift)
+        if "flc_state" in (*stages(chain), meta.get("pairing")):
+            # both states of a modulator at every position
+            frames = frames[np.repeat(np.arange(len(frames)), 2)]
+            frames["flc_state"] = np.tile([0, 1], len(frames) // 2)
+        return simulate(
+            chain,
+            self.few if grid is None else grid,
+            frames,
+            flux=1e8,
+            noise=noise,
+            seed=self.seed,
+            meta=meta,
+            name=f"simulated {source}",
+        )
+
+    def _frames(self, chain, shift):
+        # a derotator that turns by 75 deg sees both of its axes; six cycles are enough for a fit
+        n_cycles = 6
+        hwp = np.tile(_CYCLE, n_cycles)
+        steps = np.linspace(0, 1, n_cycles).repeat(_CYCLE.size)
+        frames = QTable({"hwp": hwp * u.deg, "derotator": (20 + shift + 75 * steps) * u.deg})
+        known = {"parallactic": -60 + shift + 100 * steps, "altitude": 40 + shift + 30 * steps}
+        wanted = set(stages(chain)) - {*COORDINATES, "hwp", "derotator"}
+        on_sky = bool(wanted & set(known))
+        for stage in sorted(wanted | (set(known) if on_sky else set())):
+            frames[stage] = known.get(stage, 10 + shift + 60 * steps) * u.deg
+        if on_sky:
+            # where the plate stands is given, so that any tracking law will do
+            frames["hwp_true"] = frames["hwp"] + 33 * u.deg
+        return frames

@@ -1,0 +1,286 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Derivatives of elementary matrices, copies of optics, positions, and documented equations."""
+
+import copy
+import inspect
+import re
+
+import astropy.units as u
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from astropolcal import mueller, optics, thinfilm
+from astropolcal.exceptions import ParameterError
+from astropolcal.optics import OPTICS, rotation_generator
+from astropolcal.optics._matrices import (
+    blank,
+    diattenuation_slope,
+    fill_phase_block,
+    retardance_slope,
+    transverse_share,
+    turn,
+)
+from astropolcal.optics.positions import (
+    COORDINATES,
+    FLUXES,
+    RATES,
+    check_broadcast,
+    finite_position,
+)
+
+MATRIX = arrays(float, (4, 4), elements=st.floats(-1, 1))
+ANGLE = st.floats(-3, 3)
+STEP = 1e-6
+
+
+def difference(function, x):
+    return (function(x + STEP) - function(x - STEP)) / (2 * STEP)
+
+
+# --- derivatives --------------------------------------------------------------------------------
+
+
+@given(matrix=MATRIX, angle=ANGLE)
+def test_turned_optic_moves_by_the_commutator(matrix, angle):
+    def turned(x):
+        return mueller.rotate(matrix, x * u.rad)
+
+    expected = difference(turned, angle)
+    np.testing.assert_allclose(rotation_generator(turned(angle)), expected, atol=1e-8)
+
+
+@given(matrix=MATRIX, angle=ANGLE)
+def test_turned_frame_moves_on_one_side_only(matrix, angle):
+    def turned(x):
+        return mueller.rotation_matrix(x * u.rad) @ matrix
+
+    np.testing.assert_allclose(turn(turned(angle)), difference(turned, angle), atol=1e-8)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 5)])
+def test_generators_act_on_the_last_axes(shape):
+    matrices = np.random.default_rng(1).normal(size=(*shape, 4, 4))
+    for function in (rotation_generator, turn):
+        found = function(matrices)
+        assert found.shape == matrices.shape
+        for i in np.ndindex(shape):
+            np.testing.assert_array_equal(found[i], function(matrices[i]))
+
+
+def test_what_has_no_axis_does_not_move():
+    for matrix in (np.eye(4), np.diag([1.0, 0.5, 0.5, -0.2])):
+        np.testing.assert_array_equal(rotation_generator(matrix), 0)
+
+
+@given(x=ANGLE)
+def test_slope_of_a_retarder(x):
+    expected = difference(lambda a: mueller.linear_retarder(a * u.rad), x)
+    np.testing.assert_allclose(retardance_slope(x), expected, atol=1e-9)
+
+
+@given(epsilon=st.floats(-0.99, 0.99), retardance=ANGLE)
+def test_slope_of_a_diattenuator(epsilon, retardance):
+    def matrix(e):
+        return mueller.diattenuator_retarder(e, retardance * u.rad)
+
+    found = diattenuation_slope(epsilon, np.cos(retardance), np.sin(retardance))
+    np.testing.assert_allclose(found, difference(matrix, epsilon), rtol=1e-5, atol=1e-6)
+
+
+@given(st.floats(0, 9))
+def test_share_that_is_left_of_u_near_a_polarizer(decades):
+    """With eps = 1 - d the root is sqrt(2 d - d^2), to the last digit of d."""
+    d = 10.0**-decades
+    epsilon = 1 - d
+    # what the float has lost is not the function's to bring back
+    kept = 1 - epsilon
+    assert transverse_share(epsilon) == pytest.approx(np.sqrt(kept * (2 - kept)), rel=1e-14)
+    assert transverse_share(-epsilon) == transverse_share(epsilon)
+
+
+def test_phase_block_is_a_rotation_of_u_and_v():
+    matrix = np.zeros((2, 4, 4))
+    fill_phase_block(matrix, np.array([0.6, 1.0]), np.array([0.8, 0.0]))
+    np.testing.assert_array_equal(matrix[0, 2:, 2:], [[0.6, 0.8], [-0.8, 0.6]])
+    np.testing.assert_array_equal(matrix[1, 2:, 2:], np.eye(2))
+    assert not matrix[:, :2].any()
+
+
+def test_blank_has_the_shape_of_all_values():
+    assert blank(1.0, np.zeros(3), np.zeros((2, 1))).shape == (2, 3, 4, 4)
+    assert blank().shape == (4, 4)
+
+
+# --- copies and keywords ------------------------------------------------------------------------
+
+
+def bound_optic():
+    plate = optics.LinearRetarder(retardance=[1, 2] * u.deg, mount="-hwp", name="plate")
+    plate.retardance.bounds, plate.retardance.fixed = (0, 5), True
+    plate.retardance.prior = {"mean": [1, 2]}
+    plate.position = 3 * u.deg
+    return plate
+
+
+@pytest.mark.parametrize("how", [copy.deepcopy, lambda optic: optic.copy()])
+def test_copy_shares_nothing_that_can_change(how):
+    plate = bound_optic()
+    twin = how(plate)
+    twin.retardance = [7, 8] * u.deg
+    twin.retardance.bounds, twin.retardance.fixed = (-1, 1), False
+    twin.retardance.prior["mean"].append(3)
+    twin.mount, twin.name, twin.position = "stage", "twin", 1 * u.rad
+    np.testing.assert_array_equal(plate.retardance.value, [1, 2])
+    assert plate.retardance.bounds == (0, 5)
+    assert plate.retardance.fixed
+    assert plate.retardance.prior == {"mean": [1, 2]}
+    assert (plate.mount, plate.name) == ("-hwp", "plate")
+    assert plate.position == 3 * u.deg
+
+
+def test_parameter_of_a_copy_belongs_to_the_copy():
+    """A parameter that still pointed to the first optic would set that one's value."""
+    twin = copy.deepcopy(bound_optic())
+    twin.retardance.value = [4, 5]
+    np.testing.assert_array_equal(twin.mueller([1, 2] * u.um), twin.copy().mueller([1, 2] * u.um))
+    assert twin.retardance.model is twin
+
+
+def test_optics_of_a_list_stay_one_where_they_were_one():
+    plate = bound_optic()
+    first, second = copy.deepcopy([plate, plate])
+    assert first is second
+    assert first is not plate
+
+
+@pytest.mark.parametrize("name", OPTICS)
+def test_signature_is_of_keywords_with_their_defaults(name):
+    signature = inspect.signature(OPTICS[name])
+    kinds = {parameter.kind for parameter in signature.parameters.values()}
+    assert kinds == {inspect.Parameter.KEYWORD_ONLY}
+    made = OPTICS[name]()
+    assert {*made.param_names, "mount", "name"} <= set(signature.parameters)
+    for key in made.param_names:
+        assert u.Quantity(signature.parameters[key].default) == u.Quantity(
+            getattr(made, key).value, getattr(made, key).unit
+        )
+
+
+# --- positions ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stage", [*COORDINATES, "-"])
+def test_numbers_and_angles_of_stages(stage):
+    if stage in COORDINATES:
+        assert finite_position(0.5, "position", stage) == 0.5
+        with pytest.raises(ParameterError, match="position has unit deg"):
+            finite_position(1 * u.deg, "position", stage)
+    else:
+        assert finite_position(180 * u.deg, "position", "hwp") == pytest.approx(np.pi)
+        with pytest.raises(ParameterError, match=r"position = 0\.5 needs a unit such as rad"):
+            finite_position(0.5, "position", "hwp")
+
+
+def test_stage_is_the_name_where_there_is_no_other():
+    assert finite_position(1.0, "sequence") == 1.0
+    with pytest.raises(ParameterError, match=r"hwp = 1\.0 needs a unit"):
+        finite_position(1.0, "hwp")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_position_is_finite(bad):
+    with pytest.raises(ParameterError, match=r"flux = .* must be finite"):
+        finite_position([1.0, bad], "flux")
+    with pytest.raises(ParameterError, match=r"hwp = .* must be finite"):
+        finite_position([0.0, bad] * u.deg, "hwp")
+
+
+def test_kinds_of_positions_do_not_overlap():
+    assert not set(FLUXES) & set(RATES)
+    assert {*FLUXES, *RATES, "sequence", "flc_state"} == set(COORDINATES)
+
+
+@pytest.mark.parametrize(("lam", "position"), [((3,), (4,)), ((3,), (2, 4)), ((3, 1, 5), (2, 5))])
+def test_positions_that_do_not_broadcast(lam, position):
+    fits = np.broadcast_shapes
+    try:
+        fits(lam, position)
+    except ValueError:
+        with pytest.raises(ParameterError, match=r"give the positions the shape \(n_frames, 1\)"):
+            check_broadcast(np.ones(lam), np.ones(position))
+    else:
+        assert check_broadcast(np.ones(lam), np.ones(position)) is None
+
+
+# --- the matrices in the docstrings -------------------------------------------------------------
+
+SYMBOLS = {
+    r"\epsilon": "e", r"\Delta_{45}": "f", r"\Delta_H": "h", r"\Delta_R": "r",
+    r"\sqrt{1-e^2}": "t", r"\cos\Delta": "c", r"\sin\Delta": "s",
+}  # fmt: skip
+
+
+def documented(cls, **values):
+    """Return the Mueller matrix in a docstring's equation, with numbers for its symbols."""
+    text = re.search(r"\\begin{pmatrix}(.*?)\\end{pmatrix}", inspect.getdoc(cls), re.DOTALL)[1]
+    for symbol, name in SYMBOLS.items():
+        text = text.replace(symbol, name)
+    rows = [row.split("&") for row in re.sub(r"\s", "", text).split(r"\\")]
+    return np.array([[_sum(cell, values) for cell in row] for row in rows])
+
+
+def _sum(cell, values):
+    """Return the value of a sum of products such as ``Thf-Sr`` or ``C+Th^2``."""
+    total = 0.0
+    for sign, term in re.findall(r"([+-]?)([^+-]+)", cell):
+        factors = re.findall(r"([a-zA-Z]|\d)(\^2)?", term)
+        product = np.prod(
+            [
+                (float(name) if name.isdigit() else values[name]) ** (2 if square else 1)
+                for name, square in factors
+            ]
+        )
+        total += -product if sign == "-" else product
+    return total
+
+
+@pytest.mark.parametrize(
+    ("cls", "settings"),
+    [
+        (optics.LinearRetarder, {"retardance": 1.1 * u.rad}),
+        (optics.Diattenuator, {"diattenuation": 0.3}),
+        (optics.DiattenuatorRetarder, {"diattenuation": 0.3, "retardance": 1.1 * u.rad}),
+        (optics.LinearPolarizer, {}),
+    ],
+)
+def test_documented_matrix_is_that_of_the_code(cls, settings):
+    expected = documented(cls, e=0.3, t=np.sqrt(1 - 0.09), c=np.cos(1.1), s=np.sin(1.1))
+    expected = 0.5 * expected if cls is optics.LinearPolarizer else expected
+    np.testing.assert_allclose(cls(**settings).mueller(), expected, atol=1e-14)
+
+
+def test_documented_mirror_is_that_of_its_amplitudes():
+    lam = 1.6 * u.um
+    film = ("fused silica", 120 * u.nm)
+    surface = thinfilm.reflect(lam, 45 * u.deg, "gold", [film])
+    s, p = (float(abs(r) ** 2) for r in (surface.r_s, surface.r_p))
+    e, d = (s - p) / (s + p), np.angle(surface.r_p / surface.r_s)
+    expected = documented(optics.MetalMirror, e=e, t=np.sqrt(1 - e**2), c=np.cos(d), s=np.sin(d))
+    mirror = optics.MetalMirror(material="gold", film_thickness=120 * u.nm)
+    np.testing.assert_allclose(mirror.mueller(lam), expected, atol=1e-13)
+
+
+def test_documented_elliptical_retarder_is_that_of_the_code():
+    dh, d45, dr = 0.7, -0.4, 1.3
+    d = np.sqrt(dh**2 + d45**2 + dr**2)
+    expected = documented(
+        optics.EllipticalRetarder,
+        h=dh, f=d45, r=dr, C=np.cos(d), S=np.sin(d) / d, T=(1 - np.cos(d)) / d**2,
+    )  # fmt: skip
+    found = optics.EllipticalRetarder(
+        horizontal=dh * u.rad, diagonal=d45 * u.rad, circular=dr * u.rad
+    ).mueller()
+    np.testing.assert_allclose(found, expected, atol=1e-14)

@@ -1,0 +1,140 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Units at the door, floats inside."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.modeling import Parameter
+from astropy.table import Column, QTable
+from hypothesis import given
+from hypothesis import strategies as st
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.units import angle_to_rad, canonical_factor, canonical_unit, length_to_um, to_unit
+
+FINITE = st.floats(-1e6, 1e6)
+ANGLES = (u.deg, u.rad, u.arcmin, u.hourangle, u.mas)
+LENGTHS = (u.nm, u.um, u.mm, u.m, u.AA)
+
+
+# --- internal units -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [
+        (u.deg, u.rad),
+        ("arcsec", u.rad),
+        (u.AA, u.um),
+        ("mm", u.um),
+        (u.percent, u.one),
+        (None, u.one),
+        ("", u.one),
+    ],
+)
+def test_internal_unit_of_a_kind(unit, expected):
+    assert canonical_unit(unit) == expected
+
+
+@pytest.mark.parametrize("unit", [u.s, "Hz", u.adu, u.deg / u.um, u.rad**2])
+def test_kind_without_an_internal_unit(unit):
+    for function in (canonical_unit, canonical_factor):
+        with pytest.raises(ParameterError, match="neither an angle, a length nor dimensionless"):
+            function(unit)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [(u.deg, np.pi / 180), (u.mm, 1e3), (u.nm, 1e-3), (u.percent, 0.01), (None, 1.0), (u.um, 1.0)],
+)
+def test_factor_to_the_internal_unit(unit, factor):
+    assert canonical_factor(unit) == pytest.approx(factor, rel=1e-15)
+
+
+@given(value=FINITE, unit=st.sampled_from([*ANGLES, *LENGTHS, u.percent]))
+def test_factor_is_the_conversion(value, unit):
+    expected = (value * unit).to_value(canonical_unit(unit))
+    assert value * canonical_factor(unit) == pytest.approx(expected, rel=1e-12)
+
+
+# --- conversion -------------------------------------------------------------------------------
+
+
+@given(value=FINITE, unit=st.sampled_from(ANGLES))
+def test_angle_survives_the_way_in_and_out(value, unit):
+    back = (float(angle_to_rad(value * unit)) * u.rad).to_value(unit)
+    assert back == pytest.approx(value, rel=1e-12, abs=1e-300)
+
+
+@given(value=FINITE, unit=st.sampled_from(LENGTHS))
+def test_length_survives_the_way_in_and_out(value, unit):
+    back = (float(length_to_um(value * unit)) * u.um).to_value(unit)
+    assert back == pytest.approx(value, rel=1e-12, abs=1e-300)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3,), (2, 3), (0,)])
+def test_shape_is_kept_and_the_result_is_plain(shape):
+    found = angle_to_rad(np.full(shape, 180.0) * u.deg)
+    assert type(found) is np.ndarray
+    assert found.shape == shape
+    assert found.dtype == float
+    np.testing.assert_allclose(found, np.pi)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        Parameter("x", default=90.0, unit=u.deg),
+        QTable({"x": [90.0] * u.deg})["x"],
+        Column([90.0], unit=u.deg),
+        u.Quantity(np.float32(90), u.deg),
+    ],
+    ids=["parameter", "quantity column", "column", "single precision"],
+)
+def test_whatever_carries_a_unit(value):
+    np.testing.assert_allclose(angle_to_rad(value), np.pi / 2, rtol=1e-7)
+
+
+@pytest.mark.parametrize("value", [3, True, [1, 2], np.float32(0.5), "2.5", (1.0,)])
+def test_plain_numbers_where_there_is_no_unit(value):
+    np.testing.assert_array_equal(to_unit(value, None), np.asarray(value, dtype=float))
+
+
+def test_percent_is_a_number_and_a_number_is_percent():
+    assert to_unit(3 * u.percent, None) == pytest.approx(0.03)
+    assert to_unit(0.03 * u.one, u.percent) == pytest.approx(3)
+
+
+def test_what_was_given_is_not_changed():
+    given_ = np.array([1.0, 2.0]) * u.mm
+    length_to_um(given_)[0] = 5
+    np.testing.assert_array_equal(given_.value, [1, 2])
+
+
+def test_not_a_number_and_infinity_pass():
+    """Whether a value must be finite is for the caller to say, who knows its name."""
+    assert np.isnan(angle_to_rad(np.nan * u.deg))
+    assert length_to_um(np.inf * u.m) == np.inf
+
+
+# --- what is refused ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: angle_to_rad(3.0), r"^angle = 3.0 needs a unit such as rad$"),
+        (lambda: angle_to_rad([1, 2], "theta"), r"theta = \[1, 2\] needs a unit such as rad"),
+        (lambda: length_to_um(1.6), r"^wavelength = 1.6 needs a unit such as um$"),
+        (lambda: angle_to_rad(1 * u.um, "hwp"), "hwp has unit um, which is not convertible to rad"),
+        (lambda: length_to_um(2 * u.Hz), "wavelength has unit Hz, which is not convertible to um"),
+        (lambda: to_unit(1 * u.deg, None, "q"), "q has unit deg, .* convertible to a plain number"),
+        (lambda: to_unit("east", None, "q"), "q = 'east' is not a number"),
+        (lambda: to_unit({}, None, "q"), "q = {} is not a number"),
+        (lambda: to_unit(1j, None, "q"), "q = 1j is complex; allowed are real numbers"),
+        (lambda: to_unit([1j] * u.deg, u.deg, "q"), "is complex"),
+    ],
+)
+def test_what_is_refused_is_named(call, words):
+    with pytest.raises(ParameterError, match=words):
+        call()
