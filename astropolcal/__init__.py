@@ -17,9 +17,11 @@ __all__ = [
     "Observations",
     "__version__",
     "calibrate",
+    "chain",
     "correct",
     "diagnose",
     "gap",
+    "half_wave_plate_cycles",
     "instruments",
     "load",
     "materials",
@@ -39,11 +41,21 @@ _WHERE = {
     "calibrate": "calibration",
     "correct": "correction",
     "diagnose": "gap",
+    "half_wave_plate_cycles": "simulation",
     "load": "calibration",
     "reduce_cubes": "reduction",
     "simulate": "simulation",
 }
-_MODULES = {"gap", "instruments", "materials", "mueller", "optics", "plotting", "standards"}
+_MODULES = {
+    "chain",
+    "gap",
+    "instruments",
+    "materials",
+    "mueller",
+    "optics",
+    "plotting",
+    "standards",
+}
 
 
 def __getattr__(name):
@@ -57,4 +69,5 @@ def __getattr__(name):
 
 
 def __dir__():
-    return sorted([*globals(), *_WHERE, *_MODULES])
+    # a module that has been imported is among the globals, too
+    return sorted({*globals(), *_WHERE, *_MODULES})

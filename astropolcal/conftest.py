@@ -5,6 +5,9 @@ import os
 
 import pytest
 
+# pytest finds what it needs by itself
+__all__ = []
+
 # examples that draw need no window system
 os.environ.setdefault("MPLBACKEND", "agg")
 

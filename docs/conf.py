@@ -2,13 +2,14 @@
 """
 Sphinx configuration, on the shared settings of Astropy.
 
-The build needs no network. Links to the documentation of other packages are
-resolved only where ``READTHEDOCS`` or ``ASTROPOLCAL_DOCS_ONLINE`` is set.
+Neither the build nor the pages need a network. Links to the documentation of other
+packages are resolved only where ``READTHEDOCS`` or ``ASTROPOLCAL_DOCS_ONLINE`` is set.
 """
 
 import os
 import sys
 from datetime import UTC, datetime
+from importlib.metadata import distribution
 from pathlib import Path
 
 from sphinx_astropy.conf.v3 import *  # noqa: F403
@@ -90,21 +91,32 @@ nitpick_ignore_regex = [
     (r"py:.*", r"astropolcal\.(.*\.)?_.*"),
     (r"py:.*", r"(astropy\.modeling|numpy\.typing)\..*"),
 ]
+# there is nothing to link these to, and without network there is nothing at all
+unlinked = [name for name in EXTERNAL if name not in intersphinx_mapping]
+nitpick_ignore_regex.append((r"py:.*", rf"({'|'.join(unlinked)})(\..*)?"))
 if not ONLINE:
     builtin = (
         r"(bool|bytes|dict|float|int|list|object|str|tuple|type|property|None|True|False"
         r"|[A-Z]\w*(Error|Warning|Exception)|Exception"
-        r"|(abc|argparse|collections|contextlib|dataclasses|enum|functools|pathlib|typing)\..*)"
+        r"|(abc|argparse|collections|contextlib|dataclasses|enum|functools|io|pathlib|typing)\..*)"
     )
-    nitpick_ignore_regex += [
-        (r"py:.*", rf"({'|'.join(EXTERNAL)})(\..*)?"),
-        (r"py:.*", builtin),
-    ]
+    nitpick_ignore_regex.append((r"py:.*", builtin))
 
 # -- Pages ------------------------------------------------------------------------
 
 html_title = f"astropolcal {version}"
-html_static_path = []
+# MathJax comes with the pages, so that equations show without network, too. This one file of it
+# draws in SVG and needs no fonts; the package's own extension would copy all 24 MB.
+mathjax_path = "tex-svg.js"
+html_static_path = [
+    str(
+        distribution("sphinx-mathjax-offline").locate_file(
+            f"sphinx-mathjax-offline/static/mathjax/{mathjax_path}"
+        )
+    )
+]
+# the theme would load a counter of visitors from the network on every page
+html_theme_options = {"goatcounter_analytics_url": ""}
 # one picture of each plot; the default makes three
 plot_formats = [("png", 110)]
 plot_html_show_formats = False

@@ -16,7 +16,8 @@ def _arrow(axis, angle, length=1.0, both=True, **style):
 
 
 def _frame(axis, title):
-    axis.set(xlim=(-1.75, 1.75), ylim=(-1.75, 1.75), aspect="equal", title=title)
+    axis.set(xlim=(-1.75, 1.75), ylim=(-1.75, 1.75), aspect="equal")
+    axis.set_title(title, y=0.98)
     axis.set_axis_off()
 
 

@@ -26,15 +26,16 @@ def example_of(cls):
 
     def recording(self, *args, **kwargs):
         original(self, *args, **kwargs)
-        made.append(self)
+        if type(self) is cls and not made:
+            # a copy, as the example may change the optic later
+            made.append(self.copy())
 
     cls.__init__ = recording
     try:
         _run(cls)
     finally:
         cls.__init__ = original
-    first = next((optic for optic in made if type(optic) is cls), None)
-    return cls() if first is None else first.copy()
+    return made[0] if made else cls()
 
 
 def _run(cls):

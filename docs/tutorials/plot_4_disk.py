@@ -12,18 +12,30 @@ circular polarization. What a double difference makes of it, and what the calibr
 # ---------
 #
 # A ring of scattered light, polarized by up to 40 % across the direction to the star. The
-# instrument is the published one, with the telescope in front.
+# instrument is the published one, with the telescope in front. With a folder of real tables it is
+# the one that they calibrate, and the telescope points where it pointed in a real night.
+
+import os
+from pathlib import Path
 
 import astropy.units as u
 import matplotlib.pyplot as plt
 import numpy as np
 
-from astropolcal import instruments
+from astropolcal import Observations, calibrate, instruments
 from astropolcal.correction import ScienceFrames, correct, measurement_rows
 from astropolcal.plotting.correction import plot_images
 
 charis = instruments.get("charis")
-chain = charis.on_sky(charis.published())
+folder = os.environ.get("ASTROPOLCAL_DATA")
+if folder:
+    names = ("dataset3_polarized", "hd293396")
+    lamp, star = (Observations.read(next(Path(folder).rglob(f"{name}*.ecsv"))) for name in names)
+    chains = charis.chains_for([lamp])
+    bench = calibrate(chains, lamp, instrument="charis", cross_validate=False).chain
+else:
+    bench = charis.published()
+chain = charis.on_sky(bench)
 bins = [2, 9, 16]
 wavelength = charis.wavelength
 
@@ -39,10 +51,18 @@ scene = np.stack([light, -polarized * np.cos(2 * angle), -polarized * np.sin(2 *
 # keeps it upright.
 
 n = 16
-parallactic, altitude = np.linspace(-30, 40, n) * u.deg, np.linspace(60, 75, n) * u.deg
+commanded = np.resize([0, 45, 22.5, 67.5], n) * u.deg
+if folder:
+    # frames of the whole night, so that the field turns as far as it did
+    taken = np.linspace(0, star.n_frames - 1, n).astype(int)
+    names = ("parallactic", "altitude", "derotator")
+    parallactic, altitude, derotator = (star.position(name)[taken] * u.rad for name in names)
+else:
+    parallactic, altitude = np.linspace(-30, 40, n) * u.deg, np.linspace(60, 75, n) * u.deg
+    derotator = np.linspace(55, 80, n) * u.deg
 positions = {
-    "hwp": np.resize([0, 45, 22.5, 67.5], n) * u.deg + 0.5 * parallactic + altitude,
-    "derotator": np.linspace(55, 80, n) * u.deg,
+    "hwp": commanded + 0.5 * parallactic + altitude,
+    "derotator": derotator,
     "parallactic": parallactic,
     "altitude": altitude,
 }
@@ -55,7 +75,7 @@ frames = ScienceFrames.from_arrays(
     positions,
     variance_right=beams[0],
     variance_left=beams[1],
-    hwp=np.resize([0, 45, 22.5, 67.5], n) * u.deg,
+    hwp=commanded,
     position_angle=np.zeros(n) * u.deg,
     pixel_scale=16.2,
 )
