@@ -9,6 +9,7 @@ so nothing of the physics is imported here.
 
 __all__ = ["MANIFEST_URI", "get_extensions", "get_resource_mappings"]
 
+# of schemas, which are named by URI; tags begin with tag:astropolcal.org instead
 _BASE = "asdf://astropolcal.org/astropolcal"
 #: The list of all tags and the schemas they obey.
 MANIFEST_URI = f"{_BASE}/manifests/astropolcal-1.0.0"
@@ -32,6 +33,7 @@ def get_resource_mappings():
 
     from asdf.resource import DirectoryResourceMapping
 
+    # wherever the package is, in a zip file too
     resources = files("astropolcal") / "resources"
     return [
         DirectoryResourceMapping(resources / kind, f"{_BASE}/{kind}/", recursive=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
 
-__all__ = ["atomic_path", "check_yaml", "one_line", "understood"]
+__all__ = ["atomic_path", "check_new", "check_yaml", "one_line", "understood"]
 
 # a file of ours is 12 levels deep; loaders call themselves at each and die at some thousands
 _DEEPEST = 64
@@ -33,6 +33,47 @@ _ADVICE = {
     errno.EPERM: "name a folder that you may write to",
     errno.EROFS: "name a folder that you may write to",
 }
+
+
+def check_new(path, overwrite=False, error=AstropolcalError):
+    """
+    Return the path of a file to write, before the work of writing it is done.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    overwrite : bool
+        Whether a file that exists may be replaced.
+    error : type
+        What to raise.
+
+    Returns
+    -------
+    `~pathlib.Path`
+
+    Raises
+    ------
+    AstropolcalError
+        Of the type given, if it is a folder, exists and must not be replaced, or its own
+        folder is missing.
+
+    Examples
+    --------
+    >>> from astropolcal.files import check_new
+    >>> check_new("no/run.ecsv")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.AstropolcalError: no/run.ecsv: cannot be written: there is no folder no
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise error(f"{path}: is a folder; name a file in it")
+    if path.exists() and not overwrite:
+        raise error(f"{path}: exists already; overwrite=True replaces it")
+    if not path.parent.is_dir():
+        raise error(f"{path}: cannot be written: there is no folder {path.parent}")
+    return path
 
 
 @contextmanager
@@ -77,8 +118,10 @@ def atomic_path(path, error=AstropolcalError):
     try:
         _remove_stale(path)
         yield temporary
+        # else the name could reach the disk before the content
         with open(temporary, "rb+") as stream:
             os.fsync(stream.fileno())
+        # atomic within a file system, hence the temporary file beside the final one
         os.replace(temporary, path)
         _sync_folder(path.parent)
     except OSError as problem:
@@ -241,6 +284,7 @@ def check_yaml(text, error=AstropolcalError):
                 raise error("its YAML refers to itself")
             size = known[anchor]
         elif isinstance(event, yaml.CollectionStartEvent):
+            # until the collection ends its anchor is of no known size: an alias to it is a loop
             known.pop(anchor, None)
             levels.append([anchor, 1])
             if len(levels) > _DEEPEST:
@@ -257,6 +301,7 @@ def check_yaml(text, error=AstropolcalError):
         known |= {anchor: size} if anchor else {}
         written += 1
         levels[-1][1] += size
+        # size counts what aliases stand for, written what is in the file
         if levels[-1][1] > _FREE_NODES + _MOST_REPEATS * written:
             raise error("its YAML repeats itself so often that it cannot be loaded")
 

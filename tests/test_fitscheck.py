@@ -155,6 +155,11 @@ def test_the_first_of_two_cards_of_one_keyword_counts(tmp_path, first, later, bl
     refused(stored(tmp_path, content), "NAXIS = 5000 in header 1")
 
 
+def test_a_card_that_only_begins_like_the_end(tmp_path):
+    content = block(SIMPLE, "BITPIX  = 8", "NAXIS   = 1", "END     = -0.0", "NAXIS1  = -1", "END")
+    refused(stored(tmp_path, content), "NAXIS1 = -1 in header 0, which must not be negative")
+
+
 def test_without_axes_there_are_no_data(tmp_path):
     """Whatever is claimed: astropy goes on behind the header, and so must this."""
     content = block(*NOTHING, "PCOUNT  = 8", "GCOUNT  = 5", "END")

@@ -133,6 +133,7 @@ def _chains_and_priors(chains):
     from astropolcal.converters.priors import node_from_priors, without_priors
 
     priors = node_from_priors(chains)
+    # copies: to write a calibration must not change it
     chains = [without_priors(chain) for chain in chains] if priors else chains
     node = {"chains": [_chain_node(chain) for chain in chains]}
     return node | {"priors": priors} if priors else node
@@ -182,6 +183,7 @@ def _chain_node(chain):
 
     node = {"optics": leaves(chain)}
     # a chain of one optic is that optic, which has its own name
+    # astropy counts one submodel in a model that is no compound
     named = chain.n_submodels > 1 and chain.name
     return node | {"name": chain.name} if named else node
 
@@ -317,9 +319,11 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
         raise CalibrationFileError(
             "the content does not match its checksum: it was changed after it was written"
         )
+    # after the checksum, which is of the content as it was written
     for step in CALIBRATION_TAGS[CALIBRATION_TAGS.index(tag) : -1]:
         node = MIGRATIONS[step](node)
     chains = [_chain(entry) for entry in node["chains"]]
+    # before the calibration is made: its free parameters bind the priors
     restore_priors(chains, node.get("priors", []))
     calibration = Calibration(
         chains=chains,
@@ -367,6 +371,12 @@ def _covariance(node):
     from astropolcal.converters.nodes import unit_from_text
 
     units = [unit_from_text(text) for text in node["units"]]
+    shape = np.shape(node.get("factor", [[0.0] * len(units)]))
+    if len(shape) != 2 or shape[1] != len(units):
+        # it would be laid out anew, and mean something else
+        raise CalibrationFileError(
+            f"factor of the covariance has shape {shape}; (rank, {len(units)}) is needed"
+        )
     return Covariance(
         node["names"],
         units,

@@ -9,6 +9,8 @@ from astropolcal.measurement.parameters import FreeParameters, parameter_table
 
 __all__ = ["check_calibration"]
 
+# in the unit of its declaration (degree, mm, nm, adu, none): far above all that an instrument has
+_LARGEST = 1e15
 _ACCURACY = ("wavelength", "n", "k", "s_res", "s_mean", "s_cv")
 
 
@@ -25,8 +27,9 @@ def check_calibration(calibration):
     ------
     CalibrationFileError
         If the sizes of the parameters do not fit the wavelengths, covariance
-        or identifiability are not those of the free parameters, datasets of
-        one optic disagree, or the numbers of chains and datasets differ.
+        or identifiability are not those of the free parameters, a value is far
+        outside its bounds, datasets of one optic disagree, or the numbers of
+        chains and datasets differ.
 
     Examples
     --------
@@ -55,6 +58,7 @@ def check_calibration(calibration):
         free = FreeParameters(calibration.chains, len(wavelength), calibration.ties)
     except AstropolcalError as error:
         raise CalibrationFileError(str(error)) from None
+    _check_values(calibration.chains)
     _check_shared(calibration.chains, free)
     _check_covariance(calibration.covariance, free)
     _check_identifiability(calibration.identifiability, free.names)
@@ -62,10 +66,36 @@ def check_calibration(calibration):
     _check_words(calibration, free.names)
 
 
+def _check_values(chains):
+    """Refuse values that only damage can explain."""
+    for name, parameters in parameter_table(chains).items():
+        for parameter in parameters:
+            low, high = _allowed(parameter.bounds)
+            value = np.asarray(parameter.value, dtype=float)
+            if not np.all((value >= low) & (value <= high)):
+                raise CalibrationFileError(
+                    f"{name} = {parameter.value}, which is far outside of its bounds "
+                    f"{tuple(parameter.bounds)}; from {low:g} to {high:g} can be stored"
+                )
+
+
+def _allowed(bounds):
+    """Return the range of values that can be, which is wider than the bounds of a fit."""
+    low, high = bounds
+    # a fitter without bounds leaves them now and then, a parameter that is held may be anywhere,
+    # but neither by more than the distance between them
+    one = next((bound for bound in bounds if bound is not None), 0.0)
+    slack = max(abs(one), 1.0) if low is None or high is None or high == low else high - low
+    lowest = -_LARGEST if low is None else max(low - slack, -_LARGEST)
+    highest = _LARGEST if high is None else min(high + slack, _LARGEST)
+    return lowest, highest
+
+
 def _check_shared(chains, free):
     """Check that a fitted optic has the same values in all chains."""
     table = parameter_table(chains)
     for name in [*free.by_name, *free.ties]:
+        # bit by bit: they were one number in the fit
         first, *others = (parameter.value for parameter in table[name])
         if not all(np.array_equal(first, other) for other in others):
             raise CalibrationFileError(f"{name} has different values in different datasets")
@@ -73,6 +103,7 @@ def _check_shared(chains, free):
 
 def _check_covariance(covariance, free):
     _check_names("covariance", covariance.names, free.names)
+    # a parameter with one value a wavelength has as many rows of the covariance
     units = [slot.unit for slot in free.slots for _ in range(slot.size)]
     for name, unit, expected in zip(free.names, covariance.units, units, strict=True):
         if unit != expected:
@@ -95,6 +126,7 @@ def _check_identifiability(finding, names):
     n = len(names)
     shapes = {
         "singular_values": (n,),
+        # rank and nullity add up to the number of parameters
         "null_vectors": (n - finding.rank, n),
         "identifiable": (n,),
     }
@@ -140,6 +172,12 @@ def _check_accuracy(record):
         if column.dtype.kind not in "iuf" or column.ndim != 1:
             raise CalibrationFileError(
                 f"the accuracy of {record.name}: {name} is no list of numbers"
+            )
+        # s_res, s_mean and s_cv are shares of the light, in percent
+        unit = getattr(column, "unit", None) or u.one
+        if name.startswith("s_") and not unit.is_equivalent(u.percent):
+            raise CalibrationFileError(
+                f"the accuracy of {record.name}: {name} is in {unit}, which is no fraction"
             )
     if record.accuracy is not None:
         length = u.Quantity(record.accuracy["wavelength"])

@@ -13,6 +13,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal.exceptions import CalibrationFileError
+from astropolcal.files import one_line
 
 __all__ = [
     "checksum",
@@ -44,13 +45,26 @@ def unit_from_text(text):
     """
     Return the unit that `unit_text` wrote.
 
+    Raises
+    ------
+    CalibrationFileError
+        If it is a number times a unit, such as ``"1e-3 deg"``, which nothing is written in.
+
     Examples
     --------
     >>> from astropolcal.converters.nodes import unit_from_text
     >>> unit_from_text("mm")
     Unit("mm")
     """
-    return None if text is None else u.Unit(text)
+    if text is None:
+        return None
+    unit = u.Unit(text)
+    # astropy reads a number alone as a unit too
+    if getattr(unit, "scale", 1.0) != 1.0:
+        raise CalibrationFileError(
+            f"unit {one_line(text, 40)!r}; a unit without a factor is needed"
+        )
+    return unit
 
 
 def node_from_value(value):
@@ -75,6 +89,7 @@ def node_from_value(value):
     {'value': 1.5, 'unit': 'deg'}
     """
     unit = getattr(value, "unit", None)
+    # a copy, as views of one array would share a block of the file
     number = np.array(value.value if isinstance(value, u.Quantity) else value)
     node = {"value": number if number.ndim else number.item()}
     return node if unit is None else node | {"unit": unit_text(unit)}
@@ -213,6 +228,7 @@ def checksum(node, expand=None):
     >>> checksum(1.0) == checksum(1.0000000000000002)
     False
     """
+    # the order of keys in YAML means nothing
     text = json.dumps(_spelled(node, expand), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -225,6 +241,7 @@ def _spelled(node, expand):
     if isinstance(node, u.Quantity):
         return {"quantity": _spelled(node.value, expand), "unit": unit_text(node.unit)}
     if isinstance(node, float):
+        # all bits, where a decimal text might round
         return {"float": float(node).hex()}
     if node is None or isinstance(node, (str, int)):
         return node
@@ -237,5 +254,6 @@ def _spelled_array(array):
     if array.dtype.kind == "f":
         # YAML knows one not-a-number only, floats have many
         array = np.where(np.isnan(array), np.nan, array)
+    # of the same bytes on machines of either order; a block in a file may have any
     array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).reshape(array.shape)
     return {"array": array.tobytes().hex(), "type": array.dtype.str, "shape": list(array.shape)}

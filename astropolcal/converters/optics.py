@@ -28,7 +28,7 @@ OPTIC_MODULES = {
     "DriftRotator": "modulated",
     "EllipticalRetarder": "retarders",
     "FerroelectricLiquidCrystal": "modulators",
-    "FluxGain": "modulated",
+    "FluxGain": "fluxes",
     "HarmonicGain": "modulated",
     "HarmonicRetarder": "modulated",
     "HarmonicRotator": "modulated",
@@ -38,11 +38,11 @@ OPTIC_MODULES = {
     "MetalMirror": "mirrors",
     "MuellerElement": "general",
     "ParityFlip": "mirrors",
-    "PolarizedBackground": "modulated",
+    "PolarizedBackground": "fluxes",
     "PolarizedSource": "sources",
     "PowerLawMirror": "mirrors",
     "Rotator": "rotators",
-    "StrayLight": "modulated",
+    "StrayLight": "fluxes",
     "TwoLayerWaveplate": "retarders",
     "VectorDiattenuator": "polarizers",
     "WollastonPrism": "beamsplitters",
@@ -153,6 +153,7 @@ def _check_class(optic):
     from astropolcal.optics import OPTICS
 
     cls = type(optic)
+    # a class of the same name from elsewhere would be read back as ours
     if OPTICS.get(cls.__name__) is not cls:
         raise CalibrationFileError(
             f"optic {optic.name or 'without a name'!r} is a {cls.__module__}.{cls.__qualname__}, "
@@ -232,6 +233,7 @@ def optic_from_node(name, node):
     except ParameterError as error:
         label = repr(node.get("name", "without a name"))
         raise CalibrationFileError(f"optic {label}: {error}") from None
+    # not through the class: its defaults may fix or bound otherwise than the calibration did
     for key, entry in node["parameters"].items():
         parameter = getattr(optic, key)
         parameter.fixed = entry["fixed"]

@@ -43,6 +43,7 @@ def node_from_posterior(posterior):
 
     kept = posterior if posterior.is_thinned else posterior.thinned()
     parts = kept.to_dict()
+    # what was thinned has no burn-in any more
     del parts["burn_in"]
     return {
         **plain(parts, "posterior"),
@@ -88,6 +89,7 @@ def posterior_from_node(node):
     from astropolcal.converters.nodes import plain
 
     parts = {key: value for key, value in node.items() if key not in _DERIVED}
+    # copies of our own: what ASDF gives may be tied to the file
     for key in ("chain", "log_prob", "acceptance", "fitted"):
         parts[key] = None if parts[key] is None else np.array(parts[key])
     found = {

@@ -47,6 +47,7 @@ def node_from_priors(chains):
     """
     from astropolcal.measurement import parameter_table
 
+    # one entry a parameter: chains share the optics that stand in several of them
     table = parameter_table(chains).items()
     return [
         {"parameter": name} | _node(parameters[0].prior, name)
@@ -88,10 +89,16 @@ def _frozen(node):
     import scipy.stats
 
     name = node["distribution"]
+    # names of modules and functions are there too: only distributions pass the next line
     family = getattr(scipy.stats, name, None) if isinstance(name, str) else None
     if not isinstance(family, scipy.stats.rv_continuous):
         raise ValueError(f"scipy.stats has no continuous distribution {name!r}")
-    return family(*node["args"], **node["kwds"])
+    found = family(*node["args"], **node["kwds"])
+    # scipy looks at the parameters when they are used, and gives NaN for those that cannot be
+    low, high = found.support()
+    if not low < high:
+        raise ValueError(f"{name} of {node['args']} and {node['kwds']} is no distribution")
+    return found
 
 
 def without_priors(chain):

@@ -15,8 +15,11 @@ from scipy.sparse import csr_array
 
 # below, the weights cost more than they save, or the ends of the recursion meet
 _FEWEST_PLANES, _SHORTEST = 5, 30
+# the pole of the cubic spline filter and the terms after which its powers are below 1e-14
+# (Unser, Aldroubi and Eden 1993, IEEE Trans. Signal Process. 41, 821)
 _POLE = np.sqrt(3.0) - 2.0
 _RECURSION = 25
+# pixels of the result whose weights are in memory at a time: 16 each, 12 bytes a weight
 _BLOCK = 2**17
 
 
@@ -28,9 +31,11 @@ def suits(shape, order):
 def resample(planes, matrix, offset, shape, order):
     """Return finite images at ``matrix @ pixel + offset``, (planes, *shape)."""
     count, height, width = planes.shape
+    # the slices are the last axis: the filter and the matrix then run over contiguous numbers
     values = np.ascontiguousarray(planes.transpose(1, 2, 0), dtype=float)
     if order == 3:
         _filter(values.reshape(height, -1))
+    # now (column, row, slice), so that the pixel of a weight is row + height * column
     values = np.ascontiguousarray(values.swapaxes(0, 1))
     if order == 3:
         _filter(values.reshape(width, -1))
@@ -46,11 +51,14 @@ def resample(planes, matrix, offset, shape, order):
 
 def _filter(lines):
     """Replace values by the coefficients of a cubic spline, along the first axis, in place."""
+    # the gain of the two passes, (1 - z)(1 - 1/z) = 6 for z = sqrt(3) - 2
     lines *= 6.0
     powers = _POLE ** np.arange(_RECURSION)
+    # start of the causal pass as if the signal went on mirrored at its first sample
     lines[0] = powers @ lines[:_RECURSION]
     for before, line in pairwise(lines):
         line += _POLE * before
+    # start of the anticausal pass, mirrored at the last sample
     lines[-1] = _POLE / (_POLE**2 - 1) * (lines[-1] + _POLE * lines[-2])
     for line, behind in zip(lines[-2::-1], lines[:0:-1], strict=True):
         np.subtract(behind, line, out=line)
@@ -67,6 +75,7 @@ def _weights(block, matrix, offset, size, order):
     (y, by_y), (x, by_x) = (_taps(p, n, order) for p, n in zip(places, size, strict=True))
     index = (y[:, :, None] + size[0] * x[:, None, :]).reshape(len(y), -1)
     weights = (by_y[:, :, None] * by_x[:, None, :]).reshape(index.shape)
+    # every row of the matrix has the same number of weights, 4 or 16
     ends = np.arange(0, weights.size + 1, weights.shape[1], dtype=np.int32)
     shape = (len(index), size[0] * size[1])
     return csr_array((weights.ravel(), index.ravel(), ends), shape=shape)
@@ -76,12 +85,15 @@ def _taps(place, n, order):
     """Return the pixels that have a share at each place along an axis of n pixels, and shares."""
     # what lies outside has no value in the end; it must only not lie outside of the array
     place = np.clip(place, 0.0, n - 1.0)
+    # the last pixel itself lies at the end of the last interval, not at the begin of another
     first = np.minimum(place.astype(np.int32), n - 2)
     f = (place - first)[:, None]
     g = 1.0 - f
     if order == 1:
         return first[:, None] + np.arange(2, dtype=np.int32), np.concatenate([g, f], axis=1)
+    # the cubic B-spline at distances 1 + f, f, 1 - f and 2 - f, times six
     shares = [g**3, 4 - 6 * f**2 + 3 * f**3, 4 - 6 * g**2 + 3 * g**3, f**3]
     pixels = first[:, None] + np.arange(-1, 3, dtype=np.int32)
+    # taps beyond an end fall on the pixels mirrored about it
     pixels = n - 1 - np.abs(n - 1 - np.abs(pixels))
     return pixels, np.concatenate(shares, axis=1) / 6

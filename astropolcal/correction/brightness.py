@@ -8,6 +8,7 @@ from astropolcal.exceptions import ObservationError
 
 __all__ = ["frame_brightness"]
 
+# a step shrinks the error by the instrumental polarization, some percent: ten suffice mostly
 _STEPS, _SETTLED = 50, 1e-13
 
 
@@ -53,6 +54,7 @@ def frame_brightness(rows, fluxes, **settings):
     [[0.8, 1.0, 1.2, 1.0]]
     """
     fluxes = np.asarray(fluxes, dtype=float)
+    # shape (n_wavelengths, n_frames), as the scale of an estimator
     totals = fluxes.sum(axis=0).T
     dark = ~(totals > 0)
     if dark.any():
@@ -69,6 +71,7 @@ def frame_brightness(rows, fluxes, **settings):
         if not np.all(expected > 0):
             break
         new = totals / expected
+        # only ratios are measured: the mean belongs to the brightness of the source
         new /= new.mean(axis=1, keepdims=True)
         change, scale = np.abs(new - scale).max(), new
         if change < _SETTLED:

@@ -68,6 +68,7 @@ class Channels:
         if self.pairs is None:
             return both
         plus, minus = both[:, self.pairs[:, 0]], both[:, self.pairs[:, 1]]
+        # (X+ - X-) / 2 and (I+ + I-) / 2, the half differences and sums of the paper
         return np.stack([plus[0] - minus[0], plus[1] + minus[1]]) / 2
 
     def of_unit(self, beams):
@@ -85,6 +86,7 @@ class Channels:
         fluxes = np.stack([np.stack(beam) for beam in zip(*beams, strict=True)])
         if self.observable == "intensity":
             return fluxes[:, 0]
+        # var(r - l) = var(r + l) = var(r) + var(l); halving the pair divides it by four
         total = fluxes.sum(axis=(0, 1)) / (1 if self.pairs is None else 4)
         return np.stack([total, total])
 
@@ -122,6 +124,7 @@ class Channels:
                 np.add.at(spread[0], (..., self.pairs[:, side]), sign * difference / 2)
                 np.add.at(spread[1], (..., self.pairs[:, side]), total / 2)
             difference, total = spread
+        # of right - left and right + left: both gains act on each beam, the first with its sign
         return np.stack([total + difference, total - difference], axis=-2)
 
 

@@ -63,11 +63,14 @@ def correct(
     weights : array_like or "variance", optional
         As for `estimator`; or by the variances of each pixel.
     max_condition : float
-        See `estimator`.
+        A combination of Stokes parameters is left out if its singular value is smaller than the
+        largest by more than this, see `estimator`.
     chain : `~astropy.modeling.CompoundModel`, optional
-        From the sky to the detector, see `RowModel`.
+        All optics from the sky to the detector, with optics named as the calibrated ones; by
+        default that of `sky_chain`.
     interpolate : bool
-        See `RowModel`.
+        Whether parameters known at the calibrated wavelengths only are interpolated linearly
+        between them; else each wavelength of the frames must be one of the calibrated.
     open_directions : {"infinite", "ignore"} or float
         See `linear_systematic`.
     n_samples : int
@@ -75,8 +78,14 @@ def correct(
         linearized.
     seed : int, optional
         Of the samples.
-    workers, cluster, chunk, progress
-        See ``run_blocks``.
+    workers : int, optional
+        Threads of dask among which the wavelengths are divided; by default dask is not used.
+    cluster : str, optional
+        Address of a ``dask.distributed`` scheduler, which divides them among its processes.
+    chunk : int
+        Wavelengths that are worked on at a time, more of which need more memory.
+    progress : bool
+        Whether to show a progress bar; it appears on a terminal only.
     provenance : dict, optional
         What goes into the header of the product besides versions and names of the frames.
 
@@ -131,6 +140,7 @@ def correct(
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
     n = len(components)
     source = frames.source
+    # first the components, then their covariances as the engine lays them out
     planes = n + (len(covariance_index(n)) if source.has_variances else 0)
     out = run_blocks(
         partial(correct_block, source, solution, by_variance=by_variance),
@@ -180,6 +190,7 @@ def _rows(model, frames, mode):
         frames.wavelength,
         chain=ideal_chain(model.chain, frames.wavelength),
     )
+    # what I adds to each flux is that of the real instrument: the instrumental polarization
     return np.concatenate([rows[..., :1], ideal.rows()[..., 1:]], axis=-1)
 
 
@@ -204,8 +215,9 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
     found = linear_systematic(model, solution, mode=mode, open_directions=open_directions)
     if found.is_open:
         warnings.warn(
-            "the calibration leaves open how Q and U turn: their systematic errors are infinite "
-            "unless priors close its open directions, or these are ignored",
+            "the calibration leaves open how Q and U turn: their systematic errors are infinite. "
+            "Ways out: a calibration with priors on what is open (calibrate --prior), or "
+            "open_directions (--open-directions) 'ignore' or a standard deviation",
             AstropolcalWarning,
             stacklevel=3,
         )

@@ -92,6 +92,7 @@ def correct_block(source, solution, start, stop, by_variance=False):
     known = solution.determined[wavelengths]
     for i, w in enumerate(range(start, stop)):
         bad = ~np.isfinite(out[:, i]).all(axis=0)
+        # a NaN in any frame makes the sum NaN; such pixels are fitted alone, from the other frames
         if bad.any() and known[i, :3].all():
             out[:, i, bad] = _pixel_by_pixel(source, solution, w, bad, n_out, by_variance)
         for kept, column in _columns(n, n_out):
@@ -106,6 +107,7 @@ def _columns(n, n_out):
 
 def _linear(source, solution, wavelengths, n_out, n_pixels):
     """Return the weighted sum over frames, with the same weights for all pixels."""
+    # components that are not determined are made NaN in the end, so here they may be anything
     gain = np.nan_to_num(solution.gain[wavelengths])
     n, count = gain.shape[1], len(gain)
     index = np.array(covariance_index(n)).T
@@ -115,6 +117,7 @@ def _linear(source, solution, wavelengths, n_out, n_pixels):
             part = gain[:, :, beam, frames]
             _add(out[:n], part, source.fluxes(beam, frames, wavelengths))
             if source.has_variances:
+                # for independent fluxes cov(S_i, S_j) = sum over frames of g_i g_j var(d)
                 squares = part[:, index[0]] * part[:, index[1]]
                 _add(out[n:], squares, source.variances(beam, frames, wavelengths))
     return out
@@ -131,6 +134,7 @@ def _add(out, gain, cubes):
 def _pixel_by_pixel(source, solution, w, pixels, n_out, by_variance):
     """Return what a least-squares fit gives of pixels that lack some fluxes."""
     n = len(solution.components)
+    # as for all other pixels: where V is not determined it is taken as zero
     solved = 3 if n == 4 and not solution.determined[w, 3] else n
     index = covariance_index(solved)
     size = int(pixels.sum())
@@ -146,12 +150,14 @@ def _pixel_by_pixel(source, solution, w, pixels, n_out, by_variance):
                 good &= np.isfinite(variance[channel]) & (variance[channel] > 0)
                 if by_variance:
                     with np.errstate(divide="ignore", invalid="ignore"):
+                        # a flux that the user gave the weight zero stays out
                         weight = (weight > 0) / variance[channel]
             weight = np.where(good, weight, 0.0)
             right += row[:, None] * (weight * np.where(good, data[channel], 0.0))
             products = np.array([row[i] * row[j] for i, j in index])[:, None]
             normal += products * weight
             if variance is not None:
+                # A^T W V W A: with W = 1 / V it is the normal matrix itself
                 spread += products * (weight**2 * np.where(good, variance[channel], 0.0))
     return _solved(normal, right, spread, n, n_out, solution.max_condition)
 
@@ -176,6 +182,7 @@ def _solved(normal, right, spread, n, n_out, max_condition):
     """Solve the normal equations of all pixels; NaN where they are poorly determined."""
     solved, size = right.shape
     matrix = _full(normal, solved)
+    # eigenvalues of A^T W A are the squares of the singular values of the rows
     values = np.linalg.eigvalsh(matrix)
     good = values[:, 0] * max_condition**2 > values[:, -1]
     inverse = np.full((size, solved, solved), np.nan)
@@ -183,6 +190,7 @@ def _solved(normal, right, spread, n, n_out, max_condition):
     out = np.full((n_out, size), np.nan)
     out[:solved] = np.einsum("pij,jp->ip", inverse, right)
     if n_out > n:
+        # (A^T W A)^-1 A^T W V W A (A^T W A)^-1, right for any weights W
         covariance = inverse @ _full(spread, solved) @ inverse
         for plane, (i, j) in enumerate(covariance_index(n), start=n):
             if max(i, j) < solved:
@@ -267,6 +275,7 @@ def _planned(block, ranges, shape):
     """Return one delayed result a range, of dask's map_blocks."""
     import dask.array as da
 
+    # the array of dask holds the numbers of the wavelengths only; the block reads its fluxes itself
     numbers = da.arange(shape[1], chunks=(tuple(b - a for a, b in ranges),))
     new_axes = [0, *range(2, len(shape))]
     chunks = ((shape[0],), numbers.chunks[0], *((size,) for size in shape[2:]))
@@ -316,4 +325,5 @@ def _with_cluster(plan, ranges, cluster, keep):
         places = dict(zip((future.key for future in futures), ranges, strict=True))
         for future, result in as_completed(futures, with_results=True):
             keep(places[future.key], result)
+            # results of many images must not stay in the memory of the cluster
             future.release()

@@ -107,6 +107,7 @@ class ScienceFrames:
             for frames in self.source.batches():
                 for beam in (0, 1):
                     found = self.source.fluxes(beam, frames, slice(w, w + 1))
+                    # as a rule the same pixels lack in all frames, and their ratios stay
                     fluxes[beam, frames, w] = np.nansum(found.reshape(len(found), -1), axis=1)
         return replace(self, scale=frame_brightness(rows, fluxes, **settings))
 
@@ -181,6 +182,7 @@ class ScienceFrames:
         ScienceFrames
         """
         difference, total = np.asarray(difference), np.asarray(total)
+        # var(r - l) = var(r) + var(l), shared evenly as nothing else is known
         half = None if variance is None else np.asarray(variance) / 2
         return cls.from_arrays(
             (total + difference) / 2,
@@ -288,6 +290,7 @@ def _pairs(hwp, positions, names):
                 hwp,
                 None if derotator is None else np.broadcast_to(derotator, hwp.shape, subok=True),
                 positions.get("flc_state"),
+                # on sky it follows the field, so more than at the internal source
                 derotator_tolerance=2 * u.deg,
                 labels=names,
             )
@@ -300,6 +303,7 @@ def _centres(centres, layout):
     """Return the place of the same point in the right and the left beam."""
     if centres is None:
         left, right = layout.internal_apertures[:2]
+        # the place of the left beam such that both are equally far from their rectangles
         middle = (np.add(left, right) - layout.star_offset) / 2
         centres = middle
     centres = np.asarray(centres, dtype=float)
@@ -371,9 +375,11 @@ def frame_positions(instrument, table, chain, names=None):
     if "flc_state" in stages(chain):
         _check_states(table, names)
     table["frame"], table["bin"] = np.arange(len(table)), np.zeros(len(table), dtype=int)
+    # a table of observations needs a wavelength; no position depends on it
     table["wavelength"] = 1 * u.um
     # positions are read as those of observations are; the fluxes do not matter
     table["flux_right"] = table["flux_left"] = np.ones(len(table)) * u.adu
+    # how the plate tracked the sky is all of the meta that positions depend on
     table.meta = {key: table.meta[key] for key in ("tracking",) if key in table.meta}
     observations = Observations.from_table(table, name=names[0])
     return dict(instrument.positions(observations, chain))
@@ -385,8 +391,10 @@ def _check_angles(table, stage, names):
             f"{names[0]}: no angle {stage!r}, which the calibrated chain needs; there is "
             f"{', '.join(table.colnames) or 'nothing'}"
         )
-    values = np.ma.filled(np.ma.masked_invalid(np.asarray(table[stage].value, float)), np.nan)
-    unknown = ~np.isfinite(values)
+    values = table[stage]
+    # numpy drops the mask of both kinds of masked columns without a word
+    values = values.filled(np.nan) if hasattr(values, "filled") else values
+    unknown = ~np.isfinite(np.asarray(values.value, dtype=float))
     if unknown.any():
         raise ObservationError(f"{names[int(np.argmax(unknown))]}: no angle {stage!r}")
 

@@ -20,6 +20,7 @@ from astropolcal.units import angle_to_rad
 __all__ = ["azimuthal", "derotate", "derotate_variance", "position_angles"]
 
 _QUARTER = np.pi / 2
+# also the share of a pixel without a value from which on the result has none
 _EXACT = 1e-12
 # pixels after which the influence of a spline's neighbours has fallen below rounding
 _REACH = 25
@@ -116,8 +117,10 @@ def derotate_variance(
     """
     variance = np.asarray(variance, dtype=float)
     matrix, offset, shape = _grid(variance, position_angle, centre, size, mirrored, centre_out)
+    # linear at most: a cubic spline would make negative variances beside a bright pixel
     smooth = _resampled(variance, matrix, offset, shape, min(order, 1))
     y, x = _places(matrix, offset, shape)
+    # the weights of a spline in two dimensions are products, and so are the sums of their squares
     return smooth * _gain(y, order) * _gain(x, order)
 
 
@@ -154,6 +157,7 @@ def _point(name, point):
 
 
 def _resampled(image, matrix, offset, shape, order):
+    # then nothing is interpolated, and quarter turns give back each number bit by bit
     if _on_pixels(matrix, offset):
         order = 0
     image, offset = _cropped(image, matrix, offset, shape)
@@ -164,6 +168,8 @@ def _resampled(image, matrix, offset, shape, order):
     if bad.any():
         # planes mostly lack the same pixels
         bad = bad[:1] if (bad == bad[0]).all() else bad
+        # what a cubic spline takes from pixels farther away than the next is small, and would grow
+        # the holes of masked pixels by many rows
         share = _interpolated(bad.astype(float), matrix, offset, shape, min(order, 1))
         out[np.broadcast_to(share > _EXACT, out.shape)] = np.nan
     out[:, _outside(matrix, offset, shape, flat.shape[1:])] = np.nan
@@ -176,6 +182,7 @@ def _interpolated(planes, matrix, offset, shape, order):
 
     if suits(planes.shape, order):
         return resample(planes, matrix, offset, shape, order)
+    # mirrored edges are what the filter of our own spline assumes too
     settings = {"output_shape": shape, "mode": "mirror", "order": order}
     return np.stack([affine_transform(plane, matrix, offset, **settings) for plane in planes])
 
@@ -184,6 +191,7 @@ def _cropped(image, matrix, offset, shape):
     """Return the part of the image that has an influence on the result, and the offset in it."""
     corners = np.array([[0, 0, shape[0] - 1, shape[0] - 1], [0, shape[1] - 1, 0, shape[1] - 1]])
     places = matrix @ corners + offset[:, None]
+    # the window of a frame is small in its cube: most of the filtering would be for nothing
     low = np.floor(places.min(axis=1)).astype(int) - _REACH
     high = np.ceil(places.max(axis=1)).astype(int) + _REACH + 1
     low = np.clip(low, 0, image.shape[-2:])
@@ -203,6 +211,7 @@ def _on_pixels(matrix, offset):
 def _outside(matrix, offset, shape, image_shape):
     """Return which pixels of the result lie beyond the middles of the image's last pixels."""
     y, x = _places(matrix, offset, shape)
+    # rounding of the rotation must not cost the outermost rows
     slack = 1e-9
     height, width = image_shape
     outside = (y < -slack) | (y > height - 1 + slack)
@@ -222,6 +231,7 @@ def _gain_table(order, steps=100):
     """Return the sum of the squared weights of a spline at fractions of a pixel."""
     from scipy.ndimage import map_coordinates
 
+    # the response to a single pixel at all distances is the kernel of the spline
     impulse = np.zeros(41)
     impulse[20] = 1.0
     fraction = np.linspace(0, 1, steps + 1)
@@ -259,6 +269,7 @@ def position_angles(shape, centre=None):
     height, width = shape
     x, y = _point("centre", ((width - 1) / 2, (height - 1) / 2) if centre is None else centre)
     rows, columns = np.indices(shape)
+    # north is +y and east is -x
     return np.rad2deg(np.arctan2(x - columns, rows - y)) * u.deg
 
 

@@ -16,6 +16,7 @@ from astropolcal.optics import COORDINATES
 __all__ = ["ideal_chain"]
 
 _IDENTITY, _HALF_WAVE = np.eye(4), np.diag([1.0, 1.0, -1.0, -1.0])
+# a half-wave plate at 45 deg: Q and V change sign
 _FLIP = np.diag([1.0, -1.0, 1.0, -1.0])
 
 
@@ -57,10 +58,12 @@ def _ideal(leaf, wavelength):
         return leaf
     if leaf.splits_light:
         return optics.WollastonPrism(name=name, mount=leaf.mount, theta=theta)
+    # drifts, stray light and gains of the beams are faults
     if leaf.stage in COORDINATES or leaf.depends_on_beam:
         return None
     if leaf.stage:
         return _half_wave(name, leaf.mount, theta)
+    # the mean over wavelengths: which of the three is nearest must not change along a spectrum
     matrix = np.mean(np.atleast_3d(_normalized(leaf, wavelength)), axis=0)
     nearest = min((_IDENTITY, _HALF_WAVE, _FLIP), key=lambda m: np.abs(m - matrix).max())
     if nearest is _IDENTITY:

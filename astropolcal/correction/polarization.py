@@ -3,7 +3,13 @@
 
 import numpy as np
 
-from astropolcal.stokes import _angle, aolp_error, debias_dolp, dolp_error, transverse_error
+from astropolcal.stokes import (
+    aolp_error,
+    debias_dolp,
+    dolp_error,
+    polarization_angle,
+    transverse_error,
+)
 
 __all__ = ["fractions", "polarization"]
 
@@ -41,6 +47,7 @@ def fractions(stokes, covariances, components="IQU"):
     found = {}
     with np.errstate(invalid="ignore"):
         for i, name in enumerate(components[1:].lower(), start=1):
+            # dq = (dQ - q dI) / I to first order
             variance = (
                 covariances[i, i]
                 - 2 * share[i] * covariances[0, i]
@@ -49,6 +56,7 @@ def fractions(stokes, covariances, components="IQU"):
             # what is open has no covariance, but an infinite error all the same
             variance = np.where(np.isinf(covariances[i, i]), np.inf, variance)
             found[name] = np.where(bright, np.sqrt(np.maximum(variance, 0)), np.nan)
+        # the same for the covariance of q and u
         cross = (
             covariances[1, 2]
             - share[1] * covariances[0, 2]
@@ -92,7 +100,7 @@ def polarization(q, u, errors, method="mas"):
     result = {
         "dolp": dolp,
         "dolp_debiased": np.full(dolp.shape, np.nan),
-        "aolp": np.where(dolp > 0, _angle(q, u), np.nan),
+        "aolp": np.where(dolp > 0, polarization_angle(q, u), np.nan),
     }
     for kind, error in errors.items():
         s_p, s_chi, across = _errors(q, u, dolp, error)

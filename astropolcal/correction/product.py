@@ -6,9 +6,7 @@ The primary array has the axes x, y, wavelength and Stokes (FITS order; spectra 
 two). The wavelengths, which need not be evenly spaced, stand in the table ``WAVELENGTH``.
 """
 
-import io
 import warnings
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -20,11 +18,14 @@ from astropy.utils.exceptions import AstropyUserWarning
 from astropolcal.correction.engine import covariance_index
 from astropolcal.correction.systematic import Systematic
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, check_new, understood
+from astropolcal.fitscheck import open_fits
 
-__all__ = ["read_product", "write_product"]
+__all__ = ["PRODUCT", "read_product", "write_product"]
 
-_KIND = "astropolcal Stokes product"
+#: What the keyword ``CONTENT`` of a product says.
+PRODUCT = "astropolcal Stokes product"
+# raised when a reader of the version before would misunderstand the file
 _VERSION = 1
 _KEYWORDS = {
     "created": ("DATE", "when this file was made (UTC)"),
@@ -64,13 +65,9 @@ def write_product(corrected, path, *, overwrite=False, maps=True):
     >>> write_product(None, ".")
     Traceback (most recent call last):
     ...
-    astropolcal.exceptions.ObservationError: .: exists already; overwrite=True replaces it
+    astropolcal.exceptions.ObservationError: .: is a folder; name a file in it
     """
-    path = Path(path)
-    if path.is_dir() or (path.exists() and not overwrite):
-        raise ObservationError(f"{path}: exists already; overwrite=True replaces it")
-    if not path.parent.is_dir():
-        raise ObservationError(f"{path}: there is no folder {path.parent}")
+    path = check_new(path, overwrite, ObservationError)
     hdus = [fits.PrimaryHDU(corrected.stokes, _header(corrected)), _wavelengths(corrected)]
     hdus += _errors(corrected)
     if maps:
@@ -82,7 +79,7 @@ def write_product(corrected, path, *, overwrite=False, maps=True):
 
 def _header(corrected):
     header = fits.Header()
-    header["CONTENT"] = (_KIND, "what this file is")
+    header["CONTENT"] = (PRODUCT, "what this file is")
     header["CONTVERS"] = (_VERSION, "version of its form")
     header["BUNIT"] = corrected.unit.to_string("fits")
     _axes(header, corrected)
@@ -95,31 +92,39 @@ def _header(corrected):
     header["NORTHUP"] = (corrected.north_up, "north is up and east is left")
     for key, (keyword, comment) in _KEYWORDS.items():
         if corrected.provenance.get(key):
-            value = str(corrected.provenance[key])
+            value = _printable(corrected.provenance[key])
             # a card holds 80 characters
             header[keyword] = (value, comment) if len(value) + len(comment) < 60 else value
     for word in corrected.provenance.get("held", []):
-        header["HISTORY"] = f"not free in the calibration, without error: {word}"
+        header["HISTORY"] = f"not free in the calibration, without error: {_printable(word)}"
     for i, words in enumerate(corrected.weak):
         if words:
             header["HISTORY"] = f"poorly determined at wavelength {i}: {words}"
     return header
 
 
+def _printable(text):
+    """Return a text in the characters that FITS has, space to tilde; others as Python escapes."""
+    return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in str(text))
+
+
 def _axes(header, corrected):
     """Describe the axes; the Stokes axis by the codes of the FITS standard."""
     n = corrected.stokes.ndim
+    # 1, 2, 3, 4 for I, Q, U, V (Greisen and Calabretta 2002, Table 7): evenly spaced as FITS needs
     codes = corrected.stokes_axis.value
     keys = {"CTYPE": "STOKES", "CRPIX": 1.0, "CRVAL": float(codes[0]), "CDELT": 1.0}
     for key, value in keys.items():
         header[f"{key}{n}"] = value
     header[f"CTYPE{n - 1}"] = ("BIN", "see the table WAVELENGTH")
     if n == 4 and corrected.centre is not None and corrected.pixel_scale is not None:
+        # milliarcsecond to degree
         step = corrected.pixel_scale / 3.6e6
         # offsets from the star, not coordinates on the sky
         for axis, name, sign in ((1, "XOFFSET", -1), (2, "YOFFSET", 1)):
             header[f"CTYPE{axis}"] = (name, "from the star" + (", to the east" if sign < 0 else ""))
             header[f"CUNIT{axis}"] = "deg"
+            # FITS counts pixels from one
             header[f"CRPIX{axis}"] = corrected.centre[axis - 1] + 1
             header[f"CRVAL{axis}"] = 0.0
             header[f"CDELT{axis}"] = (sign if corrected.north_up else 1) * step
@@ -189,7 +194,7 @@ def _maps(corrected):
 
 
 def _frames(corrected):
-    names = [str(name) for name in corrected.provenance.get("frames", [])] or ["unknown"]
+    names = [_printable(name) for name in corrected.provenance.get("frames", [])] or ["unknown"]
     return fits.BinTableHDU(Table({"frame": np.array(names, dtype=str)}), name="FRAMES")
 
 
@@ -219,42 +224,38 @@ def read_product(path):
     ...
     astropolcal.exceptions.ObservationError: nowhere.fits: no such file
     """
-    try:
-        # astropy does not close a file that it cannot read
-        with open(path, "rb") as stream, warnings.catch_warnings():
-            # a wrong checksum is found when the data are read, and only warned of
-            warnings.simplefilter("error", AstropyUserWarning)
-            _check_sizes(path, stream)
-            with fits.open(stream, checksum=True, memmap=False) as hdus:
-                return _read(path, hdus)
-    except FileNotFoundError:
-        raise ObservationError(f"{path}: no such file") from None
-    except ObservationError:
-        raise
-    except Exception as error:  # astropy raises errors of many kinds for damaged files
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ObservationError(f"{path}: not a readable product: {reason}") from error
+    with (
+        understood(path, ObservationError, "not a readable product"),
+        open_fits(path, whole=True) as stream,
+        warnings.catch_warnings(),
+    ):
+        # a wrong checksum is found when the data are read, and only warned of
+        warnings.simplefilter("error", AstropyUserWarning)
+        with fits.open(stream, checksum=True, memmap=False) as hdus:
+            return _read(path, hdus)
 
 
 def _read(path, hdus):
     from astropolcal.correction.result import Corrected
 
     header = hdus[0].header
-    if header.get("CONTENT") != _KIND or header.get("CONTVERS") != _VERSION:
+    if header.get("CONTENT") != PRODUCT or header.get("CONTVERS") != _VERSION:
         raise ObservationError(
             f"{path}: CONTENT = {header.get('CONTENT')!r}, version {header.get('CONTVERS')}; "
-            f"needed is {_KIND!r}, version {_VERSION}"
+            f"needed is {PRODUCT!r}, version {_VERSION}"
         )
     if header.get("POLCONV") != "IAU":
         raise ObservationError(f"{path}: POLCONV = {header.get('POLCONV')!r}; allowed is 'IAU'")
+    # FITS holds big-endian numbers
     stokes = _native(hdus[0].data)
     n = stokes.ndim
     codes = header[f"CRVAL{n}"] + header[f"CDELT{n}"] * np.arange(len(stokes))
-    table = Table.read(hdus["WAVELENGTH"])
+    table = _table(path, hdus["WAVELENGTH"])
     provenance = {
         key: header[keyword] for key, (keyword, _) in _KEYWORDS.items() if keyword in header
     }
-    provenance["frames"] = [str(name) for name in Table.read(hdus["FRAMES"])["frame"]]
+    place = ("STARX", "STARY")
+    provenance["frames"] = [str(name) for name in _table(path, hdus["FRAMES"])["frame"]]
     _check(path, hdus, stokes, codes, table)
     return Corrected(
         "".join(StokesCoord(codes).symbol),
@@ -266,25 +267,48 @@ def _read(path, hdus):
         np.asarray(table["determined"], dtype=bool),
         _native(table["leakage"]),
         [str(words).strip() for words in table["weak"]],
-        header["CORRMODE"],
-        header["OBSERVBL"],
-        u.Unit(header["BUNIT"]),
-        bool(header["NORTHUP"]),
-        (header["STARX"], header["STARY"]) if "STARX" in header else None,
-        header.get("PIXSCALE"),
+        _stated(path, header, "CORRMODE", str),
+        _stated(path, header, "OBSERVBL", str),
+        _unit(path, header["BUNIT"]),
+        _stated(path, header, "NORTHUP", bool),
+        tuple(_stated(path, header, key, float) for key in place) if "STARX" in header else None,
+        _stated(path, header, "PIXSCALE", float) if "PIXSCALE" in header else None,
         provenance,
     )
 
 
-def _check_sizes(path, stream):
-    """Refuse headers that claim more data than the file has, before anything is read."""
-    size = Path(path).stat().st_size
-    with fits.open(io.BytesIO(stream.read()), memmap=False) as hdus:
-        for hdu in hdus:
-            info = hdu.fileinfo()
-            if info["file"].compression is None and info["datLoc"] + info["datSpan"] > size:
-                raise ObservationError(f"{path}: truncated: {hdu.name or 'the image'} is not whole")
-    stream.seek(0)
+def _table(path, hdu):
+    """Return a table; one of ours has no arrays in a heap, which may claim any length."""
+    heap = [form for form in hdu.columns.formats if "P" in form or "Q" in form]
+    if heap:
+        raise ObservationError(f"{path}: not a readable product: a column of {heap[0]!r}")
+    table = Table.read(hdu)
+    for name in table.colnames:
+        if table[name].dtype.kind == "c":
+            raise ObservationError(f"{path}: not a readable product: {name} is complex")
+        if table[name].dtype.kind in "US" and not all(str(text).isascii() for text in table[name]):
+            raise ObservationError(f"{path}: not a readable product: text in {name} is no ASCII")
+    return table
+
+
+def _unit(path, text):
+    unit = u.Unit(text)
+    # a number alone is a unit too to astropy, and FITS cannot hold all of them
+    if getattr(unit, "scale", 1.0) != 1.0:
+        raise ObservationError(f"{path}: BUNIT = {text!r}; a unit without a factor is needed")
+    return unit
+
+
+def _stated(path, header, keyword, kind):
+    """Return the value of a keyword, which must be of a kind; floats may be whole numbers."""
+    value = header[keyword]
+    # True is an int to Python
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind or (kind is float and not np.isfinite(value)):
+        words = {str: "a text", bool: "T or F", float: "a finite number"}[kind]
+        raise ObservationError(f"{path}: {keyword} = {value!r}, {words} is needed")
+    return value
 
 
 def _check(path, hdus, stokes, codes, table):

@@ -141,6 +141,7 @@ class Corrected:
         if kind == "systematic" and self.systematic is not None:
             for w in range(self.stokes.shape[1]):
                 result[:, :, w] = self.systematic.covariance(self.stokes[:, w], w)
+            # the tensor knows an error also of light that was not measured: of none
             result[:, :, ~np.isfinite(self.stokes).any(axis=0)] = np.nan
         return result
 
@@ -223,6 +224,7 @@ class Corrected:
             raise ParameterError("an aperture needs images; these are spectra")
         rows, columns = np.indices(self.stokes.shape[2:])
         x, y = self._middle() if centre is None else centre
+        # whole pixels only, so that the sum has the covariance of a sum
         inside = np.hypot(columns - x, rows - y) <= radius
         if not radius > 0 or not inside.any():
             raise ParameterError(f"radius = {radius}: no pixel is inside")

@@ -22,7 +22,7 @@ from astropolcal.exceptions import (
 from astropolcal.measurement import FreeParameters
 from astropolcal.observations import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.core import finite_position
+from astropolcal.optics.positions import finite_position
 from astropolcal.propagation import Propagator
 from astropolcal.units import length_to_um
 
@@ -91,7 +91,7 @@ def sky_chain(
             instrument = instruments.get(name)
         except InstrumentError:
             instrument = None  # it need not be installed here
-        if instrument and type(instrument).on_sky is not instruments.Instrument.on_sky:
+        if instrument and instrument.has_telescope:
             known = {"wavelength": getattr(calibration, "wavelength", None), "date": date}
             options = {key: known[key] for key in instrument.sky_options}
             return instrument.on_sky(chains[0], **options)
@@ -194,6 +194,7 @@ class RowModel:
             grid = len(calibration.wavelength)
             self._free = FreeParameters(calibration.chains, grid, calibration.ties)
         placed, self._nodes = _placed(positions, stages(self.chain))
+        # fluxes of I, Q, U and V alone: a flux is linear in the light, these are its coefficients
         self._light = [Propagator(self.chain, lam, placed, source) for source in np.eye(4)]
         columns = self._light[0].shape[1]
         self.n_frames = columns // len(self._nodes)
@@ -256,6 +257,7 @@ class RowModel:
         result = {name: np.empty((2, *self._shape(), 4)) for name in wanted.values()}
         ones, zeros = np.ones(shape), np.zeros(shape)
         for k, light in enumerate(self._light):
+            # one forward sweep serves the derivatives of both beams
             sweep = light.forward(values)
             for beam, weights in enumerate([(ones, zeros), (zeros, ones)]):
                 found = sweep.derivatives(list(wanted), weights)
@@ -283,8 +285,10 @@ class RowModel:
         result = np.zeros((*shape, self._free.size))
         for name, slope in slopes.items():
             slot, factor, _ = self._free.lookup(name)
+            # tie (own value by the source) and unit (canonical by declared)
             part = slope * factor * slot.factor
             if slot.per_wavelength:
+                # w: wavelengths of the data, weighted means of those of the calibration, i
                 result[..., slot.slice] += np.einsum("w...,wi->w...i", part, self._mix)
             else:
                 result[..., slot.start] += part
@@ -328,6 +332,7 @@ class RowModel:
         slot = None if vector is None else self._slot(name)
         if slot is not None:
             _, factor, offset = self._free.lookup(name)
+            # a tied parameter follows its source: value = factor * source + offset
             value = np.reshape(factor * vector[slot.slice] + offset, value.shape)
         if value.size == 1:
             return value.reshape(())
@@ -419,4 +424,5 @@ def _placed(positions, wanted):
         raise ChainError(f"the stages have different numbers of nodes: {nodes}")
     _, weights = np.polynomial.legendre.leggauss(next(iter(nodes.values())))
     spread = {n: v.ravel() if v.ndim == 2 else np.tile(v, len(weights)) for n, v in placed.items()}
+    # the weights of Gauss and Legendre add up to the length of [-1, 1], a mean needs one
     return spread, weights / 2

@@ -21,6 +21,7 @@ COMPONENTS = ("IQU", "IQUV")
 
 # a component whose share in a poorly determined direction is larger than this is not determined
 _SHARE = 1e-3
+# the worst combination has so much more noise than the best; good cycles have 1.5 to 3
 _MAX_CONDITION = 30.0
 _MAX_NAMED = 8
 
@@ -167,6 +168,7 @@ def estimator(
     >>> bool(solution.determined.all()), bool(solution.condition.max() < 3)
     (True, True)
     """
+    # rows are (2 beams, n_wavelengths, n_frames, 4)
     rows = np.asarray(rows, dtype=float)
     if components not in COMPONENTS:
         raise ParameterError(f"components = {components!r}; allowed are {', '.join(COMPONENTS)}")
@@ -226,18 +228,21 @@ def _solve(rows, weights, components, max_condition):
 def _pseudo_inverse(rows, weights, max_condition):
     """Return the truncated inverse, the singular values and the directions left out."""
     root = np.sqrt(weights)
+    # weights of 1e-300 or 1e300 must not under- or overflow in the singular values
     size = max(root.max(), np.finfo(float).tiny)
     count, n = rows.shape
     # rows of zeros, so that there is a singular value for each component
     scaled = np.zeros((max(count, n), n))
     scaled[:count] = rows * (root / size)[:, None]
     left, values, right = np.linalg.svd(scaled, full_matrices=False)
+    # the largest always counts, unless all rows are zero
     good = (values * max_condition > values[0]) & (values > 0)
     gain = (right[good].T / values[good]) @ left[:count, good].T * (root / size)
     return gain, values, right[~good]
 
 
 def _determined(weak, n):
+    # a component that leans on an open direction is open itself
     return np.abs(weak).max(axis=0, initial=0.0) < _SHARE if len(weak) else np.ones(n, dtype=bool)
 
 
@@ -254,6 +259,7 @@ def _in_words(direction, components):
 def _leakage(gain, rows, components):
     if "V" in components:
         leakage = np.zeros(gain.shape[:2])
+        # where V was solved for, nothing leaks; where it was given up, it does as without it
         assumed = np.isnan(gain).any(axis=(2, 3))[:, 3]
         leakage[assumed] = np.einsum("wkbf,bwf->wk", gain, rows[..., 3])[assumed]
         return leakage
@@ -282,6 +288,7 @@ def _positive(name, value, shape, beams=False):
 def _inverse_variances(channels, weights):
     """Return the weights of the channels, (2, n_wavelengths, n_units)."""
     with np.errstate(divide="ignore"):
+        # a weight of zero is an infinite variance, and stays a weight of zero in its pair
         variances = channels.variances(np.moveaxis(1 / weights, 1, 2))
         return np.moveaxis(1 / variances, 2, 1)
 

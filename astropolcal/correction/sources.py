@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Where the fluxes of both beams come from: arrays in memory or on disk, or cubes in files."""
 
+import io
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,6 +11,8 @@ from astropy.io import fits
 
 from astropolcal.correction.geometry import derotate, derotate_variance
 from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.files import understood
+from astropolcal.fitscheck import open_fits, readable_fits
 
 __all__ = ["ArraySource", "CubeFiles", "TurnedSource"]
 
@@ -75,6 +78,7 @@ class ArraySource:
         batch = self._batch or (1 if isinstance(array, np.memmap) else self.n_frames)
         ends = [*range(0, self.n_frames, batch), self.n_frames]
         if self._batch is None and hasattr(array, "chunks"):
+            # a part of a chunk costs as much as all of it
             ends = np.cumsum([0, *array.chunks[0]]).tolist()
         return [slice(start, end) for start, end in pairwise(ends)]
 
@@ -228,14 +232,15 @@ class CubeFiles:
         self._beam_files = (self.files, left)
         self._scale = np.broadcast_to(np.asarray(left_scale, dtype=float), (self.n_frames,))
         self._weights = weights
+        # each file once, where both beams are in one
         found = {path: _places(path, extension) for path in dict.fromkeys([*self.files, *left])}
         self._places = [[found[path] for path in files] for files in self._beam_files]
         self._shape = self._places[0][0][0].shape
         for path, (cube, *_) in found.items():
-            if cube.shape != self._shape or len(cube.shape) != 3:
+            if cube.shape != self._shape or len(cube.shape) != 3 or 0 in cube.shape:
                 raise ObservationError(
                     f"{path}: a cube of shape {cube.shape}; {self.files[0]} has {self._shape}, and "
-                    "three axes are needed"
+                    "three axes of some length are needed"
                 )
         self.n_wavelengths = self._shape[0]
         self.has_variances = all(len(places) > 1 for places in found.values())
@@ -243,6 +248,7 @@ class CubeFiles:
 
     def _check_window(self, shape):
         x, y = self._centres[..., 0], self._centres[..., 1]
+        # up to half a pixel beyond the middle of the last one
         inside = (x > -0.5) & (x < shape[1] - 0.5) & (y > -0.5) & (y < shape[0] - 0.5)
         if not inside.all():
             frame, beam = np.argwhere(~inside)[0]
@@ -259,7 +265,9 @@ class CubeFiles:
     def fluxes(self, beam, frames, wavelengths):
         """Return the fluxes of a beam in some frames and wavelengths, (n, m, size, size)."""
         numbers = range(self.n_frames)[frames]
-        found = [self._read(beam, i, wavelengths) * self._factor(beam, i) for i in numbers]
+        # a damaged file may hold signalling NaNs, of which numpy warns where they are first used
+        with np.errstate(invalid="ignore"):
+            found = [self._read(beam, i, wavelengths) * self._factor(beam, i) for i in numbers]
         cut = [self._cut(derotate, i, beam, cube) for i, cube in zip(numbers, found, strict=True)]
         return np.stack(cut)
 
@@ -267,9 +275,10 @@ class CubeFiles:
         """Return their variances, NaN where the weight or the error is zero."""
         found = []
         for i in range(self.n_frames)[frames]:
-            known = self._read(beam, i, wavelengths, 1)
+            # variance = error^2 = 1 / inverse variance
             power = 2 if self._weights == "error" else -1
             with np.errstate(divide="ignore", invalid="ignore"):
+                known = self._read(beam, i, wavelengths, 1)
                 variance = np.where(known > 0, known**power, np.nan)
             variance = variance * self._factor(beam, i) ** 2
             found.append(self._cut(derotate_variance, i, beam, variance))
@@ -291,20 +300,16 @@ class CubeFiles:
 
     def _read(self, beam, i, wavelengths, offset=0):
         place, path = self._places[beam][i][offset], self._beam_files[beam][i]
-        try:
+        with understood(path, ObservationError, "cannot be read"):
             if place.start is not None:
                 # a thousand files would take long to open, wavelength by wavelength
                 cube = np.memmap(path, place.dtype, "r", place.start, place.shape)
                 return np.array(cube[wavelengths], dtype=float)
-            with fits.open(path) as hdus:
+            with open_fits(path) as stream, fits.open(stream) as hdus:
                 section = hdus[self._extension + offset].section
                 if len(section.shape) == 2:
                     return np.array(section[:, :], dtype=float)[None][wavelengths]
                 return np.array(section[wavelengths], dtype=float)
-        except (OSError, IndexError, TypeError, ValueError) as error:
-            raise ObservationError(
-                f"{path}: cannot be read: {' '.join(str(error).split())[:200]}"
-            ) from error
 
 
 @dataclass(frozen=True)
@@ -318,27 +323,24 @@ class _Place:
 
 def _places(path, extension):
     """Return where the cube stands in a file, and the inverse variances if they follow."""
-    try:
-        with fits.open(path, memmap=True) as hdus:
-            if len(hdus) <= extension:
-                raise ObservationError(f"{path}: no extension {extension} in it")
-            found = [_place(hdu) for hdu in hdus[extension : extension + 2]]
-    except FileNotFoundError:
-        raise ObservationError(f"{path}: no such file") from None
-    except ObservationError:
-        raise
-    except Exception as error:  # astropy raises errors of many kinds for damaged files
-        reason = " ".join(str(error).split())[:200]
-        raise ObservationError(f"{path}: not a readable FITS file: {reason}") from error
+    with (
+        readable_fits(path),
+        open_fits(path) as stream,
+        fits.open(stream, memmap=True) as hdus,
+    ):
+        if len(hdus) <= extension:
+            raise ObservationError(f"{path}: no extension {extension} in it")
+        packed = isinstance(stream, io.BytesIO)
+        found = [_place(hdu, packed) for hdu in hdus[extension : extension + 2]]
     return found if found[-1].shape == found[0].shape else found[:1]
 
 
-def _place(hdu):
+def _place(hdu, packed):
     header, info = hdu.header, hdu.fileinfo()
     # a compressed image is of a subclass
     plain = type(hdu) in (fits.ImageHDU, fits.PrimaryHDU)
     plain &= header.get("BZERO", 0) == 0 and header.get("BSCALE", 1) == 1
-    plain &= info is not None and info["file"].compression is None and "BLANK" not in header
+    plain &= info is not None and not packed and "BLANK" not in header
     bits = header.get("BITPIX", 8)
     dtype = f">{'f' if bits < 0 else 'i' if bits > 8 else 'u'}{abs(bits) // 8}"
     shape = tuple(getattr(hdu, "shape", ()))

@@ -70,9 +70,12 @@ class Systematic:
         stokes = np.nan_to_num(np.asarray(stokes, dtype=float))
         flat = stokes.reshape(len(stokes), -1)
         factor = self.factor[:, wavelength]
+        # cov(S_a, S_b) = sum over directions r of (F_ac S_c)(F_bd S_d): small, and the same for all
+        # pixels, which only need the products S_c S_d
         tensor = np.einsum("rac,rbd->abcd", factor, factor)
         products = flat[:, None] * flat[None, :]
         covariance = np.einsum("abcd,cdp->abp", tensor, products, optimize=True)
+        # what is open does not matter where there is no such light
         is_open = np.einsum("ac,cp->ap", self.open[wavelength].astype(float), np.abs(flat)) > 0
         if is_open.any():
             covariance[is_open[:, None] | is_open[None, :]] = np.nan
@@ -96,6 +99,7 @@ class Systematic:
         `~numpy.ndarray`
             Shape (n_components, n_wavelengths, n_components, n_wavelengths), of what is not open.
         """
+        # r: directions, w and v: wavelengths, a and b: components
         moved = np.einsum("rwac,cw->raw", self.factor, np.nan_to_num(stokes))
         return np.einsum("raw,rbv->awbv", moved, moved)
 
@@ -150,17 +154,20 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
         if mode == "ip":
             change = change * np.array([1.0, 0.0, 0.0, 0.0])
         scaled = change * _brightness(solution)
+        # dS = -G dA S; b: beams, f: frames, s: components of the light
         slopes[name] = -np.einsum("wkbf,bwfs->wks", gain, scaled[..., :n])
     shape = (len(gain), n, n)
     flat = model.spread(slopes).reshape(-1, model._free.size)
     covariance = full_covariance(model.calibration)
     spread = covariance._spread(flat)
+    # open: along a direction that no datum fixes; blind: of a parameter without any error
     is_open = (spread.is_open | spread.is_blind).reshape(shape)
     moved = np.where(is_open.ravel()[:, None], 0.0, spread.moved)
     if open_directions != "infinite":
         is_open, moved = np.zeros_like(is_open), spread.moved
         if open_directions != "ignore":
             axes = covariance._axes()
+            # steps: a degree, micrometre or percent in the declared units, for the length
             along = float(open_directions) * (flat * axes.steps) @ axes.open.T
             moved = np.concatenate([moved, along], axis=1)
     factor = moved.T.reshape(-1, *shape)
@@ -229,6 +236,7 @@ def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stoke
             rows = np.concatenate([rows[..., :1], solution.rows[..., 1:]], axis=-1)
         gain = estimator(rows, weights=solution.beam_weights, **settings).gain
         found[i] = np.einsum("wkbf,bwfs->wks", np.nan_to_num(gain), solution.rows[..., :n])
+    # so that the sum over samples of the products is the unbiased covariance
     factor = (found - found.mean(axis=0)) / np.sqrt(n_samples - 1)
     return Systematic(factor, np.zeros(found.shape[1:], dtype=bool), "sampled", model.held)
 
@@ -247,6 +255,7 @@ def _draws(model, count, rng):
         return
     covariance = full_covariance(model.calibration)
     axes = covariance._axes()
+    # one row a direction of the covariance, one sigma long, in declared units
     known = axes.known * axes.sigmas[:, None] * axes.steps
     for _ in range(count):
         yield start + rng.standard_normal(len(known)) @ known * factors

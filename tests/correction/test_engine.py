@@ -184,7 +184,7 @@ def test_files_that_do_not_fit(cubes, tmp_path):
     with pytest.raises(ObservationError, match="no extension 7"):
         CubeFiles(paths, CENTRES, 5, extension=7)
     (tmp_path / "text.fits").write_text("no FITS")
-    with pytest.raises(ObservationError, match=r"text\.fits: not a readable FITS file"):
+    with pytest.raises(ObservationError, match=r"text\.fits: is not a FITS file"):
         CubeFiles([tmp_path / "text.fits"], CENTRES, 5)
     with pytest.raises(ObservationError, match="no files"):
         CubeFiles([], CENTRES, 5)

@@ -1,11 +1,13 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """FITS products: what the header states, what comes back, what is refused."""
 
+import dataclasses
 from contextlib import suppress
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 
 from astropolcal.correction import Corrected, ScienceFrames, correct
 from astropolcal.exceptions import ObservationError
@@ -160,4 +162,113 @@ def test_other_files_are_refused(tmp_path):
 def test_another_convention_is_refused(path):
     fits.setval(path, "POLCONV", value="COSMO")
     with pytest.raises(ObservationError, match=r"POLCONV = 'COSMO'|checksum"):
+        Corrected.read(path)
+
+
+@pytest.mark.parametrize(
+    ("keyword", "value", "words"),
+    [
+        ("PIXSCALE", "hwp", "a finite number is needed"),
+        ("PIXSCALE", True, "a finite number is needed"),
+        ("STARX", "nan", "a finite number is needed"),
+        ("STARY", False, "a finite number is needed"),
+        ("NORTHUP", "F", "T or F is needed"),
+        ("NORTHUP", 1, "T or F is needed"),
+        ("CORRMODE", 3, "a text is needed"),
+        ("OBSERVBL", False, "a text is needed"),
+    ],
+)
+def test_a_keyword_of_another_kind_is_named(path, keyword, value, words):
+    """Taken as they are, "F" would be true and a text no scale."""
+    with fits.open(path, mode="update") as hdus:
+        assert keyword in hdus[0].header
+        hdus[0].header[keyword] = value
+        for key in ("CHECKSUM", "DATASUM"):
+            hdus[0].header.remove(key, ignore_missing=True)
+    with pytest.raises(ObservationError, match=f"{keyword} = {value!r}, {words}"):
+        Corrected.read(path)
+
+
+def test_a_scale_may_be_a_whole_number(path):
+    with fits.open(path, mode="update") as hdus:
+        hdus[0].header["PIXSCALE"] = 16
+        for key in ("CHECKSUM", "DATASUM"):
+            hdus[0].header.remove(key, ignore_missing=True)
+    found = Corrected.read(path).pixel_scale
+    assert (found, type(found)) == (16.0, float)
+
+
+@pytest.mark.parametrize("form", ["PA(999999999)", "QD(3)"])
+@pytest.mark.parametrize("name", ["WAVELENGTH", "FRAMES"])
+def test_a_column_in_a_heap_is_not_read(path, name, form):
+    """It may claim terabytes; FITS files of ours have none."""
+    with fits.open(path) as hdus:
+        old = f"TFORM{len(hdus[name].columns)}  = '{hdus[name].columns.formats[-1]:8}'".encode()
+    content = path.read_bytes()
+    place = content.index(old, content.index(f"EXTNAME = '{name}".encode()) - 2880)
+    card = f"{old[:10].decode()}'{form}'".ljust(80).encode()
+    content = content[:place] + card + content[place + 80 :]
+    for key in (b"CHECKSUM=", b"DATASUM ="):
+        content = content.replace(key, b"COMMENT  ")
+    path.write_bytes(content)
+    with pytest.raises(ObservationError, match="not a readable product"):
+        Corrected.read(path)
+
+
+@pytest.mark.parametrize("cut", [1, 2880, 30_000])
+def test_a_file_that_was_cut_off_is_not_read(path, tmp_path, cut):
+    content = path.read_bytes()
+    short = tmp_path / "short.fits"
+    short.write_bytes(content[:-cut])
+    with pytest.raises(ObservationError, match=r"short.fits: not a readable"):
+        Corrected.read(short)
+
+
+def test_a_packed_product_is_read_alike(corrected, path, tmp_path):
+    import gzip
+
+    packed = tmp_path / "packed.fits.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    np.testing.assert_array_equal(Corrected.read(packed).stokes, corrected.stokes)
+
+
+def test_names_that_fits_cannot_hold_are_spelled_out(corrected, tmp_path):
+    """FITS has the characters from space to tilde only."""
+    given = {"frames": ["étoile.fits", "a\nb.fits"], "calibration": "Ångström.asdf"}
+    other = dataclasses.replace(corrected, provenance=corrected.provenance | given)
+    other.write(tmp_path / "a.fits")
+    again = Corrected.read(tmp_path / "a.fits")
+    assert again.provenance["frames"] == [r"\xe9toile.fits", r"a\nb.fits"]
+    assert again.provenance["calibration"] == r"\xc5ngstr\xf6m.asdf"
+
+
+def test_text_that_is_no_ascii_is_refused(path):
+    content = path.read_bytes().replace(b"CRSA00000003_cube.fits", b"CRSA0000\xff003_cube.fits")
+    for key in (b"CHECKSUM=", b"DATASUM ="):
+        content = content.replace(key, b"COMMENT  ")
+    path.write_bytes(content)
+    with pytest.raises(ObservationError, match="text in frame is no ASCII"):
+        Corrected.read(path)
+
+
+def test_a_complex_column_is_refused(path):
+    with fits.open(path) as hdus:
+        hdus = fits.HDUList([hdu.copy() for hdu in hdus])
+    table = Table.read(hdus["WAVELENGTH"])
+    table["leakage"] = table["leakage"] * (1 + 1j)
+    hdus["WAVELENGTH"] = fits.BinTableHDU(table, name="WAVELENGTH")
+    for hdu in hdus:
+        for key in ("CHECKSUM", "DATASUM"):
+            hdu.header.remove(key, ignore_missing=True)
+    hdus.writeto(path, overwrite=True)
+    with pytest.raises(ObservationError, match="leakage is complex"):
+        Corrected.read(path)
+
+
+def test_a_unit_with_a_factor_is_refused(path):
+    with fits.open(path, mode="update") as hdus:
+        hdus[0].header["BUNIT"] = "2147483648"
+        for key in ("CHECKSUM", "DATASUM"):
+            hdus[0].header.remove(key, ignore_missing=True)
+    with pytest.raises(ObservationError, match="a unit without a factor is needed"):
         Corrected.read(path)

@@ -218,6 +218,11 @@ def _content(node):
         return [plain(item) for item in value] if isinstance(value, list) else value
 
     found = plain(_spelled({k: v for k, v in node.items() if k not in _DERIVED}, node_from_optic))
+    # nothing in a list is as good as no list
+    found = {k: v for k, v in found.items() if k != "priors" or v}
+    factor = found.get("covariance", {}).get("factor")
+    if factor is not None and 0 in factor.get("shape", []):
+        del found["covariance"]["factor"]
     # worked out again from the samples
     for key in ("words", "converged", "kept"):
         found.get("posterior", {}).pop(key, None)
@@ -482,10 +487,25 @@ class Csv(Reader):
 # ---- FITS --------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=1)
-def small_layout():
-    """Return the files of CHARIS with two wavelengths."""
-    return dataclasses.replace(instruments.get("charis").files, shape=(2, 201, 201))
+@lru_cache(maxsize=2)
+def small_layout(**changes):
+    """Return the files of CHARIS with two wavelengths and few pixels."""
+    return dataclasses.replace(
+        instruments.get("charis").files,
+        shape=(2, 33, 40),
+        internal_apertures=((10.0, 16.0), (28.0, 16.0), 9.0, 20.0, 0.1),
+        star_offset=(18.0, 1.5),
+        fwhm=2.5,
+        **changes,
+    )
+
+
+def two_stars(width=40):
+    """Return an image of the same star in both beams, or in that of one camera."""
+    y, x = np.indices((33, width))
+    places = ((10.0, 15.0), (28.0, 16.5)) if width == 40 else ((10.0, 15.0),)
+    star = sum(np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 2.3) for cx, cy in places)
+    return np.random.default_rng(1).normal(500, 20, (2, 33, width)) + 2e4 * star
 
 
 CARDS = {
@@ -514,7 +534,7 @@ class Cube(Reader):
     def seeds(self):
         from astropy.io import fits
 
-        noise = np.random.default_rng(1).normal(500, 20, (2, 201, 201))
+        noise = np.random.default_rng(1).normal(500, 20, (2, 33, 40))
         cube, weight = (fits.ImageHDU(x.astype("f4")) for x in (noise, np.ones_like(noise)))
         hdus = fits.HDUList([fits.PrimaryHDU(header=fits.Header(CARDS)), cube, weight])
         return {
@@ -546,6 +566,51 @@ class Cube(Reader):
             assert np.isfinite(found.values[angle])
 
 
+class Star(Cube):
+    """Cubes of a star, whose images are found."""
+
+    def seeds(self):
+        from astropy.io import fits
+
+        header = fits.Header(CARDS | {"RET-POS1": 80.0})
+        hdus = [fits.PrimaryHDU(header=header), fits.ImageHDU(two_stars().astype("f4"))]
+        return {"star": _written(fits.HDUList(hdus).writeto, self.suffix)}
+
+    def read(self, path):
+        from astropolcal.reduction.frames import reduce_frame
+
+        return reduce_frame(str(path), small_layout(), source="star")
+
+
+class Cameras(Cube):
+    """Frames whose beams have a file each; the left one is spoiled."""
+
+    def seeds(self):
+        from astropy.io import fits
+
+        hdus = [fits.PrimaryHDU(header=fits.Header(CARDS))]
+        hdus.append(fits.ImageHDU(two_stars(20).astype("f4")))
+        return {"camera": _written(fits.HDUList(hdus).writeto, self.suffix)}
+
+    def read(self, path):
+        from astropolcal.reduction.frames import reduce_frame
+
+        layout = small_layout(beam_files=("cam1", "cam2"))
+        right, left = (path.with_name(f"n00000001_cam{n}.fits") for n in (1, 2))
+        right.write_bytes(_good(Cameras, "camera"))
+        left.write_bytes(path.read_bytes())
+        try:
+            return reduce_frame(str(right), layout)
+        finally:
+            right.unlink()
+            left.unlink()
+
+
+@lru_cache(maxsize=2)
+def _good(kind, name):
+    return kind().seeds()[name]
+
+
 class Header(Reader):
     """Headers of frames: angles, dates, mode, and what the frames are."""
 
@@ -563,10 +628,14 @@ class Header(Reader):
 
     def read(self, path):
         from astropolcal.calibration._header import FrameAngles, describe
-        from astropolcal.reduction.headers import _primary, observation_time, pointing, read_header
+        from astropolcal.fitscheck import primary_header
+        from astropolcal.reduction.headers import observation_time, pointing, read_header
 
-        header, charis = _primary(path), instruments.get("charis")
+        header, charis = primary_header(path), instruments.get("charis")
+        # the header of a raw frame, on which that of its cube falls back, is read alike
+        raw = read_header("CRSA00000001_cube.fits", small_layout(), header={}, raw={1: path})
         frame = read_header(path, small_layout(), header=header)
+        assert set(raw.values) <= set(frame.values)
         for ask in (observation_time, lambda v: pointing(v, small_layout().site)):
             try:
                 ask(frame.values)
@@ -643,7 +712,8 @@ class Product(Reader):
             warnings.simplefilter("ignore")
             _check_product(found)
             copy = path.with_name("copy.fits")
-            found.write(copy, overwrite=True)
+            # what the maps hold has been asked for already
+            found.write(copy, overwrite=True, maps=False)
             again = self.read(copy)
             copy.unlink()
         np.testing.assert_array_equal(again.stokes, found.stokes)
@@ -680,7 +750,7 @@ class Science(Reader):
     def read(self, path):
         from astropolcal.correction.sources import CubeFiles
 
-        source = CubeFiles([path], [(100, 100), (36, 67)], 11)
+        source = CubeFiles([path], [(28.0, 16.5), (10.0, 15.0)], 11)
         beam = source.fluxes(0, slice(0, 1), slice(0, 1))
         return (
             source,
@@ -692,6 +762,29 @@ class Science(Reader):
         _, beam, variance = found
         assert beam.shape == (1, 1, 11, 11)
         assert variance is None or not (variance < 0).any()
+
+
+class Described(Reader):
+    """Any FITS file, which ``astropolcal info`` describes."""
+
+    suffix = ".fits"
+
+    def seeds(self):
+        return Product().seeds() | Header().seeds() | {"cube": Cube().seeds()["weights"]}
+
+    def mutate(self, rng, content):
+        return binary.mutate_fits(rng, binary.forge_checksums(content))
+
+    def read(self, path):
+        from astropolcal.scripts._describing import describe_fits
+
+        return describe_fits(path)
+
+    def check(self, found, path):
+        lines, content = found
+        assert content["file"] == str(path)
+        assert lines[0].startswith(f"{path}: ")
+        json.dumps(content)
 
 
 # ---- journals and checkpoints ------------------------------------------------------
@@ -839,8 +932,8 @@ class EntryPoints(Reader):
             raise AstropolcalError("no entry points") from error
         instruments.entry_points = lambda group: points.select(group=group)
         try:
-            names = instruments.names()
-            return names, [instruments.get(name) for name in ("charis", "bench")]
+            found = [instruments.get(name) for name in ("charis", "bench")]
+            return instruments.names(), found
         finally:
             instruments.entry_points = real
             instruments._REGISTRY.clear()
@@ -862,9 +955,12 @@ READERS = {
     "spectra": Spectra,
     "csv": Csv,
     "cube": Cube,
+    "star": Star,
+    "cameras": Cameras,
     "header": Header,
     "product": Product,
     "science": Science,
+    "info": Described,
     "checkpoint": Checkpoint,
     "challenge": Challenges,
     "journal": Journal,

@@ -1,0 +1,290 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What a FITS file claims to hold, looked at before astropy opens it.
+
+A header without an end, or one that claims a billion axes, keeps astropy busy for minutes, and
+what is packed may be immense. `check_fits` goes from header to header as Sec. 4.4.1 of the FITS
+standard 4.0 describes; what else is wrong is left for astropy to say.
+"""
+
+import bz2
+import gzip
+import io
+import lzma
+import math
+import os
+import re
+from contextlib import contextmanager
+
+from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.files import understood
+
+__all__ = [
+    "MOST_BLOCKS",
+    "MOST_HDUS",
+    "check_fits",
+    "open_fits",
+    "primary_header",
+    "readable_fits",
+]
+
+# bytes; all parts of a file are filled up to whole blocks (Sec. 3.1 of the standard)
+_BLOCK, _CARD = 2880, 80
+_END = b"END".ljust(_CARD)
+#: Blocks of a header, 36 cards each: headers of observatories have some thousand cards.
+MOST_BLOCKS = 1000
+#: Headers of a file.
+MOST_HDUS = 1000
+# of axes and of columns, by the standard; astropy loops over as many as are claimed
+_MOST_CLAIMED = 999
+# zeros are packed a thousand times smaller, cubes that are masked in part ten times
+_MOST_UNPACKED, _UNPACKED_SHARE = 2**28, 100
+_CHUNK = 2**20
+_CLAIM = re.compile(rb"(BITPIX|GROUPS|NAXIS\d{0,3}|PCOUNT|GCOUNT|TFIELDS) *= *([+-]?\d{1,70}|T)\b")
+_PACKINGS = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ": lzma.open}
+_NEEDS_MEMORY = (b"\xfd7zXZ",)
+
+
+@contextmanager
+def readable_fits(path, error=ObservationError):
+    """
+    Turn whatever goes wrong with a FITS file into one line that names it.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    error : type
+        What to raise.
+
+    Raises
+    ------
+    AstropolcalError
+        Of the type given, if the file is missing, no FITS file or damaged.
+
+    Examples
+    --------
+    >>> from astropolcal.fitscheck import readable_fits
+    >>> with readable_fits("night.fits"):
+    ...     raise KeyError("HWP")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.ObservationError: night.fits: not a readable FITS file: KeyError: 'HWP'
+    """
+    with understood(path, error, "not a readable FITS file"):
+        yield
+
+
+def open_fits(path, error=ObservationError, *, count=MOST_HDUS, whole=False):
+    """
+    Open a FITS file for astropy, after `check_fits`.
+
+    Astropy does not close a file that it cannot read, and loses its way in a packed one whose
+    headers are damaged: so it is given a file that is open, and unpacked.
+
+    Parameters
+    ----------
+    path, error, count, whole
+        As for `check_fits`.
+
+    Returns
+    -------
+    file
+        At its beginning: the file itself, or a `~io.BytesIO` of one that was packed.
+
+    Raises
+    ------
+    AstropolcalError
+        As for `check_fits`.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> from astropolcal.fitscheck import open_fits
+    >>> fits.PrimaryHDU([1, 2]).writeto("two.fits.gz")
+    >>> with open_fits("two.fits.gz") as stream, fits.open(stream) as hdus:
+    ...     hdus[0].data.tolist()
+    [1, 2]
+    """
+    check_fits(path, error, count=count, whole=whole)
+    with readable_fits(path, error):
+        file = open(path, "rb")
+        packing = _packing(file)
+        if packing is None:
+            return file
+        # bounded by the check, if it has been through all of the file
+        most = MOST_BLOCKS * _BLOCK if count == 1 else -1
+        with file, _PACKINGS[packing](file) as unpacked:
+            return io.BytesIO(unpacked.read(most))
+
+
+def primary_header(path, error=ObservationError):
+    """
+    Return the primary header of a FITS file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    error : type
+        What to raise.
+
+    Returns
+    -------
+    `~astropy.io.fits.Header`
+
+    Raises
+    ------
+    AstropolcalError
+        Of the type given, if it cannot be read.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> from astropolcal.fitscheck import primary_header
+    >>> fits.PrimaryHDU(header=fits.Header({"RET-ANG1": 22.5})).writeto("one.fits")
+    >>> primary_header("one.fits")["RET-ANG1"]
+    22.5
+    """
+    from astropy.io import fits
+
+    with readable_fits(path, error), open_fits(path, error, count=1) as stream:
+        return fits.Header.fromfile(stream)
+
+
+def check_fits(path, error=AstropolcalError, *, count=MOST_HDUS, whole=False):
+    """
+    Refuse a FITS file whose headers would take astropy minutes or all of the memory.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, which may be packed by gzip, bzip2 or xz.
+    error : type
+        What to raise.
+    count : int
+        Of how many HDUs something is going to be read.
+    whole : bool
+        Whether to refuse data that are claimed and not there.
+
+    Raises
+    ------
+    AstropolcalError
+        Of the type given, if the file is missing or no FITS file, a header has no end, claims
+        negative sizes or more axes or columns than the standard allows, or what is packed is
+        immense.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from astropolcal.fitscheck import check_fits
+    >>> cards = [b"SIMPLE  =                    T", b"NAXIS   =              9999999", b"END"]
+    >>> _ = Path("axes.fits").write_bytes(b"".join(card.ljust(80) for card in cards).ljust(2880))
+    >>> check_fits("axes.fits")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.AstropolcalError: axes.fits: not a readable FITS file: NAXIS = 9999999 in header 0, up to 999 are allowed
+    """  # noqa: E501
+    with understood(path, error, "not a readable FITS file"), open(path, "rb") as file:
+        size, packing = os.path.getsize(path), _packing(file)
+        if packing is None:
+            _check_begin(file, path, error)
+            _walk(file, count, whole, end=size)
+            return
+        if packing in _NEEDS_MEMORY:
+            # how much its unpacking takes is the choice of who packed it
+            lzma.LZMADecompressor(memlimit=_MOST_UNPACKED).decompress(file.read(_CHUNK), 1)
+            file.seek(0)
+        with _PACKINGS[packing](file) as stream:
+            _check_begin(stream, path, error)
+            _walk(stream, count, whole, most=max(_MOST_UNPACKED, _UNPACKED_SHARE * size))
+
+
+def _packing(file):
+    """Return by what mark a file begins that is packed, None if it is not."""
+    start = file.read(6)
+    file.seek(0)
+    if start.startswith(b"PK\3\4"):
+        # astropy would unpack it to the disk, whatever its size
+        raise ValueError("a zip archive: unpack it first")
+    return next((mark for mark in _PACKINGS if start.startswith(mark)), None)
+
+
+def _check_begin(stream, path, error):
+    """Say of a file of another kind what it is not; astropy would have its user try options."""
+    start = stream.read(6)
+    if not start:
+        raise ValueError("Empty or corrupt FITS file")
+    if start != b"SIMPLE":
+        raise error(f"{path}: is not a FITS file")
+    stream.seek(0)
+
+
+def _walk(stream, count, whole, **limits):
+    """Go from header to header, as far as they can be understood."""
+    # headers come one by one: where the next begins is known from the sizes in the one before
+    for number in range(count):
+        claims = _header(stream, number)
+        if claims is None or number + 1 == count < MOST_HDUS:
+            return
+        if not _skip(stream, _data_size(claims), **limits):
+            if whole:
+                raise ValueError(f"truncated: the data of HDU {number} are not whole")
+            return
+    if stream.read(1):
+        raise ValueError(f"more than {MOST_HDUS} HDUs")
+
+
+def _header(stream, number):
+    """Return the sizes that a header claims; None if there is no header any more."""
+    claims = {}
+    for _ in range(MOST_BLOCKS):
+        block = stream.read(_BLOCK)
+        if len(block) < _BLOCK:
+            return None
+        for place in range(0, _BLOCK, _CARD):
+            # to astropy a card such as "END = 0" is none
+            if block[place : place + _CARD] == _END:
+                return claims
+            found = _CLAIM.match(block, place, place + _CARD)
+            if found:
+                _add(claims, found[1].decode(), found[2], number)
+    raise ValueError(f"header {number} has no end within {MOST_BLOCKS * _BLOCK // _CARD} cards")
+
+
+def _add(claims, key, text, number):
+    value = 1 if text == b"T" else int(text)
+    # data of a negative size lead astropy back to the same header, for ever
+    if value < 0 and key != "BITPIX":
+        raise ValueError(f"{key} = {value} in header {number}, which must not be negative")
+    if key in ("NAXIS", "TFIELDS") and value > _MOST_CLAIMED:
+        raise ValueError(f"{key} = {value} in header {number}, up to {_MOST_CLAIMED} are allowed")
+    # of two cards of one keyword the first counts, for astropy too
+    claims.setdefault(key, value)
+
+
+def _data_size(claims):
+    """Return the bytes of the data, Eqs. (1) and (2) of the standard, filled up to blocks."""
+    axes = [claims.get(f"NAXIS{i + 1}", 0) for i in range(claims.get("NAXIS", 0))]
+    if not axes:
+        # without axes there are no data, whatever else is claimed
+        return 0
+    # the first axis of random groups is written as zero, and does not count
+    numbers = claims.get("PCOUNT", 0) + math.prod(axes[1:] if "GROUPS" in claims else axes)
+    bits = abs(claims.get("BITPIX", 8)) * claims.get("GCOUNT", 1) * numbers
+    return -(-bits // (8 * _BLOCK)) * _BLOCK
+
+
+def _skip(stream, size, end=None, most=None):
+    """Pass over data; return whether they are there."""
+    target = stream.tell() + size
+    if end is not None:
+        stream.seek(min(target, end))
+        return target <= end
+    if target > most:
+        # before it is done: unpacking a gigabyte of zeros takes seconds
+        raise ValueError(f"it would unpack to {target} bytes, up to {most} are allowed")
+    while stream.tell() < target:
+        if not stream.read(min(_CHUNK, target - stream.tell())):
+            return False
+    return True

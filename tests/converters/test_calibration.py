@@ -1,0 +1,441 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Nodes of calibrations: what they hold, and what is refused in them whatever the checksum says."""
+
+import copy
+import dataclasses
+import io
+
+import asdf
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import Calibration, calibrate, optics
+from astropolcal.calibration import Covariance
+from astropolcal.converters import calibration as converter
+from astropolcal.converters.calibration import (
+    CALIBRATION_TAG,
+    CALIBRATION_TAGS,
+    MIGRATIONS,
+    CalibrationConverter,
+    calibration_from_node,
+    node_from_calibration,
+)
+from astropolcal.converters.consistency import check_calibration
+from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError
+from astropolcal.measurement import Normal, Tie
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+pytestmark = pytest.mark.usefixtures("kept_schemas")
+
+LAM = [1.2, 1.6] * u.um
+
+
+@pytest.fixture(scope="module")
+def original():
+    """A calibration with units, bounds, a tie with an offset, fixed, open and masked things."""
+    chain = (
+        optics.LinearPolarizer(theta=90 * u.deg, name="polarizer", fixed={"theta": True})
+        | optics.LinearRetarder(retardance=[171, 174] * u.deg, mount="hwp", name="hwp")
+        | optics.LinearRetarder(retardance=-100 * u.deg, mount="derotator", name="derotator")
+        | optics.WollastonPrism(
+            efficiency=0.98, name="wollaston", bounds={"efficiency": (0.9, None)}
+        )
+    )
+    chain["hwp"].theta.fixed = False
+    chain["derotator"].retardance.prior = Normal(-100 * u.deg, 60 * u.arcmin)
+    frames = half_wave_plate_cycles(derotator=[45, 60, 80, 100] * u.deg)
+    data = simulate(chain, LAM, frames, seed=1, meta={"instrument": "bench", "date": "2025-05-01"})
+    table = data.to_table()
+    table["flux_right"][3] = np.nan
+    with pytest.warns(AstropolcalWarning, match="1 cell masked"):
+        data = type(data).from_table(table, name="night")
+    ties = {"derotator.theta": Tie("hwp.theta", -0.5, 3 * u.arcmin)}
+    return calibrate(chain, data, ties=ties, instrument="bench", strategy="two-step")
+
+
+@pytest.fixture
+def cal(original):
+    """A copy that a test may spoil."""
+    return dataclasses.replace(
+        original,
+        chains=[chain.copy() for chain in original.chains],
+        at_bound=list(original.at_bound),
+        datasets=[dataclasses.replace(r, meta=dict(r.meta)) for r in original.datasets],
+        fit=copy.deepcopy(original.fit),
+    )
+
+
+@pytest.fixture
+def node(original):
+    return node_from_calibration(original)
+
+
+def sealed(node):
+    """Return a node with the checksum of its content, as somebody who forges it would."""
+    return node | {"checksum": converter._checksum(node)}
+
+
+def refused(node, words):
+    with pytest.raises(CalibrationFileError, match=words) as caught:
+        calibration_from_node(sealed(node))
+    assert "\n" not in str(caught.value)
+
+
+# ---- round trips -----------------------------------------------------------------------
+
+
+def test_all_of_it_comes_back(original, node):
+    again = calibration_from_node(copy.deepcopy(node))
+    assert again.to_dict() == original.to_dict()
+    assert again.summary() == original.summary()
+    hwp, derotator, wollaston = (again.chain[n] for n in ("hwp", "derotator", "wollaston"))
+    assert hwp.retardance.unit == u.deg
+    assert hwp.retardance.shape == (2,)
+    assert hwp.theta.fixed is False
+    assert again.chain["polarizer"].theta.fixed is True
+    assert wollaston.efficiency.bounds == (0.9, None)
+    assert derotator.retardance.prior.std == 60 * u.arcmin
+    assert derotator.retardance.prior.std.unit == u.arcmin
+    tie = again.ties["derotator.theta"]
+    assert (tie.source, tie.factor, tie.offset.unit) == ("hwp.theta", -0.5, u.arcmin)
+    assert again.datasets[0].n_masked == original.datasets[0].n_masked == 1
+    assert again.measurement is None
+
+
+def test_a_node_of_a_node_is_the_same(node):
+    again = node_from_calibration(calibration_from_node(copy.deepcopy(node)))
+    assert again["checksum"] == node["checksum"]
+
+
+def test_through_a_file_of_asdf(original):
+    """As a part of any tree, beside other things and twice."""
+    buffer = io.BytesIO()
+    tree = {"night": original, "others": [original], "note": "x"}
+    asdf.AsdfFile(tree).write_to(buffer)
+    buffer.seek(0)
+    with asdf.open(buffer, lazy_load=False, memmap=False) as file:
+        assert isinstance(file["night"], Calibration)
+        assert file["others"][0] is file["night"]
+        assert file["night"].to_dict() == original.to_dict()
+
+
+def test_offset_of_a_tie_without_a_unit(original):
+    """A number of its own type, as it was given."""
+    ties = {"derotator.theta": dataclasses.replace(original.ties["derotator.theta"], offset=0.25)}
+    one = converter._tie_node("derotator.theta", ties["derotator.theta"])
+    assert one["offset"] == {"value": 0.25}
+    again = converter._tie(one)
+    assert type(again.offset) is float
+    assert again == ties["derotator.theta"]
+
+
+def test_the_node_tells_for_what_it_holds(node):
+    held = node["validity"]
+    assert held["dates"] == ["2025-05-01"]
+    assert held["optics_in_beam"] == [["polarizer", "hwp", "derotator", "wollaston"]]
+    assert set(node["written_with"]) == {"astropolcal", "asdf", "asdf-astropy", "astropy"}
+
+
+@pytest.mark.parametrize("key", ["validity", "written_with"])
+def test_what_is_for_readers_only_is_not_in_the_checksum(node, key):
+    calibration_from_node(node | {key: {"anything": 1}})
+
+
+@pytest.mark.parametrize("key", ["chains", "wavelength", "covariance", "fit", "ties", "priors"])
+def test_everything_else_is(node, key):
+    """Another value of a part is noticed, also where it would be possible."""
+    other = copy.deepcopy(node)
+    part = other[key]
+    if key == "wavelength":
+        part["value"] = part["value"] * (1 + 1e-15)
+    elif key == "chains":
+        part[0]["optics"][1].retardance.value = [171.0, 175.0]
+    elif key == "covariance":
+        part["matrix"][0, 0] *= 1 + 4e-16
+    elif key == "fit":
+        part["n_data"] = 7
+    else:
+        del part[0]
+    with pytest.raises(CalibrationFileError, match="does not match its checksum: it was changed"):
+        calibration_from_node(other)
+
+
+# ---- what is refused in spite of a right checksum ------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("key", "place", "words"),
+    [
+        ("ties", 0, "'derotator.theta' is given twice"),
+        ("stages", None, "is given twice in a list of parameters"),
+        ("directions", None, "is given twice in a list of parameters"),
+        ("priors", 0, "prior of 'derotator.retardance' is given twice"),
+    ],
+)
+def test_entries_of_one_name(node, key, place, words):
+    node = copy.deepcopy(node)
+    if key == "directions":
+        entry = {"words": "x", "parameters": [{"name": "a", "value": 1.0}] * 2}
+        node["identifiability"]["directions"].append(entry)
+    elif key == "stages":
+        node["stages"][0]["parameters"].append(node["stages"][0]["parameters"][0])
+    else:
+        node[key].append(node[key][place])
+    refused(node, words)
+
+
+def test_two_columns_of_one_name(node):
+    node = copy.deepcopy(node)
+    table = node["datasets"][0]["accuracy"]
+    table.append(table[0])
+    refused(node, "two columns of a table have the same name")
+
+
+def test_a_value_with_something_else(node):
+    node = copy.deepcopy(node)
+    node["wavelength"]["factor"] = 1000.0
+    refused(node, "a value with 'factor', which means nothing here")
+
+
+@pytest.mark.parametrize("unit", ["1e-3 um", "-1e308", "2", "0.5 deg"])
+def test_units_with_a_factor(node, unit):
+    """They would be read as something else than is written next time."""
+    node = copy.deepcopy(node)
+    node["stages"][0]["parameters"][0]["unit"] = unit
+    refused(node, "a unit without a factor is needed")
+
+
+@pytest.mark.parametrize(
+    ("wavelength", "words"),
+    [
+        ({"value": 1.6, "unit": "um"}, "must be a list of positive lengths"),
+        ({"value": [1.2, -1.6], "unit": "um"}, "must be a list of positive lengths"),
+        ({"value": [1.2, np.nan], "unit": "um"}, "must be a list of positive lengths"),
+        ({"value": [[1.2, 1.6]], "unit": "um"}, "must be a list of positive lengths"),
+    ],
+)
+def test_wavelengths_that_are_none(node, wavelength, words):
+    refused(node | {"wavelength": wavelength}, words)
+
+
+@pytest.mark.parametrize("reshape", [np.transpose, np.ravel, lambda x: x[..., None]])
+def test_a_factor_of_another_shape(node, reshape):
+    """Of as many numbers: it must not be laid out as it fits."""
+    node = copy.deepcopy(node)
+    node["covariance"]["factor"] = reshape(node["covariance"]["factor"][:2])
+    refused(node, r"factor of the covariance has shape \(.*\); \(rank, \d+\) is needed")
+
+
+# ---- values -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("optic", "key", "value", "words"),
+    [
+        # bounds 0.9 and up: 1 beyond is still something that a fitter may leave
+        ("wollaston", "efficiency", -1e308, r"from -0.1 to 1e\+15 can be stored"),
+        ("wollaston", "efficiency", -0.2, r"wollaston.efficiency = -0.2, which is far outside"),
+        ("wollaston", "efficiency", 1e16, "far outside of its bounds"),
+        # bounds -360 and 360 deg
+        ("derotator", "retardance", 1081.0, "from -1080 to 1080 can be stored"),
+        ("hwp", "retardance", [171.0, -1081.0], r"hwp.retardance = \[ +171. -1081.\]"),
+        ("polarizer", "theta", 541.0, "polarizer.theta = 541.0"),
+    ],
+)
+def test_values_that_only_damage_explains(cal, optic, key, value, words):
+    getattr(cal.chains[0][optic], key).value = value
+    with pytest.raises(CalibrationFileError, match=words):
+        check_calibration(cal)
+    with pytest.raises(CalibrationFileError, match=words):
+        node_from_calibration(cal)
+
+
+@pytest.mark.parametrize(
+    ("optic", "key", "value"),
+    [
+        ("wollaston", "efficiency", 0.89),
+        ("wollaston", "efficiency", 1.7),
+        ("derotator", "retardance", 365.0),
+        ("hwp", "theta", -181.0),
+    ],
+)
+def test_values_a_little_outside_their_bounds_are_kept(cal, optic, key, value):
+    """A fitter without bounds gives such, and a parameter that is held may be anywhere."""
+    getattr(cal.chains[0][optic], key).value = value
+    check_calibration(cal)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "good", "bad"),
+    [
+        ((None, None), [-9e14, 9e14], [-2e15, 2e15]),
+        ((0, None), [-1, 9e14], [-1.01, 2e15]),
+        ((None, -3), [-9e14, 0], [0.01, -2e15]),
+        ((0, 1), [-1, 2], [-1.01, 2.01]),
+        ((2, 2), [0, 4], [-0.01, 4.01]),
+        ((0, 0), [-1, 1], [-1.01, 1.01]),
+    ],
+)
+def test_how_far_outside_is_far(bounds, good, bad):
+    from astropolcal.converters.consistency import _allowed
+
+    low, high = _allowed(bounds)
+    assert all(low <= value <= high for value in good)
+    assert not any(low <= value <= high for value in bad)
+
+
+# ---- parts that do not belong together ---------------------------------------------------
+
+
+def change(**settings):
+    def spoil(cal):
+        for key, value in settings.items():
+            setattr(cal, key, value)
+
+    return spoil
+
+
+def spoiled_accuracy(name, values):
+    def spoil(cal):
+        table = cal.datasets[0].accuracy.copy()
+        table[name] = values
+        cal.datasets[0].accuracy = table
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda c: c.chains.append(c.chains[0]), "2 chains but 1 datasets"),
+        (change(at_bound=["hwp.thickness"]), "at_bound names 'hwp.thickness', which is no free"),
+        (lambda c: c.fit.update(masked={"a": 1}), "fit.masked is no list of reasons"),
+        (lambda c: c.fit.update(masked=["x"]), "fit.masked is no list of reasons"),
+        (lambda c: c.fit.update(outliers={"a": 1}), "fit.outliers is a dict, not a list"),
+        (lambda c: c.fit.update(outliers=[{"frames": [1]}]), "lacks what a pair of frames is told"),
+        (
+            lambda c: c.fit.update(
+                outliers=[
+                    {"frames": [1], "dataset": "a", "residual_percent": 1, "sigma": "x"}
+                    | {"brightness": 1}
+                ]
+            ),
+            "fit.outliers lacks what a pair of frames is told by",
+        ),
+        (spoiled_accuracy("s_res", [["x"], ["y"]]), "s_res is no list of numbers"),
+        (spoiled_accuracy("s_cv", [[1.0], [2.0]]), "s_cv is no list of numbers"),
+        (spoiled_accuracy("s_mean", [1, 2] * u.deg), "s_mean is in deg, which is no fraction"),
+        (spoiled_accuracy("wavelength", [1, 2] * u.deg), "must be positive lengths"),
+        (spoiled_accuracy("wavelength", [1, -2] * u.um), "must be positive lengths"),
+    ],
+)
+def test_parts_that_do_not_belong_together(cal, spoil, words):
+    spoil(cal)
+    with pytest.raises(CalibrationFileError, match=words):
+        check_calibration(cal)
+
+
+@pytest.mark.parametrize("part", ["covariance", "identifiability"])
+def test_parameters_in_another_order(cal, part):
+    names = getattr(cal, part).names
+    swapped = [names[1], names[0], *names[2:]]
+    setattr(cal, part, copy.copy(getattr(cal, part)))
+    if part == "covariance":
+        c = cal.covariance
+        cal.covariance = Covariance(swapped, [c.units[1], c.units[0], *c.units[2:]], c.matrix)
+    else:
+        cal.identifiability = dataclasses.replace(cal.identifiability, names=swapped)
+    words = f"{part} of '{names[1]}', where '{names[0]}' is free in the chains"
+    with pytest.raises(CalibrationFileError, match=words.replace("[", r"\[").replace("]", r"\]")):
+        check_calibration(cal)
+
+
+def test_a_covariance_in_other_units(cal):
+    c = cal.covariance
+    cal.covariance = Covariance(c.names, [u.arcmin, *c.units[1:]], c.matrix)
+    with pytest.raises(CalibrationFileError, match="is in arcmin, allowed is deg"):
+        check_calibration(cal)
+
+
+def test_one_optic_of_two_chains_has_one_value(cal):
+    other = cal.chains[0].copy()
+    other["hwp"].theta.value += 1e-9
+    cal.chains, cal.datasets = [cal.chains[0], other], cal.datasets * 2
+    with pytest.raises(CalibrationFileError, match=r"hwp.theta has different values in different"):
+        check_calibration(cal)
+
+
+# ---- versions ----------------------------------------------------------------------------
+
+
+def test_tags():
+    one = CalibrationConverter()
+    assert tuple(one.tags) == CALIBRATION_TAGS
+    assert one.select_tag(None, one.tags, None) == CALIBRATION_TAG == CALIBRATION_TAGS[-1]
+    assert set(MIGRATIONS) == set(CALIBRATION_TAGS[:-1])
+
+
+def test_a_node_of_the_first_version(original, node):
+    """An entry of settings named validity meant nothing then, whatever it said."""
+    old = copy.deepcopy(node)
+    old["settings"] = old["settings"] | {"validity": "of somebody else"}
+    again = calibration_from_node(sealed(old), CALIBRATION_TAGS[0])
+    assert "validity" not in again.settings
+    assert again.to_dict() == original.to_dict()
+    with pytest.raises(CalibrationFileError):
+        calibration_from_node(sealed(old), CALIBRATION_TAG)
+
+
+def test_migrations_do_not_change_what_they_are_given(node):
+    before = dict(node["settings"])
+    MIGRATIONS[CALIBRATION_TAGS[0]](node)
+    assert node["settings"] == before
+
+
+# ---- tags and types in the tree ------------------------------------------------------------
+
+
+def text_of(original):
+    buffer = io.BytesIO()
+    with asdf.config_context() as config:
+        config.array_inline_threshold = 10_000
+        asdf.AsdfFile({"calibration": original}).write_to(buffer)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"optics/linear_retarder-1.0.0", b"optics/linear_polarizer-1.0.0"),
+        (b"optics/linear_retarder-1.0.0", b"optics/unheard_of-1.0.0"),
+        (b"optics/linear_retarder-1.0.0", b"optics/linear_retarder-9.0.0"),
+        (b"optics/wollaston_prism-1.0.0", b"calibration-1.1.0"),
+        (b"calibration-1.1.0", b"optics/rotator-1.0.0"),
+        (b"calibration-1.1.0", b"calibration-7.0.0"),
+        (b"!core/ndarray-1.1.0", b"!unit/quantity-1.2.0"),
+        (b"!core/ndarray-1.1.0", b"!!binary"),
+        (b"!core/ndarray-1.1.0", b"!core/complex-1.0.0"),
+        (b"mount: hwp", b"mount: [hwp]"),
+        (b"mount: hwp", b"mount: nowhere"),
+        (b"fixed: true", b"fixed: maybe"),
+        (b"fixed: true", b"fixed: 1"),
+        (b"unit: deg", b"unit: kg"),
+        (b"unit: deg", b"unit: 3"),
+        (b"n_frames: ", b"n_frames: -"),
+        (b"rank: ", b"rank: 0.5 #"),
+        (b"wavelength:", b"wave:"),
+        (b"at_bound: ", b"at_bound: 7 #"),
+    ],
+)
+def test_one_clear_error_for_what_is_out_of_place(original, tmp_path, old, new):
+    content = text_of(original)
+    assert old in content
+    path = tmp_path / "a.asdf"
+    path.write_bytes(content.replace(old, new, 1))
+    with pytest.raises(CalibrationFileError) as caught:
+        Calibration.read(path)
+    words = str(caught.value)
+    assert words.startswith(f"{path}: ")
+    assert "\n" not in words
+    assert len(words) < 700

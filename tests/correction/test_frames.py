@@ -1,0 +1,273 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""How science frames are put together: pairs, places of the beams, brightness."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import MaskedColumn, QTable
+from astropy.utils.masked import Masked
+
+from astropolcal import instruments, optics
+from astropolcal.correction import ScienceFrames, frame_positions, measurement_rows
+from astropolcal.exceptions import ObservationError, ParameterError
+
+LAM = [1.2, 1.6] * u.um
+HWP = [0, 45, 22.5, 67.5] * u.deg
+CHAIN = optics.LinearRetarder(
+    retardance=180 * u.deg, mount="hwp", name="hwp"
+) | optics.WollastonPrism(name="wollaston")
+
+
+def arrays(n=4, **settings):
+    flux = np.arange(2.0 * n).reshape(n, 2) + 1
+    positions = settings.pop("positions", {"hwp": HWP[:n]})
+    return ScienceFrames.from_arrays(flux, 2 * flux, LAM, positions, **settings)
+
+
+# ---- arrays ----------------------------------------------------------------------------
+
+
+def test_attributes_are_taken_over():
+    frames = arrays(unit=u.electron, pixel_scale=16.2, centre=(3.0, 4.0), meta={"object": "x"})
+    assert (frames.unit, frames.pixel_scale, frames.centre) == (u.electron, 16.2, (3.0, 4.0))
+    assert frames.meta == {"object": "x"}
+    assert frames.north_up is False
+    assert frames.pairs is None
+    assert frames.names == ["frame 0", "frame 1", "frame 2", "frame 3"]
+    assert arrays(names=list("abcd")).names == list("abcd")
+
+
+@pytest.mark.parametrize(
+    ("hwp", "pairs"),
+    [
+        ([0, 45, 22.5, 67.5], [[0, 1], [2, 3]]),
+        ([0, 22.5, 45, 67.5], [[0, 2], [1, 3]]),
+        ([0, 22.5, 0, 22.5], None),
+        ([0, 45, 22.5, 0], [[0, 1]]),
+    ],
+)
+def test_pairs_by_the_angles_of_the_plate(hwp, pairs):
+    found = arrays(hwp=hwp * u.deg).pairs
+    assert (None if found is None else found.tolist()) == pairs
+
+
+def test_frames_of_two_derotator_angles_are_no_pair():
+    """Up to 2 deg apart they are; positions without a unit are in radian."""
+    near = {"hwp": HWP, "derotator": np.deg2rad([60, 61.9, 80, 81])}
+    assert arrays(positions=near, hwp=HWP).pairs.tolist() == [[0, 1], [2, 3]]
+    far = {"hwp": HWP, "derotator": [60, 62.1, 80, 81] * u.deg}
+    assert arrays(positions=far, hwp=HWP).pairs.tolist() == [[2, 3]]
+
+
+def test_pairs_that_are_given_are_not_looked_for():
+    frames = arrays(hwp=HWP, pairs=[[1, 0]])
+    assert np.asarray(frames.pairs).tolist() == [[1, 0]]
+
+
+def test_images_that_are_turned_have_north_up():
+    image = np.ones((4, 2, 5, 5))
+    frames = ScienceFrames.from_arrays(
+        image, image, LAM, {"hwp": HWP}, position_angle=[0, 90, 180, 270] * u.deg
+    )
+    assert frames.north_up
+    assert not ScienceFrames.from_arrays(image, image, LAM, {"hwp": HWP}).north_up
+
+
+def test_differences_and_sums_are_beams():
+    difference, total = np.array([[2.0, 4.0]] * 4), np.array([[10.0, 20.0]] * 4)
+    frames = ScienceFrames.from_differences(
+        difference, total, LAM, {"hwp": HWP}, variance=np.full((4, 2), 6.0), unit=u.electron
+    )
+    every = slice(None)
+    assert frames.source.fluxes(0, every, every)[0].tolist() == [6.0, 12.0]
+    assert frames.source.fluxes(1, every, every)[0].tolist() == [4.0, 8.0]
+    # var(r - l) = var(r) + var(l)
+    both = frames.source.variances(0, every, every) + frames.source.variances(1, every, every)
+    assert np.all(both == 6.0)
+    assert frames.unit == u.electron
+    without = ScienceFrames.from_differences(difference, total, LAM, {"hwp": HWP})
+    assert not without.source.has_variances
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"wavelength": [1.2] * u.um}, r"wavelength has shape \(1,\); the frames have 2 wave"),
+        ({"positions": {"hwp": HWP[:3]}}, r"hwp has 3 positions; there are 4 frames"),
+        ({"positions": {"hwp": np.zeros((5, 3)) * u.deg}}, r"hwp has 3 positions; there are 4"),
+    ],
+)
+def test_what_does_not_fit(changes, words):
+    good = arrays()
+    with pytest.raises(ObservationError, match=words):
+        dataclasses.replace(good, **changes)
+
+
+@pytest.mark.parametrize("position", [7 * u.deg, [7] * u.deg, np.zeros((5, 4)) * u.deg])
+def test_positions_of_all_frames_alike(position):
+    assert arrays(positions={"hwp": position}).positions["hwp"] is position
+
+
+def test_brightness_counts_all_light_of_a_frame():
+    """Images are summed, without what lacks a value."""
+    clouds = np.array([0.5, 1.0, 1.5, 1.0])
+    rows = measurement_rows(CHAIN, {"hwp": HWP}, LAM)
+    spectrum = np.einsum("bwfs,s->bfw", rows, [100.0, 3.0, -2.0, 0]) * clouds[:, None]
+    shape = np.zeros((5, 5))
+    shape[1:4, 1:4] = 1 / 9
+    right, left = spectrum[..., None, None] * shape
+    right[:, :, 0, 0] = left[:, :, 0, 0] = np.nan
+    for batch in (None, 1, 3):
+        frames = ScienceFrames.from_arrays(right, left, LAM, {"hwp": HWP}, batch=batch)
+        found = frames.with_brightness(rows)
+        np.testing.assert_allclose(found.scale, np.tile(clouds, (2, 1)), rtol=1e-9)
+        assert frames.scale is None
+
+
+# ---- files -----------------------------------------------------------------------------
+
+
+def layout(**changes):
+    """Return an instrument with small files."""
+    files = dataclasses.replace(
+        instruments.get("charis").files,
+        shape=(2, 20, 40),
+        internal_apertures=((10.0, 8.0), (28.0, 12.0), 9.0, 12.0, 0.1),
+        star_offset=(17.0, 3.0),
+        **changes,
+    )
+    charis = instruments.get("charis")
+    return SimpleNamespace(files=files, wavelength=LAM, positions=charis.positions)
+
+
+TABLE = QTable({"hwp": HWP, "derotator": [60] * 4 * u.deg})
+TABLE_CHAIN = optics.LinearRetarder(
+    retardance=180 * u.deg, mount="hwp", name="hwp"
+) | optics.WollastonPrism(name="wollaston")
+
+
+@pytest.fixture
+def cubes(tmp_path):
+    """Cubes whose pixels tell their number: frame, slice, row and column."""
+    frame, slice_, row, column = np.indices((4, 2, 20, 40))
+    values = 1e5 * frame + 1e4 * slice_ + 100.0 * row + column
+    paths = [tmp_path / f"CRSA0000000{i}_cube.fits" for i in range(4)]
+    for path, cube in zip(paths, values, strict=True):
+        fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(cube)]).writeto(path)
+    return values, paths
+
+
+def middle(frames, beam):
+    return frames.source.fluxes(beam, slice(0, 1), slice(0, 1))[0, 0, 1, 1] % 1e4
+
+
+def from_files(paths, instrument=None, **settings):
+    instrument = layout() if instrument is None else instrument
+    return ScienceFrames.from_files(paths, instrument, TABLE, TABLE_CHAIN, size=3, **settings)
+
+
+def test_what_files_give(cubes):
+    values, paths = cubes
+    frames = from_files(paths, centres=[(27, 11), (10, 8)])
+    assert frames.names == [str(path) for path in paths]
+    assert frames.pairs.tolist() == [[0, 1], [2, 3]]
+    assert frames.centre == (1.0, 1.0)
+    assert frames.pixel_scale == 16.2
+    assert frames.north_up is False
+    np.testing.assert_array_equal(frames.wavelength, LAM)
+    np.testing.assert_allclose(frames.positions["hwp"], HWP.to_value(u.rad))
+    np.testing.assert_array_equal(
+        frames.source.fluxes(1, slice(0, 4), slice(0, 2)), values[:, :, 7:10, 9:12]
+    )
+    turned = from_files(paths, position_angle=[0, 1, 2, 3] * u.deg, pixel_scale=7.0)
+    assert turned.north_up
+    assert turned.pixel_scale == 7.0
+
+
+@pytest.mark.parametrize(
+    ("centres", "right", "left"),
+    [
+        # row and column of the middle, as 100 row + column
+        ([(27, 11), (10, 8)], 1127, 810),
+        ((10, 8), 1127, 810),
+        (np.tile([(10.0, 8.0)], (4, 1)), 1127, 810),
+        (np.tile([[(26.0, 10.0), (9.0, 7.0)]], (4, 1, 1)), 1026, 709),
+    ],
+)
+def test_places_of_the_beams(cubes, centres, right, left):
+    """Of both, or of the left one, from which the right one is 17 and 3 pixels away."""
+    frames = from_files(cubes[1], centres=centres)
+    assert (middle(frames, 0), middle(frames, 1)) == (right, left)
+
+
+def test_by_default_the_middle_of_the_field(cubes):
+    """Half-way between both rectangles, (19, 10), less and plus half of the offset."""
+    frames = from_files(cubes[1])
+    found = frames.source._centres[0]
+    np.testing.assert_allclose(found[0] - found[1], (17, 3))
+    np.testing.assert_allclose(found.mean(axis=0), (19, 10))
+
+
+@pytest.mark.parametrize("centres", [[1.0, 2.0, 3.0], [(1.0, np.nan), (2.0, 3.0)], 5.0])
+def test_centres_that_are_none(cubes, centres):
+    with pytest.raises(ParameterError, match=r"centres of shape .*; x and y of each are needed"):
+        from_files(cubes[1], centres=centres)
+
+
+def test_files_of_two_cameras(tmp_path):
+    """Places are those in both images side by side, the left one first."""
+    instrument = layout(beam_files=("cam1", "cam2"))
+    rights = [tmp_path / f"n0000000{i}_cam1.fits" for i in range(4)]
+    row, column = np.indices((20, 20))
+    for path in rights:
+        for name, offset in (("cam1", 20.0), ("cam2", 0.0)):
+            image = np.stack([100.0 * row + column + offset] * 2)
+            hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(image)])
+            hdus.writeto(path.with_name(path.name.replace("cam1", name)))
+    frames = from_files(rights, instrument, centres=[(27, 11), (10, 8)], left_scale=2.0)
+    assert middle(frames, 0) == 1127
+    assert middle(frames, 1) == 2 * 810
+
+
+# ---- positions -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "states", [None, ["A", ""], ["A", " "], np.ma.array(["A", "B"], mask=[0, 1])]
+)
+def test_a_modulator_needs_its_state(states):
+    modulator = optics.FerroelectricLiquidCrystal(mount="flc_state", name="flc")
+    chain = modulator | CHAIN
+    table = QTable({"hwp": [0, 45] * u.deg, "derotator": [60, 60] * u.deg})
+    if states is not None:
+        table["flc_state"] = states
+    name = "a.fits" if states is None else "b.fits"
+    with pytest.raises(ObservationError, match=f"{name}: no state of the modulator, flc_state"):
+        frame_positions(instruments.get("vampires"), table, chain, names=["a.fits", "b.fits"])
+
+
+@pytest.mark.parametrize(
+    "hwp",
+    [
+        [0, np.nan] * u.deg,
+        [0, np.inf] * u.deg,
+        Masked([0.0, 45.0] * u.deg, mask=[False, True]),
+        MaskedColumn([0.0, 45.0], mask=[False, True]),
+        MaskedColumn([0.0, 45.0], mask=[False, True], unit="deg"),
+    ],
+    ids=["nan", "inf", "quantity", "column", "column with a unit"],
+)
+def test_an_angle_that_is_masked_is_none(hwp):
+    table = QTable({"hwp": hwp, "derotator": [60, 60] * u.deg})
+    with pytest.raises(ObservationError, match="b: no angle 'hwp'"):
+        frame_positions(instruments.get("charis"), table, TABLE_CHAIN, names=["a", "b"])
+
+
+def test_the_table_of_the_user_is_not_changed():
+    table = TABLE.copy()
+    frame_positions(instruments.get("charis"), table, TABLE_CHAIN)
+    assert table.colnames == TABLE.colnames

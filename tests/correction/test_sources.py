@@ -1,0 +1,255 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Where fluxes come from: arrays, arrays turned, files of one or of two cameras."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from astropolcal.correction import derotate, derotate_variance
+from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
+from astropolcal.exceptions import ObservationError
+
+ALL = slice(None)
+
+
+@pytest.fixture
+def images():
+    """Fluxes and variances of both beams, (2, 3 frames, 2 wavelengths, 9, 9)."""
+    rng = np.random.default_rng(3)
+    return rng.normal(10, 1, (2, 3, 2, 9, 9)), rng.uniform(1, 2, (2, 3, 2, 9, 9))
+
+
+# ---- arrays ----------------------------------------------------------------------------
+
+
+def test_arrays_are_given_back(images):
+    flux, variance = images
+    source = ArraySource(*flux, *variance)
+    assert (source.n_frames, source.n_wavelengths, source.image_shape) == (3, 2, (9, 9))
+    assert source.has_variances
+    assert source.names == ["frame 0", "frame 1", "frame 2"]
+    for beam in (0, 1):
+        np.testing.assert_array_equal(
+            source.fluxes(beam, slice(1, 3), slice(1, 2)), flux[beam, 1:, 1:]
+        )
+        np.testing.assert_array_equal(source.variances(beam, ALL, ALL), variance[beam])
+
+
+def test_lists_will_do():
+    source = ArraySource([[1.0, 2.0]], [[3.0, 4.0]], names=("a",))
+    assert source.fluxes(1, ALL, ALL).tolist() == [[3.0, 4.0]]
+    assert source.names == ["a"]
+
+
+def test_how_many_frames_are_read_at_a_time(images, tmp_path):
+    """All of what is in memory, one of what is on disk, and what the user says."""
+    flux, _ = images
+    assert ArraySource(*flux).batches() == [slice(0, 3)]
+    assert ArraySource(*flux, batch=2).batches() == [slice(0, 2), slice(2, 3)]
+    np.save(tmp_path / "a.npy", flux[0])
+    mapped = np.load(tmp_path / "a.npy", mmap_mode="r")
+    one_by_one = [slice(0, 1), slice(1, 2), slice(2, 3)]
+    assert ArraySource(mapped, mapped).batches() == one_by_one
+    assert ArraySource(mapped, mapped, batch=3).batches() == [slice(0, 3)]
+
+
+def test_chunks_of_dask_are_read_whole(images):
+    da = pytest.importorskip("dask.array")
+    flux = [da.from_array(beam, chunks=(2, 1, 9, 9)) for beam in images[0]]
+    source = ArraySource(*flux)
+    assert source.batches() == [slice(0, 2), slice(2, 3)]
+    assert ArraySource(*flux, batch=1).batches() == [slice(i, i + 1) for i in range(3)]
+    found = source.fluxes(0, slice(0, 2), ALL)
+    assert isinstance(found, np.ndarray)
+    np.testing.assert_array_equal(found, images[0][0, :2])
+
+
+@pytest.mark.parametrize("given", [(True, False), (False, True)])
+def test_variances_of_one_beam_only(images, given):
+    flux, variance = images
+    chosen = [v if there else None for v, there in zip(variance, given, strict=True)]
+    with pytest.raises(ObservationError, match="variances of one beam only; both or none"):
+        ArraySource(*flux, *chosen)
+
+
+@pytest.mark.parametrize(
+    ("right", "left", "variance", "shapes"),
+    [
+        ((3, 2), (3, 1), None, r"\[\(3, 1\), \(3, 2\)\]"),
+        ((3, 2), (3, 2), (2, 3), r"\[\(2, 3\), \(3, 2\)\]"),
+        ((3,), (3,), None, r"\[\(3,\)\]"),
+    ],
+)
+def test_shapes_that_do_not_fit(right, left, variance, shapes):
+    variances = [None, None] if variance is None else [np.ones(variance)] * 2
+    with pytest.raises(ObservationError, match=f"have shapes {shapes}; one shape"):
+        ArraySource(np.ones(right), np.ones(left), *variances)
+
+
+# ---- turned ----------------------------------------------------------------------------
+
+
+def test_each_frame_is_turned_by_its_own_angle(images):
+    flux, variance = images
+    angles = [10, -35, 90] * u.deg
+    options = {"centre": (4.5, 3.0), "order": 1, "mirrored": True}
+    source = TurnedSource(ArraySource(*flux, *variance), angles, **options)
+    assert source.has_variances
+    assert source.image_shape == (9, 9)
+    for i in range(3):
+        one = slice(i, i + 1)
+        expected = derotate(flux[1, i], angles[i], **options)
+        np.testing.assert_array_equal(source.fluxes(1, one, ALL)[0], expected)
+        expected = derotate_variance(variance[1, i], angles[i], **options)
+        np.testing.assert_array_equal(source.variances(1, one, ALL)[0], expected)
+
+
+@pytest.mark.parametrize(("size", "shape"), [(5, (5, 5)), ((3, 7), (3, 7)), (None, (9, 9))])
+def test_shape_of_what_is_cut_out(images, size, shape):
+    options = {} if size is None else {"size": size}
+    source = TurnedSource(ArraySource(*images[0]), [0, 0, 0] * u.deg, **options)
+    assert source.image_shape == shape
+    assert source.fluxes(0, ALL, ALL).shape == (3, 2, *shape)
+    assert source.batches() == [slice(0, 1), slice(1, 2), slice(2, 3)]
+
+
+# ---- files -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cameras(tmp_path):
+    """Two frames of two cameras: cubes and their errors."""
+    rng = np.random.default_rng(5)
+    values, errors = rng.normal(10, 1, (2, 2, 3, 12, 14)), rng.uniform(0.5, 2, (2, 2, 3, 12, 14))
+    errors[:, :, 1, 6, 7] = 0.0
+    paths = [[tmp_path / f"n{i}_cam{c}.fits" for i in range(2)] for c in (1, 2)]
+    for c in range(2):
+        for i in range(2):
+            hdus = [fits.PrimaryHDU(values[c, i]), fits.ImageHDU(errors[c, i])]
+            fits.HDUList(hdus).writeto(paths[c][i])
+    return values, errors, paths
+
+
+def test_files_of_two_cameras(cameras):
+    values, errors, (right, left) = cameras
+    source = CubeFiles(
+        right,
+        [(7, 6), (6, 5)],
+        3,
+        extension=0,
+        left_files=left,
+        left_scale=[2.0, 3.0],
+        weights="error",
+    )
+    assert source.names == [str(path) for path in right]
+    np.testing.assert_array_equal(source.fluxes(0, ALL, ALL), values[0, :, :, 5:8, 6:9])
+    scale = np.array([2.0, 3.0])[:, None, None, None]
+    np.testing.assert_allclose(source.fluxes(1, ALL, ALL), scale * values[1, :, :, 4:7, 5:8])
+    # errors are squared, and scaled like the flux; zero means that none is known
+    expected = np.where(errors > 0, errors**2, np.nan)
+    np.testing.assert_allclose(source.variances(0, ALL, ALL), expected[0, :, :, 5:8, 6:9])
+    found = source.variances(1, slice(1, 2), slice(0, 2))
+    np.testing.assert_allclose(found, 9 * expected[1, 1:, :2, 4:7, 5:8])
+    assert np.isnan(source.variances(0, ALL, slice(1, 2))[:, 0, 1, 1]).all()
+
+
+def test_centres_may_move_from_frame_to_frame(cameras):
+    values, _, (right, _) = cameras
+    centres = np.array([[(7, 6), (3, 6)], [(8, 5), (4, 5)]])
+    source = CubeFiles(right, centres, 3, extension=0)
+    found = source.fluxes(0, ALL, slice(0, 1))[:, 0]
+    np.testing.assert_array_equal(found, [values[0, 0, 0, 5:8, 6:9], values[0, 1, 0, 4:7, 7:10]])
+
+
+def test_files_are_turned_about_their_centre(cameras):
+    values, _, (right, _) = cameras
+    angles = [20, 90] * u.deg
+    source = CubeFiles(right, [(7, 6), (6, 5)], 5, extension=0, position_angle=angles, order=1)
+    for i in range(2):
+        expected = derotate(values[0, i], angles[i], centre=(7, 6), size=5, order=1)
+        np.testing.assert_array_equal(source.fluxes(0, slice(i, i + 1), ALL)[0], expected)
+
+
+def test_an_image_is_a_cube_of_one_slice(tmp_path):
+    image = np.arange(42.0).reshape(6, 7)
+    for name, hdu in (("a", fits.ImageHDU(image)), ("b", fits.CompImageHDU(image.astype("i4")))):
+        path = tmp_path / f"{name}.fits"
+        fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(path)
+        source = CubeFiles([path], [(3, 3), (3, 2)], 3)
+        assert source.n_wavelengths == 1
+        found = source.fluxes(0, ALL, ALL)
+        np.testing.assert_array_equal(found[0, 0], image[2:5, 2:5])
+
+
+def test_weights_of_another_shape_are_none(tmp_path):
+    """What follows the cube may be something else."""
+    path = tmp_path / "a.fits"
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 6, 6))), fits.ImageHDU(np.ones((6, 6)))]
+    fits.HDUList(hdus).writeto(path)
+    assert not CubeFiles([path], [(3, 3), (3, 2)], 3).has_variances
+
+
+@pytest.mark.parametrize(
+    ("centre", "words"),
+    [
+        ((13.6, 6), r"right beam's centre \[13.6, 6.0\] is outside the image of 14 x 12 pixels"),
+        ((-0.6, 6), r"right beam's centre \[-0.6, 6.0\] is outside"),
+        ((7, 11.5), r"right beam's centre \[7.0, 11.5\] is outside"),
+        ((7, np.nan), r"right beam's centre \[7.0, nan\] is outside"),
+    ],
+)
+def test_centres_outside_the_image(cameras, centre, words):
+    _, _, (right, _) = cameras
+    with pytest.raises(ObservationError, match=words):
+        CubeFiles(right, [centre, (6, 5)], 3, extension=0)
+    # up to half a pixel beyond the middle of the last one is inside
+    CubeFiles(right, [(13.4, 11.4), (-0.4, -0.4)], 3, extension=0)
+
+
+def test_a_left_file_that_is_missing_is_named(cameras):
+    _, _, (right, left) = cameras
+    left[1].unlink()
+    with pytest.raises(ObservationError, match=r"n1_cam2.fits: no such file"):
+        CubeFiles(right, [(7, 6), (6, 5)], 3, extension=0, left_files=left)
+
+
+def test_a_file_that_is_replaced_by_a_smaller_one(cameras):
+    """Compressed ones are opened anew at each reading."""
+    _, _, (right, _) = cameras
+    fits.CompImageHDU(np.ones((3, 12, 14), "i4")).writeto(right[0], overwrite=True)
+    source = CubeFiles(right[:1], [(7, 6), (6, 5)], 3)
+    fits.PrimaryHDU(np.ones(3)).writeto(right[0], overwrite=True)
+    with pytest.raises(ObservationError, match=r"n0_cam1.fits: cannot be read"):
+        source.fluxes(0, ALL, ALL)
+
+
+@pytest.mark.parametrize("shape", [(0, 6, 6), (2, 0, 6)])
+def test_a_cube_of_nothing(tmp_path, shape):
+    """Numpy cannot write one, but a header can claim it."""
+    path = tmp_path / "a.fits"
+    fits.PrimaryHDU(np.ones((2, 6, 6), "f4")).writeto(path)
+    content = path.read_bytes()
+    for i, (old, new) in enumerate(zip((6, 6, 2), shape[::-1], strict=True), start=1):
+        card = f"NAXIS{i}  = {old:20}".encode()
+        assert card in content
+        content = content.replace(card, f"NAXIS{i}  = {new:20}".encode())
+    path.write_bytes(content)
+    with pytest.raises(ObservationError, match=r"a.fits: .*(three axes|no data|not a readable)"):
+        CubeFiles([path], [(3, 3), (3, 2)], 3, extension=0)
+
+
+@pytest.mark.parametrize("kind", [">f4", ">f8"])
+def test_nans_that_signal_are_nans(tmp_path, kind):
+    """A damaged file may hold them; numpy warns where they are used, which is an error here."""
+    cube = np.ones((1, 6, 6), kind)
+    # the highest bit of the fraction is what makes a NaN quiet
+    cube.view(kind.replace("f", "u"))[0, 3, 3] = {">f4": 0x7F800001, ">f8": 0x7FF0000000000001}[
+        kind
+    ]
+    path = tmp_path / "a.fits"
+    fits.HDUList([fits.PrimaryHDU(cube), fits.ImageHDU(cube)]).writeto(path)
+    source = CubeFiles([path], [(3, 3), (3, 2)], 3, extension=0)
+    for found in (source.fluxes(0, ALL, ALL), source.variances(0, ALL, ALL)):
+        assert np.isnan(found[0, 0, 1, 1])
+        assert np.isfinite(found).sum() == 8
