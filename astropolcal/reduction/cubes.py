@@ -199,36 +199,19 @@ def simulate_cubes(
     frames = _with_headers(frames, layout, source, exposure_time, start)
     n_wavelengths, n_frames = _count(layout, wavelength), len(frames)
     beams = _beam_fluxes(chain, wavelength, frames, source, flux=flux, lamp=lamp, stokes=stokes)
-    scene = Scene(
-        layout,
-        source=source,
-        psf=psf,
-        fwhm=pixels("fwhm", fwhm, layout, n_wavelengths),
-        beta=number("beta", beta, above=1.0),
-        halo=number("halo", halo, most=1.0),
-        halo_fwhm=pixels("halo_fwhm", halo_fwhm, layout, n_wavelengths),
-        margin=number("margin", margin),
-    )
+    star = {"source": source, "psf": psf, "fwhm": fwhm, "beta": beta, "margin": margin}
+    scene = _scene(layout, n_wavelengths, halo=halo, halo_fwhm=halo_fwhm, **star)
     how = _read_out(frames, layout)
-    detector = Detector(
-        gain=number("gain", how.gain if gain is None else gain, above=0.0),
-        read_noise=number("read_noise", how.read_noise if read_noise is None else read_noise),
-        excess_noise=how.excess_noise,
-        background=per_wavelength("background", background, n_wavelengths)[:, None, None],
-        saturation=how.saturation if saturate else np.inf,
-        noise=noise,
-    )
+    limit = how.saturation if saturate else np.inf
+    level = per_wavelength("background", background, n_wavelengths)[:, None, None]
+    detector = _detector(how, gain, read_noise, background=level, saturation=limit, noise=noise)
     # a generator for each frame, so that a frame is the same however many are simulated
     *seeds, of_pixels, of_star = map(
         np.random.default_rng, np.random.SeedSequence(seed).spawn(n_frames + 2)
     )
-    centres, widths = _variations(
-        of_star,
-        scene.centre if centre is None else centre,
-        float(pixels("motion", motion, layout, 1, least=0.0)[0]),
-        number("seeing", seeing),
-        n_frames,
-    )
+    place = scene.centre if centre is None else centre
+    jitter = float(pixels("motion", motion, layout, 1, least=0.0)[0])
+    centres, widths = _variations(of_star, place, jitter, number("seeing", seeing), n_frames)
     # before the first file: a star beside the image would leave dark cubes
     scene.check_places(centres)
     response, bad = _defects(of_pixels, layout, flat_error, bad_pixels)
@@ -238,7 +221,7 @@ def simulate_cubes(
     brightest = 0.0
     for i in tqdm(range(n_frames), desc="cubes", disable=None if progress else True):
         light = scene.light(beams[:, i], centres[i], widths[i])
-        brightest = max(brightest, float((light + detector.background).max()))
+        brightest = max(brightest, float((light + level).max()))
         image, weight = detector.expose(light, response, seeds[i])
         # as extraction marks pixels without a value
         image[bad], weight[bad] = np.nan, 0.0
@@ -246,6 +229,30 @@ def simulate_cubes(
     if brightest > how.saturation and not saturate:
         _warn_of_saturation(brightest, how)
     return [cube for cube, _ in names]
+
+
+def _scene(layout, n_wavelengths, *, source, psf, fwhm, beta, halo, halo_fwhm, margin):
+    """Return what falls on the detector, of numbers that have been checked."""
+    return Scene(
+        layout,
+        source=source,
+        psf=psf,
+        fwhm=pixels("fwhm", fwhm, layout, n_wavelengths),
+        beta=number("beta", beta, above=1.0),
+        halo=number("halo", halo, most=1.0),
+        halo_fwhm=pixels("halo_fwhm", halo_fwhm, layout, n_wavelengths),
+        margin=number("margin", margin),
+    )
+
+
+def _detector(how, gain, read_noise, **settings):
+    """Return the detector that a read-out describes; numbers that are given go before it."""
+    return Detector(
+        gain=number("gain", how.gain if gain is None else gain, above=0.0),
+        read_noise=number("read_noise", how.read_noise if read_noise is None else read_noise),
+        excess_noise=how.excess_noise,
+        **settings,
+    )
 
 
 def true_observations(
