@@ -47,7 +47,10 @@ def test_attributes_are_taken_over():
         ([0, 45, 22.5, 67.5], [[0, 1], [2, 3]]),
         ([0, 22.5, 45, 67.5], [[0, 2], [1, 3]]),
         ([0, 22.5, 0, 22.5], None),
-        ([0, 45, 22.5, 0], [[0, 1]]),
+        # an angle that has no partner at all is a hole; a frame left over is none
+        ([0, 45, 22.5, 0], None),
+        ([0, 45, 0, 45.1], [[0, 1], [2, 3]]),
+        ([0, 45, 0, 0], [[0, 1]]),
     ],
 )
 def test_pairs_by_the_angles_of_the_plate(hwp, pairs):
