@@ -105,9 +105,14 @@ def _change(free, name, value):
     # adding zero turns -0.0 into 0.0
     value = np.round(value, 9) + 0.0
     if np.ndim(value) == 0:
-        return f"{name} by {value:+.3g}{unit}"
+        return f"{name} by {_signed(value, 3)}{unit}"
     low, high = np.min(value), np.max(value)
-    return f"{name} by {low:+.3g} to {high:+.3g}{unit} over the wavelengths"
+    return f"{name} by {_signed(low, 3)} to {_signed(high, 3)}{unit} over the wavelengths"
+
+
+def _signed(value, digits):
+    """Return a number with its sign; zero has none."""
+    return f"{value:+.{digits}g}" if value else "0"
 
 
 def plain(moved):
@@ -131,7 +136,14 @@ def _range(span):
     low, high = span
     if max(abs(low), abs(high)) < _NOTHING_ON_SKY:
         return "less than 0.01"
-    return f"{low:+.2g}" if high - low < _NOTHING_ON_SKY else f"{low:+.2g} to {high:+.2g}"
+    if high - low < _NOTHING_ON_SKY:
+        return _signed(low, 2)
+    return f"{_signed(low, 2)} to {_signed(high, 2)}"
+
+
+def shows_on_sky(sky):
+    """Return whether a direction changes the AoLP or the DoLP on sky by what is worth a word."""
+    return max(map(abs, (*sky["aolp_deg"], *sky["dolp_percent"]))) >= _NOTHING_ON_SKY
 
 
 # ---- near-null directions -----------------------------------------------------------------

@@ -29,5 +29,5 @@ def need(module, what):
         package = module.split(".")[0].replace("_", "-")
         raise AstropolcalError(
             f"{what} needs the package {package}, which is not installed: "
-            'pip install "astropolcal[mcmc]"'
+            'pip install "astropolcal[mcmc]", or in a clone pip install ".[mcmc]"'
         ) from error

@@ -1,12 +1,17 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What a summary says of mirrors, and of stars that no fit saw."""
+"""What a summary says of mirrors, of stars that no fit saw, and of what is left open on sky."""
 
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration._directions import shows_on_sky, sky_words
 from astropolcal.calibration.reflections import METALS, mirror_names, mirror_values
 
 _N_MIRROR_ROWS = 5
+# so many wavelengths are all shown
+_ALL_ROWS = 12
+# so many open directions are named under the accuracies for a target, and as many bad ones
+_N_OPEN = 3
 _STAR_HEAD = ("DoLP (%)", "catalogue", "AoLP (deg)", "catalogue")
 
 
@@ -18,11 +23,12 @@ def mirror_lines(calibration):
     shown = {table.meta["name"]: table for table in tables}
     # a grid of several tables need not ascend
     order = np.argsort(calibration.wavelength)
-    rows = order[np.unique(np.linspace(0, order.size - 1, _N_MIRROR_ROWS).round().astype(int))]
+    step = 1 if order.size <= _ALL_ROWS else -(-order.size // _N_MIRROR_ROWS)
+    shortened = f"; one in {step} of {order.size} wavelengths" if step > 1 else ""
     head = "       nm" + "".join(f"{name:>17}" for name in shown)
-    lines = ["Diattenuation in percent; the metals bare, at 45 deg"]
+    lines = [f"Diattenuation in percent; the metals bare, at 45 deg{shortened}"]
     lines.append(head + "".join(f"{metal:>10}" for metal in METALS))
-    for i in rows:
+    for i in order[::step]:
         line = f"{calibration.wavelength[i].to_value(u.nm):9.1f}"
         line += "".join(f"{_with_error(table, 'diattenuation', i):>17}" for table in tables)
         metals = (tables[0][f"diattenuation_{metal}"][i] for metal in METALS)
@@ -65,3 +71,54 @@ def _entry(table):
         unit = "percent" if key.startswith("diattenuation") else "deg"
         columns[f"{key}_{unit}"] = table[key].value
     return {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns
+
+
+# ---- what an accuracy for a target leaves out ---------------------------------------------
+
+
+def open_on_sky(calibration):
+    """
+    Return what is open or badly determined and changes what is measured on sky.
+
+    Of each direction ``kind``, ``words`` and the changes ``aolp_deg`` and
+    ``dolp_percent``, least and largest of the wavelengths; the worst first.
+    """
+    finding = calibration.identifiability
+    return [
+        {"kind": kind, "words": words(direction)} | direction["sky"]
+        for kind, words, directions in (
+            ("open", _open_words, finding.directions),
+            ("badly determined", _near_words, finding.near_null),
+        )
+        for direction in sorted(directions, key=_turn, reverse=True)
+        if direction.get("sky") and shows_on_sky(direction["sky"])
+    ]
+
+
+def open_lines(calibration):
+    """Say what an accuracy for a target does not include, one line a kind."""
+    found, lines = open_on_sky(calibration), []
+    for kind, says in (
+        ("open", "without what the data leave open"),
+        ("badly determined", "without what is badly determined"),
+    ):
+        words = [one["words"] for one in found if one["kind"] == kind]
+        more = [f"and {len(words) - _N_OPEN} more, see below"] if len(words) > _N_OPEN else []
+        if words:
+            lines.append(f"  {says}: {'; '.join([*words[:_N_OPEN], *more])}")
+    return lines
+
+
+def _turn(direction):
+    return max(map(abs, (direction.get("sky") or {}).get("aolp_deg", [0.0])))
+
+
+def _open_words(direction):
+    lead = direction["words"].partition(" cannot be told")[0].partition(" changes no datum")[0]
+    return f"{lead}, which on sky {sky_words(direction['sky']).removeprefix('; on sky this ')}"
+
+
+def _near_words(direction):
+    lead = direction["words"].partition(" at the noise of this fit")[0]
+    turn, gain = (max(map(abs, direction["sky"][key])) for key in ("aolp_deg", "dolp_percent"))
+    return f"{lead}, which on sky is {turn:.2g} deg of AoLP and {gain:.2g} % of the DoLP"

@@ -270,6 +270,7 @@ def _verdict(chi2, expected, p_value, noise, priors):
         says = f"the residuals are {ratio:.3g} times the noise: the noise is overestimated"
     else:
         says = "the residuals agree with the noise"
+    says += f" (p = {p_value:.3g})"
     if priors is not None and priors["p_value"] < _UNLIKELY:
         says += f"; the data disagree with the priors (p = {priors['p_value']:.3g})"
-    return f"{says} (p = {p_value:.3g}); noise: {noise.words}"
+    return f"{says}; noise: {noise.words}"

@@ -1,12 +1,19 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """A calibration in words for the terminal, and in numbers for machines."""
 
+import re
 import textwrap
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration._sky_summary import mirror_lines, mirrors, star_lines
+from astropolcal.calibration._sky_summary import (
+    mirror_lines,
+    mirrors,
+    open_lines,
+    open_on_sky,
+    star_lines,
+)
 from astropolcal.calibration.groups import what_is_left_out
 from astropolcal.calibration.target_accuracy import TARGETS, target_accuracies
 from astropolcal.words import counted
@@ -18,6 +25,9 @@ _N_COLUMNS = 5
 _ACCURACIES = ("s_res", "s_mean", "s_cv", "s_standard")
 # pairs of frames at odds with the fit that a summary names
 _MOST_OUTLIERS = 5
+# values at a bound that are listed by their wavelength
+_MOST_BOUNDS = 6
+_ELEMENT = re.compile(r"(\w+\.\w+)\[(\d+)\]")
 
 
 def summary(calibration, targets=TARGETS):
@@ -53,7 +63,7 @@ def summary(calibration, targets=TARGETS):
     """
     known = calibration.parameter_values()
     parts = [
-        _heading(calibration),
+        [*_heading(calibration), *_unusable_lines(known)],
         _global_lines(known),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
@@ -66,7 +76,7 @@ def summary(calibration, targets=TARGETS):
         _wavelength_lines(calibration, known),
         mirror_lines(calibration),
         _goodness_lines(calibration),
-        list(_wrap([str(calibration.identifiability)])),
+        list(_wrap([_with_wavelengths(str(calibration.identifiability), calibration)])),
         _gauge_lines(calibration),
         _bound_lines(calibration),
         _posterior_lines(calibration),
@@ -79,6 +89,26 @@ def _wrap(lines):
     for line in "\n".join(lines).split("\n"):
         indent = " " * (len(line) - len(line.lstrip(" -")))
         yield from textwrap.wrap(line, _WIDTH, subsequent_indent=indent) or [""]
+
+
+def _with_wavelengths(text, calibration):
+    """Name elements of parameters by their wavelength instead of their number."""
+    nm = calibration.wavelength.to_value(u.nm)
+    return _ELEMENT.sub(
+        lambda m: f"{m[1]} ({nm[int(m[2])]:.1f} nm)" if int(m[2]) < nm.size else m[0], text
+    )
+
+
+def _unusable_lines(known):
+    """Say in a line near the top that a parameter is at a bound nearly everywhere."""
+    stuck = [
+        f"{name} ({np.sum(entry['at_bound'])} of {entry['value'].size})"
+        for name, entry in known.items()
+        if entry["value"].ndim and np.mean(entry["at_bound"]) > 0.5
+    ]
+    if not stuck:
+        return []
+    return list(_wrap([f"NOT USABLE AS IT IS: at a bound at most wavelengths: {', '.join(stuck)}"]))
 
 
 def _heading(calibration):
@@ -197,6 +227,7 @@ def _target_lines(calibration, targets):
     ]
     if any(table.meta["aolp"] is None for table in tables):
         lines.append("  AoLP any: at whichever angle the accuracy is worst")
+    lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration)]
     return list(_wrap(lines))
 
 
@@ -235,32 +266,50 @@ def _wavelength_lines(calibration, known):
     left_out = (
         f"; not shown: {', '.join(list(several)[_N_COLUMNS:])}" if len(several) > len(shown) else ""
     )
-    title = f"Parameters for each wavelength (* at a bound{left_out})"
+    title = f"Parameters for each wavelength (* at a bound; ~ not determined alone{left_out})"
     rows = [*_wrap([title]), *_table_head(shown)]
-    s_mean = _by_wavelength(calibration.datasets[0].accuracy)
+    s_mean = _by_wavelength(calibration.datasets)
     for i, wavelength in enumerate(calibration.wavelength.to_value(u.nm)):
         mean = s_mean.get(round(wavelength, 2), np.nan)
         row = f"{wavelength:9.1f}" + (f"{mean:9.3f}" if np.isfinite(mean) else f"{'-':>9}")
         for entry in shown.values():
             # degrees to 0.01, shares of one to 0.0001
             digits = 2 if entry["unit"] else 4
-            row += f"{entry['value'][i]:11.{digits}f}" + ("*" if entry["at_bound"][i] else " ")
+            row += f"{entry['value'][i]:11.{digits}f}" + _mark(entry, i)
         rows.append(row.rstrip())
     return rows
+
+
+def _mark(entry, i):
+    if entry["at_bound"][i]:
+        return "*"
+    # what follows another parameter has no error of its own
+    return " " if np.isfinite(entry["std"][i]) or entry["tied"] else "~"
+
+
+def _shortened(text):
+    """Return a name that leaves a blank between columns of eleven."""
+    return text if len(text) < 11 else f"{text[:9]}."
 
 
 def _table_head(shown):
     optics, keys = zip(*(name.split(".") for name in shown), strict=True)
     units = [str(entry["unit"] or "") for entry in shown.values()]
     return [
-        f"{first:>9}{second:>9}" + "".join(f"{text[:11]:>11} " for text in texts).rstrip()
+        f"{first:>9}{second:>9}" + "".join(f"{_shortened(text):>11} " for text in texts).rstrip()
         for first, second, texts in (("", "", optics), ("", "s_mean", keys), ("nm", "%", units))
     ]
 
 
-def _by_wavelength(accuracy):
-    nm = accuracy["wavelength"].to_value(u.nm)
-    return {round(w, 2): s for w, s in zip(nm, accuracy["s_mean"].value, strict=True)}
+def _by_wavelength(datasets):
+    """Return s_mean at each wavelength, of the first dataset that has it."""
+    found = {}
+    for accuracy in (record.accuracy for record in datasets):
+        nm = accuracy["wavelength"].to_value(u.nm)
+        for w, s in zip(nm, accuracy["s_mean"].value, strict=True):
+            if np.isfinite(s):
+                found.setdefault(round(w, 2), s)
+    return found
 
 
 def _goodness_lines(calibration):
@@ -284,13 +333,27 @@ def _outlier_lines(outliers):
 
 def _gauge_lines(calibration):
     gauge = calibration.settings.get("gauge")
-    return list(_wrap([f"Gauge: {gauge}"])) if gauge else []
+    return list(_wrap([_with_wavelengths(f"Gauge: {gauge}", calibration)])) if gauge else []
 
 
 def _bound_lines(calibration):
     if not calibration.at_bound:
         return []
-    return list(_wrap([f"At a bound, so without an error: {', '.join(calibration.at_bound)}"]))
+    elements = {}
+    for name in calibration.at_bound:
+        stem, _, index = name.rstrip("]").partition("[")
+        elements.setdefault(stem, []).extend([int(index)] if index else [])
+    nm = calibration.wavelength.to_value(u.nm)
+    words = [stem + _at(nm, own) for stem, own in elements.items()]
+    return list(_wrap([f"At a bound, so without an error: {', '.join(words)}"]))
+
+
+def _at(nm, indices):
+    if not indices:
+        return ""
+    if len(indices) > _MOST_BOUNDS:
+        return f" ({len(indices)} of {len(nm)} wavelengths)"
+    return f" ({', '.join(f'{nm[i]:.1f}' for i in indices)} nm)"
 
 
 def _posterior_lines(calibration):
@@ -363,6 +426,7 @@ def to_dict(calibration, targets=TARGETS):
         "parameters": {
             name: _parameter(entry) for name, entry in calibration.parameter_values().items()
         },
+        "open_on_sky": _plain(open_on_sky(calibration)),
         "null_directions": calibration.identifiability.directions,
         "near_null_directions": calibration.identifiability.near_null,
         "sampling": list(calibration.identifiability.sampling),

@@ -16,6 +16,9 @@ from astropolcal.fitscheck import open_fits, readable_fits
 
 __all__ = ["ArraySource", "CubeFiles", "TurnedSource"]
 
+# times the longer side of an image: any turn of the field fits, and nothing beyond has light
+_MOST_SIZE = 2
+
 
 class ArraySource:
     """
@@ -195,6 +198,8 @@ class CubeFiles:
     ------
     ObservationError
         If a file is missing, no FITS file, or of another shape than the first.
+    ParameterError
+        If ``size`` is less than 1, or more than twice the images.
 
     Examples
     --------
@@ -244,7 +249,16 @@ class CubeFiles:
                 )
         self.n_wavelengths = self._shape[0]
         self.has_variances = all(len(places) > 1 for places in found.values())
+        self._check_size(size)
         self._check_window(self._shape[1:])
+
+    def _check_size(self, size):
+        height, width = self._shape[1:]
+        most = _MOST_SIZE * max(height, width)
+        if not 1 <= size <= most:
+            raise ParameterError(
+                f"size = {size}; the images are {width} x {height} pixels, allowed are 1 to {most}"
+            )
 
     def _check_window(self, shape):
         x, y = self._centres[..., 0], self._centres[..., 1]

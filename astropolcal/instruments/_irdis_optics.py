@@ -83,7 +83,8 @@ def coating_of(coating, date):
         if coating is None:
             warnings.warn(
                 "irdis: neither date nor coating of the telescope was given; it is the one from "
-                f"{RECOATING} on; give the date of the frames, or coating='before' for older ones",
+                f"{RECOATING} on; give the date of the frames (date, or --date of a command), or "
+                "coating='before' for older ones",
                 AstropolcalWarning,
                 # coating_of, telescope_optics, on_sky: the line that asked for a chain from the sky
                 stacklevel=4,

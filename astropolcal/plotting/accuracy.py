@@ -46,7 +46,8 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
 
     These are s_res, s_mean and s_cv, and s_standard for each standard of the dataset's
     source. Standards of other sources have panels of their own, with the s_cv that they
-    are compared with.
+    are compared with. Where several datasets, and every standard, have one wavelength each,
+    one panel shows them side by side.
 
     Parameters
     ----------
@@ -93,6 +94,8 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     # a standard of a source that was not fitted has no panel to be drawn into
     others = [entry for entry in standards if entry["source"] not in sources]
     count = len(records) + len(others)
+    if len(records) > 1 and not curves and _have_one_wavelength(records, standards):
+        return _draw_side_by_side(figure, calibration, records, standards)
     with style():
         figure = canvas(figure, 8.5, 2.4 + 3.6 * count)
         # one scale, so that datasets can be compared by eye
@@ -137,6 +140,49 @@ def _reference(label, pair):
             f"reference {label!r} has {lam.size} wavelengths but {value.size} accuracies"
         )
     return lam, value
+
+
+def _have_one_wavelength(records, standards):
+    return all(len(record.accuracy) == 1 for record in records) and all(
+        len(entry["wavelength_nm"]) == 1 for entry in standards
+    )
+
+
+def _draw_side_by_side(figure, calibration, records, standards):
+    """Draw one panel of points over the datasets, then the standards."""
+    values = {
+        name: np.array([record.accuracy[name].to_value(u.percent)[0] for record in records])
+        for name in _CURVES
+    }
+    at, after = np.arange(len(records)), len(records) + np.arange(len(standards))
+    with style():
+        figure = canvas(figure, max(8.5, 2.5 + 0.6 * (len(at) + len(after))), 7.0)
+        axes = figure.subplots()
+        for name, (color, marker, label) in _CURVES.items():
+            label = label.format(what_is_left_out(calibration)) if name == "s_cv" else label
+            if not np.isfinite(values[name]).any():
+                label, marker = f"{name}: not known (too few data or groups)", ""
+            axes.plot(at, values[name], marker=marker, ls="", color=color, label=label)
+        if standards:
+            predicted = [entry["s_standard_percent"][0] for entry in standards]
+            label = "s_standard: rms error when predicting a standard, which was not fitted"
+            axes.plot(after, predicted, "D", color=PURPLE, label=label)
+            compared = [entry["s_cv_percent"][0] for entry in standards]
+            label = "s_cv of the data that were fitted, for comparison"
+            axes.plot(after, compared, "_", color=GREEN, markersize=14, label=label)
+        names = [
+            f"{record.name}\n{nanometres(record.accuracy['wavelength'])[0]:.0f} nm"
+            for record in records
+        ] + [f"{entry['name']}\n{entry['wavelength_nm'][0]:.0f} nm" for entry in standards]
+        axes.set_xticks([*at, *after], names, rotation=35, ha="right", fontsize=9.5)
+        axes.set_ylabel("accuracy (% of polarization)")
+        n = [count for record in records for count in record.accuracy["n"]]
+        k = _span([k for record in records for k in record.accuracy["k"]])
+        axes.set_title(f"n = {_span(n)} data a dataset, k = {k} free parameters")
+        scale_axis(axes, _all_values(records, standards, {}))
+        heading(figure, calibration, "Accuracy of the calibration", [r.name for r in records])
+        legend_outside(figure, axes.get_legend_handles_labels()[0])
+    return figure
 
 
 def _draw_record(axes, record, calibration):
@@ -234,4 +280,4 @@ def scale_axis(axes, values):
         axes.yaxis.set_minor_formatter(NullFormatter())
     else:
         # accuracies of similar size are compared by their lengths from zero
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.08 * known.max() if known.size else None)

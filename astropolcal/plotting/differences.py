@@ -6,6 +6,7 @@ import numpy as np
 
 from astropolcal.plotting._data import DataGrid
 from astropolcal.plotting._style import (
+    COLORS,
     GREY,
     MINUS,
     SIGMA,
@@ -89,10 +90,10 @@ def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=
         spread = _s_res(calibration, dataset)
         for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
             _draw_heading(pair, grid.wavelength[row], spread[row])
-            for one, curve, look in zip(series, curves, looks(len(series)), strict=True):
+            for one, curve, look in zip(series, curves, _looks(len(series)), strict=True):
                 _draw_series(pair, grid, row, one, look)
                 if curve is not None:
-                    pair[0].plot(fine, curve[i], color=look[0])
+                    pair[0].plot(fine, curve[i], color=look["color"], linestyle=look["linestyle"])
         _label(pairs, grid, columns)
         heading(figure, calibration, grid.quantity.capitalize(), [grid.part.observations.name])
         _legend(figure, grid, series, bins, spread[bins])
@@ -113,6 +114,22 @@ def _panels(figure, count, rows, columns):
     return pairs
 
 
+def _looks(count):
+    """Return the looks of the series: where colours recur, lines are dashed and markers open."""
+    found = []
+    for i, (color, marker) in enumerate(looks(count)):
+        again = i // len(COLORS) % 2 == 1
+        found.append(
+            {
+                "color": color,
+                "marker": marker,
+                "markerfacecolor": "white" if again else color,
+                "linestyle": "--" if again else "-",
+            }
+        )
+    return found
+
+
 def _s_res(calibration, dataset):
     return calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
 
@@ -128,17 +145,16 @@ def _draw_heading(pair, wavelength, s_res):
 
 def _draw_series(pair, grid, row, one, look):
     """Draw the data of one setting of the half-wave plate, and their residuals."""
-    color, marker = look
     angle = grid.abscissa[0][one.data]
     value, residual, sigma = (
         array[row, one.data] for array in (grid.observed, grid.residual, grid.sigma)
     )
-    points = {"color": color, "marker": marker, "linestyle": "none", "label": one.label}
+    points = look | {"linestyle": "none", "label": one.label}
     pair[0].errorbar(angle, value, yerr=_bars(sigma), **points)
     pair[1].errorbar(angle, 100 * residual, yerr=_bars(100 * sigma), **points)
     # where a stage moves from datum to datum there is no model between the data
     if one.positions is None:
-        pair[0].plot(angle, value - residual, "x", color=color, markersize=8)
+        pair[0].plot(angle, value - residual, "x", color=look["color"], markersize=8)
 
 
 def _curve(grid, one, bins, fine):
@@ -187,8 +203,8 @@ def _legend(figure, grid, series, bins, s_res):
     # what is not drawn has no entry in the legend
     curves = any(one.positions is not None for one in series)
     handles = [
-        Line2D([], [], color=color, marker=marker, linestyle="-" if curves else "", label=one.label)
-        for one, (color, marker) in zip(series, looks(len(series)), strict=True)
+        Line2D([], [], **(look if curves else look | {"linestyle": ""}), label=one.label)
+        for one, look in zip(series, _looks(len(series)), strict=True)
     ]
     bars = np.isfinite(grid.sigma[bins]).any()
     seen = f"observed, with 1{SIGMA} errors" if bars else "observed (no errors given)"
@@ -204,6 +220,7 @@ def _legend(figure, grid, series, bins, s_res):
     legend_outside(
         figure,
         handles,
-        place="outside right upper",
+        # at the top a long title would run into it
+        place="outside right center",
         title=f"{plate},\n{frames}",
     )

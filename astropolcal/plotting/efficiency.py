@@ -172,6 +172,8 @@ def _map_of_pointings(fig, ax, asked, derotator):
         parallactic=_PARALLACTIC * u.deg,
     ).min(axis=-1)
     mesh = ax.pcolormesh(_PARALLACTIC, _ALTITUDE, values, cmap="cividis", shading="nearest")
+    # the cells of the last row reach beyond the zenith
+    ax.set_ylim(_ALTITUDE[0], 90)
     ax.set(xlabel="parallactic angle (deg)", ylabel="altitude (deg)")
     ax.set(xticks=np.arange(-180, 181, 90))
     turned = "" if derotator is None else f"derotator at {_degree(derotator)}, "

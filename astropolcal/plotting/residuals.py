@@ -6,6 +6,7 @@ import numpy as np
 from astropolcal.plotting._data import SAME_ANGLE, DataGrid
 from astropolcal.plotting._style import (
     BLUE,
+    GREY,
     MINUS,
     canvas,
     cell_edges,
@@ -21,6 +22,10 @@ __all__ = ["plot_residuals"]
 # share of the residuals that the colour scale covers, so that one outlier does not blank the map
 _COVERED = 99
 _MAX_TICKS = 12
+# maps have one scale unless those of their own differ by more than this factor
+_ONE_SCALE = 3
+# room above the tallest bar
+_HEADROOM = 1.05
 
 
 def plot_residuals(calibration, *, figure=None):
@@ -28,8 +33,9 @@ def plot_residuals(calibration, *, figure=None):
     Draw a map of the residuals: wavelength against datum, by derotator angle.
 
     Above the map is the rms of each datum over the wavelengths, at its right
-    the rms of each wavelength over the data; one map a dataset, all with the
-    same colours. Masked data are grey.
+    the rms of each wavelength over the data; one map a dataset. All maps have the
+    same colours, or where the residuals differ much in size each a scale of its own.
+    Masked data are grey. Datasets of one wavelength each are drawn as bars, not as maps.
 
     Parameters
     ----------
@@ -63,31 +69,83 @@ def plot_residuals(calibration, *, figure=None):
     'wavelength (nm)'
     """
     grids = [DataGrid(calibration, i) for i in range(len(calibration.datasets))]
-    limit, clipped = _limit(grids)
     with style():
-        figure = canvas(figure, 10.5, 0.8 + 5.4 * len(grids))
-        spec = figure.add_gridspec(
-            2 * len(grids), 2, width_ratios=(5, 1), height_ratios=(1, 3.6) * len(grids)
-        )
-        maps = []
-        for i, grid in enumerate(grids):
-            main = figure.add_subplot(spec[2 * i + 1, 0])
-            above = figure.add_subplot(spec[2 * i, 0], sharex=main)
-            right = figure.add_subplot(spec[2 * i + 1, 1], sharey=main)
-            maps.append(main)
-            drawn = _draw_dataset(main, above, right, grid, limit)
-            if len(grids) > 1:
-                above.set_title(grid.part.observations.name, loc="left")
-        bar = figure.colorbar(
-            drawn, ax=figure.axes, extend="both" if clipped else "neither", shrink=0.8, aspect=35
-        )
-        bar.set_label(f"observed {MINUS} model (%); grey: masked")
+        if all(grid.wavelength.size == 1 for grid in grids):
+            figure = _draw_bars(figure, grids)
+        else:
+            figure = _draw_maps(figure, grids)
         heading(
             figure,
             calibration,
             f"Residuals of the {grids[0].quantity}",
             [grid.part.observations.name for grid in grids],
         )
+    return figure
+
+
+def _draw_maps(figure, grids):
+    scales, shared = _scales(grids)
+    figure = canvas(figure, 10.5, 0.8 + 5.4 * len(grids))
+    spec = figure.add_gridspec(
+        2 * len(grids), 2, width_ratios=(5, 1), height_ratios=(1, 3.6) * len(grids)
+    )
+    for i, (grid, (limit, clipped)) in enumerate(zip(grids, scales, strict=True)):
+        main = figure.add_subplot(spec[2 * i + 1, 0])
+        above = figure.add_subplot(spec[2 * i, 0], sharex=main)
+        right = figure.add_subplot(spec[2 * i + 1, 1], sharey=main)
+        drawn = _draw_dataset(main, above, right, grid, limit)
+        if len(grids) > 1:
+            above.set_title(grid.part.observations.name, loc="left")
+        if not shared:
+            bar = _add_bar(figure, drawn, [main, above, right], clipped)
+            bar.set_label(f"observed {MINUS} model (%), own scale\ngrey: masked")
+    if shared:
+        bar = _add_bar(figure, drawn, figure.axes, clipped)
+        bar.set_label(f"observed {MINUS} model (%); grey: masked")
+    return figure
+
+
+def _add_bar(figure, drawn, panels, clipped):
+    extend = "both" if clipped else "neither"
+    return figure.colorbar(drawn, ax=panels, extend=extend, shrink=0.8, aspect=35)
+
+
+def _scales(grids):
+    """Return the colour scale of each map, and whether it is that of all."""
+    own = [_limit([grid]) for grid in grids]
+    ends = [limit for limit, _ in own]
+    if max(ends) > _ONE_SCALE * min(ends):
+        return own, False
+    return [_limit(grids)] * len(grids), True
+
+
+def _draw_bars(figure, grids):
+    """Draw the residuals at one wavelength, a panel a dataset, all with the same scale."""
+    figure = canvas(figure, 10.5, 2.2 + 1.4 * max(len(grids), 2))
+    panels = figure.subplots(len(grids), 1, sharey=True, squeeze=False)[:, 0]
+    below = None
+    for axes, grid in list(zip(panels, grids, strict=True))[::-1]:
+        order, group, ends = _layout(grid)
+        percent = 100 * grid.residual[0, order]
+        axes.bar(np.arange(len(order)) + 0.5, percent, width=0.9, color=BLUE)
+        for masked in np.flatnonzero(~np.isfinite(percent)):
+            axes.axvspan(masked, masked + 1, color="0.75", linewidth=0)
+        axes.axhline(0, color=GREY, linewidth=1)
+        for end in ends[:-1]:
+            axes.axvline(end, color="black", linewidth=0.8)
+        axes.set_xlim(0, len(order))
+        size = f"{grid.wavelength[0]:.1f} nm, rms {rms(percent):.2g} %"
+        axes.set_title(f"{grid.part.observations.name}: {size}", loc="left", fontsize=10)
+        _name_groups(axes, grid, order, group, ends)
+        # what stands below the next panel need not be said twice
+        words = axes.get_xlabel(), [text.get_text() for text in axes.get_xticklabels()]
+        if words == below:
+            axes.set_xlabel("")
+            axes.tick_params(labelbottom=False)
+        below = words
+    figure.supylabel(f"observed {MINUS} model (%); grey: masked", fontsize=11)
+    size = max(np.nanmax(np.abs(grid.residual)) for grid in grids) * 100
+    panels[0].set_ylim(-_HEADROOM * max(size, 1e-12), _HEADROOM * max(size, 1e-12))
     return figure
 
 
@@ -119,7 +177,8 @@ def _draw_dataset(main, above, right, grid, limit):
     _wavelength_rms(right, rms(percent, axis=1), grid.wavelength[lam])
     for axes in (above, right):
         axes.margins(0)
-    above.set_ylim(bottom=0)
+    # exact data have no bars
+    above.set_ylim(0, _HEADROOM * np.nanmax(rms(percent, axis=0)) or 1)
     return drawn
 
 

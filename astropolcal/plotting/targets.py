@@ -94,15 +94,18 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
 
 def _draw_parts(axes, table):
     # the parts are those of the instrument and the same for every target: the first will do
-    axes.set_title("What it is made of")
+    axes.set_title("Parts of the accuracy, the same for every target")
     lam = nanometres(table["wavelength"])
     handles, values = [], []
     for (key, label), (color, marker) in zip(_PARTS.items(), looks(len(_PARTS)), strict=True):
         value = table[key].to_value(u.percent)
+        look = {"color": color, "marker": marker}
         if not np.isfinite(value).any():
+            # text only: a marker would promise a curve
             label = f"{key}: not known, no such dataset"
+            look = {"linestyle": "none", "marker": "none"}
         # what is exactly zero stands for a calibration that is missing
-        handles.append(draw_line(axes, lam, value, color=color, marker=marker, label=label))
+        handles.append(draw_line(axes, lam, value, label=label, **look))
         values.append(value)
     scale_axis(axes, np.concatenate(values))
     return handles
@@ -113,8 +116,12 @@ def _draw_targets(axes, tables, key):
     # apart from the looks of the parts, which share the legend
     for table, (color, marker) in zip(tables, looks(len(tables) + 4)[4:], strict=True):
         lam, value = nanometres(table["wavelength"]), table[key].value
-        label = f"target of {_words(table)}"
-        lines.append(draw_line(axes, lam, value, color=color, marker=marker, label=label))
+        # large open markers and wide lines below: of curves that coincide all are seen
+        below = len(tables) - 1 - len(lines)
+        look = {"color": color, "marker": marker, "linewidth": 1.5 + 2 * below}
+        look |= {"markersize": 5.5 + 4.5 * below, "markeredgewidth": 1.5}
+        look |= {"markerfacecolor": "none"} if below else {}
+        lines.append(draw_line(axes, lam, value, label=f"target of {_words(table)}", **look))
         values.append(value)
     scale_axis(axes, np.concatenate(values))
     return lines

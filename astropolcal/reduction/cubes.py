@@ -450,7 +450,7 @@ def _defects(rng, layout, flat_error, bad_pixels):
 def _warn_of_saturation(brightest, how):
     warnings.warn(
         f"the brightest pixel has {brightest:.3g} adu, above the saturation of "
-        f"{how.saturation:g} adu: lower the flux, or cut off with saturate",
+        f"{how.saturation:g} adu: lower the flux (--flux), or cut pixels off there (--saturate)",
         AstropolcalWarning,
         stacklevel=3,
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
+from astropy.utils.exceptions import AstropyUserWarning
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.fitscheck import open_fits, readable_fits
@@ -212,8 +213,12 @@ def open_cube(path, layout):
             # astropy only warns of it, and fails later in other words
             warnings.filterwarnings("error", message=".*truncated.*")
             stream = stack.enter_context(open_fits(path))
-            hdus = stack.enter_context(fits.open(stream, memmap=True))
-            opened = _read(path, hdus, layout)
+            try:
+                hdus = stack.enter_context(fits.open(stream, memmap=True))
+                opened = _read(path, hdus, layout)
+            except AstropyUserWarning as warning:
+                # its type tells a user nothing
+                raise OSError(str(warning)) from warning
         # behind the door: what fails in the caller's block is not the file's fault
         yield opened
 

@@ -272,8 +272,10 @@ def _instrument(instrument, files=()):
     if header is not None:
         instrument = instrument.configured(header)
     if instrument.files is None:
+        known = [name for name in instruments.names() if instruments.get(name).files is not None]
         raise InstrumentError(
-            f"{instrument.name}: nothing is known of its files; its class needs an attribute files"
+            f"{instrument.name}: it is not known how its files look; they can be read of "
+            f"{', '.join(known)}"
         )
     if len(instrument.wavelength) != instrument.files.shape[0]:
         raise InstrumentError(

@@ -13,6 +13,7 @@ from astropolcal.scripts._common import (
     add_quiet,
     check_folders,
     check_outputs,
+    check_suffix,
     edit_chains,
     instrument_of,
     printer,
@@ -46,7 +47,12 @@ def add_parser(commands):
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("files", nargs="*", metavar="FILE", help="observation tables (ECSV)")
-    parser.add_argument("-o", "--output", metavar="CAL.asdf", help="write the calibration here")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="CAL.asdf",
+        help="write the calibration here; overwritten if it exists",
+    )
     parser.add_argument("--instrument", metavar="NAME", help="default: as the tables say")
     _add_model_options(parser)
     _add_accuracy_options(parser)
@@ -176,6 +182,7 @@ def run(arguments):
 
     say = printer(arguments)
     check_outputs(arguments.output, arguments.json)
+    check_suffix("-o", arguments.output, ".asdf")
     check_folders(arguments.plots)
     _check_start(arguments)
     # raises before any table is read
@@ -303,7 +310,7 @@ def _target(text):
     dolp, comma, aolp = text.partition(",")
     return (
         _quantity(text, dolp, u.percent, 0, 100),
-        _quantity(text, aolp, u.deg, -360, 360) if comma else None,
+        _quantity(text, aolp, u.deg, -180, 180) if comma else None,
     )
 
 

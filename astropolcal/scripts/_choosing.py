@@ -1,10 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Which calibration a night of frames is corrected with, and which of its chains."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ObservationError
+
+# by what a library may ask for
+_OPTIONS = {
+    "instrument": "--instrument NAME",
+    "mode": "--filter MODE",
+    "optics_in": "--optics-in NAME,NAME,...",
+}
 
 
 @dataclass
@@ -125,12 +133,14 @@ def _of_library(path, arguments, night, beam, files):
     if not dates:
         raise ObservationError(f"{files[0]}: no date in its header to choose a calibration by")
     library, mode = Library(path), arguments.filter or night.mode
-    found = [
-        library.find(
-            arguments.instrument, mode=mode, date=date, optics_in=arguments.optics_in, beam=beam
-        )
-        for date in dates
-    ]
+    wanted = {"mode": mode, "optics_in": arguments.optics_in, "beam": beam}
+    try:
+        found = [library.find(arguments.instrument, date=date, **wanted) for date in dates]
+    except CalibrationFileError as error:
+        # the library names what it needs, a user types options
+        missing = re.search(r"say which (\w+) is meant$", str(error))
+        hint = f" ({_OPTIONS[missing[1]]})" if missing else ""
+        raise CalibrationFileError(f"{error}{hint}") from error
     # a night across the change of a calibration
     if len({str(entry.path) for entry in found}) > 1:
         raise AstropolcalError(

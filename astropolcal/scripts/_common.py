@@ -110,6 +110,12 @@ def check_outputs(*paths):
         _check_writable(path, path.parent)
 
 
+def check_suffix(option, path, suffix):
+    """Raise if a file that is to be written is called what others take for another format."""
+    if path is not None and Path(path).suffix.lower() != suffix:
+        raise AstropolcalError(f"{option} {path}: the name must end with {suffix}")
+
+
 def check_folders(*paths):
     """Raise before any work is done if a folder is a file, or cannot be made or written to."""
     for path in paths:

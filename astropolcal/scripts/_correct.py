@@ -28,6 +28,8 @@ examples:
       --rotation pupil --camera-angle 113 --open-directions ignore
 """
 
+_OUTPUT = "the product; overwritten if it exists"
+
 # what a chain may ask of a frame
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 
@@ -52,7 +54,7 @@ def add_parser(commands):
         help="a calibration file, or a folder of them, from which the one that holds for the "
         "frames is taken",
     )
-    parser.add_argument("-o", "--output", metavar="OUT.fits", required=True, help="the product")
+    parser.add_argument("-o", "--output", metavar="OUT.fits", required=True, help=_OUTPUT)
     _add_solution(parser)
     _add_instrument(parser)
     _add_images(parser)
@@ -232,7 +234,7 @@ def run(arguments):
     if arguments.json:
         write_json(summary, arguments.json)
     if not is_quiet(arguments):
-        _report(summary)
+        _report(summary, result.systematic)
 
 
 def _corrected(calibration, frames, chain, arguments, provenance):
@@ -383,34 +385,45 @@ def _plain(values):
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-def _report(summary):
+def _report(summary, systematic):
     # None where nothing was determined
     condition = [value for value in summary["condition"] if value is not None]
     frames = counted(summary["n_frames"], "frame")
     print(f"Written: {summary['output']} ({frames}, mode {summary['mode']})")
     print(f"  calibration: {summary['calibration']}")
     if condition:
-        print(f"  condition: {min(condition):.3g} to {max(condition):.3g}")
+        print(
+            f"  condition number of the solution for {summary['components']}: "
+            f"{min(condition):.3g} to {max(condition):.3g}"
+        )
     for i, words in summary["poorly_determined"].items():
         line = f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}"
         print(wrapped(line, indent=4))
     aperture = summary["aperture"]
     print(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
-    for name, unit, error, words in (
-        ("dolp", "", "s_p", "degree of linear polarization"),
-        ("aolp", " deg", "s_chi", "angle of linear polarization"),
+    # JSON has null where it is infinite
+    unknown = "infinite" if systematic is not None and systematic.is_open else "not known"
+    for name, unit, error, words, scale in (
+        ("dolp", " %", "s_p", "degree of linear polarization", 100),
+        ("aolp", " deg", "s_chi", "angle of linear polarization", 1),
     ):
-        value = _middle(aperture[name], ".4f" if name == "dolp" else ".1f", unit, name == "aolp")
-        print(f"    {words}: {value}")
-        for kind in ("statistical", "systematic"):
-            print(f"      {kind} error: {_middle(aperture[f'{error}_{kind}'], '.2g', unit)}")
+        values = _scaled(aperture[name], scale)
+        shown = _middle(values, ".2f" if name == "dolp" else ".1f", unit, name == "aolp")
+        print(f"    {words}: {shown}")
+        for kind, none in (("statistical", "not known"), ("systematic", unknown)):
+            values = _scaled(aperture[f"{error}_{kind}"], scale)
+            print(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
 
 
-def _middle(values, form, unit, turns=False):
+def _scaled(values, scale):
+    return [None if value is None else scale * value for value in values]
+
+
+def _middle(values, form, unit, turns=False, none="not known"):
     """Return the median of what is known, as text; angles near 0 and 180 deg are neighbours."""
     known = np.array([value for value in values if value is not None])
     if known.size == 0:
-        return "not known"
+        return none
     if turns:
         # mean direction of doubled angles, from which the median is counted
         centre = np.degrees(np.angle(np.exp(2j * np.radians(known)).sum())) / 2

@@ -11,6 +11,7 @@ from astropolcal.scripts._common import (
     add_json,
     add_quiet,
     check_outputs,
+    check_suffix,
     edit_chains,
     instrument_of,
     is_quiet,
@@ -97,6 +98,7 @@ def run(arguments):
         return
     say, progress = printer(arguments), None if is_quiet(arguments) else _progress
     check_outputs(arguments.report, arguments.save, arguments.json)
+    check_suffix("--save", arguments.save, ".asdf")
     effects = _effects(arguments.effects)
     nominal, datasets, instrument = _nominal(arguments)
     diagnosis = diagnose(nominal, datasets, effects=effects, progress=progress)

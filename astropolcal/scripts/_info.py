@@ -3,7 +3,8 @@
 
 from pathlib import Path
 
-from astropolcal.scripts._common import add_json, wrapped, write_json
+from astropolcal.exceptions import ObservationError
+from astropolcal.scripts._common import add_json, add_quiet, printer, wrapped, write_json
 from astropolcal.scripts._describing import describe_fits, describe_table, is_observation
 from astropolcal.words import counted
 
@@ -25,6 +26,7 @@ def add_parser(commands):
     )
     parser.add_argument("--instruments", action="store_true", help="list the instruments only")
     add_json(parser, "write it")
+    add_quiet(parser)
     parser.set_defaults(run=run)
 
 
@@ -33,7 +35,7 @@ def run(arguments):
     if arguments.instruments:
         from astropolcal import instruments
 
-        print("\n".join(instruments.names()))
+        printer(arguments)("\n".join(instruments.names()))
         return
     if arguments.file is None:
         text, content = _installation()
@@ -47,8 +49,7 @@ def run(arguments):
         text, content = _table(arguments.file)
     if arguments.json:
         write_json(content, arguments.json)
-    if arguments.json != "-":
-        print(text)
+    printer(arguments)(text)
 
 
 def _installation():
@@ -161,10 +162,26 @@ def _table(path):
     """Return what an ECSV table holds: beam fluxes, or something else."""
     from astropolcal.observations.reading import read_ecsv
 
+    _check_ecsv(path)
     table = read_ecsv(path)
     if is_observation(table):
         return _observations(path)
     return _lines(*describe_table(path, table))
+
+
+def _check_ecsv(path):
+    """Refuse a file that is nothing of ours, and say what is."""
+    try:
+        with open(path, "rb") as stream:
+            known = stream.read(7) == b"# %ECSV"
+    except OSError:
+        # the reader of tables says what is wrong
+        return
+    if not known:
+        raise ObservationError(
+            f"{path}: info takes a calibration (.asdf), a folder of them, an ECSV table, or a FITS "
+            "cube or product; this is none of them"
+        )
 
 
 def _observations(path):

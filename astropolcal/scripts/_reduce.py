@@ -13,6 +13,7 @@ from astropolcal.scripts._common import (
     angles,
     check_folders,
     check_outputs,
+    check_suffix,
     cube_files,
     number_or,
     printer,
@@ -44,7 +45,13 @@ def add_parser(commands):
     parser.add_argument(
         "cubes", metavar="CUBES", nargs="+", help="cubes, or folders of them (*.fits)"
     )
-    parser.add_argument("-o", "--output", metavar="OBS.ecsv", required=True, help="the table")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OBS.ecsv",
+        required=True,
+        help="the table; overwritten if it exists",
+    )
     _add_meta(parser)
     _add_photometry(parser)
     parser.add_argument("--workers", metavar="N", type=int, help="number of processes")
@@ -122,6 +129,7 @@ def run(arguments):
     from astropolcal.reduction import reduce_run
 
     check_outputs(arguments.output, arguments.json, arguments.resume)
+    check_suffix("-o", arguments.output, ".ecsv")
     check_folders(arguments.quicklook)
     files = cube_files(arguments.cubes)
     instrument = instruments.get(arguments.instrument)

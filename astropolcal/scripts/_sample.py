@@ -2,15 +2,17 @@
 """``astropolcal sample``: samples of the posterior of a calibration's parameters."""
 
 import argparse
+import re
 import sys
 from pathlib import Path
 
-from astropolcal.exceptions import AstropolcalError
+from astropolcal.exceptions import AstropolcalError, FitError
 from astropolcal.scripts._common import (
     add_json,
     add_quiet,
     check_folders,
     check_outputs,
+    check_suffix,
     printer,
     read_datasets,
     say_written,
@@ -28,6 +30,8 @@ examples:
 The files are the tables that the calibration was made from, all of them. Which
 parameters vary, their bounds and their priors are those of the calibration.
 """
+# what the library calls them
+_OPTIONS = {"n_walkers": "--walkers", "n_steps": "--steps", "burn_in": "--burn"}
 _COLUMNS = ("median", "lower", "upper", "fitted")
 
 
@@ -46,7 +50,10 @@ def add_parser(commands):
         "files", nargs="+", metavar="FILE", help="the tables that it was made from (ECSV)"
     )
     parser.add_argument(
-        "-o", "--output", metavar="OUT.asdf", help="write the calibration with samples here"
+        "-o",
+        "--output",
+        metavar="OUT.asdf",
+        help="write the calibration with samples here; overwritten if it exists",
     )
     _add_run_options(parser)
     parser.add_argument("--plots", metavar="DIR", help="save the figures in this folder")
@@ -101,10 +108,12 @@ def run(arguments):
 
     say = printer(arguments)
     check_outputs(arguments.output, arguments.json, arguments.checkpoint)
+    check_suffix("-o", arguments.output, ".asdf")
     _check_options(arguments)
     calibration = Calibration.read(arguments.calibration)
     # recognized by content, so that their order does not matter
     calibration = calibration.with_observations(read_datasets(arguments.files))
+    _check_run(calibration, arguments)
     calibration.posterior = _sample(calibration, arguments)
     # first the files: a reader of our words may have gone in the meantime
     written = write_calibration(calibration, arguments, calibration.to_dict)
@@ -126,6 +135,29 @@ def _check_options(arguments):
         )
 
 
+def _check_run(calibration, arguments):
+    """Refuse names of parameters that are wrong, then packages that are missing."""
+    from astropolcal.calibration import LogPosterior
+    from astropolcal.calibration._optional import need
+
+    if arguments.parameters:
+        LogPosterior(calibration.live_measurement(), parameters=arguments.parameters)
+    need("emcee", "sampling")
+    # the summary comes last, and must not fail after hours
+    need("arviz_stats.base", "the summary of a posterior")
+    if arguments.checkpoint:
+        need("h5py", "a checkpoint")
+
+
+def _in_options(error):
+    """Return a complaint about numbers of walkers or steps in words of the options."""
+    text = re.sub(r" with thin = 1 keeps", " leaves", str(error))
+    text = re.sub(r" with thin = (\d+) keeps", r", of which one in \1 is kept, leaves", text)
+    for name, option in _OPTIONS.items():
+        text = text.replace(f"{name} = ", f"{option} ")
+    return FitError(text)
+
+
 def _sample(calibration, arguments):
     from astropolcal.calibration import sample
 
@@ -140,6 +172,8 @@ def _sample(calibration, arguments):
             checkpoint=arguments.checkpoint,
             progress=not arguments.quiet,
         )
+    except FitError as error:
+        raise _in_options(error) from error
     except KeyboardInterrupt:
         if arguments.checkpoint and Path(arguments.checkpoint).exists():
             print(

@@ -10,6 +10,7 @@ from astropolcal.scripts._common import (
     angles,
     check_folders,
     check_outputs,
+    check_suffix,
     edit_chains,
     printer,
     write_json,
@@ -28,8 +29,10 @@ examples:
   astropolcal simulate -o run.ecsv --derotator 45,70,95 --fix hwp.w_sio2=1.66mm
   astropolcal simulate -o true.ecsv --cubes lamp        image cubes, raw headers
   astropolcal simulate --cubes star --source star --altitude 67,64 \\
-      --parallactic 24,30 --derotator 97 --fix star.q=0.01
+      --parallactic 24,30 --derotator 97 --fix star.q=0.01 --flux 1e6
 """
+
+_PSF = "moffat"
 
 #: Options of ``--cubes`` that are numbers: default, unit and meaning.
 _IMAGES = {
@@ -57,7 +60,8 @@ def add_parser(commands):
         "-o",
         "--output",
         metavar="OBS.ecsv",
-        help="the table (required without --cubes; with it, the true fluxes)",
+        help="the table (required without --cubes; with it, the true fluxes); overwritten if it "
+        "exists",
     )
     parser.add_argument("--instrument", metavar="NAME", default="charis", help="default: charis")
     parser.add_argument("--calibration", metavar="CAL.asdf", help="take the chain from this file")
@@ -151,7 +155,7 @@ def _add_cubes(parser):
     group.add_argument(
         "--psf",
         choices=("moffat", "gaussian"),
-        default="moffat",
+        default=_PSF,
         help="profile of a star's core (default: %(default)s)",
     )
     for name, (default, unit, meaning) in _IMAGES.items():
@@ -172,7 +176,9 @@ def run(arguments):
     if not (arguments.output or arguments.cubes):
         raise AstropolcalError("nothing to write: give -o OBS.ecsv, --cubes DIR or both")
     check_outputs(arguments.output, arguments.json)
+    check_suffix("-o", arguments.output, ".ecsv")
     check_folders(arguments.cubes)
+    _check_images(arguments)
     chain, wavelength, meta = _truth(arguments)
     # free and prior mean nothing for what is true
     (chain,) = edit_chains([chain], without=arguments.without, fix=arguments.fix)
@@ -189,6 +195,16 @@ def run(arguments):
     if arguments.json:
         write_json(_summary(observations, arguments), arguments.json)
     printer(arguments)(f"Written: {', '.join(written)}")
+
+
+def _check_images(arguments):
+    """Refuse options of image cubes where none are made."""
+    if arguments.cubes:
+        return
+    usual = {name: default for name, (default, *_) in _IMAGES.items()}
+    for name, default in (usual | {"psf": _PSF, "saturate": False}).items():
+        if getattr(arguments, name) != default:
+            raise AstropolcalError(f"--{name.replace('_', '-')}: is for --cubes DIR")
 
 
 def _frames(arguments, chain):

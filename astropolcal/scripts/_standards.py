@@ -4,7 +4,14 @@
 import math
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.scripts._common import add_json, check_outputs, wrapped, write_json
+from astropolcal.scripts._common import (
+    add_json,
+    add_quiet,
+    check_outputs,
+    printer,
+    wrapped,
+    write_json,
+)
 from astropolcal.words import counted
 
 # more stars than this make a figure unreadable
@@ -46,6 +53,7 @@ def add_parser(commands):
     )
     add_json(parser, "write it")
     add("--plot", metavar="FILE", help="draw altitude and parallactic angle over the night")
+    add_quiet(parser)
     parser.set_defaults(run=run)
 
 
@@ -59,8 +67,7 @@ def run(arguments):
         _plot(seen, arguments.plot)
     if arguments.json:
         write_json(content, arguments.json)
-    if arguments.json != "-":
-        print(text)
+    printer(arguments)(text)
 
 
 def _check(arguments):

@@ -10,7 +10,6 @@ import os
 import sys
 import warnings
 
-from astropolcal.exceptions import AstropolcalError
 from astropolcal.version import version
 
 __all__ = ["build_parser", "main"]
@@ -96,22 +95,36 @@ def main(argv=None):
     vampires
     0
     """
-    arguments = build_parser().parse_args(argv)
+    try:
+        return _run(argv)
+    except KeyboardInterrupt:
+        print("astropolcal: interrupted", file=sys.stderr)
+        # 128 + SIGINT, as shells have it
+        return 130
+    except BrokenPipeError:
+        # whoever read our output has gone; do not complain again at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def _run(argv):
+    """Run the command; return its status unless it is stopped from outside."""
+    # here, not above: it loads astropy, and an interruption meanwhile is one of the command
+    from astropolcal.exceptions import AstropolcalError
+
     with warnings.catch_warnings():
         # a user has no use for file and line of our code
         warnings.showwarning = _show_warning
         try:
+            arguments = build_parser().parse_args(argv)
             arguments.run(arguments)
         except AstropolcalError as error:
             print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
             return 2
-        except KeyboardInterrupt:
-            print("astropolcal: interrupted", file=sys.stderr)
-            # 128 + SIGINT, as shells have it
-            return 130
-        except BrokenPipeError:
-            # whoever read our output has gone; do not complain again at exit
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        except MemoryError as error:
+            words = _one_line(error) or "give it less to do at a time"
+            print(f"astropolcal: error: not enough memory: {words}", file=sys.stderr)
+            return 2
     return 0
 
 

@@ -160,6 +160,7 @@ def test_numbers_for_machines_are_plain():
     ("turn", "gain", "words"),
     [
         ([1, 1], [0, 0], "by +1 deg and changes the DoLP by less than 0.01 % of itself"),
+        ([-5.26, 0], [0, 3], "by -5.3 to 0 deg and changes the DoLP by 0 to +3 % of itself"),
         ([-0.5, 2], [0.1, 0.1], "by -0.5 to +2 deg and changes the DoLP by +0.1 % of itself"),
         ([0.004, -0.004], [-3, 1], "less than 0.01 deg and changes the DoLP by -3 to +1 % of"),
     ],

@@ -303,7 +303,10 @@ def test_a_wrong_prior_is_found(make, chain):
         test = lack_of_fit(m, cal, noise)
         assert test.priors["p_value"] < 1e-6
         assert test.p_value < 1e-6
-        assert "the data disagree with the priors" in test.words
+        assert (
+            f"(p = {test.p_value:.3g}); the data disagree with the priors "
+            f"(p = {test.priors['p_value']:.3g}); noise: "
+        ) in test.words
     found = cal.fit["lack_of_fit"][0]["words"]
     assert "the data disagree with the priors" in found
 

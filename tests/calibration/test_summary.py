@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from astropolcal.calibration._sky_summary import star_lines
+from astropolcal.calibration._sky_summary import (
+    mirror_lines,
+    open_lines,
+    open_on_sky,
+    star_lines,
+)
 from astropolcal.calibration.summary import (
     _accuracy_lines,
     _bound_lines,
@@ -19,7 +24,9 @@ from astropolcal.calibration.summary import (
     _plain,
     _rows,
     _standard_lines,
+    _unusable_lines,
     _wavelength_lines,
+    _with_wavelengths,
     _wrap,
 )
 
@@ -147,29 +154,33 @@ def test_a_standard_shows_its_prediction():
 def test_a_row_a_wavelength_with_stars_at_bounds():
     known = {
         "hwp.retardance": _entry(
-            [10.0, 20.0, 30.0], unit=u.deg, at_bound=np.array([0, 1, 0], bool)
+            [10.0, 20.0, 30.0], [0.1, np.nan, np.nan], u.deg, at_bound=np.array([0, 1, 0], bool)
         ),
-        "w.efficiency": _entry([0.9, 0.95, 1.0]),
+        "w.efficiency": _entry([0.9, 0.95, 1.0], 0.01),
         "hwp.theta": _entry(1.0),
         "held.retardance": _entry([1.0, 2.0, 3.0], fixed=True),
     }
     cal = _calibration(datasets=[_record(s_mean=np.array([0.1, np.nan, 0.3]))])
     title, optics, keys, units, *rows = _wavelength_lines(cal, known)
-    assert title == "Parameters for each wavelength (* at a bound)"
+    assert title == "Parameters for each wavelength (* at a bound; ~ not determined alone)"
     assert optics.split() == ["hwp", "w"]
     assert keys.split() == ["s_mean", "retardance", "efficiency"]
     assert units.split() == ["nm", "%", "deg"]
     assert [row.split() for row in rows] == [
         ["1200.0", "0.100", "10.00", "0.9000"],
         ["1700.0", "-", "20.00*", "0.9500"],
-        ["2200.0", "0.300", "30.00", "1.0000"],
+        ["2200.0", "0.300", "30.00~", "1.0000"],
     ]
 
 
 def test_more_than_five_columns_are_named():
     known = {f"o{i}.p": _entry([1.0, 2.0, 3.0]) for i in range(7)}
     lines = _wavelength_lines(_calibration(), known)
-    assert lines[0] == "Parameters for each wavelength (* at a bound; not shown: o5.p, o6.p)"
+    title = " ".join(" ".join(lines[:2]).split())
+    assert title.startswith(
+        "Parameters for each wavelength (* at a bound; ~ not determined alone; "
+        "not shown: o5.p, o6.p)"
+    )
     assert all(len(line) <= 80 for line in lines)
 
 
@@ -178,6 +189,25 @@ def test_a_wavelength_that_the_first_table_lacks_has_no_accuracy():
     cal.datasets[0].accuracy["s_mean"] = [0.1, 0.2, 0.3] * u.percent
     rows = _wavelength_lines(cal, {"a.b": _entry([1.0, 2.0])})[-2:]
     assert [row.split()[:2] for row in rows] == [["1000.0", "-"], ["1200.0", "0.100"]]
+
+
+def test_each_wavelength_has_the_accuracy_of_the_first_dataset_that_has_it():
+    values = np.array([[0.1, np.nan, np.nan], [0.7, 0.2, np.nan]])
+    cal = _calibration(datasets=[_record(s_mean=row) for row in values])
+    rows = _wavelength_lines(cal, {"a.b": _entry([1.0, 2.0, 3.0])})[-3:]
+    assert [row.split()[1] for row in rows] == ["0.100", "0.200", "-"]
+
+
+def test_long_names_do_not_run_together():
+    names = ("calibration_polarizer.diattenuation", "m3.diattenuation", "derotator.horizontal")
+    lines = _wavelength_lines(_calibration(), {name: _entry([1.0, 2, 3]) for name in names})
+    assert lines[1].split() == ["calibrati.", "m3", "derotator"]
+    assert lines[2].split() == ["s_mean", "diattenua.", "diattenua.", "horizontal"]
+
+
+def test_what_follows_another_parameter_has_no_mark():
+    known = {"a.b": _entry([1.0, 2.0, 3.0], tied="c.d")}
+    assert "~" not in "".join(_wavelength_lines(_calibration(), known)[1:])
 
 
 def test_nothing_per_wavelength_no_table():
@@ -211,8 +241,95 @@ def test_some_outliers_are_named_and_the_others_counted(count, more):
 def test_nothing_tested_nothing_said():
     assert _goodness_lines(_calibration()) == []
     assert _bound_lines(_calibration()) == []
-    lines = _bound_lines(_calibration(at_bound=["a.b", "c.d[3]"]))
-    assert lines == ["At a bound, so without an error: a.b, c.d[3]"]
+
+
+def test_values_at_bounds_are_named_by_their_wavelength():
+    lines = _bound_lines(_calibration(at_bound=["a.b", "c.d[2]", "e.f[0]", "e.f[1]"]))
+    assert " ".join(lines) == (
+        "At a bound, so without an error: a.b, c.d (2200.0 nm), e.f (1200.0, 1700.0 nm)"
+    )
+    many = _calibration(
+        at_bound=[f"c.d[{i}]" for i in range(7)], wavelength=np.arange(600, 609) * u.nm
+    )
+    assert _bound_lines(many) == ["At a bound, so without an error: c.d (7 of 9 wavelengths)"]
+
+
+def test_elements_in_words_are_named_by_their_wavelength():
+    words = _with_wavelengths("hwp.retardance[1] by +1 deg, a.b[9]", _calibration())
+    assert words == "hwp.retardance (1700.0 nm) by +1 deg, a.b[9]"
+
+
+@pytest.mark.parametrize(("stuck", "says"), [(1, False), (2, True), (3, True)])
+def test_a_parameter_at_a_bound_nearly_everywhere_is_not_usable(stuck, says):
+    known = {
+        "w.efficiency": _entry([1.0, 1.0, 1.0], at_bound=np.arange(3) < stuck),
+        "hwp.theta": _entry(1.0, at_bound=np.array(True)),
+    }
+    line = f"NOT USABLE AS IT IS: at a bound at most wavelengths: w.efficiency ({stuck} of 3)"
+    assert _unusable_lines(known) == ([line] if says else [])
+
+
+# --- what is left open on sky, mirrors -----------------------------------------------------------
+
+
+def _direction(words, turn=None, gain=0.0):
+    sky = {} if turn is None else {"sky": {"aolp_deg": [turn, turn], "dolp_percent": [gain, gain]}}
+    return {"words": words, "parameters": {}} | sky
+
+
+def _with_directions(directions, near_null=()):
+    finding = SimpleNamespace(directions=list(directions), near_null=list(near_null))
+    return _calibration(identifiability=finding)
+
+
+def test_what_is_open_on_sky_is_said_of_the_worst_first():
+    cal = _with_directions(
+        [
+            _direction("a.b by +1 deg cannot be told from c.d by +1 deg; on sky", 0.5),
+            _direction("e.f by +1 deg cannot be told from g.h by +1 deg; on sky", -2.0),
+            _direction("i.j by +1 deg cannot be told from g.h by +1 deg; on sky", 0.001),
+            _direction("k.l changes no datum: it cannot be determined"),
+        ],
+        [_direction("m.n is uncertain by 7 deg at the noise of this fit; on sky", 0.3, 0.02)],
+    )
+    found = open_on_sky(cal)
+    assert [(one["kind"], one["aolp_deg"][0]) for one in found] == [
+        ("open", -2.0),
+        ("open", 0.5),
+        ("badly determined", 0.3),
+    ]
+    assert open_lines(cal) == [
+        "  without what the data leave open: e.f by +1 deg, which on sky turns the AoLP by -2 deg "
+        "and changes the DoLP by less than 0.01 % of itself; a.b by +1 deg, which on sky turns "
+        "the AoLP by +0.5 deg and changes the DoLP by less than 0.01 % of itself",
+        "  without what is badly determined: m.n is uncertain by 7 deg, which on sky is 0.3 deg "
+        "of AoLP and 0.02 % of the DoLP",
+    ]
+
+
+def test_many_open_directions_are_counted():
+    cal = _with_directions(_direction(f"a.b{i} by +1 deg cannot be told", 1.0) for i in range(5))
+    assert open_lines(cal)[0].endswith("; and 2 more, see below")
+    assert open_lines(_with_directions([])) == []
+
+
+@pytest.mark.parametrize(("n", "shown", "says"), [(7, 7, None), (12, 12, None), (22, 5, 5)])
+def test_mirrors_at_all_of_a_few_wavelengths(n, shown, says, monkeypatch):
+    from astropolcal.calibration import _sky_summary
+
+    def values(calibration, name):
+        keys = ["diattenuation", "diattenuation_err"]
+        keys += [f"diattenuation_{metal}" for metal in _sky_summary.METALS]
+        return QTable({key: np.ones(n) * u.percent for key in keys}, meta={"name": name})
+
+    monkeypatch.setattr(_sky_summary, "mirror_names", lambda calibration: ["m3"])
+    monkeypatch.setattr(_sky_summary, "mirror_values", values)
+    title, _, *rows = mirror_lines(_calibration(wavelength=np.linspace(600, 800, n) * u.nm))
+    assert len(rows) == shown
+    assert title.endswith(f"one in {says} of {n} wavelengths" if says else "at 45 deg")
+
+
+# --- stars ---------------------------------------------------------------------------------------
 
 
 def test_a_star_beside_its_catalogue():

@@ -358,7 +358,9 @@ def test_a_poor_wavelength_is_flagged(calibration, star, charis, track):
 
 def test_open_calibrations_warn(open_calibration, star, charis):
     frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
-    with pytest.warns(AstropolcalWarning, match="leaves open how Q and U turn.*--prior.*--open-directions"):
+    with pytest.warns(
+        AstropolcalWarning, match="leaves open how Q and U turn.*--prior.*--open-directions"
+    ):
         found = correct(open_calibration, frames)
     assert np.isinf(found.fractional_errors("systematic")["q"]).all()
     assert np.isinf(found.polarization()["s_chi_systematic"]).all()

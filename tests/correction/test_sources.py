@@ -8,7 +8,7 @@ from astropy.io import fits
 
 from astropolcal.correction import derotate, derotate_variance
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import ObservationError, ParameterError
 
 ALL = slice(None)
 
@@ -205,6 +205,15 @@ def test_centres_outside_the_image(cameras, centre, words):
         CubeFiles(right, [centre, (6, 5)], 3, extension=0)
     # up to half a pixel beyond the middle of the last one is inside
     CubeFiles(right, [(13.4, 11.4), (-0.4, -0.4)], 3, extension=0)
+
+
+@pytest.mark.parametrize("size", [0, 29, 4000])
+def test_sizes_that_make_no_sense(cameras, size):
+    _, _, (right, _) = cameras
+    words = rf"size = {size}; the images are 14 x 12 pixels, allowed are 1 to 28"
+    with pytest.raises(ParameterError, match=words):
+        CubeFiles(right, [(7, 6), (6, 5)], size, extension=0)
+    assert CubeFiles(right, [(7, 6), (6, 5)], 28, extension=0).image_shape == (28, 28)
 
 
 def test_a_left_file_that_is_missing_is_named(cameras):

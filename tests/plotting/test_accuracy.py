@@ -163,3 +163,16 @@ def test_reference_of_other_length_is_refused(elliptical):
     curve = ([1200, 1500, 2200] * u.nm, [0.1, 0.2] * u.percent)
     with pytest.raises(ParameterError, match="3 wavelengths but 2 accuracies"):
         plot_accuracy(elliptical, {"mine": curve})
+
+
+def test_datasets_of_one_wavelength_share_a_panel(several):
+    single = [
+        replace(one, accuracy=one.accuracy[i : i + 1]) for i, one in enumerate(several.datasets)
+    ]
+    (axes,) = plot_accuracy(replace(several, datasets=single)).axes
+    assert [text.get_text() for text in axes.get_xticklabels()] == [
+        "polarized\n1200 nm",
+        "unpolarized\n1400 nm",
+    ]
+    expected = [one.accuracy["s_res"].to_value(u.percent)[0] for one in single]
+    np.testing.assert_allclose(lines(axes)["s_res"].get_ydata(), expected)

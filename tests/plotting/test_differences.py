@@ -15,6 +15,7 @@ from astropolcal.exceptions import CalibrationFileError, ParameterError, Wavelen
 from astropolcal.observations import get_observable
 from astropolcal.plotting import plot_double_differences, plot_residuals
 from astropolcal.plotting._data import DataGrid
+from astropolcal.plotting.differences import _looks
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 
@@ -295,7 +296,11 @@ def test_one_wavelength_and_many_derotator_angles():
     calibration = calibrate(chain, simulate(chain, [1.6] * u.um, frames, seed=1))
     axes = plot_residuals(calibration).axes[0]
     assert len(axes.get_xticklabels()) == 9
-    assert axes.get_ylim() == pytest.approx((1568, 1632))
+    # no map of a single row, but a bar a datum
+    assert not axes.collections
+    drawn = [bar.get_height() for bar in axes.patches]
+    np.testing.assert_allclose(np.sort(drawn), np.sort(100 * calibration.residuals))
+    assert "1600.0 nm" in axes.get_title(loc="left")
     assert len(plot_double_differences(calibration).axes) == 2
 
 
@@ -319,3 +324,23 @@ def test_charis_dataset_is_drawn_as_the_paper_has_it(shared_data):
         calibration.measurement.observable.name
         == get_observable("normalized_double_difference").name
     )
+
+
+# ---- many series -----------------------------------------------------------------
+
+
+def test_where_colours_recur_lines_and_markers_are_others():
+    found = _looks(16)
+    assert found[0]["color"] == found[8]["color"]
+    assert [one["linestyle"] for one in found] == ["-"] * 8 + ["--"] * 8
+    assert {one["markerfacecolor"] for one in found[8:]} == {"white"}
+
+
+def test_long_title_and_legend_do_not_overlap(elliptical):
+    part = elliptical.measurement.datasets[0]
+    figure = plot_double_differences(elliptical, [1600] * u.nm)
+    assert part.observations.name in figure.get_suptitle()
+    figure.suptitle("Double difference\n" + 45 * "n")
+    figure.draw_without_rendering()
+    title, legend = figure._suptitle.get_window_extent(), figure.legends[0].get_window_extent()
+    assert not title.overlaps(legend)

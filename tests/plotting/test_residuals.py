@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from astropolcal.plotting import plot_residuals
 from astropolcal.plotting._data import DataGrid
-from astropolcal.plotting.residuals import _layout, _limit, _name_groups
+from astropolcal.plotting.residuals import _layout, _limit, _name_groups, _scales
 
 
 def parts(figure):
@@ -134,3 +134,19 @@ def test_one_derotator_angle_and_single_frames(single_angle):
     assert [text.get_text() for text in main.get_xticklabels()] == ["70°"]
     assert "normalized single difference" in figure.get_suptitle()
     assert cells(main).shape == (5, 8)
+
+
+def test_maps_of_other_size_have_a_scale_of_their_own():
+    large, small, alike = (grid_of(np.full(9, size)) for size in (0.02, 0.0005, 0.015))
+    scales, shared = _scales([large, small])
+    assert not shared
+    assert [limit for limit, _ in scales] == pytest.approx([2.0, 0.05])
+    scales, shared = _scales([large, alike])
+    assert shared
+    assert scales[0] == scales[1]
+
+
+def test_tallest_bar_has_room_above(drawn):
+    above = parts(drawn[0])[1]
+    tallest = np.nanmax(above.patches[0].get_data().values)
+    assert above.get_ylim()[1] == pytest.approx(1.05 * tallest)

@@ -58,6 +58,12 @@ def test_parts_are_named_and_unknown_ones_said(targets):
     total = found["s_abs = √(s_unpol² + s_sky²): scales with the intensity"]
     np.testing.assert_allclose(total.get_ydata(), line.get_ydata())
     assert legend(figure)[:4] == list(found)
+    # what is not drawn has no marker in the legend
+    assert found["s_sky: not known, no such dataset"].get_marker() == "none"
+    # of targets whose curves coincide the one below is the larger
+    one, two = figure.axes[2].lines
+    assert one.get_markersize() > two.get_markersize()
+    assert one.get_linewidth() > two.get_linewidth()
 
 
 def test_labels_of_targets(targets):

@@ -226,7 +226,9 @@ def test_spelling_of_targets(text, dolp, aolp):
     assert found[1] is None if aolp is None else found[1].to_value(u.deg) == pytest.approx(aolp)
 
 
-@pytest.mark.parametrize("text", ["", "x", "101", "-1", "nan", "1,", "1,x", "1,2,3", "1um", "1,5%"])
+@pytest.mark.parametrize(
+    "text", ["", "x", "101", "-1", "nan", "1,", "1,x", "1,2,3", "1um", "1,5%", "5,200", "5,-181"]
+)
 def test_impossible_targets_get_one_line(tables, capsys, text):
     line = complaint(capsys, tables["first"], f"--target={text}")
     assert f"--target {text}" in line

@@ -139,6 +139,13 @@ def test_library_needs_a_date(night, library):
         chosen(library, night({"MJD": None}), optics_in=["nbs"])
 
 
+def test_options_are_named_where_a_library_needs_to_know_more(night, tmp_path):
+    for mode in ("J", "H"):
+        with_validity(Calibration.read(OLD), mode=mode).write(tmp_path / f"{mode}.asdf")
+    with pytest.raises(AstropolcalError, match=r"say which mode is meant \(--filter MODE\)"):
+        chosen(tmp_path, night({"MJD": 60982.5}), optics_in=["nbs"])
+
+
 def test_no_calibration_holds_for_the_date(night, library):
     with pytest.raises(AstropolcalError, match="2020"):
         chosen(library, night({"MJD": 59000.0}), optics_in=["nbs"])

@@ -171,6 +171,7 @@ def test_a_frame_without_angles_is_named(night, tmp_path):
         (["--optics-in", ""], "no chain no optional optics; it holds for .* with nbs"),
         (["--centre", "300,5"], "outside the image"),
         (["--cluster", "tcp://127.0.0.1:1"], "cluster tcp"),
+        (["--size", "4000"], "size = 4000; the images are 201 x 201 pixels, allowed are 1 to 402"),
         (["--max-condition", "0.5"], "max_condition = 0.5"),
         (["--radius", "0"], "no pixel is inside"),
     ],

@@ -154,5 +154,32 @@ def test_middle_of_numbers(values, words):
     assert _middle(values, ".4f", "") == words
 
 
+@pytest.mark.parametrize(
+    ("systematic", "words"),
+    [
+        (None, "not known"),
+        (SimpleNamespace(is_open=False), "not known"),
+        (SimpleNamespace(is_open=True), "infinite"),
+    ],
+)
+def test_report_has_units(capsys, systematic, words):
+    aperture = {"radius": 10.0, "dolp": [0.0099], "aolp": [30.0]}
+    aperture |= {"s_p_statistical": [0.0012], "s_chi_statistical": [2.0]}
+    aperture |= {"s_p_systematic": [None], "s_chi_systematic": [None]}
+    summary = {
+        "output": "o.fits", "n_frames": 4, "mode": "stokes", "calibration": "c.asdf",
+        "components": "IQU", "condition": [1.5, None, 1.6], "poorly_determined": {},
+        "aperture": aperture,
+    }  # fmt: skip
+    _correct._report(summary, systematic)
+    lines = capsys.readouterr().out.splitlines()
+    assert "  condition number of the solution for IQU: 1.5 to 1.6" in lines
+    assert "    degree of linear polarization: 0.99 %" in lines
+    assert "      statistical error: 0.12 %" in lines
+    assert "    angle of linear polarization: 30.0 deg" in lines
+    assert "      statistical error: 2 deg" in lines
+    assert lines.count(f"      systematic error: {words}") == 2
+
+
 def test_what_is_not_finite_is_null():
     assert _plain([1.0, np.nan, np.inf, np.float32(2.0)]) == [1.0, None, None, 2.0]

@@ -139,7 +139,8 @@ def test_any_fits_file_is_listed(tmp_path, capsys, name):
     [
         ("x.fits", b"hello", "x.fits: is not a FITS file"),
         ("x.fits", None, "x.fits: no such file"),
-        ("x.txt", b"hello", "x.txt: not an ECSV table"),
+        ("x.txt", b"hello", "x.txt: info takes a calibration (.asdf), a folder"),
+        ("x.png", b"\x89PNG\r\n", "x.png: info takes a calibration (.asdf), a folder"),
         ("x.txt", None, "x.txt: no such file"),
     ],
 )

@@ -54,6 +54,24 @@ def test_interruption_is_status_130(running, capsys):
     assert capsys.readouterr().err == "astropolcal: interrupted\n"
 
 
+def test_interruption_while_the_commands_are_loaded(monkeypatch, capsys):
+    monkeypatch.setattr(module, "build_parser", lambda: fail(KeyboardInterrupt()))
+    assert main([]) == 130
+    assert capsys.readouterr().err == "astropolcal: interrupted\n"
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("Unable to allocate 21 GiB", "Unable to allocate 21 GiB"),
+        ("", "give it less to do at a time"),
+    ],
+)
+def test_no_memory_is_one_line(running, capsys, said, words):
+    assert running(lambda: fail(MemoryError(said))) == 2
+    assert capsys.readouterr().err == f"astropolcal: error: not enough memory: {words}\n"
+
+
 def test_errors_that_are_bugs_are_not_hidden(running):
     with pytest.raises(ZeroDivisionError):
         running(lambda: 1 / 0)
@@ -111,7 +129,7 @@ def test_options_that_cannot_be_understood(argv, words, capsys):
 
 
 def test_commands_that_do_something_can_be_quiet():
-    assert set(COMMANDS) - set(QUIET) == {"info", "standards"}
+    assert set(QUIET) == set(COMMANDS)
 
 
 @pytest.mark.parametrize("command", QUIET)
@@ -155,6 +173,9 @@ def call(folder, words):
         "efficiency cal.asdf",
         "challenge -n 1 --kinds none --wavelengths 5 --derotator-angles 3",
         "diagnose run.ecsv --effects beam_gain --derotator linear",
+        "info run.ecsv",
+        "info --instruments",
+        "standards --kind unpolarized --json stars.json",
     ],
 )
 def test_quiet_commands_print_nothing(words, desk, capsys):

@@ -326,9 +326,11 @@ def test_table_that_is_missing(capsys, tmp_path):
         (["--parameters", "derotator.theta"], "no free parameter 'derotator.theta'"),
         (["--walkers", "3"], "need a whole number from"),
         (["--walkers", "many"], "--walkers"),
-        (["--steps", "0"], "n_steps = 0"),
-        (["--steps", "100", "--burn", "99"], "burn_in = 99; 100 steps allow"),
-        (["--burn", "-1"], "burn_in = -1"),
+        (["--steps", "0"], "--steps 0; allowed"),
+        (["--steps", "100", "--burn", "99"], "--burn 99; 100 steps allow"),
+        (["--burn", "-1"], "--burn -1"),
+        (["--steps", "1"], "--steps 1 leaves fewer than two steps"),
+        (["-o", "out.fits"], "-o out.fits: the name must end with .asdf"),
         (["--burn", "some"], "'some' is neither a number nor auto"),
         (["--seed", "-1"], "--seed -1"),
         (["--resume"], "--resume needs --checkpoint"),
@@ -357,3 +359,16 @@ def test_missing_emcee(calibration, table, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "emcee", None)
     complaint = fails(capsys, calibration, table)
     assert "sampling needs the package emcee, which is not installed" in complaint
+    assert 'in a clone pip install ".[mcmc]"' in complaint
+    # what can be mended without installing anything is said first
+    complaint = fails(capsys, calibration, table, "--parameters", "hwp.tilt")
+    assert "no free parameter 'hwp.tilt'" in complaint
+
+
+def test_what_only_the_summary_needs_is_missed_before_the_run(
+    calibration, table, capsys, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "arviz_stats.base", None)
+    assert "summary of a posterior needs the package arviz-stats" in fails(
+        capsys, calibration, table
+    )

@@ -172,7 +172,7 @@ def get_effect(name):
     # all names would be a line of more than a thousand characters
     raise GapError(
         f"no effect {name!r}{f'{near} All' if near else '; all'} {len(EFFECTS)} are listed by "
-        "'astropolcal diagnose --effects help', and by list(astropolcal.gap.EFFECTS)"
+        "'astropolcal diagnose --effects help'"
     )
 
 
