@@ -275,7 +275,7 @@ def _wavelength_lines(calibration, known):
         for entry in shown.values():
             # degrees to 0.01, shares of one to 0.0001
             digits = 2 if entry["unit"] else 4
-            row += f"{entry['value'][i]:11.{digits}f}" + _mark(entry, i)
+            row += f"{entry['value'][i]:z11.{digits}f}" + _mark(entry, i)
         rows.append(row.rstrip())
     return rows
 
