@@ -6,6 +6,8 @@ Outside, every quantity carries its unit. Inside, the hot path sees plain
 floats: angles in radian, lengths in micrometre, everything else as a number.
 """
 
+from functools import lru_cache
+
 import astropy.units as u
 import numpy as np
 
@@ -80,9 +82,13 @@ def canonical_factor(unit):
     >>> float(canonical_factor(u.mm))
     1000.0
     """
-    if unit is None:
-        return 1.0
-    return float(u.Unit(unit).to(canonical_unit(unit)))
+    return 1.0 if unit is None else _factor(u.Unit(unit))
+
+
+@lru_cache
+def _factor(unit):
+    # there are a handful of units, and half a million questions in an hour of fits
+    return float(unit.to(canonical_unit(unit)))
 
 
 def to_unit(value, unit, name="value"):

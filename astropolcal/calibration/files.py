@@ -161,6 +161,8 @@ def _strict_asdf():
         # other versions of asdf and its plugins do not matter, what is in the file does
         warnings.simplefilter("ignore", AsdfWarning)
         warnings.simplefilter("error", AsdfConversionWarning)
+        # without its schema a node would pass unseen
+        warnings.filterwarnings("error", "Unable to locate schema", AsdfWarning)
         config.validate_on_read = True
         config.warn_on_failed_conversion = False
         config.lazy_tree = False

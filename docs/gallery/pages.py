@@ -3,6 +3,7 @@
 
 import inspect
 import io
+import json
 import re
 import textwrap
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpydoc.docscrape import NumpyDocString
 
 from astropolcal import optics
 from astropolcal.chain import leaves
+from astropolcal.converters.optics import node_from_optic
 from astropolcal.gap.effects import EFFECTS, Context, Insertion
 from astropolcal.gap.problem import law_basis
 from astropolcal.optics import OPTICS
@@ -187,11 +189,17 @@ def _edited(effect):
         return []
     after = effect.edit(before, _few()).chains
     for old, new in zip(before, after, strict=True):
-        known = {leaf.name: yaml_of(optic=leaf) for leaf in leaves(old)}
-        found = [leaf for leaf in leaves(new) if known.get(leaf.name) != yaml_of(optic=leaf)]
+        known = {leaf.name: _content(leaf) for leaf in leaves(old)}
+        found = [leaf for leaf in leaves(new) if known.get(leaf.name) != _content(leaf)]
         if found:
             return [(leaf, leaf.name in known) for leaf in found]
     return []
+
+
+def _content(optic):
+    """Return all that a calibration file says of an optic, as text."""
+    node = node_from_optic(optic)
+    return type(optic).__name__ + json.dumps(node, default=np.ndarray.tolist, sort_keys=True)
 
 
 _CLASSES = {}

@@ -5,7 +5,7 @@ import asdf.schema
 import pytest
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def kept_schemas():
     """Let ASDF parse each of its schemas once: that is most of the time of reading a file."""
     real, known = asdf.schema._make_schema_loader, {}
