@@ -12,6 +12,11 @@ __all__ = []
 os.environ.setdefault("MPLBACKEND", "agg")
 
 
+def pytest_ignore_collect(config):
+    """Where slow tests are left out, examples are not even looked for: all of them are slow."""
+    return True if config.option.markexpr == "not slow" else None
+
+
 @pytest.fixture(autouse=True)
 def _in_empty_folder(tmp_path, monkeypatch):
     """Run each example in a folder of its own, so that none leaves files behind."""
