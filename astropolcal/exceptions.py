@@ -25,7 +25,28 @@ __all__ = [
 
 
 class AstropolcalError(Exception):
-    """Root of every error that astropolcal raises on purpose."""
+    """
+    Root of every error that astropolcal raises on purpose.
+
+    Parameters
+    ----------
+    *words : str
+        The message.
+    argument : str, optional
+        Name of the argument that the message is about, where the caller may know it by
+        another name, such as an option of a command.
+
+    Examples
+    --------
+    >>> from astropolcal.exceptions import FitError
+    >>> error = FitError("n_steps = 0; allowed are whole numbers from 1 up", argument="n_steps")
+    >>> error.argument
+    'n_steps'
+    """
+
+    def __init__(self, *words, argument=None):
+        super().__init__(*words)
+        self.argument = argument
 
 
 class ParameterError(AstropolcalError, ValueError):

@@ -137,9 +137,13 @@ def to_unit(value, unit, name="value"):
     if unit != u.dimensionless_unscaled:
         raise ParameterError(f"{name} = {value!r} needs a unit such as {unit}")
     try:
-        return np.asarray(value, dtype=float)
+        found = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         raise ParameterError(f"{name} = {value!r} is not a number") from None
+    # numpy makes NaN of None
+    if np.isnan(found).any() and None in np.asarray(value, dtype=object).flat:
+        raise ParameterError(f"{name} = {value!r} is not a number")
+    return found
 
 
 def angle_to_rad(value, name="angle"):

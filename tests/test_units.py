@@ -131,6 +131,8 @@ def test_not_a_number_and_infinity_pass():
         (lambda: to_unit(1 * u.deg, None, "q"), "q has unit deg, .* convertible to a plain number"),
         (lambda: to_unit("east", None, "q"), "q = 'east' is not a number"),
         (lambda: to_unit({}, None, "q"), "q = {} is not a number"),
+        (lambda: to_unit(None, None, "q"), "q = None is not a number"),
+        (lambda: to_unit([1.0, None], None, "q"), r"q = \[1.0, None\] is not a number"),
         (lambda: to_unit(1j, None, "q"), "q = 1j is complex; allowed are real numbers"),
         (lambda: to_unit([1j] * u.deg, u.deg, "q"), "is complex"),
     ],

@@ -8,6 +8,8 @@ from astropolcal.calibration._directions import shows_on_sky, sky_words
 from astropolcal.calibration.reflections import METALS, mirror_names, mirror_values
 
 _N_MIRROR_ROWS = 5
+# a diattenuation of so many times that of any metal is pointed at
+_ABOVE = 3
 # so many wavelengths are all shown
 _ALL_ROWS = 12
 # so many open directions are named under the accuracies for a target, and as many bad ones
@@ -33,7 +35,29 @@ def mirror_lines(calibration):
         line += "".join(f"{_with_error(table, 'diattenuation', i):>17}" for table in tables)
         metals = (tables[0][f"diattenuation_{metal}"][i] for metal in METALS)
         lines.append(line + "".join(f"{value.to_value(u.percent):10.2f}" for value in metals))
-    return lines
+    return lines + [words for table in tables if (words := _above_metals(table))]
+
+
+def _above_metals(table):
+    """Say where a mirror polarizes far more than any metal does, with certainty."""
+    percent = {
+        key: table[key].to_value(u.percent)
+        for key in table.colnames
+        if key.startswith("diattenuation")
+    }
+    most = np.max([np.abs(percent[f"diattenuation_{metal}"]) for metal in METALS], axis=0)
+    # what is held has no error
+    least = np.abs(percent["diattenuation"])
+    least = least - 3 * np.nan_to_num(percent["diattenuation_err"], posinf=np.inf)
+    above = least / most
+    i = int(np.argmax(above))
+    if not above[i] > _ABOVE:
+        return ""
+    return (
+        f"{table.meta['name']}: {percent['diattenuation'][i]:.2f} % at "
+        f"{table['wavelength'][i].to_value(u.nm):.1f} nm is more than {_ABOVE} times what a bare "
+        "metal has: a coating, or something else that the model lacks"
+    )
 
 
 def _with_error(table, key, i):

@@ -217,7 +217,9 @@ class Library:
             kinds = {getattr(e.validity, key) for e in found}
             if len(kinds) > 1 and wanted[key] is None:
                 names = ", ".join(f"{e.name} ({e.validity})" for e in found)
-                raise CalibrationFileError(f"{self._label}: {names}: say which {key} is meant")
+                raise CalibrationFileError(
+                    f"{self._label}: {names}: say which {key} is meant", argument=key
+                )
         if len(found) > 1 and wanted["date"] is None:
             names = ", ".join(e.name for e in found)
             raise CalibrationFileError(f"{self._label}: {names}: a date is needed to choose")

@@ -172,23 +172,25 @@ def _kept_burn_in(burn_in, n_steps, thin):
     # two kept steps at least must be left, for a standard deviation
     most = (n_steps // thin - 2) * thin
     if not isinstance(burn_in, (int, np.integer)) or not 0 <= burn_in <= most:
-        raise FitError(
-            f"burn_in = {burn_in!r}; {n_steps} steps allow whole numbers from 0 to {most}"
-        )
+        raise _refused("burn_in", burn_in, f"{n_steps} steps allow whole numbers from 0 to {most}")
     return -(-int(burn_in) // thin)
 
 
 def _check(n, n_walkers, n_steps, thin, every):
     for name, value in (("n_steps", n_steps), ("thin", thin), ("checkpoint_every", every)):
         if not isinstance(value, (int, np.integer)) or value < 1:
-            raise FitError(f"{name} = {value!r}; allowed are whole numbers from 1 up")
+            raise _refused(name, value, "allowed are whole numbers from 1 up")
     if n_steps < 2 * thin:
-        raise FitError(f"n_steps = {n_steps} with thin = {thin} keeps fewer than two steps")
+        kept = f", as one in {thin} is kept" if thin > 1 else ""
+        raise _refused("n_steps", n_steps, f"allowed are whole numbers from {2 * thin} up{kept}")
     fewest = max(2 * n, 4)
     if not isinstance(n_walkers, (int, np.integer)) or n_walkers < fewest:
-        raise FitError(
-            f"n_walkers = {n_walkers!r}; {n} parameters need a whole number from {fewest} up"
-        )
+        reason = f"{n} parameters need a whole number from {fewest} up"
+        raise _refused("n_walkers", n_walkers, reason)
+
+
+def _refused(name, value, reason):
+    return FitError(f"{name} = {value!r}; {reason}", argument=name)
 
 
 def _run(emcee, sampler, laplace, chain, thin, seed, progress):

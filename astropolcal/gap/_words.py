@@ -78,10 +78,12 @@ def in_title(texts):
 
 
 def shortened(name, width):
-    """Return a name of at most so many characters, its middle left out."""
+    """Return a name of at most so many characters, its middle left out; a date stays whole."""
     if len(name) <= width:
         return name
-    tail = (width - 1) // 2
+    ends = [len(name) - i for i, letter in enumerate(name, 1) if letter in "_ "]
+    # what stands after a separator, if enough is left for a beginning
+    tail = max((n for n in ends if 0 < n <= 2 * (width - 1) // 3), default=(width - 1) // 2)
     return f"{name[: width - 1 - tail]}{_ELLIPSIS}{name[len(name) - tail :]}"
 
 

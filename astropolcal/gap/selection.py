@@ -89,6 +89,7 @@ def _forward(base, scores, library, alpha, groups, say):
     model, selected, refused = base, [], 0
     history = [_errors(base, groups)]
     while len(selected) < _MOST_CAUSES and refused < _MOST_REFUSED:
+        say(f"looking for effect {len(selected) + 1}, at most {_MOST_CAUSES}")
         pick = choose if selected else _looking_ahead
         candidate = pick(model, scores, alpha=alpha)
         if candidate is None or not _worthy(model, candidate):

@@ -71,7 +71,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
         then show what there is.
     weakest : int
         How many of the determined directions to show, those with the largest errors; more
-        where more are called near null.
+        where more are called badly determined.
     hwp : `~astropy.units.Quantity`, optional
         Half-wave-plate angles; by default those of the calibration's data.
     figure : `~matplotlib.figure.Figure`, optional
@@ -162,7 +162,7 @@ def _weak_rows(finding, known, count):
     for vector, sigma in list(zip(vectors, sigmas, strict=True))[::-1][:count]:
         vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
         words = _near_null_words(near_null, finding.names, covariance.units, vector)
-        name = f"{'near null' if words else 'weak'} {len(rows) + 1}"
+        name = f"{'badly determined' if words else 'largest error'} {len(rows) + 1}"
         words = words or _weak_words(finding.names, covariance.units, vector, sigma)
         rows.append(_Row(name, vector, words))
     return rows
@@ -194,7 +194,9 @@ def _weak_words(names, units, vector, sigma):
             size = f"{typical:+.2g}" if len(part) == 1 else f"{typical:.2g}"
             parts.append((share, f"{stem} by {size} {unit}{over}"))
     parts.sort(reverse=True)
-    return f"1{_SIGMA} changes " + ", ".join(text for _, text in parts[:_MOST_NAMES])
+    named = [text for _, text in parts[:_MOST_NAMES]]
+    more = f" and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
+    return f"1{_SIGMA} changes {', '.join(named)}{more}"
 
 
 def _step_unit(unit):
@@ -214,7 +216,7 @@ def _draw_values(axes, finding, known, n_weak):
     threshold = _threshold(values, rank, largest)
     is_weak = _is_weak(values[:rank], known, n_weak)
     axes.set_yscale("log")
-    kinds = ((~is_weak, "o", BLUE, "determined"), (is_weak, "s", ORANGE, "called weak in (b)"))
+    kinds = ((~is_weak, "o", BLUE, "determined"), (is_weak, "s", ORANGE, "shown in (b)"))
     for which, marker, color, label in kinds:
         if which.any():
             axes.plot(index[:rank][which], values[:rank][which], marker, color=color, label=label)
@@ -225,7 +227,10 @@ def _draw_values(axes, finding, known, n_weak):
         axes.axhline(threshold, color=BLACK, linestyle="--", linewidth=1, label="limit of the rank")
     open_words = f"{n_open} open" if n_open else "none open"
     axes.set_title(f"(a) {rank} of {finding.n_free} combinations determined, {open_words}")
-    axes.set(xlabel="direction, the best determined first", ylabel="singular value (1/step)")
+    axes.set(
+        xlabel="direction, the best determined first",
+        ylabel="singular value\n(data per deg, µm or %)",
+    )
     axes.set_xlim(0, len(values) + 1)
     axes.xaxis.get_major_locator().set_params(integer=True)
     low = threshold / 300 if n_open else values[rank - 1] / 3

@@ -7,6 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
 
+from astropolcal.calibration.reflections import mirror_names
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.plotting._points import draw_entry, draw_law, legend_of, mark_half_wave
@@ -243,8 +244,9 @@ def _per_wavelength(known):
 def other_parameters(calibration):
     """Return the free parameters given per wavelength that no other figure shows."""
     shown = {*_RETARDANCES, "efficiency"}
+    mirrors = {f"{name}.diattenuation" for name in mirror_names(calibration)}
     names = _per_wavelength(calibration.parameter_values())
-    return [name for name in names if name.rpartition(".")[2] not in shown]
+    return [n for n in names if n not in mirrors and n.rpartition(".")[2] not in shown]
 
 
 # ---- common to all figures of parameters ------------------------------------------

@@ -84,7 +84,9 @@ def _check(seen):
 
 def _place(site):
     lon, lat = site.lon.wrap_at(180 * u.deg).deg, site.lat.deg
-    return f"{abs(lon):.2f}° {'E' if lon >= 0 else 'W'}, {abs(lat):.2f}° {'N' if lat >= 0 else 'S'}"
+    name = f"{site.info.name}, " if site.info.name else ""
+    east, north = "E" if lon >= 0 else "W", "N" if lat >= 0 else "S"
+    return f"{name}{abs(lon):.2f}° {east}, {abs(lat):.2f}° {north}"
 
 
 def _hours(star, first):

@@ -100,6 +100,9 @@ def _draw_parts(axes, table):
     for (key, label), (color, marker) in zip(_PARTS.items(), looks(len(_PARTS)), strict=True):
         value = table[key].to_value(u.percent)
         look = {"color": color, "marker": marker}
+        if key == "s_abs":
+            # the sum is often its largest part: wide and open, and below it
+            look |= {"linewidth": 4, "markersize": 10, "markerfacecolor": "none", "zorder": 1.9}
         if not np.isfinite(value).any():
             # text only: a marker would promise a curve
             label = f"{key}: not known, no such dataset"

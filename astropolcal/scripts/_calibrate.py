@@ -225,6 +225,8 @@ def run(arguments):
     written = write_calibration(calibration, arguments, lambda: to_dict(calibration, targets))
     say(summary(calibration, targets))
     say_written(say, written)
+    if not arguments.output:
+        say("\nThe calibration was not kept; -o cal.asdf writes it to a file.")
 
 
 def _is_known(observations):

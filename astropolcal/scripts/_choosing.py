@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Which calibration a night of frames is corrected with, and which of its chains."""
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -138,8 +137,7 @@ def _of_library(path, arguments, night, beam, files):
         found = [library.find(arguments.instrument, date=date, **wanted) for date in dates]
     except CalibrationFileError as error:
         # the library names what it needs, a user types options
-        missing = re.search(r"say which (\w+) is meant$", str(error))
-        hint = f" ({_OPTIONS[missing[1]]})" if missing else ""
+        hint = f" ({_OPTIONS[error.argument]})" if error.argument in _OPTIONS else ""
         raise CalibrationFileError(f"{error}{hint}") from error
     # a night across the change of a calibration
     if len({str(entry.path) for entry in found}) > 1:

@@ -12,6 +12,7 @@ from astropolcal.scripts._common import (
     add_json,
     add_quiet,
     check_outputs,
+    check_suffix,
     cube_files,
     is_quiet,
     number_or,
@@ -205,6 +206,8 @@ def run(arguments):
     from astropolcal.correction import ScienceFrames
 
     check_outputs(arguments.output, arguments.json, arguments.spectrum, arguments.plot)
+    check_suffix("-o", arguments.output, ".fits")
+    check_suffix("--spectrum", arguments.spectrum, ".ecsv")
     files = cube_files(arguments.cubes)
     # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)

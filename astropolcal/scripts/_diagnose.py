@@ -3,6 +3,7 @@
 
 import argparse
 import sys
+import time
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
@@ -96,7 +97,7 @@ def run(arguments):
     if arguments.effects == "help":
         print(_list_of_effects())
         return
-    say, progress = printer(arguments), None if is_quiet(arguments) else _progress
+    say, progress = printer(arguments), None if is_quiet(arguments) else _Progress()
     check_outputs(arguments.report, arguments.save, arguments.json)
     check_suffix("--save", arguments.save, ".asdf")
     effects = _effects(arguments.effects)
@@ -110,8 +111,15 @@ def run(arguments):
     say_written(say, written)
 
 
-def _progress(line):
-    print(f"astropolcal: {line}", file=sys.stderr, flush=True)
+class _Progress:
+    """Says what is done next, and after how many seconds."""
+
+    def __init__(self):
+        self.started = time.monotonic()
+
+    def __call__(self, line):
+        text = f"astropolcal: {time.monotonic() - self.started:3.0f} s  {line}"
+        print(wrapped(text, indent=20), file=sys.stderr, flush=True)
 
 
 # ---- effects --------------------------------------------------------------------------------

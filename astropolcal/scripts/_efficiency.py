@@ -16,6 +16,8 @@ from astropolcal.scripts._common import (
     write_json,
 )
 
+# what is printed as more than 1
+_ABOVE_ONE = 1.0005
 _EPILOG = """\
 examples:
   astropolcal efficiency                         published values of CHARIS
@@ -293,6 +295,8 @@ def _table_text(content):
     for i, row in enumerate(content["efficiency"]):
         angle = f"{content['derotator_deg'][i]:8.2f} " if turns else ""
         lines.append(angle + "".join(f"{value:z8.3f}" for value in row))
+    if np.max(content["efficiency"]) >= _ABOVE_ONE:
+        lines.append("Above 1: optics before the analyzer add polarization of their own.")
     return "\n".join(lines)
 
 

@@ -116,9 +116,17 @@ def _library(folder):
         lines += [name, f"  UNREADABLE: {reason}"]
     overlaps = library.overlaps()
     lines += [f"OVERLAP: {words}" for words in overlaps]
+    if not (files or problems) and (others := _others(folder)):
+        lines.append(f"  {counted(others, 'table or FITS file', 'tables and FITS files')} in it; "
+                     "astropolcal info FILE tells of one")  # fmt: skip
     content = {"folder": str(folder), "calibrations": files}
     text = "\n".join(wrapped(line, indent=4) for line in lines)
     return text, content | {"unreadable": problems, "overlaps": overlaps}
+
+
+def _others(folder):
+    """Return the number of files that could be told of one by one."""
+    return sum(path.suffix.lower() in (".ecsv", ".fits") for path in Path(folder).iterdir())
 
 
 def _plain(row):

@@ -2,7 +2,6 @@
 """``astropolcal sample``: samples of the posterior of a calibration's parameters."""
 
 import argparse
-import re
 import sys
 from pathlib import Path
 
@@ -150,12 +149,9 @@ def _check_run(calibration, arguments):
 
 
 def _in_options(error):
-    """Return a complaint about numbers of walkers or steps in words of the options."""
-    text = re.sub(r" with thin = 1 keeps", " leaves", str(error))
-    text = re.sub(r" with thin = (\d+) keeps", r", of which one in \1 is kept, leaves", text)
-    for name, option in _OPTIONS.items():
-        text = text.replace(f"{name} = ", f"{option} ")
-    return FitError(text)
+    """Return an error about an argument of `sample` as one about the option."""
+    words, option = str(error), _OPTIONS.get(error.argument)
+    return FitError(f"{option} {words.removeprefix(f'{error.argument} = ')}" if option else words)
 
 
 def _sample(calibration, arguments):

@@ -36,7 +36,9 @@ def location(site):
         return site
     key = str(site).strip().lower().replace(" ", "_").replace("-", "_")
     if key in SITES:
-        return EarthLocation.from_geodetic(*SITES[key])
+        place = EarthLocation.from_geodetic(*SITES[key])
+        place.info.name = key.replace("_", " ").title()
+        return place
     raise ParameterError(
         f"site = {site!r} is not known{did_you_mean(key, SITES)} (known: {', '.join(SITES)}; any "
         "other as an EarthLocation)"

@@ -23,6 +23,8 @@ KINDS = ("polarized", "unpolarized")
 #: Bands in which the catalogue has magnitudes.
 MAGNITUDES = ("V", "J", "H", "K")
 
+# names are numbers for the most part, and all are alike; these differ by a digit or a sign
+_SIMILAR = 0.8
 _DATA = Path(__file__).resolve().parents[1] / "data"
 
 
@@ -234,7 +236,7 @@ def get(name):
     if key in index:
         return _stars()[index[key]]
     # the index holds aliases too; what is suggested are the catalogue's own names
-    hint = did_you_mean(key, index, most=3, show=index.get)
+    hint = did_you_mean(key, index, most=3, cutoff=_SIMILAR, show=index.get)
     raise ParameterError(f"the catalogue has no standard star {str(name)!r}{hint}")
 
 

@@ -803,7 +803,7 @@ def test_schema_that_cannot_be_read_lets_nothing_pass(path, content, calibration
         config.add_resource_mapping({uri: b"a: &twice 1\nb: &twice 2\n"})
         with pytest.raises(CalibrationFileError, match="Unable to locate schema"):
             Calibration.read(path)
-        with pytest.raises(CalibrationFileError, match="cannot be written: .*Unable to locate"):
+        with pytest.raises(CalibrationFileError, match=r"cannot be written: .*Unable to locate"):
             calibration.write(path, overwrite=True)
     assert path.read_bytes() == content
     Calibration.read(path)

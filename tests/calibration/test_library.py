@@ -209,8 +209,9 @@ def test_replaced_one_does_not_come_back(calibration, library):
 def test_open_choice_is_refused(calibration, library):
     library.add(calibration, name="a.asdf", optics_in=[])
     library.add(calibration, name="b.asdf", optics_in=["nbs"])
-    with refused("a.asdf .*b.asdf .*say which optics_in"):
+    with refused("a.asdf .*b.asdf .*say which optics_in") as caught:
         library.find("charis", date="2026-01-01")
+    assert caught.value.argument == "optics_in"
     library.add(calibration, name="c.asdf", optics_in=["nbs"], valid_from="2026-01-01")
     with refused("b.asdf, c.asdf: a date is needed"):
         library.find("charis", optics_in=["nbs"])

@@ -572,13 +572,15 @@ def test_killed_runs_lose_one_interval_at_most(tmp_path, request):
         ({"n_steps": 0}, "n_steps = 0; allowed are whole numbers"),
         ({"n_steps": 10.5}, r"n_steps = 10\.5"),
         ({"thin": 0}, "thin = 0"),
-        ({"thin": 40}, "keeps fewer than two steps"),
+        ({"thin": 40}, "n_steps = .*; allowed are whole numbers from 80 up, as one in 40"),
         ({"checkpoint_every": -1}, "checkpoint_every = -1"),
     ],
 )
 def test_bad_numbers(small, options, message):
-    with pytest.raises(FitError, match=message):
+    with pytest.raises(FitError, match=message) as caught:
         sample(small, **(RUN | options))
+    # a command says it in words of its options
+    assert str(caught.value).startswith(f"{caught.value.argument} = ")
 
 
 def test_calibration_from_a_file_has_no_data(small, tmp_path):

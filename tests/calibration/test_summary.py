@@ -329,6 +329,33 @@ def test_mirrors_at_all_of_a_few_wavelengths(n, shown, says, monkeypatch):
     assert title.endswith(f"one in {says} of {n} wavelengths" if says else "at 45 deg")
 
 
+@pytest.mark.parametrize(
+    ("percent", "std", "says"),
+    [
+        ([1.0, 1.0], [0.1, 0.1], None),
+        # 3 times the 1.2 % of the worst metal is 3.6 %
+        ([3.7, -4.9], [0.01, 0.5], "m3: 3.70 % at 600.0 nm is more than 3 times"),
+        ([3.7, -4.9], [0.01, 0.1], "m3: -4.90 % at 800.0 nm is more than 3 times"),
+        # what is open says nothing, what is held has no error
+        ([50.0, 1.0], [np.inf, 0.1], None),
+        ([50.0, 1.0], [np.nan, 0.1], "m3: 50.00 % at 600.0 nm"),
+    ],
+)
+def test_a_mirror_unlike_any_metal_is_pointed_at(percent, std, says, monkeypatch):
+    from astropolcal.calibration import _sky_summary
+
+    columns = {"wavelength": [600, 800] * u.nm, "diattenuation": percent * u.percent}
+    columns |= {"diattenuation_err": std * u.percent}
+    metals = {f"diattenuation_{metal}": [0.5, -1.2] * u.percent for metal in _sky_summary.METALS}
+    metals["diattenuation_gold"] = [1.2, 0.3] * u.percent
+    table = QTable(columns | metals, meta={"name": "m3"})
+    monkeypatch.setattr(_sky_summary, "mirror_names", lambda calibration: ["m3"])
+    monkeypatch.setattr(_sky_summary, "mirror_values", lambda calibration, name: table)
+    lines = mirror_lines(_calibration(wavelength=[600, 800] * u.nm))
+    assert len(lines) == 4 + bool(says)
+    assert not says or lines[-1].startswith(says)
+
+
 # --- stars ---------------------------------------------------------------------------------------
 
 

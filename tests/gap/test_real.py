@@ -2,7 +2,7 @@
 """
 Effects withheld from models of real data, each with a known answer.
 
-Eight of the 22 wavelengths are enough to see them, and keep the tests short.
+Five to eight of the 22 wavelengths are enough to see them, and keep the tests short.
 """
 
 import numpy as np
@@ -54,7 +54,7 @@ def test_elliptical_retardance_that_the_derotator_lacks(shared_data, name):
     for chain in chains:
         for leaf in leaves(chain):
             leaf.theta.fixed = True
-    found = diagnose(*thinned(chains, data, 8))
+    found = diagnose(*thinned(chains, data, 6))
     assert found.verdict == "effect"
     # the flat field is missing as well; nothing else is as large
     large = named(found, least=0.05)

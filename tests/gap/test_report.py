@@ -375,6 +375,11 @@ def test_percent(value, words):
 def test_names_that_are_too_long():
     assert _words.shortened("short", 9) == "short"
     assert _words.shortened("dataset_2025-10-05", 9) == "data\N{HORIZONTAL ELLIPSIS}0-05"
+    name = "dataset3_polarized_2025-10-05"
+    assert _words.shortened(name, 19) == "dataset3\N{HORIZONTAL ELLIPSIS}2025-10-05"
+    assert _words.shortened(name, 28) == "dataset3_polarize\N{HORIZONTAL ELLIPSIS}2025-10-05"
+    # no room for a beginning
+    assert _words.shortened(name, 9) == "data\N{HORIZONTAL ELLIPSIS}0-05"
     assert _words.in_title(["a", "b"]) == "a and b"
     assert _words.in_title(["a", "b", "c"]) == "a, b and 1 more"
     assert _words.in_title([]) == ""

@@ -50,9 +50,7 @@ def test_singular_values_are_drawn_and_open_ones_counted(undetermined):
     axes = panel(plot_identifiability(undetermined), "(a)")
     drawn = points(axes)
     assert axes.get_yscale() == "log"
-    shown = np.concatenate(
-        [drawn["determined"].get_ydata(), drawn["called weak in (b)"].get_ydata()]
-    )
+    shown = np.concatenate([drawn["determined"].get_ydata(), drawn["shown in (b)"].get_ydata()])
     np.testing.assert_allclose(np.sort(shown)[::-1], finding.singular_values[: finding.rank])
     open_ones = drawn[f"{n_open} open"]
     assert len(open_ones.get_xdata()) == n_open
@@ -97,7 +95,7 @@ def test_loadings_are_those_of_the_words(undetermined):
     axes = panel(figure, "(b)")
     rows = [text.get_text() for text in axes.get_yticklabels()]
     n_open = finding.n_free - finding.rank
-    assert rows == [f"open {i + 1}" for i in range(n_open)] + ["weak 1", "weak 2"]
+    assert rows == [f"open {i + 1}" for i in range(n_open)] + ["largest error 1", "largest error 2"]
     table = np.abs(np.asarray(axes.images[0].get_array()))
     # each direction has length 1
     np.testing.assert_allclose(np.sum(table**2, axis=1), 1, rtol=1e-9)
@@ -139,7 +137,7 @@ def test_weak_directions_are_the_largest_errors(elliptical):
         np.linalg.norm(vectors[:, -1][[s == stem for s in stems]]) for stem in dict.fromkeys(stems)
     ]
     np.testing.assert_allclose(np.abs(table[0]), expected, atol=1e-6)
-    assert "weak 1: 1\N{GREEK SMALL LETTER SIGMA} changes" in all_words(figure)
+    assert "largest error 1: 1\N{GREEK SMALL LETTER SIGMA} changes" in all_words(figure)
 
 
 def test_near_null_directions_keep_their_own_words(elliptical):
@@ -156,8 +154,8 @@ def test_near_null_directions_keep_their_own_words(elliptical):
     finding.near_null = [{"words": "uncertain by 12 deg at the noise", "parameters": moved}]
     figure = plot_identifiability(replace(elliptical, identifiability=finding), weakest=2)
     rows = [text.get_text() for text in panel(figure, "(b)").get_yticklabels()]
-    assert rows == ["near null 1", "weak 2"]
-    assert "near null 1: uncertain by 12 deg at the noise" in all_words(figure)
+    assert rows == ["badly determined 1", "largest error 2"]
+    assert "badly determined 1: uncertain by 12 deg at the noise" in all_words(figure)
 
 
 def test_parameters_at_a_bound_have_no_part(at_bound):

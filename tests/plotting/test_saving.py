@@ -12,6 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from astropolcal import optics
 from astropolcal.calibration import Posterior
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.plotting import (
@@ -23,6 +24,7 @@ from astropolcal.plotting import (
     plot_retardances,
     save_all,
 )
+from astropolcal.plotting.parameters import other_parameters
 
 DRAW = [
     plot_accuracy,
@@ -69,7 +71,16 @@ def test_writes_every_figure_as_png(elliptical, tmp_path):
 def test_each_dataset_has_its_double_differences(several, tmp_path):
     found = names(save_all(several, tmp_path))
     assert found[:2] == ["double_differences.png", "double_differences_2.png"]
-    assert found[-1] == "other_parameters.png"
+    # its free diattenuation is there and nowhere else
+    assert "mirrors.png" in found
+    assert "other_parameters.png" not in found
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_what_no_other_figure_shows_is_drawn(elliptical, tmp_path):
+    gain = optics.BeamGain(imbalance=np.zeros(elliptical.wavelength.size), name="flat")
+    calibration = replace(elliptical, chains=[elliptical.chain | gain])
+    assert other_parameters(calibration) == ["flat.imbalance"]
 
 
 @pytest.mark.usefixtures("unpainted")

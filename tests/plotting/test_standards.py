@@ -51,6 +51,7 @@ def test_labels_have_units_and_the_legend_is_outside(seen):
     assert lower.get_ylabel() == "parallactic angle (deg)"
     assert lower.get_xlabel() == "time on 2025-11-04 (hours UTC)"
     assert NIGHT in figure.get_suptitle()
+    assert "\nSubaru, 155.48° W, 19.83° N" in figure.get_suptitle()
     figure.draw_without_rendering()
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts[:3] == ["HD 293396", "HD 30675", "HD 14069"]

@@ -174,6 +174,8 @@ def test_a_frame_without_angles_is_named(night, tmp_path):
         (["--size", "4000"], "size = 4000; the images are 201 x 201 pixels, allowed are 1 to 402"),
         (["--max-condition", "0.5"], "max_condition = 0.5"),
         (["--radius", "0"], "no pixel is inside"),
+        (["-o", "out.asdf"], r"-o out\.asdf: the name must end with \.fits"),
+        (["--spectrum", "star.txt"], r"--spectrum star\.txt: the name must end with \.ecsv"),
     ],
 )
 def test_bad_input(night, tmp_path, words, message, monkeypatch):

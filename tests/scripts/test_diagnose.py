@@ -2,6 +2,7 @@
 """``astropolcal diagnose``."""
 
 import json
+import re
 
 import astropy.units as u
 import numpy as np
@@ -78,7 +79,8 @@ def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys):
     printed = capsys.readouterr()
     assert printed.out.startswith("The model misses frames left out of the fit")
     assert str(report) in printed.out
-    assert "astropolcal: scanning the effects" in printed.err
+    assert re.search(r"^astropolcal: +\d+ s  scanning the effects$", printed.err, re.M)
+    assert re.search(r" s  looking for effect 1, at most \d$", printed.err, re.M)
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["verdict"] == "effect"
     assert [cause["effect"] for cause in content["causes"]] == ["beam_gain"]
@@ -139,6 +141,8 @@ def test_bad_input(folder, cal, tmp_path, capsys):
     assert "separated by commas" in complaint(capsys, table, "--effects", ",")
     assert "no folder" in complaint(capsys, table, "--report", tmp_path / "no" / "gap.html")
     assert "same frames" in complaint(capsys, table, table)
+    line = complaint(capsys, table, "--save", tmp_path / "better.fits")
+    assert line.endswith("better.fits: the name must end with .asdf")
     assert "--derotator" in complaint(capsys, cal, table, "--derotator", "linear")
     line = complaint(capsys, cal, dark)
     assert "unpolarized.ecsv: its source is 'unpolarized'" in line

@@ -44,6 +44,17 @@ def test_published_values_without_a_file(capsys):
     assert float(rows[0][1]) < 0.4 < 0.95 < float(rows[1][1])
 
 
+def test_more_than_one_is_explained(capsys):
+    run("--instrument", "irdis", "--derotator", 90, "--date", "2020-01-01")
+    out = capsys.readouterr().out
+    words = "Above 1: optics before the analyzer add polarization of their own."
+    numbers = [float(text) for text in re.findall(r"\d\.\d{3}", out)]
+    assert (words in out) == (max(numbers) > 1)
+    assert max(numbers) > 1
+    run("--derotator", 45)
+    assert "Above 1" not in capsys.readouterr().out
+
+
 def test_calibration_of_a_lamp_is_taken_to_the_sky(calibration, tmp_path):
     out = tmp_path / "out.json"
     run(calibration, "--altitude", 50, "--parallactic", -30, "--json", out, "-q")

@@ -81,6 +81,15 @@ def test_empty_folder(tmp_path, capsys):
     assert capsys.readouterr().out.strip().endswith("0 calibrations")
 
 
+def test_folder_of_tables_says_how_to_look_at_one(tmp_path, capsys):
+    for name in ("a.ecsv", "b.ECSV", "c.fits", "notes.txt"):
+        (tmp_path / name).write_text("")
+    assert main(["info", str(tmp_path)]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "0 calibrations" in text
+    assert "3 tables and FITS files in it; astropolcal info FILE tells of one" in text
+
+
 def test_damaged_file_is_bad_input(tmp_path, capsys):
     path = tmp_path / "bad.asdf"
     path.write_bytes(OLD.read_bytes()[:900])

@@ -8,7 +8,7 @@ import astropy.units as u
 import pytest
 
 from astropolcal import instruments
-from astropolcal.exceptions import AstropolcalError
+from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.observations import Observations
 from astropolcal.reduction.cubes import simulate_cubes
 from astropolcal.scripts import _reduce
@@ -71,6 +71,14 @@ def test_words_that_cannot_be_read(cubes, tmp_path, words, capsys):
     with pytest.raises(SystemExit):
         command(cubes, "-o", tmp_path / "obs.ecsv", *words)
     assert words[1].split(",")[0] in capsys.readouterr().err
+
+
+def test_what_is_written_and_who_took_it_are_known_before_the_work(cubes, tmp_path):
+    with pytest.raises(AstropolcalError, match=r"-o obs\.fits: the name must end with \.ecsv"):
+        command(cubes, "-o", "obs.fits")
+    with pytest.raises(InstrumentError, match=r"did you mean 'charis'\?") as caught:
+        command(cubes, "-o", tmp_path / "obs.ecsv", "--instrument", "charsi")
+    assert all(name in str(caught.value) for name in instruments.names())
 
 
 def test_missing_places(cubes, tmp_path):

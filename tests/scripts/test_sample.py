@@ -329,7 +329,7 @@ def test_table_that_is_missing(capsys, tmp_path):
         (["--steps", "0"], "--steps 0; allowed"),
         (["--steps", "100", "--burn", "99"], "--burn 99; 100 steps allow"),
         (["--burn", "-1"], "--burn -1"),
-        (["--steps", "1"], "--steps 1 leaves fewer than two steps"),
+        (["--steps", "1"], "--steps 1; allowed are whole numbers from 2 up"),
         (["-o", "out.fits"], "-o out.fits: the name must end with .asdf"),
         (["--burn", "some"], "'some' is neither a number nor auto"),
         (["--seed", "-1"], "--seed -1"),

@@ -129,6 +129,12 @@ def test_no_two_stars_share_a_name():
     assert len(set(keys)) >= len(stars)
 
 
+@pytest.mark.parametrize("name", ["HD 999", "HR 1", "Vega", "star"])
+def test_a_star_like_no_other_gets_none(name):
+    with pytest.raises(ParameterError, match=rf"no standard star '{name}'$"):
+        standards.get(name)
+
+
 def test_unknown_star_gets_a_suggestion():
     with pytest.raises(ParameterError, match=r"'HD 30676'; did you mean HD 30675"):
         standards.get("HD 30676")
