@@ -10,6 +10,7 @@ import ast
 import importlib
 import inspect
 import io
+import pkgutil
 import re
 import subprocess
 import sys
@@ -260,6 +261,19 @@ def test_public_module_has_complete_all(path):
     missing = [name for name in module.__all__ if not hasattr(module, name)]
     assert not missing, f"{_id(path)}: __all__ names {missing}, which the module does not have"
     assert len(set(module.__all__)) == len(module.__all__), f"{_id(path)}: __all__ repeats a name"
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in PUBLIC_FILES if path.name == "__init__.py"], ids=_id
+)
+def test_no_function_hides_a_module_of_its_name(path):
+    """Else it depends on what was imported first which of the two a name is."""
+    package = importlib.import_module(_module_name(path))
+    modules = {info.name for info in pkgutil.iter_modules(package.__path__)}
+    hidden = [
+        n for n in modules & set(package.__all__) if not inspect.ismodule(getattr(package, n))
+    ]
+    assert not hidden, f"{_module_name(path)}: {hidden}: name the modules otherwise"
 
 
 @pytest.mark.parametrize("name", PUBLIC)

@@ -12,7 +12,7 @@ from astropy.table import Table
 
 from astropolcal import Observations, calibrate, instruments
 from astropolcal.calibration import polarimetric_efficiency, star_check, star_stokes
-from astropolcal.calibration.target_accuracy import target_accuracies
+from astropolcal.calibration.targets import target_accuracies
 from astropolcal.exceptions import AstropolcalWarning
 
 CHARIS = instruments.get("charis")

@@ -13,7 +13,7 @@ from astropolcal.chain import leaves, stages
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments import Instrument, SkyLaw
 from astropolcal.observations import Observations
-from astropolcal.observations.pointing import TRACKING
+from astropolcal.observations.pointings import TRACKING
 
 
 class Plain(Instrument):

@@ -12,7 +12,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.observations.pointing import location_of
+from astropolcal.observations.pointings import location_of
 from astropolcal.testing import RULES, Conformance, check_instrument
 
 GRID = [0.6, 0.7] * u.um

@@ -44,7 +44,7 @@ from astropolcal.calibration.noise import (
 )
 from astropolcal.calibration.null_channel import estimate_noise, noise_from_null_channel
 from astropolcal.calibration.posterior import Posterior, autocorrelation, autocorrelation_time
-from astropolcal.calibration.profile import Profile, profile
+from astropolcal.calibration.profiles import Profile, profile
 from astropolcal.calibration.quantities import (
     derived_data,
     derived_efficiency,
@@ -60,11 +60,11 @@ from astropolcal.calibration.robust import LOSSES, outlying_data, robust_sigma
 from astropolcal.calibration.sampling import sample
 from astropolcal.calibration.sky import sky_consequences
 from astropolcal.calibration.standards import add_standard, standard_accuracy
-from astropolcal.calibration.star_check import add_star_check, star_check
+from astropolcal.calibration.star_checks import add_star_check, star_check
 from astropolcal.calibration.stars import star_accuracy, star_stokes
 from astropolcal.calibration.starts import BinProblem, search_branches
-from astropolcal.calibration.summary import summary, to_dict
-from astropolcal.calibration.target_accuracy import (
+from astropolcal.calibration.summaries import summary, to_dict
+from astropolcal.calibration.targets import (
     absolute_accuracy,
     four_accuracies,
     groups_by,

@@ -19,7 +19,7 @@ from astropolcal import instruments
 from astropolcal.chain import join, leaves, stages, system_mueller
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.instruments import SkyLaw
-from astropolcal.observations.pointing import horizontal, tracked
+from astropolcal.observations.pointings import horizontal, tracked
 from astropolcal.optics import COORDINATES, Rotator
 from astropolcal.units import angle_to_rad
 

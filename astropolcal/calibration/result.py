@@ -402,7 +402,7 @@ class Calibration:
         -------
         str
         """
-        from astropolcal.calibration.summary import summary
+        from astropolcal.calibration.summaries import summary
 
         return summary(self)
 
@@ -415,7 +415,7 @@ class Calibration:
         dict
             The keys of ``astropolcal calibrate --json``; not-a-number as None.
         """
-        from astropolcal.calibration.summary import to_dict
+        from astropolcal.calibration.summaries import to_dict
 
         return to_dict(self)
 

@@ -12,11 +12,10 @@ from astropy.table import QTable
 
 from astropolcal.calibration.noise import data_by_wavelength
 from astropolcal.exceptions import FitError
+from astropolcal.observations.quality import MAD_TO_SIGMA
 
 __all__ = ["LOSSES", "outlying_data", "robust_sigma"]
 
-# standard deviation over median absolute deviation of normal noise
-_MAD = 1.4826
 # noise of a wavelength is at least this share of the median of its dataset
 _FLOOR = 0.1
 # robust standard deviations beyond which a frame is at odds with the model
@@ -83,7 +82,7 @@ def _scales(measurement, residuals):
     scale = np.empty(residuals.size)
     _, _, rows = data_by_wavelength(measurement)
     for row in rows:
-        scale[row] = _MAD * np.median(np.abs(residuals[row])) if np.size(row) else 0.0
+        scale[row] = MAD_TO_SIGMA * np.median(np.abs(residuals[row])) if np.size(row) else 0.0
     for where in measurement.segments:
         least = _FLOOR * np.median(scale[where]) if scale[where].size else 0.0
         scale[where] = np.maximum(scale[where], max(least, 1e-12))
@@ -155,7 +154,7 @@ def _outliers(part, residuals, scaled, limit):
     off = common - np.median(common)
     # what noise alone gives a median of so many wavelengths
     least = np.array([1.25 / np.sqrt(rows.sum()) for rows in members])
-    spread = np.maximum(_MAD * np.median(np.abs(off)), least)
+    spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off)), least)
     bright = brightness(part.observations)
     numbers = np.asarray(part.observations.frames["frame"])
     found = []

@@ -13,7 +13,7 @@ from astropolcal.gap.effects import EFFECTS, Effect, check_effect, get_effect, r
 from astropolcal.gap.model import Model, nominal_model
 from astropolcal.gap.planning import Exposure, plan
 from astropolcal.gap.problem import GapProblem
-from astropolcal.gap.remainder import Component, outlying_frames, remainder
+from astropolcal.gap.remainders import Component, outlying_frames, remainder
 from astropolcal.gap.residuals import Where, locate
 from astropolcal.gap.shrinkage import HeldOut, frame_groups, held_out
 

@@ -8,7 +8,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal.exceptions import InstrumentError, ObservationError
-from astropolcal.observations.pointing import pointing
+from astropolcal.observations.pointings import pointing
 
 __all__ = ["frame_table"]
 

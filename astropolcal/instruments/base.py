@@ -23,7 +23,7 @@ from astropolcal.observations import (
     sky_positions,
 )
 from astropolcal.observations.coordinates import angle_change
-from astropolcal.observations.pointing import location_of
+from astropolcal.observations.pointings import location_of
 
 __all__ = ["Instrument"]
 

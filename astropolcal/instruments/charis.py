@@ -20,9 +20,9 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments._keywords import frame_time
 from astropolcal.instruments._subaru_optics import SITE, fold_mirror, misaligned, polarizer
 from astropolcal.instruments.base import Instrument
+from astropolcal.instruments.keywords import frame_time
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.instruments.telescope import (
     INTERNAL,

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments._choices import check_choice
-from astropolcal.observations.pointing import TRACKING
+from astropolcal.observations.pointings import TRACKING
 
 __all__ = ["SkyLaw"]
 

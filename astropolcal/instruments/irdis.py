@@ -36,7 +36,7 @@ from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.telescope import INTERNAL, STARS, star_source
 from astropolcal.observations import is_star
-from astropolcal.observations.pointing import location_of
+from astropolcal.observations.pointings import location_of
 
 __all__ = ["IRDIS"]
 

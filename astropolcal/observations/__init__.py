@@ -26,7 +26,7 @@ from astropolcal.observations.observables import (
     get_observable,
 )
 from astropolcal.observations.pairing import pair_frames
-from astropolcal.observations.pointing import (
+from astropolcal.observations.pointings import (
     motion,
     pointing,
     sky_angles,

@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration import target_accuracies
-from astropolcal.calibration.target_accuracy import TARGETS
+from astropolcal.calibration.targets import TARGETS
 from astropolcal.exceptions import ObservationError
 from astropolcal.plotting._style import (
     canvas,

@@ -10,7 +10,7 @@ from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import atomic_path, check_new
-from astropolcal.instruments._keywords import TEXTS, unit_of
+from astropolcal.instruments.keywords import TEXTS, unit_of
 
 
 def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):

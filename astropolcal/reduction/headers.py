@@ -20,7 +20,7 @@ from erfa import ErfaError
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import one_line
 from astropolcal.fitscheck import primary_header
-from astropolcal.instruments._keywords import (
+from astropolcal.instruments.keywords import (
     ANGLES,
     RANGES,
     TEXTS,

@@ -176,8 +176,8 @@ def run(arguments):
     """Calibrate, print the summary and write what was asked for."""
     from astropolcal.calibration import summary, to_dict
     from astropolcal.calibration.standards import add_standard
-    from astropolcal.calibration.star_check import add_star_check
-    from astropolcal.calibration.target_accuracy import TARGETS
+    from astropolcal.calibration.star_checks import add_star_check
+    from astropolcal.calibration.targets import TARGETS
     from astropolcal.observations import get_observable
 
     say = printer(arguments)

@@ -9,7 +9,7 @@ telescope. `SerkowskiLaw` is the wavelength dependence of interstellar
 polarization as an astropy model.
 """
 
-from astropolcal.standards.catalogue import KINDS, MAGNITUDES, StandardStar, catalogue, get, names
+from astropolcal.standards.catalogues import KINDS, MAGNITUDES, StandardStar, catalogue, get, names
 from astropolcal.standards.information import TelescopeInformation, telescope_information
 from astropolcal.standards.law import LinearStokes, SerkowskiLaw, whittet_width
 from astropolcal.standards.searching import search

@@ -8,7 +8,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.observations.pointing import offline, pointing
+from astropolcal.observations.pointings import offline, pointing
 from astropolcal.units import angle_to_rad
 from astropolcal.words import did_you_mean
 

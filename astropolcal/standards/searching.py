@@ -18,7 +18,7 @@ from astropolcal.standards._sky import (
     night_times,
     pointing,
 )
-from astropolcal.standards.catalogue import check_kind, get, names
+from astropolcal.standards.catalogues import check_kind, get, names
 from astropolcal.standards.visibility import Observability
 from astropolcal.units import angle_to_rad
 

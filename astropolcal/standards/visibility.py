@@ -21,7 +21,7 @@ from astropolcal.standards._sky import (
     offline,
     pointing,
 )
-from astropolcal.standards.catalogue import StandardStar, get
+from astropolcal.standards.catalogues import StandardStar, get
 from astropolcal.standards.information import TelescopeInformation, telescope_information
 
 __all__ = ["Observability", "observability"]

@@ -31,6 +31,7 @@ from astropolcal.simulation import half_wave_plate_cycles, simulate
 CHARIS = instruments.get("charis")
 FRAMES, WAVELENGTHS, WALKERS = (16, 64, 256, 1024), (1, 5, 22, 88, 352), (6, 24, 96, 384)
 """What is varied; the other two stay at 64 frames, 22 wavelengths and one walker."""
+_TURNS = 5
 
 
 def measurement(n_frames=64, n_wavelengths=22):
@@ -83,8 +84,11 @@ def processor():
 
 
 def table():
-    rows = Table(rows=list(curves()), names=("axis", "number", "function", "seconds"))
-    rows["seconds"] = np.array([float(f"{s:.3g}") for s in rows["seconds"]])
+    # a machine that is shared may be slow for a while
+    turns = [list(curves()) for _ in range(_TURNS)]
+    rows = Table(rows=turns[0], names=("axis", "number", "function", "seconds"))
+    least = np.min([[row[3] for row in turn] for turn in turns], axis=0)
+    rows["seconds"] = np.array([float(f"{s:.3g}") for s in least])
     rows.meta.update(
         machine=processor(), date=time.strftime("%Y-%m"), python=platform.python_version(),
         numpy=np.__version__, scipy=scipy.__version__, astropy=astropy.__version__,

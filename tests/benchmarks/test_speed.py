@@ -5,6 +5,7 @@ Speed, by comparison with something that does the same on the same machine.
 Not part of the normal run: ``pytest tests/benchmarks``. How times are compared, `timing` says.
 """
 
+import os
 import statistics
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from scipy.linalg import svd
 from scipy.optimize import least_squares
 from timing import interleaved, report
 
-from astropolcal import calibrate, instruments
+from astropolcal import Calibration, calibrate, instruments
 from astropolcal.calibration import BinProblem, search_branches
 from astropolcal.chain import leaves, system_mueller
 from astropolcal.measurement import Measurement
@@ -94,6 +95,19 @@ def test_calibration(benchmark, observations):
     assert benchmark.stats.stats.median < 2.0
 
 
+def test_calibration_file(benchmark, observations, tmp_path):
+    """Written and read again, with all checks; the goal is 0.2 s."""
+    calibration = calibrate(CHARIS.chain(), observations, cross_validate=False)
+    path = tmp_path / "cal.asdf"
+
+    def there_and_back():
+        calibration.write(path, overwrite=True)
+        return Calibration.read(path)
+
+    assert benchmark(there_and_back).chains[0].submodel_names == calibration.chain.submodel_names
+    assert benchmark.stats.stats.median < 0.2
+
+
 # --- ratios ----------------------------------------------------------------------------------
 
 
@@ -143,7 +157,12 @@ def test_fitter_against_bare_scipy(measurement, capsys):
 
 
 def test_analytic_against_finite_differences(measurement, capsys):
-    """Two-point differences, as astropy would use; the goal is a factor of 20."""
+    """
+    Two-point differences, as astropy would use.
+
+    They take 94 predictions, so what speeds a prediction up makes this ratio smaller: it was
+    above 20 when one took three times as long.
+    """
     vector = measurement.vector()
 
     def analytic():
@@ -162,7 +181,7 @@ def test_analytic_against_finite_differences(measurement, capsys):
     np.testing.assert_allclose(analytic(), differences(), atol=1e-5)
     times = interleaved(analytic, differences)
     report(capsys, f"Jacobian {times[0] * 1e3:.2f} ms, {times[1] / times[0]:.0f} times faster")
-    assert times[1] / times[0] >= 20
+    assert times[1] / times[0] >= 10
 
 
 def test_system_mueller_against_a_plain_loop(capsys):
@@ -198,22 +217,28 @@ def test_system_mueller_against_a_plain_loop(capsys):
 # --- processes ------------------------------------------------------------------------------
 
 
-def _seconds(code, repeats=7):
+def _seconds(code, cache, repeats=7):
+    """Return the median of what a program prints, with its modules compiled as installed ones."""
+    environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(cache)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     times = []
-    for _ in range(repeats):
+    for _ in range(repeats + 1):
         result = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        )
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True,
+            env=environment,
+        )  # fmt: skip
         times.append(float(result.stdout))
-    return statistics.median(times)
+    # the first one compiles
+    return statistics.median(times[1:])
 
 
-def test_import_over_astropy_modeling(capsys):
+def test_import_over_astropy_modeling(capsys, tmp_path):
     """What the package adds where astropy.modeling is imported, lazy names resolved."""
     extra = _seconds(
         "import time, astropy.modeling.fitting; t = time.process_time(); "
         "from astropolcal import Observations, calibrate, instruments, optics; "
-        "print(time.process_time() - t)"
+        "print(time.process_time() - t)",
+        tmp_path,
     )
     report(capsys, f"import astropolcal adds {extra * 1e3:.0f} ms to astropy.modeling")
     assert extra <= 0.15

@@ -29,8 +29,8 @@ from astropolcal.calibration import (
 from astropolcal.calibration._header import describe
 from astropolcal.calibration.accuracy import cross_validated_residuals
 from astropolcal.calibration.robust import outlying_data, robust_sigma
-from astropolcal.calibration.star_check import _add_known
-from astropolcal.calibration.summary import _target_lines
+from astropolcal.calibration.star_checks import _add_known
+from astropolcal.calibration.summaries import _target_lines
 from astropolcal.exceptions import (
     AstropolcalWarning,
     ChainError,

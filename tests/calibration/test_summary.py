@@ -15,7 +15,7 @@ from astropolcal.calibration._sky_summary import (
     open_on_sky,
     star_lines,
 )
-from astropolcal.calibration.summary import (
+from astropolcal.calibration.summaries import (
     _accuracy_lines,
     _bound_lines,
     _global_lines,

@@ -23,7 +23,7 @@ from astropolcal.calibration import (
 )
 from astropolcal.calibration.groups import GROUPS
 from astropolcal.calibration.standards import add_standard
-from astropolcal.calibration.target_accuracy import target_accuracies
+from astropolcal.calibration.targets import target_accuracies
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import get_observable

@@ -7,7 +7,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.instruments import Instrument, SkyLaw
-from astropolcal.observations.pointing import location_of
+from astropolcal.observations.pointings import location_of
 
 __all__ = ["TwinCam"]
 

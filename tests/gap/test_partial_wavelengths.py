@@ -6,7 +6,7 @@ import numpy as np
 
 from astropolcal import instruments
 from astropolcal.gap import diagnose
-from astropolcal.gap.remainder import remainder
+from astropolcal.gap.remainders import remainder
 from astropolcal.gap.residuals import locate
 from astropolcal.optics import BeamGain
 from astropolcal.plotting import plot_gap_maps, plot_gap_spectrum

@@ -12,7 +12,7 @@ from astropolcal import instruments
 from astropolcal.chain import leaves, remove_optic
 from astropolcal.gap import diagnose
 from astropolcal.gap.alternatives import thinned
-from astropolcal.gap.remainder import outlying_frames
+from astropolcal.gap.remainders import outlying_frames
 from astropolcal.observations import Observations
 
 pytestmark = pytest.mark.slow

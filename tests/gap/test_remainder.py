@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from astropolcal.gap.remainder import outlying_frames, remainder
+from astropolcal.gap.remainders import outlying_frames, remainder
 
 # its package has a function of the same name
-shapes = import_module("astropolcal.gap.remainder")
+shapes = import_module("astropolcal.gap.remainders")
 WAVELENGTH = np.array([2.0, 1.2, 1.4, 1.6, 1.8])
 
 

@@ -9,7 +9,7 @@ from astropy.io.fits.card import Undefined
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.instruments._keywords import (
+from astropolcal.instruments.keywords import (
     ANGLES,
     RANGES,
     TEXTS,

@@ -17,7 +17,7 @@ from star_data import observe_star, star_chain
 from astropolcal import Calibration, Observations, calibrate, instruments, standards
 from astropolcal.calibration.groups import GROUPS
 from astropolcal.calibration.standards import standard_accuracy
-from astropolcal.calibration.target_accuracy import target_accuracies
+from astropolcal.calibration.targets import target_accuracies
 from astropolcal.scripts._calibrate import _target
 from astropolcal.scripts.main import build_parser, main
 from astropolcal.simulation import half_wave_plate_cycles, simulate

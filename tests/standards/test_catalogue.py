@@ -7,7 +7,7 @@ import pytest
 
 from astropolcal import standards
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
-from astropolcal.standards.catalogue import _normal
+from astropolcal.standards.catalogues import _normal
 
 STARS, POLARIZATION = standards.catalogue()
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from astropolcal import standards
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.standards import Observability, SerkowskiLaw, StandardStar, telescope_information
-from astropolcal.standards.catalogue import _law, _mean_angle, _normal
+from astropolcal.standards.catalogues import _law, _mean_angle, _normal
 from astropolcal.standards.searching import _degree, _in_band
 from astropolcal.standards.visibility import _spread
 

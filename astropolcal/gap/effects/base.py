@@ -22,7 +22,7 @@ from astropolcal.exceptions import InstrumentError
 from astropolcal.gap.effects.roles import SEVERAL, Roles
 from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
-from astropolcal.observations.pointing import TRACKING
+from astropolcal.observations.pointings import TRACKING
 from astropolcal.units import canonical_factor
 
 __all__ = [

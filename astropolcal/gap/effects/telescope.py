@@ -13,7 +13,7 @@ from astropolcal import optics
 from astropolcal.chain import insert_optic
 from astropolcal.gap.effects._shared import LAG, Discrete, lagging
 from astropolcal.gap.effects.base import Edit, EffectParameter, Insertion, label_of
-from astropolcal.observations.pointing import TRACKING
+from astropolcal.observations.pointings import TRACKING
 
 __all__ = [
     "AltitudeSign",

@@ -15,7 +15,7 @@ from astropolcal.calibration._sky_summary import (
     star_lines,
 )
 from astropolcal.calibration.groups import what_is_left_out
-from astropolcal.calibration.target_accuracy import TARGETS, target_accuracies
+from astropolcal.calibration.targets import TARGETS, target_accuracies
 from astropolcal.words import counted
 
 __all__ = ["summary", "to_dict"]

@@ -252,7 +252,7 @@ def motion(observations, angle, duty=None):
     Examples
     --------
     >>> from astropolcal.observations import Observations, example_table
-    >>> from astropolcal.observations.pointing import motion
+    >>> from astropolcal.observations.pointings import motion
     >>> motion(Observations.from_table(example_table()), [0.0, 0.1, 0.2, 0.3], duty=0.5).round(3)
     array([0.05, 0.05, 0.05, 0.05])
     """
@@ -317,7 +317,7 @@ def smeared(angle, change, nodes=3, when="middle"):
 
     Examples
     --------
-    >>> from astropolcal.observations.pointing import smeared
+    >>> from astropolcal.observations.pointings import smeared
     >>> smeared([1.0], [0.2], nodes=2).round(3).tolist()
     [[0.942], [1.058]]
     """
@@ -364,7 +364,7 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
     >>> import astropy.units as u
     >>> import numpy as np
     >>> from astropolcal.observations import Observations, example_table
-    >>> from astropolcal.observations.pointing import sky_positions
+    >>> from astropolcal.observations.pointings import sky_positions
     >>> table = example_table()
     >>> table["altitude"], table["parallactic"] = 60 * u.deg, 30 * u.deg
     >>> np.rad2deg(sky_positions(Observations.from_table(table))["hwp"]).round(1).tolist()

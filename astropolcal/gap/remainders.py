@@ -59,7 +59,7 @@ class Component:
     Examples
     --------
     >>> import numpy as np
-    >>> from astropolcal.gap.remainder import Component
+    >>> from astropolcal.gap.remainders import Component
     >>> Component("a", "difference", 0.6, 1e-9, np.ones(2), np.ones(3), "everywhere").share
     0.6
     """
@@ -94,7 +94,7 @@ def remainder(model, *, alpha=_ALPHA):
     >>> import astropy.units as u
     >>> from astropolcal import instruments
     >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.gap.remainder import remainder
+    >>> from astropolcal.gap.remainders import remainder
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -224,7 +224,7 @@ def outlying_frames(model):
     >>> import numpy as np
     >>> from astropolcal import instruments
     >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.gap.remainder import outlying_frames
+    >>> from astropolcal.gap.remainders import outlying_frames
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

@@ -169,7 +169,7 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     --------
     >>> import astropy.units as u
     >>> from astropy.table import QTable
-    >>> from astropolcal.calibration.target_accuracy import target_accuracy
+    >>> from astropolcal.calibration.targets import target_accuracy
     >>> lam = [1.2, 1.6] * u.um
     >>> lamp = QTable({"wavelength": lam, "s_mean": [0.10, 0.05] * u.percent})
     >>> star = QTable({"wavelength": lam, "s_mean": [0.03, 0.02] * u.percent})
@@ -265,7 +265,7 @@ def target_accuracies(calibration, targets=TARGETS, column="s_mean"):
     --------
     >>> import astropy.units as u
     >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.calibration.target_accuracy import target_accuracies
+    >>> from astropolcal.calibration.targets import target_accuracies
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
