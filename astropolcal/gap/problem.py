@@ -33,6 +33,8 @@ _HOLD = 1e-6
 _FIRST_DAMPING, _LEAST_DAMPING, _FREE, _STUCK = 1e-5, 1e-7, 1e-3, 1e3
 # a coefficient closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-9
+# so often it is guessed which bounds hold; a slope below this share of its terms is none
+_GUESSES, _ROUNDING = 10, 1e-13
 
 
 class GapProblem:
@@ -317,9 +319,7 @@ class GapProblem:
         high = (self.high[live] - q[live]) * scale
         found = solve_triangular(triangle, wanted, check_finite=False) if n else wanted
         if np.any((found < low) | (found > high)):
-            slack = 1e-9 * np.maximum(1.0, scale)
-            found = lsq_linear(triangle, wanted, (low - slack, high + slack), method="bvls").x
-            found = np.clip(found, low, high)
+            found = _within(triangle, wanted, low, high, found)
         left = matrix @ found - target
         step = np.zeros(self.size)
         step[live] = found / scale
@@ -362,6 +362,32 @@ class GapProblem:
         is_open = np.sum(right[~good] ** 2, axis=0) > TOUCHES**2
         prior = np.divide(1, self.tight, out=np.full(self.size, np.inf), where=self.tight > 0)
         return np.minimum(np.where(is_open, np.inf, np.sqrt(variance) / scale), prior)
+
+
+def _within(triangle, wanted, low, high, found):
+    """
+    Return the least squares within bounds, given those without.
+
+    What was outside is guessed to be at its bound, and the guess is corrected for all at once
+    (Portugal, Judice & Vicente 1994, doi:10.2307/2153286). It is nearly always right after two or
+    three; scipy, which takes ten times as long, does what is left.
+    """
+    held = (found < low) | (found > high)
+    tiny = _ROUNDING * np.linalg.norm(wanted)
+    for _ in range(_GUESSES):
+        found = np.clip(found, low, high)
+        if not held.all():
+            factors, rest = _triangle(triangle[:, ~held], wanted - triangle[:, held] @ found[held])
+            found[~held] = solve_triangular(factors, rest, check_finite=False)
+        # where a bound holds, the sum of squares falls outwards only
+        inwards = triangle.T @ (wanted - triangle @ found) * np.where(found > low, -1.0, 1.0)
+        wrong = np.where(held, (inwards > tiny) & (low < high), (found < low) | (found > high))
+        if not wrong.any():
+            return found
+        held ^= wrong
+    slack = 1e-9 * np.maximum(1.0, np.abs(found))
+    found = lsq_linear(triangle, wanted, (low - slack, high + slack), method="bvls").x
+    return np.clip(found, low, high)
 
 
 def _triangle(matrix, target):
