@@ -149,6 +149,8 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     ------
     CalibrationFileError
         If no calibration holds, several do, or a file is damaged.
+    ParameterError
+        If the header is none.
 
     Examples
     --------
@@ -171,6 +173,11 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     ((22, 4, 4), (22, 16, 16))
     """
     library = _library(path)
+    if header is not None and not hasattr(header, "get"):
+        raise ParameterError(
+            f"header = {header!r} is of type {type(header).__name__}; a FITS header or a mapping "
+            "is needed, such as astropy.io.fits.getheader(file)"
+        )
     told = {} if header is None else describe(header, instrument)
     chosen = {"instrument": instrument, "mode": mode, "date": date}
     wanted = {key: told.get(key) if value is None else value for key, value in chosen.items()}

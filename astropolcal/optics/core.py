@@ -22,6 +22,7 @@ from astropolcal.optics._matrices import rotation_generator, turn
 from astropolcal.optics._modelling import KeywordOnly, copied_attributes
 from astropolcal.optics.positions import COORDINATES, FLUXES, check_broadcast, finite_position
 from astropolcal.units import canonical_factor, length_to_um, to_unit
+from astropolcal.words import did_you_mean
 
 __all__ = ["COORDINATES", "FLUXES", "Optic", "rotation_generator"]
 
@@ -109,11 +110,21 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         try:
             super().__init__(name=name, **values, **kwargs)
         except (TypeError, InputParameterError) as error:
+            self._check_names(kwargs)
             raise ParameterError(f"{type(self).__name__}: {error}") from None
         # astropy would call the five channels x0 to x4
         self._inputs = self._outputs = LIGHT
         self._mount, self._position = None, 0.0
         self.mount = mount
+
+    def _check_names(self, kwargs):
+        known = [*inspect.signature(type(self)).parameters, "bounds", "fixed", "tied", "meta"]
+        for key in kwargs:
+            if key not in known:
+                raise ParameterError(
+                    f"{type(self).__name__}: no parameter {key!r}{did_you_mean(key, known)} (its "
+                    f"parameters are {', '.join(self.param_names)})"
+                )
 
     @classmethod
     def _at_the_door(cls, key, value):

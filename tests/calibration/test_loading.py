@@ -206,6 +206,12 @@ def test_published_mirror_is_said(tmp_path):
 # ---- what it holds for -------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("header", ["frame.fits", 60960.5, ["a", "b"]])
+def test_what_is_no_header_is_refused(path, header):
+    with pytest.raises(ParameterError, match=r"header = .* is of type \w+; a FITS header or a map"):
+        load(path, header)
+
+
 def test_calibration_in_memory(calibration, loaded):
     here = load(calibration, HEADER)
     assert here.content_hash == loaded.content_hash

@@ -776,8 +776,10 @@ def test_value_of_other_number_of_wavelengths_is_refused(label):
 def test_unknown_and_positional_arguments_are_refused(label):
     cls = CASES[label].optic
     assert {"theta", "mount", "name", *cls().own_names} <= set(inspect.signature(cls).parameters)
-    with pytest.raises(ParameterError, match=r"parameter 'retardence'"):
+    with pytest.raises(ParameterError, match=r"parameter 'retardence'.* parameters are theta"):
         cls(retardence=1 * u.deg)
+    with pytest.raises(ParameterError, match=r"no parameter 'thetta'; did you mean 'theta'\?"):
+        cls(thetta=1 * u.deg)
     with pytest.raises(ParameterError, match=r"by keyword: \('theta'"):
         cls(1 * u.deg)
     with pytest.raises(ParameterError, match=r"has no parameter \['retardence'\]"):
