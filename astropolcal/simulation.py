@@ -14,7 +14,7 @@ from astropolcal.optics.positions import finite_position
 from astropolcal.propagation import Propagator
 from astropolcal.units import length_to_um
 
-__all__ = ["entering_flux", "expected_fluxes", "half_wave_plate_cycles", "simulate"]
+__all__ = ["check_seed", "entering_flux", "expected_fluxes", "half_wave_plate_cycles", "simulate"]
 
 #: The angles of a calibration run of CHARIS (paper, Sec. 5.1).
 _CYCLE = np.array([0, 45, 11.25, 56.25, 22.5, 67.5, 33.75, 78.75])
@@ -107,8 +107,8 @@ def simulate(
     Raises
     ------
     ParameterError
-        If flux, gain, lamp or noise are not positive or of the wrong shape, or
-        the chain lets no light through in some frame.
+        If flux, gain, lamp or noise are not positive or of the wrong shape, the
+        chain gives negative flux, or the seed is none.
     ChainError
         If the position of a stage is missing in ``frames``.
 
@@ -122,7 +122,7 @@ def simulate(
     >>> simulate(charis.chain(), charis.wavelength, frames, seed=1).n_frames
     16
     """
-    wavelength = np.atleast_1d(u.Quantity(wavelength))
+    wavelength, seed = np.atleast_1d(u.Quantity(wavelength)), check_seed(seed)
     # for unit source, (n_wavelengths, n_frames)
     right, left = expected_fluxes(chain, wavelength, frames, source)
     scale = entering_flux(flux, lamp, len(frames), len(wavelength))
@@ -139,6 +139,39 @@ def simulate(
     # meta that are given go before it
     table.meta = {"simulated": True, **(meta or {})}
     return Observations.from_table(table, name=name)
+
+
+def check_seed(seed):
+    """
+    Return the seed of random numbers if it is one.
+
+    Parameters
+    ----------
+    seed : int, None or `~numpy.random.Generator`
+        What `numpy.random.default_rng` takes.
+
+    Returns
+    -------
+    int, None or `~numpy.random.Generator`
+        The same.
+
+    Raises
+    ------
+    ParameterError
+        If it is negative, or no whole number.
+
+    Examples
+    --------
+    >>> from astropolcal.simulation import check_seed
+    >>> check_seed(7)
+    7
+    """
+    try:
+        # draws nothing, so that a generator stays as it is
+        np.random.default_rng(seed)
+    except (TypeError, ValueError):
+        raise ParameterError(f"seed = {seed!r}; allowed are whole numbers from 0 up") from None
+    return seed
 
 
 def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
@@ -196,7 +229,7 @@ def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
     right, left = (np.broadcast_to(flux, shape) for flux in propagator.fluxes())
     # a beam that is extinguished may be below zero by a rounding error
     if min(right.min(), left.min()) < -_ROUNDING:
-        raise ParameterError("the chain gives negative flux: it is not physical")
+        raise ParameterError("the chain gives negative flux: it is not physical", argument="chain")
     return right.clip(0.0), left.clip(0.0)
 
 

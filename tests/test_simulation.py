@@ -12,6 +12,7 @@ from astropolcal.chain import with_beam
 from astropolcal.exceptions import AstropolcalWarning, ChainError, ParameterError
 from astropolcal.propagation import Propagator
 from astropolcal.simulation import (
+    check_seed,
     entering_flux,
     expected_fluxes,
     half_wave_plate_cycles,
@@ -261,3 +262,21 @@ def test_flux_that_enters_is_lamp_times_flux(flux, lamp, expected):
 def test_flux_of_another_shape_or_sign_is_refused(flux, lamp, words):
     with pytest.raises(ParameterError, match=words):
         entering_flux(flux, lamp, 3, 2)
+
+
+# --- seeds ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "a"])
+@pytest.mark.parametrize("noise", [True, False])
+def test_seed_that_is_none_is_refused(chain, frames, seed, noise):
+    with pytest.raises(ParameterError, match=f"seed = {seed!r}; allowed are whole numbers from 0"):
+        simulate(chain, WAVELENGTH, frames, seed=seed, noise=noise)
+
+
+def test_seed_is_returned_and_a_generator_left_as_it_is():
+    assert check_seed(None) is None
+    assert check_seed(0) == 0
+    rng = np.random.default_rng(3)
+    assert check_seed(rng) is rng
+    assert rng.random() == np.random.default_rng(3).random()

@@ -18,6 +18,8 @@ _NOTHING_ON_SKY = 0.005
 _PART = 0.1
 # the sky is worked out for so many near-null directions, the worst
 _ON_SKY = 6
+# open directions that differ in their wavelength only and are told one by one
+_MOST_ALIKE = 3
 
 
 def step_of(unit):
@@ -98,6 +100,27 @@ def _open_words(free, moved, lead):
         known = "by them, only its prior tells it" if with_prior else "and keeps its start value"
         return f"{lead} changes no datum: it cannot be determined {known}"
     return f"{lead} by +{step[1]:g}{step[2]} cannot be told from {', '.join(others)}"
+
+
+def first_of_each_kind(directions):
+    """Return the words of open directions; of one at each wavelength, of the first few."""
+    kinds = {}
+    for direction in directions:
+        kinds.setdefault(_kind(direction), []).append(direction["words"])
+    words = []
+    for alike in kinds.values():
+        # a line that counts a single one would be as long as that one
+        n = len(alike) if len(alike) <= _MOST_ALIKE + 1 else _MOST_ALIKE
+        words += alike[:n]
+        words += [f"and {len(alike) - n} more of the same kind"] if n < len(alike) else []
+    return words
+
+
+def _kind(direction):
+    """Return what leads and what else moves; a lead for all wavelengths has no likes."""
+    lead, bracket, _ = direction["words"].partition("[")
+    is_element = bracket and " " not in lead
+    return (lead if is_element else direction["words"], *sorted(direction.get("parameters", ())))
 
 
 def _change(free, name, value):

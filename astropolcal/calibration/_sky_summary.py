@@ -1,12 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What a summary says of mirrors, of stars that no fit saw, and of what is left open on sky."""
 
+import textwrap
+
 import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration._directions import shows_on_sky, sky_words
 from astropolcal.calibration.reflections import METALS, mirror_names, mirror_values
 
+_WIDTH = 80
 _N_MIRROR_ROWS = 5
 # a diattenuation of so many times that of any metal is pointed at
 _ABOVE = 3
@@ -35,7 +38,8 @@ def mirror_lines(calibration):
         line += "".join(f"{_with_error(table, 'diattenuation', i):>17}" for table in tables)
         metals = (tables[0][f"diattenuation_{metal}"][i] for metal in METALS)
         lines.append(line + "".join(f"{value.to_value(u.percent):10.2f}" for value in metals))
-    return lines + [words for table in tables if (words := _above_metals(table))]
+    # the table may be wider, a sentence need not
+    return lines + [s for t in tables for s in textwrap.wrap(_above_metals(t), _WIDTH)]
 
 
 def _above_metals(table):

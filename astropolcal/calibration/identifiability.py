@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from astropolcal.calibration._directions import (
+    first_of_each_kind,
     led,
     near_null_directions,
     open_directions,
@@ -101,7 +102,7 @@ class Identifiability:
 
     def __str__(self):
         lines = [f"The data determine {self.rank} combinations of {self.n_free} free parameters."]
-        lines += [f"  - {direction['words']}" for direction in self.directions]
+        lines += [f"  - {words}" for words in first_of_each_kind(self.directions)]
         lines += [f"  - badly determined: {direction['words']}" for direction in self.near_null]
         lines += [f"  - {words}" for words in self.sampling]
         lines += [f"  - mirror solution: {words}" for words in self.mirrors]

@@ -17,6 +17,7 @@ from astropolcal.calibration._refit import Refit
 from astropolcal.calibration.accuracy import leave_out_groups
 from astropolcal.calibration.covariance import Covariance, full_covariance
 from astropolcal.exceptions import FitError
+from astropolcal.simulation import check_seed
 
 __all__ = ["Resampled", "bootstrap"]
 
@@ -170,7 +171,7 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
         raise FitError(f"n = {n}; a bootstrap needs at least 2 resamples")
     refit = Refit(calibration)
     groups = _blocks(refit.measurement, block)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(check_seed(seed))
     # what all data determine, a resample must determine too
     wanted = _singular_values(refit, 1.0)
     samples, rejected = [], 0

@@ -13,6 +13,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.chain import join, leaves
+from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.observations import is_star
 
@@ -72,6 +73,11 @@ def two_step(measurement, weighting, joint, run, options):
     stages : list of dict
         Values after each step.
 
+    Raises
+    ------
+    FitError
+        If no dataset is of a polarized source.
+
     Examples
     --------
     >>> import astropy.units as u
@@ -86,6 +92,7 @@ def two_step(measurement, weighting, joint, run, options):
     ['per wavelength, misalignments held', 'global']
     """
     parts = [dataset.observations for dataset in measurement.datasets]
+    _check_polarized(parts)
     single = {slot.name for slot in measurement.free.slots if not slot.per_wavelength}
     several = {slot.name for slot in measurement.free.slots if slot.per_wavelength}
     ties = measurement.free.ties
@@ -110,6 +117,15 @@ def two_step(measurement, weighting, joint, run, options):
         _copy_values(step.put_back(), measurement.chains)
     measurement.parameters = measurement.free.start()
     return _worst(outcomes), weighting, stages
+
+
+def _check_polarized(parts):
+    if not any(kind_of_source(part.source) == "polarized" for part in parts):
+        stated = ", ".join(sorted({repr(part.source) for part in parts}))
+        raise FitError(
+            f"strategy 'two-step' is for a polarized source, but the source is {stated}; "
+            "allowed here are 'joint' and 'sequential'"
+        )
 
 
 def sequential(measurement, weights, joint, run, options):

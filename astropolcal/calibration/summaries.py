@@ -14,6 +14,7 @@ from astropolcal.calibration._sky_summary import (
     open_on_sky,
     star_lines,
 )
+from astropolcal.calibration._unusable import unusable_words
 from astropolcal.calibration.groups import what_is_left_out
 from astropolcal.calibration.targets import TARGETS, target_accuracies
 from astropolcal.words import counted
@@ -63,7 +64,7 @@ def summary(calibration, targets=TARGETS):
     """
     known = calibration.parameter_values()
     parts = [
-        [*_heading(calibration), *_unusable_lines(known)],
+        [*_heading(calibration), *_unusable_lines(calibration, known)],
         _global_lines(known),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
@@ -99,16 +100,9 @@ def _with_wavelengths(text, calibration):
     )
 
 
-def _unusable_lines(known):
-    """Say in a line near the top that a parameter is at a bound nearly everywhere."""
-    stuck = [
-        f"{name} ({np.sum(entry['at_bound'])} of {entry['value'].size})"
-        for name, entry in known.items()
-        if entry["value"].ndim and np.mean(entry["at_bound"]) > 0.5
-    ]
-    if not stuck:
-        return []
-    return list(_wrap([f"NOT USABLE AS IT IS: at a bound at most wavelengths: {', '.join(stuck)}"]))
+def _unusable_lines(calibration, known):
+    words = unusable_words(calibration, known)
+    return list(_wrap(words)) if words else []
 
 
 def _heading(calibration):
@@ -237,11 +231,14 @@ def _target_row(table):
     row = f"  {dolp:4.3g} %" + (
         f"{'any':>10}" if angle is None else f"{angle.to_value(u.deg):10.4g}"
     )
+    # a calibration that is missing can only add to them
+    mark = ">" if table.meta["missing"] else ""
     for key in ("s_Q", "s_U", "s_p", "s_chi"):
         # s_Q and s_U only lead to s_p: their worst values would crowd the table
         worst = (np.max,) if key in ("s_p", "s_chi") else ()
         for function in (np.median, *worst):
-            row += f"{_short(table[key].value, function):>10}"
+            text = _short(table[key].value, function)
+            row += f"{mark + text if text != '-' else text:>10}"
     return row
 
 

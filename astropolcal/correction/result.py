@@ -210,7 +210,7 @@ class Corrected:
         Parameters
         ----------
         radius : float
-            Pixels; a pixel counts if its middle is inside.
+            Pixels; a pixel counts if its middle is inside. The circle may not leave the images.
         centre : (float, float), optional
             0-based x and y; by default that of the images.
 
@@ -228,6 +228,14 @@ class Corrected:
         inside = np.hypot(columns - x, rows - y) <= radius
         if not radius > 0 or not inside.any():
             raise ParameterError(f"radius = {radius}: no pixel is inside")
+        height, width = inside.shape
+        # to the outer edge of the outermost pixels
+        largest = min(x, width - 1 - x, y, height - 1 - y) + 0.5
+        if radius > largest:
+            raise ParameterError(
+                f"radius = {radius:g} leaves the images of {width} x {height} pixels; allowed "
+                f"around ({x:g}, {y:g}) are up to {largest:g}"
+            )
         covariance = None if self.covariance is None else self.covariance[..., inside].sum(axis=-1)
         changed = {"stokes": self.stokes[..., inside].sum(axis=-1), "covariance": covariance}
         return type(self)(**{**self.__dict__, **changed})

@@ -14,6 +14,7 @@ import numpy as np
 from astropolcal.calibration import full_covariance
 from astropolcal.correction.solve import estimator
 from astropolcal.exceptions import ParameterError
+from astropolcal.simulation import check_seed
 
 __all__ = ["Systematic", "linear_systematic", "sampled_systematic"]
 
@@ -202,7 +203,7 @@ def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stoke
     Raises
     ------
     ParameterError
-        If there are fewer than two samples.
+        If there are fewer than two samples, or the seed is none.
 
     Examples
     --------
@@ -221,6 +222,7 @@ def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stoke
     """
     if n_samples < 2:
         raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")
+    rng = np.random.default_rng(check_seed(seed))
     n = len(solution.components)
     settings = {
         "components": solution.components,
@@ -230,7 +232,7 @@ def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stoke
     }
     bright = _brightness(solution)
     found = np.empty((n_samples, len(solution.gain), n, n))
-    for i, vector in enumerate(_draws(model, n_samples, np.random.default_rng(seed))):
+    for i, vector in enumerate(_draws(model, n_samples, rng)):
         rows = model.rows(vector) * bright
         if mode == "ip":
             rows = np.concatenate([rows[..., :1], solution.rows[..., 1:]], axis=-1)

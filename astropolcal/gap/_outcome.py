@@ -1,11 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Outcome of sealed challenges: rates of right answers, pulls, shrinkage, a figure."""
 
+from collections import Counter
 from itertools import pairwise
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
+
+from astropolcal.words import counted
 
 
 class ChallengeResult:
@@ -77,9 +80,25 @@ class ChallengeResult:
         return [record for record in self.records if record.get("right") is False]
 
     @property
+    def answered(self):
+        """Records of the challenges that could be made."""
+        return [record for record in self.records if "right" in record]
+
+    @property
+    def shortfall(self):
+        """How many challenges could be made, and why not the others; empty if all could."""
+        reasons = Counter(r.get("error", "not made") for r in self.records if "right" not in r)
+        if not reasons:
+            return ""
+        made, n = len(self.answered), len(self.records)
+        why = "; ".join(f"{reason} ({count})" for reason, count in reasons.items())
+        others = "; not the others" if made else ""
+        return f"{made} of {n} challenges could be made{others}: {why}"
+
+    @property
     def table(self):
-        """One row a challenge."""
-        rows = [record for record in self.records if "right" in record]
+        """One row a challenge that could be made."""
+        rows = self.answered
         table = QTable()
         table["index"] = [r["index"] for r in rows]
         table["kind"] = [r["kind"] for r in rows]
@@ -123,7 +142,11 @@ class ChallengeResult:
     def words(self):
         """Return the summary as lines of text."""
         summary = self.summary()
-        lines = [f"{len(self.records)} challenges, {len(self.failures)} wrong answers"]
+        made, wrong = len(self.answered), counted(len(self.failures), "wrong answer")
+        lines = [f"{counted(made, 'challenge')}, {wrong}"] if made else []
+        if self.shortfall:
+            # what was never asked was not answered rightly either
+            lines.insert(0, self.shortfall)
         for name, rate in summary["rates"].items():
             value, low, high = (100 * rate[key] for key in ("value", "low", "high"))
             lines.append(f"{name:<24}{value:6.1f} % ({low:.1f} to {high:.1f}; {rate['n']})")
@@ -147,12 +170,19 @@ class ChallengeResult:
         Returns
         -------
         `~matplotlib.figure.Figure`
-            Points with the interval of Wilson (1927) at 68 %.
+            Points with the interval of Wilson (1927) at 68 %. Where no challenge has an
+            effect to be found, they are by kind.
         """
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(7.5, 5), layout="constrained") if figure is None else figure
         axes = figure.subplots()
+        figure.suptitle(f"{len(self.answered)} sealed challenges, 68 % binomial intervals")
+        axes.set(ylim=(-4, 104), ylabel="right answers (%)")
+        axes.grid(color="0.88", linewidth=0.7)
+        if not any(record["snr"] for record in self.answered):
+            self._draw_quiet(axes)
+            return figure
         edges = np.geomspace(*self.settings["snr"], bins + 1)
         # a size is reached within two percent
         edges[[0, -1]] *= 0.95, 1.05
@@ -163,13 +193,24 @@ class ChallengeResult:
             label = f"nothing to be found, and nothing said ({quiet[3]})"
             axes.axhline(100 * quiet[0], color="0.45", linestyle="--", label=label)
             axes.axhspan(100 * quiet[1], 100 * quiet[2], color="0.45", alpha=0.15, linewidth=0)
-        axes.set(xscale="log", xlim=edges[[0, -1]], ylim=(-4, 104), ylabel="right answers (%)")
+        axes.set(xscale="log", xlim=edges[[0, -1]])
         axes.set_xlabel("signal-to-noise ratio of the weakest effect")
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.grid(color="0.88", linewidth=0.7)
         figure.legend(loc="outside lower center", ncols=1, frameon=False)
-        figure.suptitle(f"{len(self.records)} sealed challenges, 68 % binomial intervals")
         return figure
+
+    def _draw_quiet(self, axes):
+        """Draw the kinds without an effect to be found: they have no signal-to-noise ratio."""
+        kinds = [kind for kind in ("none", "absorbed") if self.of(kind)]
+        for i, kind in enumerate(kinds):
+            value, low, high, n = self.rate(kind)
+            bar = 100 * np.array([[max(value - low, 0)], [max(high - value, 0)]])
+            axes.errorbar(i, 100 * value, bar, color="0.3", marker="o", capsize=2.5)
+            axes.annotate(
+                counted(n, "challenge"), (i, 100 * value), (8, -12), textcoords="offset points"
+            )
+        axes.set_xticks(range(len(kinds)), labels=kinds)
+        axes.set(xlim=(-1, max(len(kinds), 1)), xlabel="kind of challenge, no effect to be found")
 
     def _draw(self, axes, edges, shift, label, kinds, color, marker):
         pairs = pairwise(edges)

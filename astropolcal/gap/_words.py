@@ -218,22 +218,28 @@ def _of_frames(content):
     return "frames left out of the fit" if content["cross_validated"] else "the frames of the fit"
 
 
+def _of_differences(frames):
+    # calibrate gives double differences, which hide a part of the gap
+    return f"the single differences of {frames}"
+
+
 def _how_large(content):
     frames = "the frames" if content["exchanged"] else _of_frames(content)
     chance = p_is(content["gap_p_value"])
     before, noise = (percent(content[f"{key}_percent"]) for key in ("gap_before", "noise_floor"))
     if content["verdict"] == "none":
         return (
-            f"The model agrees with the measurements: it predicts {frames} to {before} % of "
-            f"polarization, and the noise is {noise} % (residuals as large by noise alone: "
-            f"{chance})."
+            f"The model agrees with the measurements: it predicts {_of_differences(frames)} to "
+            f"{before} % of polarization, and the noise is {noise} % (residuals as large "
+            f"by noise alone: {chance})."
         )
     real = f"the gap is real (residuals as large by noise alone: {chance})"
     # a pattern can be certain where the sum of squares is not conspicuous
     if content["gap_p_value"] > content["alpha"]:
         real = f"the residuals are no larger than noise ({chance}), but their pattern is not one"
     return (
-        f"The model misses {frames} by {before} % of polarization where the noise is {noise} %; "
+        f"The model misses {_of_differences(frames)} by {before} % of polarization where the "
+        f"noise is {noise} %; "
         f"{real}."
     )
 
@@ -328,8 +334,8 @@ def _what_is_left(content):
 # ---- for the terminal ------------------------------------------------------------------------
 
 
-def text(content, accuracies):
-    """Return a report as text of at most 80 columns."""
+def text(content, accuracies, frames=()):
+    """Return a report as text of at most 80 columns; ``frames`` are lines on those not used."""
     parts = [
         content["sentences"],
         _table_lines(content),
@@ -338,6 +344,7 @@ def text(content, accuracies):
         _where_lines(content["where"]),
         _accuracy_lines(content, accuracies),
         [f"Nominal model: {content['nominal']}"],
+        list(frames),
     ]
     return "\n\n".join("\n".join(_wrapped(part)) for part in parts if part)
 

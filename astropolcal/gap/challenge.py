@@ -93,7 +93,7 @@ def make_challenge(seed, *, kind="single", effect=None, snr=30.0, setup=None):
     if not (np.isfinite(snr) and snr > 0):
         raise GapError(f"snr = {snr}; it must be finite and positive")
     bench = Bench(Setup() if setup is None else setup, np.random.default_rng(seed))
-    planted = [] if kind == "none" else plant(bench, kind, effect, snr)
+    planted = [] if kind == "none" else _planted(bench, kind, effect, snr)
     key = Key(
         kind,
         [one.name for one in planted],
@@ -103,6 +103,21 @@ def make_challenge(seed, *, kind="single", effect=None, snr=30.0, setup=None):
     )
     fluxes, key.chains = bench.expose(planted)
     return bench.record(fluxes), bench.setup.chains(), key
+
+
+def _planted(bench, kind, effect, snr):
+    """Return the effects of a challenge; what fails names the kind that was asked for."""
+    if kind != "pair":
+        return plant(bench, kind, effect, snr)
+    if effect is not None:
+        # an unknown name is another mistake than no pair
+        get_effect(effect)
+    try:
+        return plant(bench, kind, effect, snr)
+    except GapError as error:
+        # each of a pair is planted like a single effect
+        what = kind if effect is None else f"{kind} with {effect!r}"
+        raise GapError(f"no two effects found for a challenge of kind {what}") from error
 
 
 # ---- a challenge is answered and scored ------------------------------------------------------
@@ -231,8 +246,9 @@ def run_challenge(
     checkpoint : path-like, optional
         File to which each record is appended as a line of JSON. A run with the
         same settings goes on from it.
-    progress : bool
-        Whether to show a bar on a terminal.
+    progress : bool or callable
+        Whether to show a bar on a terminal, or what is called after each
+        challenge with how many are done and how many there are.
 
     Returns
     -------
@@ -254,12 +270,15 @@ def run_challenge(
     records = _journal(checkpoint, settings)
     todo = [i for i in range(n) if i not in records]
     # disable=None shows the bar on a terminal only
-    hidden = None if progress else True
+    hidden = None if progress is True else True
     with tqdm(total=n, initial=n - len(todo), desc="challenges", disable=hidden) as bar:
-        for record in _outcomes(todo, settings, client):
+        outcomes = _outcomes(todo, settings, client)
+        for done, record in enumerate(outcomes, n - len(todo) + 1):
             records[record["index"]] = record
             _append(checkpoint, record)
             bar.update()
+            if callable(progress):
+                progress(done, n)
     return ChallengeResult([records[i] for i in range(n)], settings)
 
 

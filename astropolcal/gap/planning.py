@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 
 from astropolcal.chain import stages
-from astropolcal.exceptions import GapError
+from astropolcal.exceptions import GapError, ParameterError
 from astropolcal.gap._forecast import LEAST_GAIN, MODULATOR, STATES, Foreseen, Known, separation
 from astropolcal.gap.effects import EFFECTS, Roles, get_effect
 from astropolcal.gap.model import nominal_model
@@ -257,7 +257,14 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=4):
     lists = {pair: [] for pair in pairs}
     n_open, fixing = old[None].directions[1].shape[1] if model.problem.size else 0, []
     for group in _groups(candidates):
-        new = {name: Foreseen(old[name], model, group) for name in old}
+        try:
+            new = {name: Foreseen(old[name], model, group) for name in old}
+        except ParameterError as error:
+            # a model of data that lack much need not be physical at angles they do not have, and
+            # foresees nothing there
+            if error.argument != "chain":
+                raise
+            continue
         for j, exposure in enumerate(group):
             for a, b in pairs:
                 # whichever of both is the truth, the other has to fail

@@ -7,13 +7,15 @@ All of them say the same: `to_dict` works it out, and the others show it.
 
 import base64
 import io
+import warnings
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from astropolcal import instruments
 from astropolcal.chain import leaves
-from astropolcal.exceptions import GapError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
 from astropolcal.files import atomic_path
 from astropolcal.gap import _numbers, _words
 from astropolcal.gap.planning import few, plan
@@ -282,10 +284,10 @@ def summary(diagnosis, content=None):
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> data = simulate(chain, wavelength, frames, seed=1)
     >>> print(summary(diagnose(chain, data)).splitlines()[0])
-    The model agrees with the measurements: it predicts frames left out of the fit
+    The model agrees with the measurements: it predicts the single differences of
     """
     content = to_dict(diagnosis) if content is None else content
-    return _words.text(content, _numbers.ACCURACIES)
+    return _words.text(content, _numbers.ACCURACIES, _about_frames(diagnosis))
 
 
 # ---- a page ------------------------------------------------------------------------------------
@@ -341,6 +343,7 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None, content=None
     page = environment.get_template("report.html").render(
         content=to_dict(diagnosis) if content is None else content,
         datasets=_about(diagnosis),
+        frames=_about_frames(diagnosis),
         figures=_images(figures),
         size_figures=_images(size_figures),
         sizes=_words.sizes,
@@ -363,6 +366,42 @@ def _about(diagnosis):
         }
         for o in diagnosis.nominal.observations
     ]
+
+
+def _about_frames(diagnosis):
+    """Return a line on the frames that are left out, and one on those that calibrate would."""
+    masked, used = [], []
+    for o in diagnosis.nominal.observations:
+        masked += _frames_by_reason(o.name, o.mask, o.mask_reasons)
+        prepared = _prepared(o)
+        extra = prepared.mask & ~o.mask
+        new = [why for why, n in prepared.mask_reasons.items() if n > o.mask_reasons.get(why, 0)]
+        used += _frames_by_reason(o.name, extra, new)
+    lines = [f"Left out, as the tables mask them: {_words.listed(masked)}."] if masked else []
+    if used:
+        lines.append(f"Used here, though calibrate masks them: {_words.listed(used)}.")
+    return lines
+
+
+def _frames_by_reason(name, mask, reasons):
+    """Return how many frames of a dataset have masked cells, and why, or nothing."""
+    count = int(mask.any(axis=1).sum())
+    why = f" ({', '.join(reasons)})" if reasons else ""
+    return [f"{count} of {len(mask)} frames of {name}{why}"] if count else []
+
+
+def _prepared(observations):
+    """Return a dataset with the masks with which calibrate would take it."""
+    if observations.instrument is None:
+        return observations
+    with warnings.catch_warnings():
+        # what is masked is said in our own words
+        warnings.simplefilter("ignore", AstropolcalWarning)
+        try:
+            return instruments.get(observations.instrument).prepare(observations)
+        except AstropolcalError:
+            # an unknown instrument, or nothing would be left: calibrate refuses such a table
+            return observations
 
 
 def _images(figures):

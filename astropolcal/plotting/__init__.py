@@ -12,7 +12,7 @@ from astropolcal.plotting.comparison import plot_comparison
 from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
 from astropolcal.plotting.effects import plot_effect_scores, plot_effect_sizes
-from astropolcal.plotting.efficiency import plot_polarimetric_efficiency
+from astropolcal.plotting.efficiency import plot_derotator_offsets, plot_polarimetric_efficiency
 from astropolcal.plotting.gap import plot_gap_maps, plot_gap_spectrum, plot_where
 from astropolcal.plotting.history import plot_history
 from astropolcal.plotting.identifiability import plot_identifiability
@@ -34,6 +34,7 @@ __all__ = [
     "plot_comparison",
     "plot_corner",
     "plot_correlations",
+    "plot_derotator_offsets",
     "plot_double_differences",
     "plot_effect_scores",
     "plot_effect_sizes",

@@ -1,8 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Figures of the effects of a diagnosis: their scan, and the sizes of those that were found."""
 
+import textwrap
+
 import numpy as np
 
+from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap._numbers import Fitted
 from astropolcal.gap._words import in_title, is_determined
@@ -20,6 +23,9 @@ from astropolcal.plotting._style import (
 )
 
 __all__ = ["plot_effect_scores", "plot_effect_sizes"]
+
+# characters of a label beside a panel
+_LABEL = 26
 
 
 def verdict_line(diagnosis):
@@ -173,7 +179,7 @@ def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
     >>> frames = half_wave_plate_cycles(derotator=[45, 70, 95, 120] * u.deg)
     >>> data = simulate(truth, wavelength, frames, seed=1)
     >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
-    >>> plot_effect_sizes(diagnosis, "beam_gain").axes[0].get_ylabel()
+    >>> plot_effect_sizes(diagnosis, "beam_gain").axes[0].get_ylabel()[:9]
     'imbalance'
     """
     sizes = _sizes_by_wavelength(diagnosis, effect, content)
@@ -185,8 +191,7 @@ def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
             axes.set_axis_off()
         for axes, (name, size) in zip(grid.flat, sizes.items(), strict=False):
             _size_panel(axes, nm, size, _absent(diagnosis.improved, effect, name))
-            unit = f" ({size['unit']})" if size["unit"] else ""
-            axes.set_ylabel(f"{name.partition('.')[2].replace('_', ' ')}{unit}")
+            axes.set_ylabel(_label(diagnosis.improved, name, size["unit"]))
             wavelength_label(axes)
     return figure
 
@@ -209,6 +214,16 @@ def _absent(model, effect, name):
     """Return the value at which an effect is absent in the unit of its size, scalar or (W,)."""
     (parameter,) = (p for p in model.added[effect] if p.name == name)
     return parameter.canonical_neutral / model.problem.free.by_name[name].factor
+
+
+def _label(model, name, unit):
+    """Return what a size is, in the words of its optic, and its unit."""
+    optic, _, key = name.partition(".")
+    carriers = (leaf for chain in model.chains for leaf in leaves(chain) if leaf.name == optic)
+    carrier = next(carriers, None)
+    description = "" if carrier is None else getattr(carrier, key).__doc__
+    words = f"{key.replace('_', ' ')}{': ' if description else ''}{description}"
+    return textwrap.fill(f"{words} ({unit or 'fraction'})", _LABEL)
 
 
 def _size_panel(axes, nm, size, absent):

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Polarimetric efficiency over wavelength, derotator angle and pointing: lines and maps."""
+"""Polarimetric efficiency over wavelength, derotator angle and offset, and pointing."""
 
 import astropy.units as u
 import numpy as np
@@ -8,7 +8,7 @@ from astropolcal.calibration.efficiency import has_derotator, polarimetric_effic
 from astropolcal.chain import stages
 from astropolcal.plotting._style import canvas, looks, nanometres, style
 
-__all__ = ["plot_polarimetric_efficiency"]
+__all__ = ["plot_derotator_offsets", "plot_polarimetric_efficiency"]
 
 _DEROTATOR = np.arange(0, 181, 2.5)
 _ALTITUDE = np.arange(20, 91, 5.0)
@@ -89,6 +89,59 @@ def plot_polarimetric_efficiency(
         if maps:
             _map_of_pointings(fig, axes[-1], asked, derotator if turns else None)
         fig.suptitle(title or "Polarimetric efficiency")
+    return fig
+
+
+def plot_derotator_offsets(best, *, title=None, figure=None):
+    """
+    Draw the polarimetric efficiency of an observation against the offset of the derotator.
+
+    Parameters
+    ----------
+    best : `~astropolcal.calibration.BestDerotator`
+        Of `~astropolcal.calibration.best_derotator`.
+    title : str, optional
+        Title of the figure.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+        Lines of the mean and the least efficiency over the observation and all wavelengths, at
+        the angle of polarization that is measured worst; the best offset is marked.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.calibration import best_derotator
+    >>> from astropolcal.plotting.efficiency import plot_derotator_offsets
+    >>> charis = instruments.get("charis")
+    >>> best = best_derotator(charis.on_sky(charis.published()), charis.wavelength,
+    ...                       [60, 65] * u.deg, [-30, -20] * u.deg,
+    ...                       offsets=range(0, 180, 5) * u.deg)
+    >>> [line.get_label() for line in plot_derotator_offsets(best).axes[0].get_lines()][:2]
+    ['mean', 'least']
+    """
+    # offsets may have been tried in any order
+    table = best.table[np.argsort(best.table["offset"])]
+    offset, marked = table["offset"].to_value(u.deg), best.offset.to_value(u.deg)
+    with style():
+        fig = canvas(figure, 6.5, 5.2)
+        ax = fig.subplots()
+        for (color, marker), name in zip(looks(2), ("mean", "least"), strict=True):
+            # markers tell the lines apart without colour; at all offsets they would be a band
+            every = max(1, len(offset) // 12)
+            ax.plot(offset, table[name], color=color, marker=marker, markevery=every, label=name)
+        words = f"best offset, {_degree(best.offset)}"
+        ax.axvline(marked, color="black", linestyle="--", label=words, zorder=1)
+        # optics before the analyzer may add polarization of their own
+        ax.set(ylim=(-0.02, 1.02 * max(1.0, np.max(table["mean"]))))
+        ax.set(xlabel="derotator offset (deg)", ylabel="measured share of the polarization")
+        ax.set_title(f"{best.law} still; over all times and wavelengths")
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
+        fig.suptitle(title or "Polarimetric efficiency of an observation")
     return fig
 
 

@@ -215,6 +215,7 @@ def _draw_values(axes, finding, known, n_weak):
     largest = values.max(initial=0.0) or 1.0
     threshold = _threshold(values, rank, largest)
     is_weak = _is_weak(values[:rank], known, n_weak)
+    low = threshold / 30 if n_open else values[rank - 1] / 3
     axes.set_yscale("log")
     kinds = ((~is_weak, "o", BLUE, "determined"), (is_weak, "s", ORANGE, "shown in (b)"))
     for which, marker, color, label in kinds:
@@ -222,8 +223,9 @@ def _draw_values(axes, finding, known, n_weak):
             axes.plot(index[:rank][which], values[:rank][which], marker, color=color, label=label)
     if n_open:
         # at their true values, a rounding error, they would press all others together
-        label = f"{n_open} open: {_rounding(values[rank:])}"
-        axes.plot(index[rank:], np.full(n_open, threshold / 30), "v", color=VERMILION, label=label)
+        label = f"{n_open} open: {_rounding(values[rank:])} (below the axis)"
+        at_edge = {"color": VERMILION, "label": label, "clip_on": False, "zorder": 3}
+        axes.plot(index[rank:], np.full(n_open, low), "v", **at_edge)
         axes.axhline(threshold, color=BLACK, linestyle="--", linewidth=1, label="limit of the rank")
     open_words = f"{n_open} open" if n_open else "none open"
     axes.set_title(f"(a) {rank} of {finding.n_free} combinations determined, {open_words}")
@@ -233,7 +235,6 @@ def _draw_values(axes, finding, known, n_weak):
     )
     axes.set_xlim(0, len(values) + 1)
     axes.xaxis.get_major_locator().set_params(integer=True)
-    low = threshold / 300 if n_open else values[rank - 1] / 3
     axes.set_ylim(low, largest * 3)
     axes.legend(loc="center left" if n_open else "lower left")
     if known is not None and len(known[2]):

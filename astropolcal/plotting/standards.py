@@ -1,8 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Standard stars over a night."""
 
-from itertools import pairwise
-
 import astropy.units as u
 import numpy as np
 
@@ -16,19 +14,23 @@ _MOST = 8
 # a marker every so many hours tells the curves apart without colour
 _EVERY = 1.0
 _TICK = 45
+_CROWDED = 405
 
 
-def plot_observability(seen, *, figure=None):
+def plot_observability(seen, *, total=None, figure=None):
     """
     Draw altitude and parallactic angle of stars against time.
 
     The curves are thick while a star is above its lowest altitude, thin and
-    dotted below; only dark hours are drawn.
+    dotted below; only dark hours are drawn. The parallactic angle has no jumps, as
+    in the table of a star: the axis goes beyond 180 deg where a star does.
 
     Parameters
     ----------
     seen : sequence of Observability
         Up to eight stars of one night at one site.
+    total : int, optional
+        Of how many stars these are the first, for the title.
     figure : `~matplotlib.figure.Figure`, optional
         An empty figure to draw into.
 
@@ -58,8 +60,7 @@ def plot_observability(seen, *, figure=None):
         for star, look in zip(seen, looks(len(seen)), strict=True):
             hours = _hours(star, seen[0])
             _curve(upper, hours, star.table["altitude"].value, star, look)
-            wrapped = _wrapped(star.table["parallactic"].value)
-            _curve(lower, *_broken(hours, wrapped), star, look)
+            _curve(lower, hours, star.table["parallactic"].value, star, look)
         _finish(upper, lower, seen)
         handles = [
             upper.plot([], [], color=c, marker=m, label=s.name)[0]
@@ -67,7 +68,10 @@ def plot_observability(seen, *, figure=None):
         ]
         dotted = upper.plot([], [], color=GREY, ls=":", label="too low to observe")
         legend_outside(figure, handles + dotted, columns=min(len(seen) + 1, 4))
-        figure.suptitle(f"Standard stars, night of {seen[0].night}\n{_place(seen[0].site)}")
+        few = total is not None and total > len(seen)
+        which = f"the first {len(seen)} of {total} standard stars" if few else "Standard stars"
+        title = f"{which[0].upper()}{which[1:]}, night of {seen[0].night}"
+        figure.suptitle(f"{title}\n{_place(seen[0].site)}")
     return figure
 
 
@@ -96,26 +100,13 @@ def _hours(star, first):
     return (star.table["time"].mjd - start) * 24
 
 
-def _wrapped(angle):
-    return (angle + 180) % 360 - 180
-
-
-def _broken(hours, angle):
-    """Put a gap where the angle jumps by a turn."""
-    # within a step of minutes no star turns by half a turn, except in the wrapping
-    jump = [i + 1 for i, (a, b) in enumerate(pairwise(angle)) if abs(a - b) > 180]
-    return np.insert(hours, jump, np.nan), np.insert(angle, jump, np.nan)
-
-
 def _curve(axes, hours, values, star, look):
     """Draw one star: faint below the limit, with markers where it is observable."""
     color, marker = look
-    # the curve may have gaps put in: its hours are not those of the table
-    good = np.interp(hours, _hours(star, star), star.table["observable"]) > 0.5
-    good |= np.isnan(hours)
+    good = star.table["observable"]
     axes.plot(hours, values, color=color, linestyle=":", linewidth=1)
     axes.plot(hours, np.where(good, values, np.nan), color=color, linewidth=2)
-    count = max(len(hours) // max(int((np.nanmax(hours) - np.nanmin(hours)) / _EVERY), 1), 1)
+    count = max(len(hours) // max(int((hours[-1] - hours[0]) / _EVERY), 1), 1)
     axes.plot(
         hours[::count], np.where(good, values, np.nan)[::count], color=color, marker=marker, ls=""
     )
@@ -129,7 +120,11 @@ def _finish(upper, lower, seen):
     upper.set_ylim(0, 90)
     upper.set_yticks(np.arange(0, 91, 15))
     lower.set_ylabel("parallactic angle (deg)")
-    lower.set_ylim(-180, 180)
-    lower.set_yticks(np.arange(-180, 181, _TICK))
+    angles = np.concatenate([star.table["parallactic"].value for star in seen])
+    low = min(_TICK * np.floor(angles.min() / _TICK), -180)
+    high = max(_TICK * np.ceil(angles.max() / _TICK), 180)
+    lower.set_ylim(low, high)
+    # twice as wide where the labels would crowd
+    lower.set_yticks(np.arange(low, high + 1, _TICK if high - low <= _CROWDED else 2 * _TICK))
     date = seen[0].table["time"][0].to_value("iso", "date")
     lower.set_xlabel(f"time on {date} (hours UTC)")

@@ -295,7 +295,7 @@ def _held(arguments, chains):
     """Return the parameters that were fixed by name, as the gauge is to name them."""
     from astropolcal.measurement import parameter_table
 
-    # a later --prior frees again what --fix held
+    # a --prior frees one parameter of an optic that --fix holds
     names = {text.partition("=")[0] for text in arguments.fix}
     loose = {text.partition("=")[0] for text in arguments.prior}
     known = parameter_table(chains)

@@ -2,9 +2,14 @@
 """``astropolcal challenge``: the diagnosis against sealed simulated data."""
 
 import argparse
-from contextlib import nullcontext
+import multiprocessing
+import signal
+import sys
+import time
+import warnings
+from contextlib import contextmanager
 
-from astropolcal.exceptions import AstropolcalError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
 from astropolcal.scripts._common import (
     add_json,
     add_quiet,
@@ -23,6 +28,8 @@ examples:
 A run that was interrupted goes on if it is started again with the same
 checkpoint.
 """
+# seconds between two lines of progress where there is no terminal for a bar
+_BETWEEN = 10
 
 
 def add_parser(commands):
@@ -90,10 +97,14 @@ def run(arguments):
             ),
             client=client,
             checkpoint=arguments.checkpoint,
-            progress=not arguments.quiet,
+            progress=_progress(arguments),
         )
     if arguments.json:
         write_json(result.to_dict(), arguments.json)
+    if not result.answered:
+        raise GapError(result.shortfall)
+    if result.shortfall:
+        warnings.warn(result.shortfall, AstropolcalWarning, stacklevel=2)
     if arguments.figure:
         from astropolcal.plotting._style import save
 
@@ -102,22 +113,60 @@ def run(arguments):
         print(_report(result))
 
 
+@contextmanager
 def _workers(count):
     """Return a pool of processes, or nothing where one is enough."""
     if count < 1:
         raise AstropolcalError(f"--workers {count}: allowed are whole numbers from 1 up")
     if count == 1:
-        return nullcontext()
+        yield None
+        return
     from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
 
+    others = multiprocessing.active_children()
     # what is forked from a process with threads may hang
-    return ProcessPoolExecutor(count, mp_context=get_context("spawn"))
+    context = multiprocessing.get_context("spawn")
+    # an interruption from the keyboard goes to all processes; this one ends the others
+    ignored = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+    pool = ProcessPoolExecutor(count, mp_context=context, **ignored)
+    try:
+        yield pool
+    except BaseException as problem:
+        if isinstance(problem, KeyboardInterrupt):
+            print("astropolcal: stopping ...", file=sys.stderr, flush=True)
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - set(others):
+            process.terminate()
+        raise
+    pool.shutdown()
+
+
+def _progress(arguments):
+    """Return what says how far the challenges are: a bar on a terminal, else lines."""
+    if is_quiet(arguments):
+        return False
+    return True if sys.stderr.isatty() else _Progress()
+
+
+class _Progress:
+    """Says now and then how many challenges are done, and after how many seconds."""
+
+    def __init__(self):
+        self.started = self.said = time.monotonic()
+
+    def __call__(self, done, n):
+        now = time.monotonic()
+        if now - self.said >= _BETWEEN:
+            self.said = now
+            seconds = f"{now - self.started:3.0f} s"
+            print(f"astropolcal: {seconds}  {done} of {n} challenges", file=sys.stderr, flush=True)
 
 
 def _report(result):
     """Return the rates, and the wrong answers one by one."""
-    lines = [result.words(), "(in brackets: interval of each rate at 68 %; number it is from)"]
+    lines = [result.words()]
+    if result.summary()["rates"]:
+        lines.append("(in brackets: interval of each rate at 68 %; number it is from)")
     for record in result.failures:
         # only what went wrong is listed; the rates hold the rest
         truth = " + ".join(record["effects"]) or "nothing"

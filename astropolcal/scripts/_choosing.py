@@ -114,9 +114,13 @@ def _check_validity(calibration, path, arguments, night):
             raise AstropolcalError(
                 f"{path} does not hold for {date}: {held}; --any-date takes it all the same"
             )
-    # --filter says that the mode is right, whatever it is called
-    mode = None if arguments.filter else night.mode
+    # --filter names the mode as the file does, whatever the headers call it
+    mode = arguments.filter or night.mode
     if mode and held.mode and mode.casefold().split() != held.mode.casefold().split():
+        if arguments.filter:
+            raise AstropolcalError(
+                f"--filter {mode!r}: {path} holds for mode {held.mode!r}; allowed is that one"
+            )
         raise AstropolcalError(
             f"the frames are in mode {mode!r}, but {path} holds for {held}; --filter {held.mode!r} "
             "if it is the same by another name"

@@ -271,8 +271,9 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
     Raises
     ------
     ChainError, ParameterError
-        If a name or a value does not fit.
+        If a name or a value does not fit, or a parameter is to be fixed and free at once.
     """
+    _check_fixed(fix, free, prior)
     # before the rest: what is out of the model has no parameters to edit
     for name in without:
         present = [name in {leaf.name for leaf in leaves(chain)} for chain in chains]
@@ -298,6 +299,21 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
             parameter.prior = _normal(name, parameter, value)
             parameter.fixed = False
     return chains
+
+
+def _check_fixed(fix, free, prior):
+    """Refuse to hold what is named as free, or given a prior, as well."""
+    for held in (text.partition("=")[0] for text in fix):
+        for option, texts in (("free", free), ("prior", prior)):
+            for text in texts:
+                name = text.partition("=")[0]
+                # an optic and one of its parameters: the parameter is the exception, if edited last
+                inside = option == "free" and name.startswith(f"{held}.")
+                if name == held or inside:
+                    raise ParameterError(
+                        f"--{option} {text} cannot be combined with --fix {held}: a parameter is "
+                        "either held or free"
+                    )
 
 
 def _parameters(chains, name):
@@ -359,6 +375,8 @@ def _set(name, parameter, text):
         np.inf if parameter.bounds[1] is None else parameter.bounds[1],
     )
     if not (np.isfinite(value) and low <= value <= high):
+        # bounds that were computed carry rounding errors
+        low, high = (float(f"{bound:.7g}") for bound in (low, high))
         raise ParameterError(
             f"{name}={text}: allowed is {low} to {high} {parameter.unit or ''}".rstrip()
         )

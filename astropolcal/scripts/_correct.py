@@ -6,7 +6,7 @@ import argparse
 import astropy.units as u
 import numpy as np
 
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.scripts._choosing import choose_calibration, configured
 from astropolcal.scripts._common import (
     add_json,
@@ -62,7 +62,10 @@ def add_parser(commands):
     _add_errors(parser)
     parser.add_argument("--spectrum", metavar="OUT.ecsv", help="table of the star in an aperture")
     parser.add_argument(
-        "--radius", metavar="PIXELS", type=float, default=10.0, help="of the aperture (default: 10)"
+        "--radius",
+        metavar="PIXELS",
+        type=float,
+        help="of the aperture (default: 10, or half of a smaller --size)",
     )
     parser.add_argument("--plot", metavar="FILE", help="figure of the result")
     parser.add_argument("--workers", metavar="N", type=int, help="threads of dask")
@@ -186,8 +189,8 @@ def _add_images(parser):
         "--camera-angle",
         metavar="DEG",
         type=float,
-        default=0.0,
-        help="position angle of the +y axis, or with --rotation pupil that from the zenith",
+        help="position angle of the +y axis, or with --rotation pupil that from the zenith "
+        "(default: 0)",
     )
     parser.add_argument("--mirrored", action="store_true", help="east is to the right of north")
 
@@ -208,6 +211,7 @@ def run(arguments):
     check_outputs(arguments.output, arguments.json, arguments.spectrum, arguments.plot)
     check_suffix("-o", arguments.output, ".fits")
     check_suffix("--spectrum", arguments.spectrum, ".ecsv")
+    _check_options(arguments)
     files = cube_files(arguments.cubes)
     # before the images are opened: which calibration holds is known from headers
     calibration, chain, provenance = choose_calibration(arguments, files)
@@ -231,13 +235,39 @@ def run(arguments):
     result = _corrected(calibration, frames, chain, arguments, provenance)
     result.write(arguments.output, overwrite=True)
     # for the report, too, not only for --spectrum
-    star = result.aperture(arguments.radius)
+    star = result.aperture(_radius(arguments))
     _write_others(result, star, arguments)
     summary = _summary(result, star, arguments, len(files))
     if arguments.json:
         write_json(summary, arguments.json)
     if not is_quiet(arguments):
         _report(summary, result.systematic)
+
+
+def _check_options(arguments):
+    """Refuse options that have no meaning beside the others, before any work is done."""
+    from astropolcal.simulation import check_seed
+
+    if arguments.rotation == "none" and arguments.camera_angle is not None:
+        raise ParameterError(
+            f"--camera-angle {arguments.camera_angle:g}: is for --rotation fixed or --rotation "
+            "pupil; with --rotation none the images are not turned"
+        )
+    if arguments.seed is not None and not arguments.samples:
+        raise ParameterError(f"--seed {arguments.seed}: is for --samples N")
+    check_seed(arguments.seed)
+    # a size that is none is refused with the images, whose width it depends on
+    largest = arguments.size / 2
+    if arguments.radius is not None and arguments.radius > largest > 0:
+        raise ParameterError(
+            f"--radius {arguments.radius:g}: leaves the images of --size {arguments.size}; "
+            f"allowed are up to {largest:g} pixels"
+        )
+
+
+def _radius(arguments):
+    """Return the radius of the aperture; the usual one, as far as it is in the images."""
+    return min(10.0, arguments.size / 2) if arguments.radius is None else arguments.radius
 
 
 def _corrected(calibration, frames, chain, arguments, provenance):
@@ -335,7 +365,7 @@ def _position_angles(table, arguments):
     if arguments.rotation == "none":
         return None
     # from north through east
-    angle = np.full(len(table), arguments.camera_angle) * u.deg
+    angle = np.full(len(table), arguments.camera_angle or 0.0) * u.deg
     if arguments.rotation == "pupil":
         if "parallactic" not in table.colnames:
             raise ObservationError("--rotation pupil needs the parallactic angle of every frame")
@@ -377,7 +407,7 @@ def _summary(result, star, arguments, n_frames):
         "leakage_q": _plain(result.leakage[:, 1]),
         "leakage_u": _plain(result.leakage[:, 2]),
         "held": [] if result.systematic is None else result.systematic.held,
-        "aperture": {"radius": arguments.radius}
+        "aperture": {"radius": _radius(arguments)}
         | {name: _plain(values) for name, values in spectrum.items()},
     }
 

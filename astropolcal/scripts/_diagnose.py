@@ -33,6 +33,13 @@ examples:
 
 Several tables are used together. The effects are listed by --effects help.
 """
+_PAGES = (".html", ".htm")
+# what the figure with both channels of the data shows
+_SPECTRUM = (
+    "Gap of the fit at each wavelength before and after, with the noise. The verdict and the "
+    "shares are of the differences and the sums of the beams together, of the sums less the "
+    "drift and flicker of the lamp; the gap in percent is of the differences alone"
+)
 
 
 def add_parser(commands):
@@ -100,6 +107,7 @@ def run(arguments):
     say, progress = printer(arguments), None if is_quiet(arguments) else _Progress()
     check_outputs(arguments.report, arguments.save, arguments.json)
     check_suffix("--save", arguments.save, ".asdf")
+    _check_page(arguments.report)
     effects = _effects(arguments.effects)
     nominal, datasets, instrument = _nominal(arguments)
     diagnosis = diagnose(nominal, datasets, effects=effects, progress=progress)
@@ -109,6 +117,12 @@ def run(arguments):
     written = _write(diagnosis, content, arguments, instrument)
     say(summary(diagnosis, content))
     say_written(say, written)
+
+
+def _check_page(path):
+    """Raise if the page is called what others take for another format."""
+    if path is not None and Path(path).suffix.lower() not in _PAGES:
+        raise AstropolcalError(f"--report {path}: the name must end with {' or '.join(_PAGES)}")
 
 
 class _Progress:
@@ -229,7 +243,7 @@ def _figures(diagnosis):
     from astropolcal.plotting import gap
 
     figures = {
-        "Gap at each wavelength before and after, with the noise": gap.plot_gap_spectrum(diagnosis),
+        _SPECTRUM: gap.plot_gap_spectrum(diagnosis),
         "Residuals of the differences, by wavelength and frame": gap.plot_gap_maps(diagnosis),
         "Where the gap of the nominal model lies": gap.plot_where(diagnosis),
     }

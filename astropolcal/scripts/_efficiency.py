@@ -45,7 +45,12 @@ def add_parser(commands):
     parser.add_argument("file", nargs="?", metavar="CAL.asdf", help="calibration")
     parser.add_argument("--instrument", metavar="NAME", help="default: that of the file, or charis")
     _add_observation(parser)
-    parser.add_argument("-o", "--output", metavar="FILE", help="save the figure (PNG, PDF, SVG)")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        help="save the figure (PNG, PDF, SVG); with --target that of the derotator offsets",
+    )
     add_json(parser)
     add_quiet(parser)
     parser.set_defaults(run=run)
@@ -94,10 +99,11 @@ def run(arguments):
     arguments.parallactic = _or(arguments.parallactic, 0.0)
     instrument, chain, grid = _chain(arguments)
     content = _table(arguments, instrument, chain, grid)
+    best = None
     if arguments.target or arguments.night:
-        content["best_derotator"] = _best(arguments, instrument, chain, grid)
+        best, content["best_derotator"] = _best(arguments, instrument, chain, grid)
     if arguments.output:
-        _draw(arguments, instrument, chain, grid)
+        _draw(arguments, instrument, chain, grid, best)
     if arguments.json:
         write_json(content, arguments.json)
     if not is_quiet(arguments):
@@ -128,6 +134,11 @@ def _chain(arguments):
     if name is None:
         raise InstrumentError(f"{arguments.file}: names no instrument; give --instrument NAME")
     instrument = instruments.get(name)
+    if calibration.instrument and not instrument.answers_to(calibration.instrument):
+        raise InstrumentError(
+            f"{arguments.file}: the calibration is of instrument {calibration.instrument!r}, not "
+            f"{instrument.name!r}"
+        )
     # a chain that has the telescope already is better than the published one
     chains = sorted(calibration.chains, key=lambda chain: "parallactic" not in stages(chain))
     grid = calibration.wavelength
@@ -206,6 +217,7 @@ def _rows(wanted, grid):
 
 
 def _best(arguments, instrument, chain, grid):
+    """Return the best derotator offset, and what is said of it."""
     from astropolcal.calibration import best_derotator
 
     altitude, parallactic = _track(arguments, instrument)
@@ -215,7 +227,7 @@ def _best(arguments, instrument, chain, grid):
     turned = np.unwrap(parallactic.to_value(u.deg), period=360)
     # the offset whose worst moment is the best
     row = int(np.argmax(best.table["least"]))
-    return {
+    return best, {
         "law": best.law,
         "offset_deg": float(best.offset.to_value(u.deg)),
         "least": float(best.table["least"][row]),
@@ -228,9 +240,6 @@ def _best(arguments, instrument, chain, grid):
 
 def _track(arguments, instrument):
     """Return altitude and parallactic angle over the observation."""
-    from astropy.coordinates import SkyCoord
-    from astropy.time import Time
-
     from astropolcal.observations import pointing
 
     if not (arguments.target and arguments.night):
@@ -238,22 +247,51 @@ def _track(arguments, instrument):
     location = instrument.location
     if location is None:
         raise InstrumentError(f"{instrument.name}: its site is not known")
+    return pointing(_target(arguments.target), _times(arguments.night), location)
+
+
+def _target(text):
+    from astropy.coordinates import SkyCoord
+
     try:
         # degrees only: names would ask a server
-        coord = SkyCoord(*(float(x) for x in arguments.target.split(",")), unit=u.deg)
-        start, end = (Time(text, scale="utc") for text in arguments.night.split("/"))
-    except (TypeError, ValueError) as error:
+        ra, dec = (float(part) for part in text.split(","))
+        if not np.isfinite([ra, dec]).all():
+            raise ValueError
+        return SkyCoord(ra, dec, unit=u.deg)
+    except ValueError:
         raise ParameterError(
-            f"--target {arguments.target} --night {arguments.night}: write RA,DEC in degree and "
-            f"START/END such as 2025-11-03T08:00/2025-11-03T12:00 ({error})"
+            f"--target {text}: write RA,DEC in degree, such as 75.2,28.3; allowed is a "
+            "declination from -90 to 90"
         ) from None
-    return pointing(coord, start + (end - start) * np.linspace(0, 1, 25), location)
 
 
-def _draw(arguments, instrument, chain, grid):
+def _times(text):
+    """Return moments over the observation."""
+    from astropy.time import Time
+
+    try:
+        start, end = (Time(part, scale="utc") for part in text.split("/"))
+    except ValueError:
+        raise ParameterError(
+            f"--night {text}: write START/END in UTC, such as 2025-11-03T08:00/2025-11-03T12:00"
+        ) from None
+    if end < start:
+        raise ParameterError(f"--night {text}: ends before it starts; write START/END")
+    return start + (end - start) * np.linspace(0, 1, 25)
+
+
+def _draw(arguments, instrument, chain, grid, best=None):
     from astropolcal.plotting._style import save
-    from astropolcal.plotting.efficiency import plot_polarimetric_efficiency
+    from astropolcal.plotting.efficiency import plot_derotator_offsets, plot_polarimetric_efficiency
 
+    if best is not None:
+        title = (
+            f"Polarimetric efficiency of {instrument.name}\n"
+            f"target {arguments.target}, {arguments.night}"
+        )
+        save(plot_derotator_offsets(best, title=title), arguments.output)
+        return
     figure = plot_polarimetric_efficiency(
         chain,
         grid,

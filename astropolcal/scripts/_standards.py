@@ -12,7 +12,7 @@ from astropolcal.scripts._common import (
     wrapped,
     write_json,
 )
-from astropolcal.words import counted
+from astropolcal.words import counted, did_you_mean
 
 # more stars than this make a figure unreadable
 _DRAWN = 5
@@ -32,8 +32,18 @@ def add_parser(commands):
     add = parser.add_argument
     add("name", nargs="?", metavar="NAME", help="a star, such as 'HD 293396'")
     add("--kind", choices=("polarized", "unpolarized"), help="only stars of this kind")
-    add("--band", metavar="BAND", help="magnitude and polarization in this band, such as H")
-    add("--magnitude", metavar="LO,HI", help="brightest and faintest magnitude")
+    add(
+        "--band",
+        metavar="BAND",
+        help="magnitude and polarization in this band, such as H; the magnitude in V "
+        "where the catalogue has none in it",
+    )
+    add(
+        "--magnitude",
+        metavar="LO,HI",
+        help="brightest and faintest magnitude, in --band, or in V where "
+        "the catalogue has none in it",
+    )
     add("--near", metavar="RA,DEC", help="degrees, or 05:26:06,+16:42:00")
     add("--radius", metavar="DEG", type=float, help="goes with --near (default: 15)")
     add("--site", metavar="SITE", help="subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT")
@@ -62,9 +72,9 @@ def run(arguments):
     _check(arguments)
     check_outputs(arguments.json, arguments.plot)
     # text for people, content for machines, nights for the figure
-    text, content, seen = (_one if arguments.name else _many)(arguments)
+    text, content, seen, total = (_one if arguments.name else _many)(arguments)
     if arguments.plot:
-        _plot(seen, arguments.plot)
+        _plot(seen, total, arguments.plot)
     if arguments.json:
         write_json(content, arguments.json)
     printer(arguments)(text)
@@ -95,12 +105,12 @@ def _one(arguments):
     content = _facts(star)
     lines = _describe(star)
     if arguments.night is None:
-        return "\n".join(lines), content, []
+        return "\n".join(lines), content, [], 1
     seen = _observability(star.name, arguments)
     content |= {"site": arguments.site, "night": seen.night} | _angles(seen)
     lines += ["", f"Night of {seen.night}, {arguments.site}, above {arguments.min_altitude:g} deg"]
     lines += _night_lines(seen, content)
-    return "\n".join(lines), content, [seen]
+    return "\n".join(lines), content, [seen], 1
 
 
 def _observability(name, arguments):
@@ -203,13 +213,17 @@ def _many(arguments):
     # a machine gets all unless it asks for fewer
     content["stars"] = [_row(row) for row in found[: arguments.limit]]
     shown = found[: arguments.limit or (_LISTED if arguments.night else None)]
-    lines = _night_table(shown) if arguments.night else _table(shown)
+    lines = _night_table(shown) if arguments.night else _table(shown, arguments.band)
+    lines += _band_lines(shown, arguments)
     more = len(found) - len(shown)
     if more:
         lines += ["", f"{counted(more, 'more star')}; --limit {len(found)} lists all"]
     # ordered by the score already
-    best = found["name"][:_DRAWN] if arguments.plot else []
-    return "\n".join(lines), content, [_observability(str(n), arguments) for n in best]
+    best = shown["name"][:_DRAWN] if arguments.plot else []
+    if len(best) and len(best) < len(shown):
+        lines += ["", f"The figure shows the first {len(best)} of {len(shown)} stars."]
+    seen = [_observability(str(name), arguments) for name in best]
+    return "\n".join(lines), content, seen, len(shown)
 
 
 def _where(arguments):
@@ -221,18 +235,46 @@ def _where(arguments):
     }
 
 
-def _table(found):
+def _band_lines(shown, arguments):
+    """Return the note on what is of another band than was asked for."""
+    band, lines = arguments.band, []
+    if band is None:
+        return lines
+    known = shown[[math.isfinite(value) for value in shown["magnitude"].value]]
+    others = sum(str(row["magnitude_band"]) != band for row in known)
+    if others:
+        selects = ", by which --magnitude selects them" if arguments.magnitude else ""
+        lines.append(f"{others} of {len(shown)} have no magnitude in {band}: V instead{selects}.")
+    if not arguments.night and not all(_has_degree(row, band) for row in shown):
+        lines.append(f"* no polarization in {band}: p is of the band nearest to V")
+    return ["", *lines] if lines else []
+
+
+def _has_degree(row, band):
+    """Return whether the degree of polarization of a star is known in a band, or none is asked."""
+    from astropolcal import standards
+
+    if band is None:
+        return True
+    star = standards.get(str(row["name"]))
+    return star.law is not None or band in star.polarization["band"]
+
+
+def _table(found, band=None):
     near = "separation" in found.colnames
-    lines = ["name            kind         RA (ICRS)  dec     mag     p (%)"]
-    lines[0] += "            deg" if near else ""
+    degree = f"p (%) in {band}" if band else "p (%)"
+    lines = ["name            kind         RA (ICRS)  dec     mag     "]
+    lines[0] += f"{degree:<17}deg" if near else degree
     for row in found:
         # of right ascension
         hours = row["ra"].value / 15
         clock = f"{int(hours):02d} {60 * (hours % 1):04.1f}"
         away = f"  {row['separation'].value:5.1f}" if near else ""
+        degree = f"{_pair(row['p'].value, row['p_err'].value, '.3f'):<15}"
+        mark = " " if _has_degree(row, band) else "*"
         lines.append(
             f"{row['name']:<15} {row['kind']:<11}  {clock}  {row['dec'].value:+z6.1f}   "
-            f"{_magnitude(row):<7} {_pair(row['p'].value, row['p_err'].value, '.3f'):<15}{away}"
+            f"{_magnitude(row):<7}{mark}{degree}{away}"
         )
     return [line.rstrip() for line in lines]
 
@@ -362,11 +404,19 @@ def _position(text):
 
 def _site(text):
     """Return the place, by name or as LON,LAT,HEIGHT."""
-    # a name, which the catalogue of sites knows
-    if "," not in text:
-        return text
     import astropy.units as u
     from astropy.coordinates import EarthLocation
+
+    from astropolcal.standards._sky import SITES, location
+
+    if "," not in text:
+        try:
+            return location(text)
+        except ParameterError:
+            raise ParameterError(
+                f"--site {text}: not known{did_you_mean(text, SITES)}; allowed are "
+                f"{', '.join(SITES)}, or LON,LAT,HEIGHT in deg, deg and m"
+            ) from None
 
     lon, lat, height = _numbers(text, "--site", 3)
     try:
@@ -375,8 +425,8 @@ def _site(text):
         raise ParameterError(f"--site {text}: {error}") from None
 
 
-def _plot(seen, path):
+def _plot(seen, total, path):
     from astropolcal.plotting._style import save
     from astropolcal.plotting.standards import plot_observability
 
-    save(plot_observability(seen), path)
+    save(plot_observability(seen, total=total), path)

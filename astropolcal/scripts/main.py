@@ -7,6 +7,7 @@ Exit status 0, or 2 with one clear line on bad input.
 
 import argparse
 import os
+import re
 import sys
 import warnings
 
@@ -18,7 +19,16 @@ _DESCRIPTION = "Calibrate polarimeters, and say how well their model fits."
 
 
 class _OneLineParser(argparse.ArgumentParser):
-    """A parser whose complaint is one line, like every other error here."""
+    """
+    A parser whose complaint is one line, like every other error here.
+
+    What starts with a minus sign and a digit is a value, such as ``-155,19,4200``: no option does.
+    """
+
+    def __init__(self, *arguments, **settings):
+        super().__init__(*arguments, **settings)
+        # argparse itself knows single numbers only, and takes a list for an unknown option
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def error(self, message):
         # argparse prints the usage in several lines before its complaint

@@ -9,6 +9,7 @@ from astropolcal import optics
 from astropolcal.calibration._directions import (
     LARGE,
     declared_step,
+    first_of_each_kind,
     led,
     near_null_directions,
     open_directions,
@@ -293,6 +294,31 @@ def test_a_finding_reads_as_a_list():
         "  - few angles",
         "  - mirror solution: other sign",
     ]
+
+
+def _alike(count, name="m.d", other="w.e"):
+    return [
+        {"words": f"{name}[{i}] by +0.01 cannot be told from {other}", "parameters": {name: 0.0}}
+        for i in range(count)
+    ]
+
+
+@pytest.mark.parametrize(("count", "more"), [(3, 0), (4, 0), (5, 2), (22, 19)])
+def test_open_directions_that_differ_by_wavelength_are_counted(count, more):
+    other = {"words": "hwp.theta by +1 deg cannot be told from w.e", "parameters": {"w.e": 1.0}}
+    alone = {"words": "m.d[9] changes no datum", "parameters": {"m.d": 1.0, "x.y": 1.0}}
+    words = first_of_each_kind([other, *_alike(count), alone])
+    assert words[0] == other["words"]
+    assert words[-1] == alone["words"]
+    told = [line for line in words if line.startswith("m.d[") and line != alone["words"]]
+    assert len(told) + more == count
+    says = [f"and {more} more of the same kind"] if more else []
+    assert [line for line in words if "of the same kind" in line] == says
+
+
+def test_directions_of_parameters_for_all_wavelengths_are_all_told():
+    many = [{"words": f"o{i}.theta by +1 deg", "parameters": {"p.theta": 1.0}} for i in range(6)]
+    assert first_of_each_kind(many) == [one["words"] for one in many]
 
 
 # --- the telescope ---------------------------------------------------------------------------

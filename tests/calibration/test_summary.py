@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from astropolcal.calibration import _unusable
 from astropolcal.calibration._sky_summary import (
     mirror_lines,
     open_lines,
@@ -24,6 +25,7 @@ from astropolcal.calibration.summaries import (
     _plain,
     _rows,
     _standard_lines,
+    _target_row,
     _unusable_lines,
     _wavelength_lines,
     _with_wavelengths,
@@ -44,8 +46,9 @@ def _accuracy(n=3, **columns):
     return QTable({"wavelength": np.linspace(1200, 2200, n) * u.nm, **values})
 
 
-def _record(name="night", n_masked=0, **columns):
-    return SimpleNamespace(name=name, n_frames=16, n_masked=n_masked, accuracy=_accuracy(**columns))
+def _record(name="night", n_masked=0, source=None, **columns):
+    own = {"name": name, "n_frames": 16, "n_masked": n_masked, "source": source}
+    return SimpleNamespace(**own, accuracy=_accuracy(**columns))
 
 
 def _calibration(**changes):
@@ -266,7 +269,65 @@ def test_a_parameter_at_a_bound_nearly_everywhere_is_not_usable(stuck, says):
         "hwp.theta": _entry(1.0, at_bound=np.array(True)),
     }
     line = f"NOT USABLE AS IT IS: at a bound at most wavelengths: w.efficiency ({stuck} of 3)"
-    assert _unusable_lines(known) == ([line] if says else [])
+    assert _unusable_lines(_calibration(), known) == ([line] if says else [])
+
+
+def _angles(stuck):
+    return {
+        name: _entry(1.0, unit="deg", at_bound=np.array(i < stuck))
+        for i, name in enumerate(("polarizer.theta", "hwp.theta", "derotator.theta"))
+    } | {"hwp.w_sio2": _entry(1.6, unit="mm"), "m3.theta": _entry(0.0, unit="deg", fixed=True)}
+
+
+@pytest.mark.parametrize(
+    ("stuck", "p_value", "says"),
+    [(1, 0.0, False), (2, 0.0, True), (3, 0.0, True), (3, 0.3, False), (3, np.nan, False)],
+)
+def test_most_angles_at_bounds_and_large_residuals_are_not_usable(stuck, p_value, says):
+    tests = [{"times_noise": 41.2, "p_value": p_value}, {"times_noise": 80.0, "p_value": p_value}]
+    cal = _calibration(fit={"lack_of_fit": tests})
+    lines = _unusable_lines(cal, _angles(stuck))
+    assert bool(lines) is says
+    assert all(len(line) <= 80 for line in lines)
+    if says:
+        words = " ".join(lines)
+        assert words.startswith("NOT USABLE AS IT IS: at a bound: polarizer.theta, hwp.theta")
+        assert "41.2 times the noise" in words
+        assert "astropolcal diagnose" in words
+
+
+@pytest.mark.parametrize(
+    ("source", "percent", "std", "fixed", "says"),
+    [
+        ("unpolarized", [-99.0, -98.0, -100.0], np.nan, False, True),
+        ("unpolarized standard star", [60.0, 70.0, 1.0], 2.0, False, True),
+        # one wavelength that went astray, a small one, one within its error, and one held
+        ("unpolarized", [60.0, 2.0, 1.0], np.nan, False, False),
+        ("unpolarized", [8.0, 9.0, 9.0], 0.1, False, False),
+        ("unpolarized", [60.0, 70.0, 80.0], 20.0, False, False),
+        ("unpolarized", [60.0, 70.0, 80.0], np.nan, True, False),
+        ("polarized", [-99.0, -98.0, -100.0], np.nan, False, False),
+        (None, [-99.0, -98.0, -100.0], np.nan, False, False),
+    ],
+)
+def test_a_mirror_that_polarizes_as_none_does(monkeypatch, source, percent, std, fixed, says):
+    table = QTable({"diattenuation": percent * u.percent})
+    table["diattenuation_err"] = np.full(3, std) * u.percent
+    monkeypatch.setattr(_unusable, "mirror_names", lambda calibration: ["m3"])
+    monkeypatch.setattr(_unusable, "mirror_values", lambda calibration, name: table)
+    known = {"m3.diattenuation": _entry(np.array(percent) / 100, fixed=fixed)}
+    words = " ".join(_unusable_lines(_calibration(datasets=[_record(source=source)]), known))
+    assert ("NOT USABLE AS IT IS: m3 polarizes by more than 30 %" in words) is says
+    assert (f"is the source of night really {source!r}" in words) is says
+
+
+@pytest.mark.parametrize(("missing", "shown"), [([], "0.2"), (["on_sky"], ">0.2")])
+def test_lower_limits_for_a_target_are_marked(missing, shown):
+    columns = {key: np.full(3, 0.2) for key in ("s_Q", "s_U", "s_p")}
+    table = QTable({key: value * u.percent for key, value in columns.items()})
+    table["s_chi"] = np.full(3, np.nan) * u.deg
+    table.meta |= {"aolp": None, "dolp": 1 * u.percent, "missing": missing}
+    assert _target_row(table).split() == ["1", "%", "any", *[shown] * 4, "-", "-"]
 
 
 # --- what is left open on sky, mirrors -----------------------------------------------------------
@@ -352,8 +413,10 @@ def test_a_mirror_unlike_any_metal_is_pointed_at(percent, std, says, monkeypatch
     monkeypatch.setattr(_sky_summary, "mirror_names", lambda calibration: ["m3"])
     monkeypatch.setattr(_sky_summary, "mirror_values", lambda calibration, name: table)
     lines = mirror_lines(_calibration(wavelength=[600, 800] * u.nm))
-    assert len(lines) == 4 + bool(says)
-    assert not says or lines[-1].startswith(says)
+    # the table, and a sentence that is broken like the rest of the summary
+    assert " ".join(lines[4:]).startswith(says or "")
+    assert bool(lines[4:]) is bool(says)
+    assert all(len(line) <= 80 for line in lines)
 
 
 # --- stars ---------------------------------------------------------------------------------------

@@ -150,6 +150,14 @@ def test_apertures_of_no_size(images, radius):
         images.aperture(0.1, centre=(2.5, 2.5))
 
 
+def test_an_aperture_does_not_leave_the_images():
+    found = make((7, 9), centre=(5.0, 3.0))
+    found.aperture(3.5)
+    words = r"radius = 3.6 leaves the images of 9 x 7 pixels; allowed around \(5, 3\) are up to 3.5"
+    with pytest.raises(ParameterError, match=words):
+        found.aperture(3.6)
+
+
 def test_an_aperture_without_errors(images):
     images.covariance = None
     assert images.aperture(2).covariance is None

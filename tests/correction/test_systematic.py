@@ -127,6 +127,11 @@ def test_at_least_two_samples(model, solution):
         sampled_systematic(model, solution, n_samples=1)
 
 
+def test_seed_that_is_none_is_refused(model, solution):
+    with pytest.raises(ParameterError, match="seed = -1; allowed are whole numbers from 0 up"):
+        sampled_systematic(model, solution, n_samples=5, seed=-1)
+
+
 def test_nothing_open_has_finite_errors():
     one = Systematic(np.zeros((0, 2, 3, 3)), np.zeros((2, 3, 3), dtype=bool), "linear")
     assert not one.covariance(STOKES, 1).any()

@@ -111,6 +111,7 @@ def test_what_is_unlisted_is_explained_by_no_effect():
         ({"effect": "beam_gian"}, "did you mean 'beam_gain'"),
         ({"kind": "unlisted", "effect": "odd"}, "there are"),
         ({"kind": "absorbed", "effect": "mirror_flip"}, "no effect found"),
+        ({"kind": "pair", "snr": 1e-3}, "no two effects found for a challenge of kind pair"),
     ],
 )
 def test_what_cannot_be_made_is_refused(options, words):
@@ -256,3 +257,10 @@ def test_a_cluster_of_dask_gives_the_same_answers():
         for run in (here, there)
     ]
     assert timeless[0] == timeless[1]
+
+
+def test_progress_is_told_after_each_challenge(tmp_path):
+    told, options = [], {"kinds": ["none"], "setup": SMALL, "checkpoint": tmp_path / "c.jsonl"}
+    run_challenge(1, **options)
+    run_challenge(2, **options, progress=lambda *numbers: told.append(numbers))
+    assert told == [(2, 2)]

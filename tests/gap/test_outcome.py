@@ -128,11 +128,21 @@ def test_everything_can_be_written_as_json(result):
 
 def test_words_are_the_summary(result):
     lines = result.words().splitlines()
-    assert lines[0] == "9 challenges, 3 wrong answers"
+    words = "8 of 9 challenges could be made; not the others: too dark (1)"
+    assert lines.pop(0) == words == result.shortfall
+    assert lines[0] == "8 challenges, 3 wrong answers"
     value, low, high = (100 * x for x in wilson(1, 2))
     assert lines[1] == f"{'recall':<24}{value:6.1f} % ({low:.1f} to {high:.1f}; 2)"
     assert lines[-1].startswith("shrinkage over oracle")
     assert "shrinkage" not in ChallengeResult([record(0)], {}).words()
+
+
+def test_what_could_not_be_made_is_no_right_answer():
+    dark = {"index": 0, "kind": "single", "verdict": "not made", "error": "too dark"}
+    none = ChallengeResult([dark, dark | {"index": 1}], {})
+    assert none.words() == "0 of 2 challenges could be made: too dark (2)"
+    assert none.answered == []
+    assert ChallengeResult([record(0)], {}).shortfall == ""
 
 
 # ---- table ---------------------------------------------------------------------------------
@@ -175,7 +185,7 @@ def test_points_are_rates_and_bars_their_intervals(result):
     assert "one effect, named first or in the first group (2)" in labels
     assert axes.get_xlabel() == "signal-to-noise ratio of the weakest effect"
     assert axes.get_ylabel() == "right answers (%)"
-    assert figure.get_suptitle() == "9 sealed challenges, 68 % binomial intervals"
+    assert figure.get_suptitle() == "8 sealed challenges, 68 % binomial intervals"
 
 
 def test_the_line_of_quiet_answers_has_its_band(result):
@@ -194,6 +204,16 @@ def test_kinds_that_were_not_asked_are_not_drawn():
     assert len(figure.axes[0].containers) == 1
     assert len(figure.legends[0].get_texts()) == 1
     assert not figure.axes[0].patches
+
+
+def test_quiet_challenges_alone_are_drawn_by_kind():
+    quiet = [record(0, "none", snr=[]), record(1, "absorbed", right=False, snr=[])]
+    (axes,) = ChallengeResult(quiet, {"snr": [8.0, 128.0]}).plot().axes
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["none", "absorbed"]
+    assert axes.get_xscale() == "linear"
+    assert "signal-to-noise" not in axes.get_xlabel()
+    points = [c.lines[0].get_ydata()[0] for c in axes.containers]
+    assert points == [100, 0]
 
 
 def test_a_size_at_the_end_of_the_range_has_its_bin():

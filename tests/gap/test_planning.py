@@ -7,7 +7,8 @@ import pytest
 from gap_data import WAVELENGTH, chain, fitted, observed, with_effect
 
 from astropolcal import instruments
-from astropolcal.exceptions import GapError
+from astropolcal.exceptions import GapError, ParameterError
+from astropolcal.gap import _forecast
 from astropolcal.gap.effects import get_effect
 from astropolcal.gap.planning import Exposure, exposures, few, plan
 from astropolcal.reduction.cubes import both_states
@@ -131,6 +132,35 @@ def test_impossible_exposures(model, exposure, message):
 def test_unknown_effect(model):
     with pytest.raises(GapError):
         plan(model, ["no_such_effect"])
+
+
+@pytest.mark.parametrize(("argument", "foresees"), [("chain", True), (None, False)])
+def test_where_a_model_is_not_physical_it_foresees_nothing(
+    model, members, monkeypatch, argument, foresees
+):
+    angles = tuple(np.arange(8) * 11.25)
+    candidates = [Exposure(0, angles, (("derotator", angle),)) for angle in (10.0, 150.0)]
+    candidates.append(Exposure(0, angles, (("derotator", 150.0),), lamp=2.0))
+
+    def of_one(chain, wavelength, frames, **options):
+        if options["flux"].max() > 1.5 * brightness:
+            raise ParameterError("the chain gives negative flux", argument=argument)
+        return simulate(chain, wavelength, frames, **options)
+
+    seen = []
+    monkeypatch.setattr(
+        _forecast, "simulate", lambda *a, **k: seen.append(k["flux"]) or simulate(*a, **k)
+    )
+    plan(model, members=members, candidates=candidates[:1])
+    brightness = np.max(seen)
+    monkeypatch.setattr(_forecast, "simulate", of_one)
+    if foresees:
+        assert plan(model, members=members, candidates=candidates) == plan(
+            model, members=members, candidates=candidates[:2]
+        )
+    else:
+        with pytest.raises(ParameterError, match="negative flux"):
+            plan(model, members=members, candidates=candidates)
 
 
 def test_words_of_an_exposure():

@@ -6,18 +6,19 @@ import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal import instruments
+from astropolcal import Observations, instruments
 from astropolcal.exceptions import GapError
 from astropolcal.gap import EFFECTS, _words, diagnose, get_effect
 from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.effects import Context
 from astropolcal.gap.model import nominal_model
-from astropolcal.gap.report import causes_table, summary, to_dict, write_html
+from astropolcal.gap.report import _about_frames, causes_table, summary, to_dict, write_html
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
@@ -231,7 +232,7 @@ def test_an_alternative_has_no_size_and_the_nominal_model_no_prediction(found):
     improved = replace(found.improved, added={"beams_swapped": []})
     content = to_dict(replace(found, improved=improved, causes=[swapped]))
     assert content["accuracy_before"]["datasets"][0]["s_cv_percent"] is None
-    assert "The model misses the frames by" in content["sentences"][0]
+    assert "The model misses the single differences of the frames by" in content["sentences"][0]
     assert "has no size" in content["causes"][0]["words"]
     assert content["causes"][0]["parameters"] == {}
     assert content["causes"][0]["gap_cv_before_percent"] is None
@@ -460,3 +461,31 @@ def test_page_of_nothing_and_of_the_unknown(nothing, unknown, tmp_path):
 def test_page_that_cannot_be_written(found, content, tmp_path):
     with pytest.raises(GapError, match="cannot be written"):
         write_html(found, tmp_path / "nowhere" / "gap.html", content=content)
+
+
+# ---- frames that calibrate would mask ----------------------------------------------------------
+
+
+def unusual(data):
+    """A diagnosis with these observations, of which nothing but the frames is asked."""
+    return SimpleNamespace(nominal=SimpleNamespace(observations=[data]))
+
+
+def test_frames_of_an_unstable_lamp_are_said_to_be_used():
+    chain = CHARIS.chain("polarized", wavelength=WAVELENGTH)
+    meta = {"instrument": "CHARIS", "source": "polarized"}
+    data = simulate(chain, WAVELENGTH, FRAMES, seed=1, meta=meta, name="run")
+    assert _about_frames(unusual(data)) == []
+    scale = np.ones(data.n_frames)
+    scale[:2] = 3.0
+    table = data.to_table()
+    for side in ("left", "right"):
+        table[f"flux_{side}"] *= np.repeat(scale, data.n_bins)
+    data = Observations.from_table(table, name="run")
+    n = data.n_frames
+    words = f"2 of {n} frames of run (unstable lamp)."
+    assert _about_frames(unusual(data)) == [f"Used here, though calibrate masks them: {words}"]
+    # who masks them first, as calibrate does, has them left out
+    lit = np.repeat(scale[:, None] > 1, data.n_bins, axis=1)
+    masked = data.with_mask(lit, "unstable lamp")
+    assert _about_frames(unusual(masked)) == [f"Left out, as the tables mask them: {words}"]

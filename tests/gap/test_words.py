@@ -223,8 +223,9 @@ def test_aliases_are_parted_into_causes_and_others():
 def test_sentences_of_a_gap_that_is_closed():
     large, what, left = _words.sentences(content())
     assert large == (
-        "The model misses frames left out of the fit by 2.00 % of polarization where the noise is "
-        "0.450 %; the gap is real (residuals as large by noise alone: p = 1e-09)."
+        "The model misses the single differences of frames left out of the fit by 2.00 % of "
+        "polarization where the noise is 0.450 %; the gap is real (residuals as large by noise "
+        "alone: p = 1e-09)."
     )
     assert what == (
         "The model lacks one effect: unequal gains, which explains 90 % of what exceeds the noise."
@@ -238,8 +239,8 @@ def test_sentences_of_a_gap_that_is_closed():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"cross_validated": False}, "misses the frames of the fit by"),
-        ({"exchanged": True}, "misses the frames by"),
+        ({"cross_validated": False}, "misses the single differences of the frames of the fit by"),
+        ({"exchanged": True}, "misses the single differences of the frames by"),
         ({"gap_p_value": 0.02}, "the residuals are no larger than noise (p = 0.02), but"),
         ({"gap_p_value": 0.0}, "by noise alone: p < 1e-99"),
     ],
@@ -250,7 +251,7 @@ def test_how_large_the_gap_is(changes, words):
 
 def test_sentences_of_no_gap():
     large, what, left = _words.sentences(content(verdict="none", causes=[], gap_p_value=0.7))
-    assert large.startswith("The model agrees with the measurements: it predicts frames left out")
+    assert large.startswith("The model agrees with the measurements: it predicts the single ")
     assert large.endswith("the noise is 0.450 % (residuals as large by noise alone: p = 0.7).")
     # the least of the corrected probabilities
     assert "None of the 12 effects that were tried is needed (the least," in what

@@ -119,7 +119,7 @@ def sized(sizes, parameters, factor=1.0):
         wavelength=NM / 1000,
         free=SimpleNamespace(by_name={name: SimpleNamespace(factor=factor) for name in sizes}),
     )
-    model = SimpleNamespace(problem=problem, added={"one": parameters})
+    model = SimpleNamespace(problem=problem, added={"one": parameters}, chains=[])
     found = diagnosis(causes=[cause("one")])
     found.nominal = found.improved = model
     return found, {"causes": [{"parameters": sizes}]}

@@ -52,12 +52,18 @@ def test_singular_values_are_drawn_and_open_ones_counted(undetermined):
     assert axes.get_yscale() == "log"
     shown = np.concatenate([drawn["determined"].get_ydata(), drawn["shown in (b)"].get_ydata()])
     np.testing.assert_allclose(np.sort(shown)[::-1], finding.singular_values[: finding.rank])
-    open_ones = drawn[f"{n_open} open"]
+    (label,) = (label for label in drawn if label.startswith(f"{n_open} open"))
+    open_ones = drawn[label]
     assert len(open_ones.get_xdata()) == n_open
     limit = drawn["limit of the rank"].get_ydata()[0]
     assert finding.singular_values[finding.rank] <= limit
     assert limit < finding.singular_values[finding.rank - 1]
     assert (np.array(open_ones.get_ydata()) < limit).all()
+    # they belong below, so they stand on the edge and not at a value
+    assert (np.array(open_ones.get_ydata()) == axes.get_ylim()[0]).all()
+    assert not open_ones.get_clip_on()
+    full = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert any(text.endswith("(below the axis)") for text in full)
     assert f"{finding.rank} of {finding.n_free}" in axes.get_title()
     assert f"{n_open} open" in axes.get_title()
 

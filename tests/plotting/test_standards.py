@@ -24,9 +24,9 @@ def test_curves_are_the_tables(seen):
         np.testing.assert_allclose(line.get_ydata(), star.table["altitude"].value)
         hours = line.get_xdata()
         assert hours[0] == pytest.approx((star.table["time"].mjd[0] % 1) * 24)
-    for line in lower.lines:
-        values = line.get_ydata()
-        assert np.all(np.isnan(values) | (np.abs(values) <= 180))
+    dotted = [line for line in lower.lines if line.get_linestyle() == ":"]
+    for line, star in zip(dotted, seen, strict=True):
+        np.testing.assert_allclose(line.get_ydata(), star.table["parallactic"].value)
 
 
 def test_thick_curves_are_only_where_the_star_is_observable(seen):
@@ -37,11 +37,24 @@ def test_thick_curves_are_only_where_the_star_is_observable(seen):
         np.testing.assert_array_equal(drawn, star.table["observable"])
 
 
-def test_a_curve_has_a_gap_where_the_angle_jumps(seen):
-    _, lower = plot_observability(seen[1:2]).axes
+def test_the_angle_goes_on_beyond_half_a_turn_as_in_the_table(seen):
+    # culminates north of the zenith
+    upper, lower = plot_observability(seen[1:2]).axes
     values = lower.lines[0].get_ydata()
-    assert np.sum(np.isnan(values)) == 1
-    assert np.nanmax(np.abs(np.diff(values))) < 180
+    assert np.max(np.abs(np.diff(values))) < 180
+    assert values.max() > 180
+    low, high = lower.get_ylim()
+    assert low <= values.min()
+    assert values.max() <= high
+    # the markers are at the same times in both panels
+    marked = [next(x for x in axes.lines if x.get_linestyle() == "None") for axes in (upper, lower)]
+    np.testing.assert_array_equal(*(line.get_xdata() for line in marked))
+
+
+def test_the_title_says_of_how_many_stars_these_are_the_first(seen):
+    title = plot_observability(seen, total=4).get_suptitle()
+    assert title.startswith("The first 3 of 4 standard stars, night of")
+    assert plot_observability(seen, total=3).get_suptitle().startswith("Standard stars, night of")
 
 
 def test_labels_have_units_and_the_legend_is_outside(seen):

@@ -14,6 +14,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 from star_data import WAVELENGTH as STAR_WAVELENGTH
 from star_data import observe_star, star_chain
 
+import astropolcal
 from astropolcal import Calibration, Observations, calibrate, instruments, standards
 from astropolcal.calibration.groups import GROUPS
 from astropolcal.calibration.standards import standard_accuracy
@@ -252,10 +253,77 @@ def test_what_is_fixed_is_named_in_the_gauge(tables, tmp_path):
 
 
 def test_a_prior_on_what_was_fixed_frees_it_again(tables, tmp_path):
-    both = ["--fix", "hwp.theta", "--prior", "hwp.theta=0+-0.1deg", "--fix", "derotator.theta"]
+    both = ["--fix", "hwp", "--prior", "hwp.theta=0+-0.1deg", "--fix", "derotator.theta"]
     summary = run(tmp_path, tables["first"], *both)
-    assert summary["gauge"].startswith("held: derotator.theta; prior on hwp.theta")
+    assert "prior on hwp.theta" in summary["gauge"]
+    assert "hwp.theta" not in summary["gauge"].partition(";")[0]
     assert not summary["parameters"]["hwp.theta"]["fixed"]
+    assert summary["parameters"]["hwp.w_sio2"]["fixed"]
+
+
+@pytest.mark.parametrize(
+    ("held", "option", "other"),
+    [
+        ("hwp.theta", "--free", "hwp.theta"),
+        ("hwp.theta=0", "--free", "hwp.theta"),
+        ("hwp", "--free", "hwp.theta"),
+        ("hwp", "--free", "hwp"),
+        ("hwp.theta=0", "--prior", "hwp.theta=0+-0.1deg"),
+    ],
+)
+def test_held_and_free_at_once_is_refused(tables, capsys, held, option, other):
+    line = complaint(capsys, tables["first"], "--fix", held, option, other)
+    name = held.partition("=")[0]
+    assert f"{option} {other} cannot be combined with --fix {name}" in line
+
+
+def test_all_of_an_optic_is_freed_but_what_is_held(tables, tmp_path):
+    known = run(tmp_path, tables["first"], "--free", "hwp", "--fix", "hwp.theta=0")["parameters"]
+    assert known["hwp.theta"]["fixed"]
+    assert not known["hwp.w_sio2"]["fixed"]
+
+
+# ---- what a summary says at the top, and what is refused ---------------------------------
+
+
+def _edited(path, to, edit):
+    table = Observations.read(path).to_table()
+    edit(table)
+    table.write(to, format="ascii.ecsv")
+    return to
+
+
+def _top(capsys, *arguments):
+    """Return what the summary says before its first blank line."""
+    assert main(["calibrate", *map(str, arguments)]) == 0
+    return " ".join(capsys.readouterr().out.split("\n\n")[0].split())
+
+
+def test_a_lamp_with_the_wrong_source_is_not_usable(tables, tmp_path, capsys):
+    wrong = _edited(
+        tables["first"], tmp_path / "lamp.ecsv", lambda t: t.meta.update(source="unpolarized")
+    )
+    top = _top(capsys, wrong)
+    assert "NOT USABLE AS IT IS: fold_mirror polarizes by more than 30 % at 3 of 3" in top
+    assert "is the source of lamp really 'unpolarized'" in top
+    assert "NOT USABLE" not in _top(capsys, tables["first"], tables["dark"])
+
+
+def test_exchanged_beams_are_not_usable(tmp_path, capsys):
+    def exchange(table):
+        left, right = table["flux_left"].copy(), table["flux_right"].copy()
+        table["flux_left"], table["flux_right"] = right, left
+
+    right = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
+    top = _top(capsys, _edited(right, tmp_path / "beams.ecsv", exchange))
+    assert "NOT USABLE AS IT IS: at a bound: calibration_polarizer.theta, hwp.theta" in top
+    assert "check which beam is left" in top
+    assert "NOT USABLE" not in _top(capsys, right)
+
+
+def test_two_steps_need_a_polarized_source(tables, capsys):
+    line = complaint(capsys, tables["dark"], "--strategy", "two-step")
+    assert "'two-step' is for a polarized source, but the source is 'unpolarized'" in line
 
 
 # ---- lamps and stars ------------------------------------------------------------------

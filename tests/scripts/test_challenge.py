@@ -2,10 +2,14 @@
 
 import argparse
 import json
+import time
+from concurrent.futures import CancelledError
+from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
-from astropolcal.exceptions import AstropolcalError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
+from astropolcal.gap.challenge import ChallengeResult
 from astropolcal.scripts import _challenge
 
 SMALL = ["-n", "2", "--kinds", "none", "--wavelengths", "5", "--derotator-angles", "3"]
@@ -41,8 +45,6 @@ def test_json_on_stdout_is_nothing_but_json(command, capsys):
 
 
 def test_wrong_answers_are_listed():
-    from astropolcal.gap.challenge import ChallengeResult
-
     wrong = {
         "index": 4,
         "kind": "single",
@@ -81,3 +83,74 @@ def test_bad_input_is_refused(command, options, words):
 def test_an_unknown_format_of_the_figure_is_refused(command, tmp_path):
     with pytest.raises(AstropolcalError, match="odd"):
         command(*SMALL, "-n", "1", "--figure", tmp_path / "f.odd")
+
+
+# ---- what could not be made, or was stopped ----------------------------------------------------
+
+DARK = {"index": 0, "kind": "single", "verdict": "not made", "error": "too dark"}
+QUIET = {"index": 1, "kind": "none", "verdict": "none", "right": True}
+QUIET |= {"snr": [], "effects": [], "causes": []}
+
+
+@pytest.fixture
+def outcome(monkeypatch):
+    """Function that sets the records of the challenges."""
+
+    def replace(*records):
+        result = ChallengeResult(records, {"snr": [8.0, 300.0]})
+        run_challenge = "astropolcal.gap.challenge.run_challenge"
+        monkeypatch.setattr(run_challenge, lambda *args, **options: result)
+
+    return replace
+
+
+def test_challenges_that_all_could_not_be_made_are_an_error(command, outcome, tmp_path):
+    outcome(DARK)
+    with pytest.raises(GapError, match=r"^0 of 1 challenges could be made: too dark \(1\)$"):
+        command("--json", tmp_path / "c.json")
+    # the records are kept
+    assert json.loads((tmp_path / "c.json").read_text())["challenges"] == [DARK]
+
+
+def test_challenges_of_which_some_could_not_be_made_warn(command, outcome, capsys):
+    outcome(DARK, QUIET)
+    with pytest.warns(AstropolcalWarning, match="1 of 2 challenges could be made"):
+        command()
+    assert "1 challenge, 0 wrong answers" in capsys.readouterr().out
+
+
+def test_without_a_rate_there_is_no_footnote_on_rates():
+    assert "in brackets" in _challenge._report(ChallengeResult([QUIET], {}))
+    assert "in brackets" not in _challenge._report(ChallengeResult([DARK], {}))
+
+
+def test_an_interruption_ends_the_workers_at_once(capsys):
+    started = time.monotonic()
+    futures = []
+
+    def interrupted():
+        with _challenge._workers(2) as pool:
+            futures.extend(pool.submit(time.sleep, 60) for _ in range(5))
+            while not futures[0].running():
+                time.sleep(0.01)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.monotonic() - started < 20
+    assert capsys.readouterr().err == "astropolcal: stopping ...\n"
+    # what had begun ended with its process, and the rest never began
+    for future in futures:
+        with pytest.raises((CancelledError, BrokenProcessPool)):
+            future.result(timeout=20)
+
+
+def test_progress_without_a_terminal_is_a_line_now_and_then(capsys):
+    progress = _challenge._Progress()
+    progress(1, 9)
+    progress.said -= _challenge._BETWEEN
+    progress(2, 9)
+    progress(3, 9)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("astropolcal: ")
+    assert line.endswith("2 of 9 challenges")

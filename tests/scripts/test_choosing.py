@@ -118,6 +118,22 @@ def test_another_mode_is_refused_unless_it_is_the_same(night, tmp_path):
     assert chosen(path, files[1:], optics_in=["nbs"])
 
 
+def test_mode_that_is_stated_is_that_of_the_file(night, tmp_path):
+    path = tmp_path / "c.asdf"
+    with_validity(Calibration.read(OLD), mode="broadband JHK").write(path)
+    files = night({"FILTNAME": "J"})
+    with pytest.raises(AstropolcalError, match=r"--filter 'foo': .*c.asdf .* 'broadband JHK'; al"):
+        chosen(path, files, optics_in=["nbs"], filter="foo")
+    assert chosen(path, files, optics_in=["nbs"], filter="Broadband  jhk")
+
+
+def test_mode_is_not_compared_where_the_file_holds_for_any(night, monkeypatch):
+    from astropolcal.calibration import validity
+
+    monkeypatch.setattr(validity, "validity_of", lambda _: validity.Validity("charis"))
+    assert chosen(OLD, night({"FILTNAME": "J"}), optics_in=["nbs"], filter="foo")
+
+
 # ---- a library -------------------------------------------------------------------------
 
 

@@ -306,6 +306,7 @@ def test_an_optic_that_only_one_chain_has_may_be_taken_out(chains):
         ({"fix": ["nobody.theta=0"]}, ChainError, "no optic 'nobody'"),
         ({"free": ["hwp.phi"]}, ParameterError, "hwp has no parameter 'phi'; it has "),
         ({"fix": ["hwp.theta=6"]}, ParameterError, r"hwp.theta=6: allowed is -5.0 to 5.0 deg"),
+        ({"fix": ["hwp.w_sio2=-1mm"]}, ParameterError, r"allowed is 0\.980388 to 2\.287572 mm"),
         ({"fix": ["hwp.theta=nan"]}, ParameterError, "hwp.theta=nan: not a number"),
         ({"prior": ["hwp.theta"]}, ParameterError, r"prior hwp.theta=: write it as MEAN\+-STD"),
         ({"prior": ["hwp.theta=0+-1s"]}, ParameterError, "must be convertible to deg"),

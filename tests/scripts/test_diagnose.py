@@ -77,7 +77,7 @@ def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys):
     arguments = [*tables, "--derotator", "linear", *FEW, *outputs]
     assert main(["diagnose", *map(str, arguments)]) == 0
     printed = capsys.readouterr()
-    assert printed.out.startswith("The model misses frames left out of the fit")
+    assert printed.out.startswith("The model misses the single differences of frames")
     assert str(report) in printed.out
     assert re.search(r"^astropolcal: +\d+ s  scanning the effects$", printed.err, re.M)
     assert re.search(r" s  looking for effect 1, at most \d$", printed.err, re.M)
@@ -140,6 +140,9 @@ def test_bad_input(folder, cal, tmp_path, capsys):
     assert "did you mean 'beam_gain'" in complaint(capsys, table, "--effects", "beam_gian")
     assert "separated by commas" in complaint(capsys, table, "--effects", ",")
     assert "no folder" in complaint(capsys, table, "--report", tmp_path / "no" / "gap.html")
+    page = tmp_path / "gap.pdf"
+    words = f"--report {page}: the name must end with .html or .htm"
+    assert words in complaint(capsys, table, "--report", page)
     assert "same frames" in complaint(capsys, table, table)
     line = complaint(capsys, table, "--save", tmp_path / "better.fits")
     assert line.endswith("better.fits: the name must end with .asdf")

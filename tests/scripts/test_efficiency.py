@@ -11,6 +11,7 @@ import pytest
 
 from astropolcal import calibrate, instruments
 from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
+from astropolcal.plotting import _style
 from astropolcal.scripts import _efficiency
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -105,6 +106,15 @@ def test_figure_is_written(tmp_path):
     assert (tmp_path / "efficiency.png").stat().st_size > 10_000
 
 
+def test_figure_of_a_target_shows_its_offsets(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(_style, "save", lambda figure, path: drawn.append(figure))
+    run("--target", "72.7,28.3", "--night", NIGHT, "-o", tmp_path / "x.png", "--json", "-")
+    (ax,) = drawn[0].axes
+    assert ax.get_xlabel() == "derotator offset (deg)"
+    assert f"72.7,28.3, {NIGHT}" in drawn[0].get_suptitle()
+
+
 def test_unknown_format_of_the_figure_is_refused(tmp_path):
     with pytest.raises(AstropolcalError, match="xyz"):
         run("-o", tmp_path / "efficiency.xyz", "-q")
@@ -117,6 +127,28 @@ def test_unknown_format_of_the_figure_is_refused(tmp_path):
         (["--target", "72.7,28.3"], ParameterError, "--target and --night belong together"),
         (["--target", "x", "--night", NIGHT], ParameterError, "write RA,DEC in degree"),
         (["--target", "1,2", "--night", "yesterday"], ParameterError, "START/END"),
+        (
+            ["--target", "1,2,3", "--night", NIGHT],
+            ParameterError,
+            "--target 1,2,3: write RA,DEC in",
+        ),
+        (
+            ["--target", "nan,2", "--night", NIGHT],
+            ParameterError,
+            "--target nan,2: write RA,DEC in",
+        ),
+        (["--target", "1,nan", "--night", NIGHT], ParameterError, "--target 1,nan: write RA,DEC"),
+        (["--target", "1,95", "--night", NIGHT], ParameterError, "--target 1,95: .* -90 to 90"),
+        (
+            ["--target", "1,2", "--night", "2025-11-03"],
+            ParameterError,
+            r"^--night 2025-11-03: write START/END in UTC, such as 2025-11-03T08:00/\S+$",
+        ),
+        (
+            ["--target", "72.7,28.3", "--night", "/".join(NIGHT.split("/")[::-1])],
+            ParameterError,
+            r"--night 2025-11-03T13:00/2025-11-03T10:00: ends before it starts",
+        ),
         (["--wavelength", "5"], ParameterError, r"--wavelength 5: allowed are 1.160 to 2.369 um"),
         (["--altitude", "95"], AstropolcalError, "altitude = 95 deg"),
         (["--law", "sky"], ParameterError, "--law sky: allowed of charis are pupil, field"),
@@ -130,6 +162,13 @@ def test_unknown_format_of_the_figure_is_refused(tmp_path):
 def test_bad_input_is_one_error(argv, error, words):
     with pytest.raises(error, match=words):
         run(*argv)
+
+
+def test_file_of_another_instrument_is_refused(calibration):
+    words = r"cal.asdf: the calibration is of instrument 'charis', not 'irdis'"
+    with pytest.raises(InstrumentError, match=words):
+        run(calibration, "--instrument", "irdis")
+    run(calibration, "--instrument", "CHARIS", "-q")
 
 
 def test_law_and_coating_are_those_of_the_instrument(tmp_path):

@@ -2,6 +2,7 @@
 """The command itself: exit status, one line of complaint, and what -q leaves."""
 
 import argparse
+import re
 import sys
 import warnings
 from types import SimpleNamespace
@@ -123,6 +124,39 @@ def test_options_that_cannot_be_understood(argv, words, capsys):
     assert err.startswith("astropolcal: error: ")
     assert err.count("\n") == 1
     assert words in err
+
+
+@pytest.mark.parametrize(
+    ("argv", "name", "value"),
+    [
+        (["simulate", "--parallactic", "-30,40"], "parallactic", [-30, 40]),
+        (["simulate", "--parallactic=-30,40"], "parallactic", [-30, 40]),
+        (["simulate", "--derotator", "-45,0,45", "-q"], "derotator", [-45, 0, 45]),
+        (["simulate", "--hwp", "-.5,3"], "hwp", [-0.5, 3]),
+        (["simulate", "--seed", "-1"], "seed", -1),
+        (["simulate", "--flux", "-1e3"], "flux", -1000),
+        (["standards", "--site", "-155,19,4200"], "site", "-155,19,4200"),
+        (["efficiency", "--target", "-75.2,28.3", "--law", "field"], "target", "-75.2,28.3"),
+        (["efficiency", "--derotator", "-45", "0", "45", "-q"], "derotator", [-45, 0, 45]),
+        (["efficiency", "--derotator", "0", "-4.5e1", "--altitude", "5"], "derotator", [0, -45]),
+        (["efficiency", "--parallactic", "-30", "x.asdf"], "parallactic", -30),
+        (["correct", "x", "--calibration", "c", "-o", "o", "--centre", "-1,5"], "centre", (-1, 5)),
+    ],
+)
+def test_negative_values_are_values(argv, name, value):
+    assert getattr(build_parser().parse_args(argv), name) == value
+
+
+@pytest.mark.parametrize("argv", [["info", "-x"], ["simulate", "--seed", "-q"], ["info", "-x1"]])
+def test_words_that_look_like_options_are_no_values(argv, capsys):
+    with pytest.raises(SystemExit):
+        build_parser().parse_args(argv)
+    assert "astropolcal: error: " in capsys.readouterr().err
+
+
+def test_no_option_looks_like_a_negative_number():
+    for parser in COMMANDS.values():
+        assert not [o for o in parser._option_string_actions if re.match(r"-\.?\d", o)]
 
 
 # ---- quiet -------------------------------------------------------------------------------

@@ -92,6 +92,8 @@ def test_calibration_of_the_internal_source_serves_for_a_star(tmp_path):
         (["-o", "x.ecsv", "--bad-pixels", "0.1"], "--bad-pixels: is for --cubes DIR"),
         (["-o", "x.ecsv", "--psf", "gaussian"], "--psf: is for --cubes DIR"),
         (["-o", "x.ecsv", "--saturate"], "--saturate: is for --cubes DIR"),
+        (["-o", "x.ecsv", "--seed", "-1"], "seed = -1; allowed are whole numbers from 0 up"),
+        (["--cubes", "cubes", *TWO, "--seed", "-1"], "seed = -1; allowed are"),
         (["-o", "x.fits"], "-o x.fits: the name must end with .ecsv"),
         (["--cubes", "missing/cubes", *TWO], "no folder"),
         (["--cubes", "cubes", *TWO, "--halo", "2"], "halo = 2"),

@@ -109,7 +109,9 @@ def test_a_site_may_be_a_place(capsys):
         (["HD 30675", "--site", "subaru"], "go together"),
         (["HD 30675", "--plot", "x.png"], "--plot needs --site and --night"),
         (["HD 30675", "--site", "subaru", "--night", "2025-02-30"], "night = '2025-02-30'"),
-        (["HD 30675", "--site", "atlantis", "--night", "2025-11-03"], "site = 'atlantis'"),
+        (["HD 30675", "--site", "atlantis", "--night", "2025-11-03"], "--site atlantis: not known"),
+        (["--site", "3", "--night", "2025-11-03"], "--site 3: .*, or LON,LAT,HEIGHT in deg, deg"),
+        (["--site", "subaro", "--night", "2025-11-03"], "did you mean 'subaru'"),
         (["HD 30675", "--site", "1,2,three", "--night", "2025-11-03"], "--site 1,2,three"),
         (["HD 30675", "--site=10,95,0", "--night", "2025-11-03"], "--site 10,95,0"),
         (["Cha F7", *NIGHT], "does not rise above 30 deg"),
@@ -205,3 +207,35 @@ def test_a_column_of_zero_has_no_sign():
         columns[f"parallactic_{end}"] = [value] * u.deg
     line = _night_table(QTable(columns))[1]
     assert "   0 to    0" in line
+
+
+def test_a_figure_of_fewer_stars_than_are_listed_says_so(capsys, tmp_path):
+    plot = ["--plot", str(tmp_path / "night.png")]
+    text = printed(capsys, *NIGHT, "--limit", "6", *plot)
+    assert "The figure shows the first 5 of 6 stars." in text
+    assert "figure" not in printed(capsys, *NIGHT, "--limit", "5", *plot)
+
+
+def test_what_is_of_another_band_is_said(capsys):
+    words = ["--kind", "unpolarized", "--magnitude", "9,10"]
+    text = printed(capsys, *words, "--band", "H")
+    head, *lines = text.splitlines()
+    assert head.endswith("p (%) in H")
+    n = len(standards.search(kind="unpolarized", magnitude=(9, 10), band="H"))
+    note = f"{n} of {n} have no magnitude in H: V instead, by which --magnitude selects them."
+    assert note in lines
+    # the catalogue has no unpolarized star in the infrared
+    assert all("*" in line for line in lines[:n])
+    assert lines[-1] == "* no polarization in H: p is of the band nearest to V"
+    assert "no magnitude in H" in printed(capsys, *words, "--band", "H", *NIGHT)
+    plain = printed(capsys, *words)
+    assert "*" not in plain
+    assert "no magnitude" not in plain
+
+
+def test_what_is_of_the_band_needs_no_note(capsys):
+    lines = printed(capsys, "--band", "H", "--near", "72.7,28.3", "--radius", "1").splitlines()
+    assert lines[0].split()[-4:] == ["(%)", "in", "H", "deg"]
+    assert len(lines) == 2
+    assert " H " in lines[1]
+    assert "*" not in lines[1]
