@@ -77,6 +77,7 @@ def select(base, scores, library, alpha, groups, say):
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> model = nominal_model([chain], [simulate(chain, charis.wavelength, frames, seed=1)])
     >>> select(model, [], EFFECTS.values(), 0.01, None, print)[0]
+    looking for effect 1, at most 6
     []
     """
     selected, history = _forward(base, scores, library, alpha, groups, say)
