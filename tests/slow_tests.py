@@ -16,7 +16,7 @@ from collections import defaultdict
 from pathlib import Path
 
 #: The longest case, and all cases of a test together, in seconds.
-ONE, ALL = 0.06, 0.2
+ONE, ALL = 0.04, 0.15
 LIST = Path(__file__).with_name("slow_tests.txt")
 
 
