@@ -214,12 +214,14 @@ def _content(node):
         if isinstance(value, dict):
             return {key: plain(item) for key, item in value.items()}
         if type(value) is int:
-            return float(value) if abs(value) < 2**53 else value
+            return float(value) if abs(value) < 2**1000 and float(value) == value else value
         return [plain(item) for item in value] if isinstance(value, list) else value
 
     found = plain(_spelled({k: v for k, v in node.items() if k not in _DERIVED}, node_from_optic))
     # nothing in a list is as good as no list
     found = {k: v for k, v in found.items() if k != "priors" or v}
+    if not found.get("identifiability", {}).get("near_null", True):
+        del found["identifiability"]["near_null"]
     factor = found.get("covariance", {}).get("factor")
     if factor is not None and 0 in factor.get("shape", []):
         del found["covariance"]["factor"]
