@@ -87,7 +87,7 @@ def canonical_factor(unit):
 
 @lru_cache
 def _factor(unit):
-    # there are a handful of units, and half a million questions in an hour of fits
+    # there are a handful of units, and 600 fits ask 600,000 times
     return float(unit.to(canonical_unit(unit)))
 
 

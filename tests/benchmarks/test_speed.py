@@ -161,7 +161,7 @@ def test_analytic_against_finite_differences(measurement, capsys):
     Two-point differences, as astropy would use.
 
     They take 94 predictions, so what speeds a prediction up makes this ratio smaller: it was
-    above 20 when one took three times as long.
+    above 20 when one took twice as long.
     """
     vector = measurement.vector()
 
