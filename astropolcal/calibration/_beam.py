@@ -1,20 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Which of a calibration's chains the light of a frame went through."""
 
-from astropolcal import instruments
 from astropolcal.calibration._system import split_chain
-from astropolcal.calibration.validity import beam_words, optics_words, validity_of
-from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError
+from astropolcal.calibration.validity import (
+    beam_words,
+    instrument_of,
+    optics_words,
+    validity_of,
+)
+from astropolcal.exceptions import AstropolcalError, ChainError
 from astropolcal.instruments import without_nuisance
-
-
-def instrument_of(calibration):
-    """Return the instrument; None without one, or for a name that somebody chose."""
-    name = calibration.instrument
-    try:
-        return None if name is None else instruments.get(name)
-    except InstrumentError:
-        return None
 
 
 def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"):

@@ -24,8 +24,8 @@ def describe(header, instrument=None, stated=()):
     ----------
     header : `~astropy.io.fits.Header` or mapping
         Primary header.
-    instrument : str, optional
-        Name of the instrument, by default that whose identity stands in the header.
+    instrument : str or Instrument, optional
+        The instrument, by default that whose identity stands in the header.
     stated : set of str
         What is not to be looked for.
 
@@ -38,7 +38,7 @@ def describe(header, instrument=None, stated=()):
     if instrument is None:
         found = _recognized(header)
     else:
-        found = instruments.get(instrument)
+        found = instruments.get(instrument) if isinstance(instrument, str) else instrument
     layout = found.files
     if layout is None:
         return {"instrument": found.name}

@@ -14,13 +14,18 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments
-from astropolcal.calibration._beam import inner_optics, instrument_of, telescope_optics, told_beam
+from astropolcal.calibration._beam import inner_optics, telescope_optics, told_beam
 from astropolcal.calibration._header import FrameAngles, describe
 from astropolcal.calibration._system import at_bins, errors, match_wavelengths
 from astropolcal.calibration.covariance import full_covariance
 from astropolcal.calibration.library import Entry, Library
 from astropolcal.calibration.result import Calibration
-from astropolcal.calibration.validity import content_hash, validity_of
+from astropolcal.calibration.validity import (
+    check_frames,
+    content_hash,
+    instrument_of,
+    validity_of,
+)
 from astropolcal.chain import (
     join,
     leaves,
@@ -126,7 +131,13 @@ class SystemMueller:
         return np.zeros(shape, dtype=bool) if flags is None else flags.reshape(shape)
 
 
-def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=None):
+# what a caller can do about a header that does not say enough
+_WAYS = {"date": "load(..., date=) states it", "mode": "load(..., mode={})"}
+
+
+def load(
+    path, header=None, *, instrument=None, mode=None, date=None, optics_in=None, max_age=None
+):
     """
     Load the calibration that holds for a frame.
 
@@ -140,6 +151,10 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
         before it.
     instrument, mode, date, optics_in
         As for `~astropolcal.calibration.Library.find`.
+    max_age : `~astropy.units.Quantity`, optional
+        Time between the data of the calibration and a frame from which on there is a warning; by
+        default that of the instrument (`~astropolcal.instruments.Instrument`), a year for most.
+        A calibration whose end of validity was stated is never too old.
 
     Returns
     -------
@@ -148,9 +163,16 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     Raises
     ------
     CalibrationFileError
-        If no calibration holds, several do, or a file is damaged.
+        If no calibration holds, several do, a file is damaged, the header lacks a date or a mode
+        that the calibration needs and none is stated here, or the instrument has changed between
+        the data of the calibration and the frame.
     ParameterError
-        If the header is none.
+        If the header is none, or ``max_age`` no time.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If the calibration is older than ``max_age``.
 
     Examples
     --------
@@ -185,8 +207,14 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     if header is not None and optics_in is None:
         beam = instruments.get(wanted["instrument"]).optics_of(header)
     entry = library.find(**wanted, optics_in=optics_in, beam=beam)
-    stated = {key for key, value in chosen.items() if value is not None}
-    return LoadedCalibration(entry, optics_in=optics_in, stated=stated)
+    stated = {key: value for key, value in chosen.items() if value is not None}
+    loaded = LoadedCalibration(entry, optics_in=optics_in, stated=stated, max_age=max_age)
+    if header is not None:
+        # whether the light comes from the sky, whose mirrors may have changed, is known later
+        loaded._check([("the frame", wanted["date"], wanted["mode"])], light="internal")
+    elif date is not None:
+        loaded._check(loaded._stated_frame(), light="internal")
+    return loaded
 
 
 def _library(source):
@@ -211,8 +239,10 @@ class LoadedCalibration:
     optics_in : sequence of str, optional
         Optional optics in the beam; needed if the calibration has several sets of them, and
         the headers do not tell which.
-    stated : set of str
-        Which of ``instrument``, ``mode``, ``date`` the user vouches for, whatever headers say.
+    stated : dict of str to str
+        What the user states of ``instrument``, ``mode`` and ``date``, whatever headers say.
+    max_age : `~astropy.units.Quantity`, optional
+        As for `load`.
 
     Attributes
     ----------
@@ -237,12 +267,12 @@ class LoadedCalibration:
     <LoadedCalibration lab.asdf: an instrument, any mode, from any date on, optics in the beam not known>
     """  # noqa: E501
 
-    def __init__(self, entry, optics_in=None, stated=()):
+    def __init__(self, entry, optics_in=None, stated=None, max_age=None):
         self.calibration = entry.calibration
         self.path, self.validity = entry.path, entry.validity
         self.content_hash = entry.content_hash
         self.optics_in = optics_in
-        self._stated = frozenset(stated)
+        self._stated, self._max_age = dict(stated or {}), max_age
         self._covariance = full_covariance(self.calibration)._axes()
 
     def __repr__(self):
@@ -289,7 +319,9 @@ class LoadedCalibration:
         Raises
         ------
         CalibrationFileError
-            If the calibration does not hold for the header.
+            If the calibration does not hold for the header, the header lacks a date or a mode that
+            was not stated to `load` either, or the instrument has changed in between. Positions
+            are taken for what they are, unless a date was stated.
         ObservationError
             If the header lacks an angle.
         ChainError, ParameterError
@@ -300,7 +332,7 @@ class LoadedCalibration:
         Warns
         -----
         AstropolcalWarning
-            If an optic is not calibrated and has published values.
+            If an optic is not calibrated and has published values, or the calibration is old.
         """
         if (header is None) == (positions is None):
             raise ParameterError("give either header or positions")
@@ -308,7 +340,9 @@ class LoadedCalibration:
         single = isinstance(header, Mapping) or hasattr(header, "cards")
         headers = [header] if single else list(() if header is None else header)
         if header is not None:
-            self._check(headers)
+            self._check(self._frames(headers), light)
+        elif "date" in self._stated:
+            self._check(self._stated_frame(), light)
         chain, assumed = self._chain(light, headers)
         if header is not None:
             found = self.instrument.positions(FrameAngles(headers, self.instrument), chain)
@@ -325,32 +359,35 @@ class LoadedCalibration:
             shown = {name: angle[0] for name, angle in shown.items()}
         return SystemMueller(value, lam, beam, shown, *parts, assumed)
 
-    def _check(self, headers):
+    def _check(self, frames, light):
         """Refuse frames for which the calibration does not hold."""
+        options = {"max_age": self._max_age, "light": light, "ways": _WAYS}
+        check_frames(self.calibration, frames, self.path.name, **options)
+
+    def _stated_frame(self):
+        """Return a frame without a header, of the date that was stated."""
+        mode = self._stated.get("mode", self.validity.mode)
+        return [("the frame", self._stated["date"], mode)]
+
+    def _frames(self, headers):
+        """Return what to call each frame, its date and its mode; refuse other instruments."""
         instrument = self.instrument
         if instrument is None:
             raise InstrumentError(
                 f"{self.path.name}: instrument {self.calibration.instrument!r} has no map of "
                 "header keywords; give positions"
             )
+        frames = []
         for i, header in enumerate(headers):
-            self._check_frame(header, instrument, f"frame {i}")
-
-    def _check_frame(self, header, instrument, label):
-        told = describe(header, instrument.name, self._stated)
-        held, name = self.validity, self.path.name
-        stated = told.get("stated")
-        if stated is not None and not instrument.answers_to(stated):
-            raise CalibrationFileError(f"{label} is of {stated}, but {name} holds for {held}")
-        date = told.get("date")
-        if date is not None and not held.holds(date):
-            raise CalibrationFileError(f"{label} was taken {date}, but {name} holds for {held}")
-        mode = told.get("mode")
-        if mode and held.mode and mode.casefold().split() != held.mode.casefold().split():
-            raise CalibrationFileError(
-                f"{label} is in mode {mode!r}, but {name} holds for {held}; load(..., mode=) if "
-                "it is the same by another name"
-            )
+            told = describe(header, instrument.name, self._stated)
+            if told.get("stated") is not None and not instrument.answers_to(told["stated"]):
+                raise CalibrationFileError(
+                    f"frame {i} is of {told['stated']}, but {self.path.name} holds for "
+                    f"{self.validity}"
+                )
+            date, mode = (self._stated.get(key, told.get(key)) for key in ("date", "mode"))
+            frames.append((f"frame {i}", date, mode))
+        return frames
 
     # ---- the chain ---------------------------------------------------------------------
 

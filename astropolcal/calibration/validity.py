@@ -5,16 +5,28 @@ import re
 import warnings
 from dataclasses import asdict, dataclass, replace
 
+import astropy.units as u
+import numpy as np
 from astropy.time import Time
 from erfa import ErfaWarning
 
 from astropolcal import instruments
-from astropolcal.exceptions import AstropolcalError, CalibrationFileError
+from astropolcal.chain import leaves
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    CalibrationFileError,
+    InstrumentError,
+    ParameterError,
+)
+from astropolcal.instruments import Instrument
 
 __all__ = ["Validity", "content_hash", "validity_of", "with_validity"]
 
 _STATED = ("mode", "valid_from", "valid_until", "optics_in")
 _DAY = re.compile(r"\d{4}-\d\d(-\d\d)?(T[0-9:.]+)?")
+# how a caller states what headers lack, where a command has no option for it
+_WAYS = {"date": "date= states it", "mode": "mode={}"}
 
 
 @dataclass(frozen=True)
@@ -69,9 +81,11 @@ class Validity:
 
     def holds(self, date):
         """Return whether a moment (text, date or Time, UTC) is within the range."""
-        date = _moment(date, "date")
-        after = self.valid_from is None or self.valid_from <= date
-        return after and (self.valid_until is None or date < self.valid_until)
+        return self._spans(_moment(date, "date"))
+
+    def _spans(self, moment):
+        after = self.valid_from is None or self.valid_from <= moment
+        return after and (self.valid_until is None or moment < self.valid_until)
 
     def to_dict(self):
         """Return it as text and lists, ready for JSON."""
@@ -167,8 +181,7 @@ def validity_of(calibration):
     stated = calibration.settings.get("validity") or {}
     if not isinstance(stated, dict) or set(stated) - set(_STATED):
         raise CalibrationFileError(f"validity = {stated!r}; allowed are {', '.join(_STATED)}")
-    records = calibration.datasets
-    dates = [text for record in records if (text := _day(record.meta.get("date")))]
+    records, dates = calibration.datasets, _dates(calibration)
     # of several modes none is that of the calibration
     modes = {record.meta.get("mode") for record in records}
     mode = modes.pop() if len(modes) == 1 else None
@@ -178,6 +191,177 @@ def validity_of(calibration):
         "optics_in": _optics_of(calibration) if "optics_in" not in stated else None,
     }
     return Validity(calibration.instrument, **(derived | stated))
+
+
+def instrument_of(calibration):
+    """Return the instrument; None without one, or for a name that somebody chose."""
+    name = calibration.instrument
+    try:
+        return None if name is None else instruments.get(name)
+    except InstrumentError:
+        return None
+
+
+def check_frames(
+    calibration, frames, name, *, max_age=None, light="sky", ways=None, dates=True
+):
+    """
+    Refuse frames for which a calibration does not hold, and warn if it is old for some.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    frames : sequence of (str, str or `~astropy.time.Time`, str)
+        What to call each frame, when it was taken (UTC) and its mode; None where not known.
+    name : str
+        What to call the calibration.
+    max_age : `~astropy.units.Quantity`, optional
+        Age from which on there is a warning; by default that of the instrument, and none where
+        the end of the validity was stated.
+    light : {"sky", "internal"}
+        Whether the light passed the telescope, whose mirrors may have changed.
+    ways : dict of str to str, optional
+        What the caller can do about a missing ``date`` or ``mode``, and an ``other date``, in
+        words.
+
+    dates : bool
+        Whether the dates matter, or only the mode.
+
+    Raises
+    ------
+    CalibrationFileError
+        If the calibration holds for other dates or another mode, a frame lacks what would tell,
+        or the instrument has changed in between.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If the calibration is too old; once, for the frame that is furthest from its data.
+    """
+    held, ways = validity_of(calibration), _WAYS if ways is None else ways
+    dated = dates and (held.valid_from is not None or held.valid_until is not None)
+    moments = {}
+    for label, date, mode in frames:
+        _check_mode(held, label, mode, name, ways["mode"].format(repr(held.mode)))
+        if dated and date is None:
+            raise CalibrationFileError(
+                f"{label}: its date is not known, and {name} holds for {held}; {ways['date']}"
+            )
+        if dated:
+            moment = _moment(date, "date")
+            if not held._spans(moment):
+                raise CalibrationFileError(
+                    f"{label} was taken {moment}, but {name} holds for {held}"
+                    f"{ways.get('other date', '')}"
+                )
+            moments.setdefault(moment, label)
+    days = _dates(calibration) or ([held.valid_from] if held.valid_from else [])
+    if not (moments and days):
+        return
+    changes = _changes(calibration, light)
+    if held.valid_from and held.valid_from > days[-1]:
+        # who states that it holds from a later day on vouches for what changed until then
+        changes = [change for change in changes if held.valid_from[:10] < change[1]]
+    for day, label in {moment[:10]: label for moment, label in moments.items()}.items():
+        _check_changes(changes, days, day, f"{label}, {name}", ways["date"])
+    # (n_moments, n_days), in days
+    apart = np.abs((_time(list(moments))[:, None] - _time(days)).to_value(u.day)).min(axis=1)
+    limit, worst = _max_age(max_age, held, instrument_of(calibration)), apart.argmax()
+    if apart[worst] > limit:
+        moment = list(moments)[worst]
+        warnings.warn(
+            f"{moments[moment]} was taken {moment}, {apart[worst] / 365.25:.1f} yr from the data "
+            f"of {name} ({' to '.join(dict.fromkeys((days[0], days[-1])))}); a calibration counts "
+            f"as old after {limit:g} d (max_age), and what has changed since is not in its errors",
+            AstropolcalWarning,
+            stacklevel=3,
+        )
+
+
+def _check_mode(held, label, mode, name, way):
+    if held.mode is None:
+        return
+    if mode is None:
+        raise CalibrationFileError(
+            f"{label}: its mode is not known, and {name} holds for {held}; {way} states it"
+        )
+    if _folded(mode) != _folded(held.mode):
+        raise CalibrationFileError(
+            f"{label} is in mode {mode!r}, but {name} holds for {held}; if it is the same by "
+            f"another name, {way} says so"
+        )
+
+
+def _folded(text):
+    return " ".join(str(text).split()).casefold()
+
+
+def _changes(calibration, light):
+    """Return the dated changes of the instrument that matter to light on its way."""
+    instrument = instrument_of(calibration)
+    if instrument is None:
+        return []
+    own = {leaf.name for chain in calibration.chains for leaf in leaves(chain)}
+    # a published telescope of the right epoch stands in where none was calibrated
+    renewed = "date" in instrument.sky_options
+    return [
+        change
+        for change in instrument.changes
+        if change[0] is None or (light == "sky" and (change[0] in own or not renewed))
+    ]
+
+
+def _check_changes(changes, days, day, label, way):
+    """Refuse a day between which and all days of the data the instrument has changed."""
+    for _, first, last, words in changes:
+        spans = [sorted([old[:10], day]) for old in days]
+        # on an unknown day from first on and before last; ISO dates compare as text
+        if all(lo < last and hi >= first and not (first <= lo and hi < last) for lo, hi in spans):
+            raise CalibrationFileError(
+                f"{label}: {words} between the data of the calibration "
+                f"({' to '.join(dict.fromkeys((days[0][:10], days[-1][:10])))}) and {day}; "
+                f"calibrate anew, or {way}"
+            )
+
+
+def _max_age(max_age, held, instrument):
+    """Return the age in days from which on a calibration is old."""
+    if max_age is None:
+        # who states an end has thought of it
+        if held.valid_until is not None:
+            return np.inf
+        max_age = Instrument.max_age if instrument is None else instrument.max_age
+    try:
+        days = float(u.Quantity(max_age).to_value(u.day))
+    except (TypeError, u.UnitConversionError):
+        days = np.nan
+    if not days >= 0:
+        raise ParameterError(f"max_age = {max_age!r}; a time is needed, such as 1 yr")
+    return days
+
+
+def instrument_of(calibration):
+    """Return the instrument; None without one, or for a name that somebody chose."""
+    name = calibration.instrument
+    try:
+        return None if name is None else instruments.get(name)
+    except InstrumentError:
+        return None
+
+
+def _dates(calibration):
+    """Return the dates of a calibration's data, the oldest first."""
+    return sorted(
+        text for record in calibration.datasets if (text := _day(record.meta.get("date")))
+    )
+
+
+def _time(moments):
+    """Return ISO texts as `~astropy.time.Time`, without a word on leap seconds to come."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ErfaWarning)
+        return Time(moments, format="isot", scale="utc")
 
 
 def _day(value):

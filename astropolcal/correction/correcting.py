@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from astropolcal.calibration.validity import check_frames
 from astropolcal.correction.engine import correct_block, covariance_index, run_blocks
 from astropolcal.correction.ideal import ideal_chain
 from astropolcal.correction.result import Corrected
@@ -19,6 +20,12 @@ __all__ = ["MODES", "correct"]
 
 #: The whole Mueller matrix, or instrumental polarization only.
 MODES = ("stokes", "ip")
+
+# what a caller can do about frames that do not say enough
+_WAYS = {
+    "date": "ScienceFrames(..., date=) states it, any_date=True takes any",
+    "mode": "ScienceFrames(..., mode={})",
+}
 
 
 def correct(
@@ -33,6 +40,8 @@ def correct(
     chain=None,
     interpolate=False,
     open_directions="infinite",
+    max_age=None,
+    any_date=False,
     n_samples=0,
     seed=None,
     workers=None,
@@ -73,6 +82,11 @@ def correct(
         between them; else each wavelength of the frames must be one of the calibrated.
     open_directions : {"infinite", "ignore"} or float
         See `linear_systematic`.
+    max_age : `~astropy.units.Quantity`, optional
+        Time between the data of the calibration and the frames from which on there is a warning;
+        by default that of the instrument, see `~astropolcal.calibration.load`.
+    any_date : bool
+        Take the calibration whatever the date of the frames.
     n_samples : int
         If above zero, systematic errors are sampled, see `sampled_systematic`; else they are
         linearized.
@@ -97,6 +111,9 @@ def correct(
     ------
     ObservationError
         If the frames do not determine Q and U.
+    CalibrationFileError
+        If the calibration does not hold for the frames' date and mode, these are not known and
+        the calibration does not hold for all, or the instrument has changed in between.
     ParameterError, ChainError, WavelengthRangeError
         If a choice is unknown, a position is missing, or a wavelength is not calibrated.
 
@@ -104,7 +121,7 @@ def correct(
     -----
     AstropolcalWarning
         If combinations of Stokes parameters are poorly determined at some wavelengths, or the
-        calibration leaves open how they change.
+        calibration leaves open how they change; or if the calibration is old.
 
     Examples
     --------
@@ -123,6 +140,9 @@ def correct(
     (0.02, -0.01)
     """
     by_variance = _check_choices(mode, weights)
+    if hasattr(calibration, "datasets"):
+        when = {"max_age": max_age, "dates": not any_date, "ways": _WAYS}
+        check_frames(calibration, frames.moments(), "the calibration", **when)
     model = RowModel(
         calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
     )

@@ -7,10 +7,12 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from astropolcal.calibration._header import describe
 from astropolcal.chain import stages
 from astropolcal.correction.brightness import frame_brightness
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.fitscheck import primary_header
 from astropolcal.observations import Observations, pair_frames
 from astropolcal.optics import COORDINATES
 
@@ -42,6 +44,10 @@ class ScienceFrames:
         Of the star in the images, 0-based x and y.
     pixel_scale : float or None
         Milliarcsecond.
+    date : str, `~astropy.time.Time`, sequence of those, or None
+        When the frames were taken (UTC), one moment for all or one for each.
+    mode : str, sequence of str, or None
+        Mode of the instrument, as the calibration calls it.
     meta : dict
         More that goes into a product's header.
 
@@ -66,6 +72,8 @@ class ScienceFrames:
     north_up: bool = False
     centre: tuple | None = None
     pixel_scale: float | None = None
+    date: object = None
+    mode: str | None = None
     meta: dict = field(default_factory=dict)
 
     def __post_init__(self):
@@ -86,6 +94,27 @@ class ScienceFrames:
     def names(self):
         """What the frames are called."""
         return self.source.names
+
+    def moments(self):
+        """
+        Return name, date and mode of each frame; None where they are not known.
+
+        Raises
+        ------
+        ParameterError
+            If there is not one date or mode for all, or one for each frame.
+        """
+        parts = [list(map(str, self.names))]
+        for key in ("date", "mode"):
+            value = getattr(self, key)
+            scalar = isinstance(value, str) or not hasattr(value, "__len__") or np.ndim(value) == 0
+            parts.append([value] * len(parts[0]) if scalar else list(value))
+            if len(parts[-1]) != len(parts[0]):
+                raise ParameterError(
+                    f"{len(parts[-1])} values of {key}; allowed are one for all, or one for each "
+                    f"of the {len(parts[0])} frames"
+                )
+        return list(zip(*parts, strict=True))
 
     def with_brightness(self, rows, **settings):
         """
@@ -146,7 +175,8 @@ class ScienceFrames:
         centre, mirrored, order
             As for `derotate`.
         **settings
-            More attributes: ``pairs``, ``scale``, ``unit``, ``pixel_scale``, ``meta``.
+            More attributes: ``pairs``, ``scale``, ``unit``, ``pixel_scale``, ``date``, ``mode``,
+            ``meta``.
 
         Returns
         -------
@@ -235,7 +265,7 @@ class ScienceFrames:
         size, position_angle, mirrored, order, left_scale
             As for ``CubeFiles``.
         **settings
-            More attributes.
+            More attributes. Without ``date`` and ``mode`` the headers of the files tell.
 
         Returns
         -------
@@ -264,6 +294,10 @@ class ScienceFrames:
         if settings.get("pairs") is None and "hwp" in table.colnames:
             settings["pairs"] = _pairs(table["hwp"], positions, source.names)
         settings.setdefault("pixel_scale", layout.pixel_scale)
+        if not {"date", "mode"} <= set(settings):
+            told = [describe(primary_header(path), instrument) for path in files]
+            for key in ("date", "mode"):
+                settings.setdefault(key, [each[key] for each in told])
         middle = ((size - 1) / 2, (size - 1) / 2)
         return cls(
             source,

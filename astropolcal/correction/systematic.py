@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from astropolcal.calibration import full_covariance
+from astropolcal.calibration._directions import led
 from astropolcal.correction.solve import estimator
 from astropolcal.exceptions import ParameterError
 from astropolcal.simulation import check_seed
@@ -124,8 +125,10 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
         As for `correct`.
     open_directions : {"infinite", "ignore"} or float
         Errors along directions that the calibration leaves open: infinite; zero, as if the
-        choice that it made were true; or a standard deviation along each direction, whose
-        length is counted in degrees, micrometres and percent.
+        choice that it made were true; or the standard deviation of the parameter that each
+        direction is named after (``calibration.identifiability.directions``), in degrees of an
+        angle, micrometres of a thickness, percent of anything else. All that cannot be told from
+        this parameter moves along.
 
     Returns
     -------
@@ -168,8 +171,10 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
         is_open, moved = np.zeros_like(is_open), spread.moved
         if open_directions != "ignore":
             axes = covariance._axes()
-            # steps: a degree, micrometre or percent in the declared units, for the length
-            along = float(open_directions) * (flat * axes.steps) @ axes.open.T
+            # rows in which the leading parameter moves by one step: degree, micrometre, percent
+            steps = np.array([row for row, _ in led(model._free, axes.open)])
+            steps = steps.reshape(-1, flat.shape[1])
+            along = float(open_directions) * (flat * axes.steps) @ steps.T
             moved = np.concatenate([moved, along], axis=1)
     factor = moved.T.reshape(-1, *shape)
     return Systematic(factor, is_open, "linear", model.held)

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What the polarimeters at the Nasmyth focus of Subaru share: site and calibration unit."""
+"""What the polarimeters at the Nasmyth focus of Subaru share: site, calibration unit and dated changes."""
 
 import astropy.units as u
 import numpy as np
@@ -8,6 +8,12 @@ from astropolcal import optics
 
 #: Longitude, latitude (deg) and height (m) of the Subaru Telescope.
 SITE = (-155.4761, 19.8255, 4139.0)
+
+#: What has changed; both days are known to the month only (McIntosh et al. 2026, Sec. 2 and 7).
+CHANGES = (
+    (None, "2025-08-01", "2025-10-01", "the Nasmyth beam switcher was installed"),
+    ("m3", "2025-12-01", "2026-01-01", "the tertiary mirror M3 was coated anew"),
+)
 
 
 def misaligned(about, most=5):

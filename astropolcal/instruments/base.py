@@ -54,6 +54,12 @@ class Instrument(ABC):
         How half-wave plate and derotator follow the sky.
     sky_options : tuple of str
         Which of ``wavelength`` and ``date`` its ``telescope_optics`` take.
+    max_age : `~astropy.units.Quantity`
+        Age from which on a calibration counts as old.
+    changes : tuple of (str or None, str, str, str)
+        Dated changes that no calibration outlives: the optic that changed (None: all light is
+        concerned), the first day on which it may have changed, the first on which it certainly
+        had (both ISO), and the change in words.
 
     Examples
     --------
@@ -82,6 +88,8 @@ class Instrument(ABC):
     files = None
     references = ()
     sky_options = ()
+    max_age = 365 * u.day
+    changes = ()
 
     @abstractmethod
     def chain(self, source="polarized", optics_in=(), *, wavelength=None, **options):

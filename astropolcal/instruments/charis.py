@@ -20,7 +20,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments._subaru_optics import SITE, fold_mirror, misaligned, polarizer
+from astropolcal.instruments._subaru_optics import CHANGES, SITE, fold_mirror, misaligned, polarizer
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.keywords import frame_time
 from astropolcal.instruments.layout import FileLayout
@@ -135,6 +135,7 @@ class CHARIS(Instrument):
     )
     sources = (*INTERNAL, *STARS)
     optional_optics = ("nbs", "dichroic")
+    changes = CHANGES
 
     def chain(
         self,

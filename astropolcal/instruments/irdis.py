@@ -75,6 +75,7 @@ class IRDIS(Instrument):
     )
     sources = (*INTERNAL, *STARS)
     sky_options = ("wavelength", "date")
+    changes = (("ut", RECOATING, RECOATING, "the telescope's mirrors were coated anew"),)
     #: Names of the filters with coefficients, in the order of ``wavelength``.
     filters = FILTERS
     #: What keeps the direction of polarization that is measured fixed to the image.

@@ -20,7 +20,7 @@ from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.instruments import _vampires_optics as _optics
 from astropolcal.instruments._choices import check_choice
-from astropolcal.instruments._subaru_optics import fold_mirror, polarizer
+from astropolcal.instruments._subaru_optics import CHANGES, fold_mirror, polarizer
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.telescope import INTERNAL, M3_MODELS, STARS, star_source, telescope
 from astropolcal.instruments.vampires_headers import (
@@ -66,6 +66,7 @@ class VAMPIRES(Instrument):
     )
     sources = (*INTERNAL, *STARS)
     optional_optics = ("flc",)
+    changes = CHANGES
 
     def chain(
         self,

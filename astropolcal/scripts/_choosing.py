@@ -4,6 +4,8 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import astropy.units as u
+
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ObservationError
 
 # by what a library may ask for
@@ -12,15 +14,28 @@ _OPTIONS = {
     "mode": "--filter MODE",
     "optics_in": "--optics-in NAME,NAME,...",
 }
+# what a user can do about frames that do not say enough
+_WAYS = {
+    "date": "--any-date takes it all the same",
+    "mode": "--filter {}",
+    "other date": "; --any-date takes it all the same",
+}
 
 
 @dataclass
 class Night:
-    """What the headers of all frames tell: dates of the first and the last, mode, optics."""
+    """What the headers tell: date (or None) of each frame, and mode and optics of all."""
 
-    dates: list
+    moments: dict
     mode: str | None = None
     beam: dict = field(default_factory=dict)
+
+    @property
+    def dates(self):
+        """Dates of the first and the last frame."""
+        # ISO dates sort as text; a calibration that holds at both ends holds between them
+        known = sorted(date for date in self.moments.values() if date)
+        return list(dict.fromkeys((known[0], known[-1]))) if known else []
 
 
 def read_night(files, instrument, raw=None):
@@ -34,26 +49,22 @@ def read_night(files, instrument, raw=None):
         raise AstropolcalError(f"{instrument.name}: it is not known how its files look")
     # which keywords there are may depend on the mode
     layout = configured(instrument, files).files
-    dates, modes, headers = [], {}, []
+    moments, modes, headers = {}, {}, []
     for file in files:
         frame = read_header(file, layout, raw=raw)
         if frame.values.get("filter"):
             # the first file of each mode, to be named
             modes.setdefault(frame.values["filter"], file)
         try:
-            dates.append(observation_time(frame.values).isot)
+            moments[str(file)] = observation_time(frame.values).isot
         except ObservationError:
-            # only a choice by date needs it
-            pass
+            # whether it is needed depends on the calibration
+            moments[str(file)] = None
         headers.append(primary_header(file))
     if len(modes) > 1:
         (one, first), (other, second) = list(modes.items())[:2]
         raise ObservationError(f"{first} is in mode {one!r}, {second} in {other!r}: correct apart")
-    # ISO dates sort as text
-    dates.sort()
-    # a calibration that holds at both ends holds between them
-    ends = list(dict.fromkeys((dates[0], dates[-1]))) if dates else []
-    return Night(ends, next(iter(modes), None), told_beam(headers, instrument, files))
+    return Night(moments, next(iter(modes), None), told_beam(headers, instrument, files))
 
 
 def configured(instrument, files):
@@ -89,8 +100,7 @@ def choose_calibration(arguments, files, raw=None):
     if calibration is None:
         entry = _of_library(path, arguments, night, beam, files)
         calibration, path = entry.calibration, entry.path
-    else:
-        _check_validity(calibration, path, arguments, night)
+    _check_validity(calibration, path, arguments, night)
     chain = sky_chain(
         calibration,
         optics_in=arguments.optics_in,
@@ -106,25 +116,15 @@ def choose_calibration(arguments, files, raw=None):
 
 
 def _check_validity(calibration, path, arguments, night):
-    from astropolcal.calibration.validity import validity_of
+    """Refuse frames for which the calibration does not hold, unless the user wants it."""
+    from astropolcal.calibration.validity import check_frames
 
-    held = validity_of(calibration)
-    for date in () if arguments.any_date else night.dates:
-        if not held.holds(date):
-            raise AstropolcalError(
-                f"{path} does not hold for {date}: {held}; --any-date takes it all the same"
-            )
     # --filter names the mode as the file does, whatever the headers call it
     mode = arguments.filter or night.mode
-    if mode and held.mode and mode.casefold().split() != held.mode.casefold().split():
-        if arguments.filter:
-            raise AstropolcalError(
-                f"--filter {mode!r}: {path} holds for mode {held.mode!r}; allowed is that one"
-            )
-        raise AstropolcalError(
-            f"the frames are in mode {mode!r}, but {path} holds for {held}; --filter {held.mode!r} "
-            "if it is the same by another name"
-        )
+    frames = [(file, date, mode) for file, date in night.moments.items()]
+    max_age = None if arguments.max_age is None else arguments.max_age * u.yr
+    options = {"max_age": max_age, "ways": _WAYS, "dates": not arguments.any_date}
+    check_frames(calibration, frames, str(path), **options)
 
 
 def _of_library(path, arguments, night, beam, files):

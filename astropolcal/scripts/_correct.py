@@ -123,7 +123,7 @@ def _add_errors(parser):
         type=number_or("infinite", "ignore"),
         default="infinite",
         help="systematic errors along what the calibration leaves open: infinite (default), "
-        "ignore, or a standard deviation in degrees, micrometres and percent",
+        "ignore, or the standard deviation of the angle that each is named after, in degrees",
     )
     parser.add_argument(
         "--samples",
@@ -156,6 +156,13 @@ def _add_instrument(parser):
         "--any-date",
         action="store_true",
         help="take the calibration even if it does not hold for the date of the frames",
+    )
+    parser.add_argument(
+        "--max-age",
+        metavar="YEARS",
+        type=float,
+        help="time between the data of the calibration and the frames from which on there is a "
+        "warning (default: that of the instrument, mostly 1)",
     )
     parser.add_argument(
         "--interpolate",
@@ -231,6 +238,9 @@ def run(arguments):
         mirrored=arguments.mirrored,
         scale=scale,
         left_scale=left_scale,
+        # date and mode were checked when the calibration was chosen
+        date=None,
+        mode=calibration.validity.mode,
     )
     result = _corrected(calibration, frames, chain, arguments, provenance)
     result.write(arguments.output, overwrite=True)
@@ -288,6 +298,7 @@ def _corrected(calibration, frames, chain, arguments, provenance):
         weights="variance" if arguments.weights == "variance" else None,
         max_condition=arguments.max_condition,
         open_directions=arguments.open_directions,
+        any_date=True,
         n_samples=arguments.samples,
         seed=arguments.seed,
         workers=arguments.workers,

@@ -144,7 +144,7 @@ def layout(**changes):
         **changes,
     )
     charis = instruments.get("charis")
-    return SimpleNamespace(files=files, wavelength=LAM, positions=charis.positions)
+    return SimpleNamespace(name="lab", files=files, wavelength=LAM, positions=charis.positions)
 
 
 TABLE = QTable({"hwp": HWP, "derotator": [60] * 4 * u.deg})

@@ -1,9 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Systematic errors: linear against sampled, and against wrong calibrations."""
 
+import astropy.units as u
 import numpy as np
 import pytest
 
+from astropolcal import calibrate
 from astropolcal.correction import (
     RowModel,
     Systematic,
@@ -109,6 +111,30 @@ def test_open_directions_are_infinite_or_ignored(open_calibration, track):
         linear_systematic(model, solution, open_directions=-1.0)
     with pytest.raises(ParameterError, match="open_directions = 'maybe'"):
         linear_systematic(model, solution, open_directions="maybe")
+
+
+def test_open_directions_are_counted_in_degrees_of_their_angles(charis, open_calibration, track):
+    """Other fits of the same data, each with one angle 0.2 deg away, are wrong by the claim."""
+    positions, chain = track()[1], open_calibration.chain
+    leads = [d["words"].partition(" by ")[0] for d in open_calibration.identifiability.directions]
+    data = open_calibration.measurement.datasets[0].observations
+    here = {name: getattr(chain[name[:-6]], "theta").quantity for name in leads}
+    flux, found = None, []
+    for moved in (None, *leads):
+        fix = {name: angle + 0.2 * (name == moved) * u.deg for name, angle in here.items()}
+        fit = calibrate(chain, data, instrument="charis", fix=fix, cross_validate=False)
+        model = RowModel(fit, positions, fit.wavelength)
+        if flux is None:
+            flux = np.einsum("bwfs,s->bfw", model.rows()[..., :3], STOKES)
+        found.append(estimator(model.rows()).apply(flux)[:, 9])
+    change = np.linalg.norm(np.array(found[1:]) - found[0], axis=0)
+    model = RowModel(open_calibration, positions, open_calibration.wavelength)
+    solution = estimator(model.rows())
+    claimed, least = (
+        linear_systematic(model, solution, open_directions=s).covariance(STOKES, 9)
+        for s in (0.2, 0.0)
+    )
+    np.testing.assert_allclose(np.sqrt(np.diag(claimed - least))[1:], change[1:], rtol=0.05)
 
 
 def test_parameters_without_error_are_listed(linear):

@@ -10,7 +10,7 @@ from astropy.io import fits
 from astropolcal import Calibration, instruments
 from astropolcal.calibration.library import Library
 from astropolcal.calibration.validity import content_hash, with_validity
-from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.scripts._choosing import choose_calibration, configured, read_night
 
 OLD = Path(__file__).parents[1] / "calibration" / "data" / "calibration-1.0.0.asdf"
@@ -25,6 +25,7 @@ def night(tmp_path):
         files = []
         for i, changes in enumerate(headers):
             cards = {"INSTRUME": "CHARIS", "RET-ANG1": 0.0, "D_IMRANG": 45.0, "MJD": 60982.5}
+            cards["FILTNAME"] = "broadband JHK"
             header = fits.Header({k: v for k, v in (cards | changes).items() if v is not None})
             files.append(tmp_path / f"CRSA{i + 1:08d}_cube.fits")
             fits.PrimaryHDU(header=header).writeto(files[-1])
@@ -36,7 +37,7 @@ def night(tmp_path):
 def chosen(calibration, files, **options):
     """Return the provenance of what is chosen, with the options of the command."""
     known = {"calibration": str(calibration), "instrument": None, "optics_in": None}
-    known |= {"any_date": False, "filter": None} | options
+    known |= {"any_date": False, "filter": None, "max_age": None} | options
     return choose_calibration(SimpleNamespace(**known), files)[2]
 
 
@@ -64,12 +65,12 @@ def test_one_date_is_named_once(night):
 
 
 def test_frames_without_date_or_mode_say_nothing(night):
-    found = read_night(night({"MJD": None}), CHARIS)
+    found = read_night(night({"MJD": None, "FILTNAME": None}), CHARIS)
     assert (found.dates, found.mode) == ([], None)
 
 
 def test_frames_of_two_modes_are_refused(night):
-    files = night({"FILTNAME": "Broadband"}, {"FILTNAME": "J"}, {})
+    files = night({"FILTNAME": "Broadband"}, {"FILTNAME": "J"}, {"FILTNAME": None})
     words = r"1_cube.fits is in mode 'Broadband', .*2_cube.fits in 'J': correct apart"
     with pytest.raises(ObservationError, match=words):
         read_night(files, CHARIS)
@@ -101,7 +102,7 @@ def test_file_for_another_date_is_taken_if_that_is_wanted(night):
 
 
 def test_file_for_another_date_is_refused(night):
-    words = r"does not hold for 2024-07-09T00:00.*; --any-date takes it all the same"
+    words = r"was taken 2024-07-09, but .* holds for .*; --any-date takes it all the same"
     with pytest.raises(AstropolcalError, match=words):
         chosen(OLD, night({"MJD": 60500.0}, {"MJD": 60500.5}), optics_in=["nbs"])
 
@@ -110,7 +111,7 @@ def test_another_mode_is_refused_unless_it_is_the_same(night, tmp_path):
     path = tmp_path / "c.asdf"
     with_validity(Calibration.read(OLD), mode="Broadband").write(path)
     files = night({"FILTNAME": "J"}, {"FILTNAME": "BROADBAND"})
-    words = r"in mode 'J', but .*c.asdf holds for .*; --filter 'Broadband' if it is the same"
+    words = r"in mode 'J', but .*c.asdf holds for .*; if it is the same by .* --filter 'Broadband'"
     with pytest.raises(AstropolcalError, match=words):
         chosen(path, files[:1], optics_in=["nbs"])
     assert chosen(path, files[:1], optics_in=["nbs"], filter="Broadband")
@@ -122,7 +123,7 @@ def test_mode_that_is_stated_is_that_of_the_file(night, tmp_path):
     path = tmp_path / "c.asdf"
     with_validity(Calibration.read(OLD), mode="broadband JHK").write(path)
     files = night({"FILTNAME": "J"})
-    with pytest.raises(AstropolcalError, match=r"--filter 'foo': .*c.asdf .* 'broadband JHK'; al"):
+    with pytest.raises(AstropolcalError, match=r"mode 'foo', but .*--filter 'broadband JHK'"):
         chosen(path, files, optics_in=["nbs"], filter="foo")
     assert chosen(path, files, optics_in=["nbs"], filter="Broadband  jhk")
 
@@ -132,6 +133,24 @@ def test_mode_is_not_compared_where_the_file_holds_for_any(night, monkeypatch):
 
     monkeypatch.setattr(validity, "validity_of", lambda _: validity.Validity("charis"))
     assert chosen(OLD, night({"FILTNAME": "J"}), optics_in=["nbs"], filter="foo")
+
+
+def test_frames_that_do_not_say_enough(night, tmp_path):
+    bare = {"MJD": None, "FILTNAME": None}
+    for lacking, option in (({"MJD"}, {"any_date": True}), ({"FILTNAME"}, {"filter": "broadband JHK"})):
+        (file,) = night({key: value for key, value in bare.items() if key in lacking})
+        with pytest.raises(AstropolcalError, match=r"cube.fits: its \w+ is not known, .*--(an|fi)"):
+            chosen(OLD, [file], optics_in=["nbs"])
+        assert chosen(OLD, [file], optics_in=["nbs"], **option)
+        file.unlink()
+
+
+def test_calibration_that_is_old(night):
+    early, late = night({"MJD": 60990.0}, {"MJD": 61313.5})
+    with pytest.raises(AstropolcalError, match="M3 was coated anew between .*--any-date"):
+        chosen(OLD, [early, late], optics_in=["nbs"])
+    with pytest.warns(AstropolcalWarning, match="0.1 yr from the data"):
+        chosen(OLD, [early], optics_in=["nbs"], max_age=0.01)
 
 
 # ---- a library -------------------------------------------------------------------------
@@ -159,7 +178,7 @@ def test_options_are_named_where_a_library_needs_to_know_more(night, tmp_path):
     for mode in ("J", "H"):
         with_validity(Calibration.read(OLD), mode=mode).write(tmp_path / f"{mode}.asdf")
     with pytest.raises(AstropolcalError, match=r"say which mode is meant \(--filter MODE\)"):
-        chosen(tmp_path, night({"MJD": 60982.5}), optics_in=["nbs"])
+        chosen(tmp_path, night({"FILTNAME": None}), optics_in=["nbs"])
 
 
 def test_no_calibration_holds_for_the_date(night, library):
