@@ -135,9 +135,7 @@ class SystemMueller:
 _WAYS = {"date": "load(..., date=) states it", "mode": "load(..., mode={})"}
 
 
-def load(
-    path, header=None, *, instrument=None, mode=None, date=None, optics_in=None, max_age=None
-):
+def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=None, max_age=None):
     """
     Load the calibration that holds for a frame.
 

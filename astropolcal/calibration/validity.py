@@ -202,9 +202,7 @@ def instrument_of(calibration):
         return None
 
 
-def check_frames(
-    calibration, frames, name, *, max_age=None, light="sky", ways=None, dates=True
-):
+def check_frames(calibration, frames, name, *, max_age=None, light="sky", ways=None, dates=True):
     """
     Refuse frames for which a calibration does not hold, and warn if it is old for some.
 

@@ -24,9 +24,10 @@ def frame_brightness(rows, fluxes, **settings):
     rows : `~numpy.ndarray`
         As `measurement_rows` gives them.
     fluxes : array_like
-        Of the whole image of each beam, (2, n_frames, n_wavelengths).
+        Of the whole image of each beam, (2, n_frames, n_wavelengths); NaN where there is none,
+        which gives the brightness one.
     **settings
-        Of `estimator`: ``components``, ``observable``, ``pairs``, ``weights``.
+        Of `estimator`, without ``scale``.
 
     Returns
     -------
@@ -56,23 +57,30 @@ def frame_brightness(rows, fluxes, **settings):
     fluxes = np.asarray(fluxes, dtype=float)
     # shape (n_wavelengths, n_frames), as the scale of an estimator
     totals = fluxes.sum(axis=0).T
-    dark = ~(totals > 0)
+    missing = np.isnan(totals)
+    dark = ~(totals > 0) & ~missing
     if dark.any():
         wavelength, frame = np.argwhere(dark)[0]
         raise ObservationError(
             f"frame {frame} has no light at wavelength {wavelength}: the sum of both beams is "
             f"{totals[wavelength, frame]:.4g}"
         )
-    scale = totals / totals.mean(axis=1, keepdims=True)
+    if missing.any():
+        weights = settings.get("weights")
+        weights = 1.0 if weights is None else np.asarray(weights, dtype=float)
+        settings["weights"] = np.broadcast_to(weights, (2, *totals.shape)) * ~missing
+        fluxes = np.nan_to_num(fluxes)
+    # at a wavelength where not even I is determined, the sums have the last word
+    unknown = ~estimator(rows, **settings).determined[:, 0]
+    scale = _shared(totals, missing)
     for _ in range(_STEPS):
         stokes = estimator(rows, scale=scale, **settings).apply(fluxes)
         # the light of an undetermined component is not known, and small
         expected = np.einsum("bwfs,sw->wf", rows[..., : len(stokes)], np.nan_to_num(stokes))
-        if not np.all(expected > 0):
+        expected[unknown] = 1.0
+        if not np.all(expected[~missing] > 0):
             break
-        new = totals / expected
-        # only ratios are measured: the mean belongs to the brightness of the source
-        new /= new.mean(axis=1, keepdims=True)
+        new = _shared(totals / expected, missing)
         change, scale = np.abs(new - scale).max(), new
         if change < _SETTLED:
             return scale
@@ -80,3 +88,10 @@ def frame_brightness(rows, fluxes, **settings):
         "the brightness of the frames does not settle: there is too little light, or it is not "
         "that of one source in all frames"
     )
+
+
+def _shared(brightness, missing):
+    """Return brightness over its mean: only ratios are measured, the mean is the source's."""
+    known = np.where(missing, 0.0, brightness)
+    mean = known.sum(axis=1, keepdims=True) / np.maximum((~missing).sum(axis=1, keepdims=True), 1)
+    return np.where(missing | (mean == 0), 1.0, known / np.where(mean == 0, 1.0, mean))

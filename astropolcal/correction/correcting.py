@@ -14,7 +14,8 @@ from astropolcal.correction.result import Corrected
 from astropolcal.correction.rows import RowModel
 from astropolcal.correction.solve import estimator
 from astropolcal.correction.systematic import linear_systematic, sampled_systematic
-from astropolcal.exceptions import AstropolcalWarning, ParameterError
+from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
+from astropolcal.observations import OBSERVABLES
 
 __all__ = ["MODES", "correct"]
 
@@ -33,7 +34,8 @@ def correct(
     frames,
     *,
     mode="stokes",
-    observable="intensity",
+    observable=None,
+    brightness=None,
     components="IQU",
     weights=None,
     max_condition=30.0,
@@ -63,10 +65,16 @@ def correct(
         ``"stokes"`` inverts the Mueller matrices of the frames. ``"ip"`` removes only the
         instrumental polarization that the calibration predicts, and takes the instrument for
         ideal in everything else (see `ideal_chain`); for comparison.
-    observable : {"intensity", "single", "double"}
+    observable : {"intensity", "single", "double"}, optional
         What is fitted: the beams, or their single or double differences and sums. The
         last are blind to what is the same in both frames of a pair, such as a gain that differs
-        between the beams.
+        between the beams. By default what the calibration fitted: single differences, or double
+        ones. Frames that have no pairs are fitted by their intensities, with a warning; frames
+        that belong to no pair are left out, with a warning.
+    brightness : {"measured", "given"}, optional
+        How bright the frames were: as their light says (`frame_brightness`), or ``frames.scale``
+        and else all the same. By default measured where there is no ``frames.scale``. It is also
+        taken as given, with a warning, where there is too little light.
     components : {"IQU", "IQUV"}
         Without V it is taken as zero. With V it is solved for where the frames determine it.
     weights : array_like or "variance", optional
@@ -120,7 +128,8 @@ def correct(
     Warns
     -----
     AstropolcalWarning
-        If combinations of Stokes parameters are poorly determined at some wavelengths, or the
+        If the frames have no pairs, or some have none, where the calibration fitted pairs; if
+        their brightness cannot be measured; if combinations of Stokes parameters are poorly determined at some wavelengths, or the
         calibration leaves open how they change; or if the calibration is old.
 
     Examples
@@ -146,16 +155,22 @@ def correct(
     model = RowModel(
         calibration, frames.positions, frames.wavelength, chain=chain, interpolate=interpolate
     )
-    solution = estimator(
-        _rows(model, frames, mode),
-        components=components,
-        observable=observable,
-        pairs=frames.pairs,
-        weights=None if by_variance else weights,
-        scale=frames.scale,
-        max_condition=max_condition,
-        labels=frames.names,
-    )
+    observable, doubts = _observable(calibration, frames, observable)
+    how = {
+        "components": components,
+        "observable": observable,
+        "pairs": frames.pairs,
+        "weights": None if by_variance else weights,
+        "max_condition": max_condition,
+        "labels": frames.names,
+    }
+    rows = model.rows()
+    # raises where the frames determine too little, whatever their brightness
+    estimator(rows, scale=frames.scale, **how)
+    frames, unmeasured = _with_brightness(frames, rows, brightness, how)
+    solution = estimator(_rows(model, rows, frames, mode), scale=frames.scale, **how)
+    for words in (*doubts, *unmeasured):
+        warnings.warn(words, AstropolcalWarning, stacklevel=2)
     _warn_of_weak(solution, frames.wavelength)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
     n = len(components)
@@ -200,8 +215,43 @@ def _check_choices(mode, weights):
     return by_variance
 
 
-def _rows(model, frames, mode):
-    rows = model.rows()
+def _observable(calibration, frames, observable):
+    """Return what is fitted, by default what the calibration has fitted, and doubts in words."""
+    fitted = getattr(calibration, "settings", {}).get("observable")
+    if observable is None and fitted in OBSERVABLES:
+        observable = "single" if OBSERVABLES[fitted].frames_per_datum == 1 else "double"
+        if observable == "double" and frames.pairs is None:
+            return "intensity", [
+                "the calibration fitted pairs of frames, and these frames have none (half-wave "
+                "plate angles 45 deg apart, hwp=): their intensities are fitted, so that unequal "
+                "gains of the beams, and what the optics behind the half-wave plate polarize "
+                "unknown to the calibration, do not cancel"
+            ]
+    # of a chain that nobody fitted: what cancels most
+    observable = observable or ("intensity" if frames.pairs is None else "double")
+    if observable != "double" or frames.pairs is None:
+        return observable, []
+    names, alone = frames.names, set(range(len(frames.names))) - set(np.ravel(frames.pairs))
+    words = f"{len(alone)} of {len(names)} frames have no partner 45 deg away and are left out"
+    return observable, [f"{words}; the first is {names[min(alone)]}"] if alone else []
+
+
+def _with_brightness(frames, rows, brightness, how):
+    """Return the frames with measured brightness, unless another is wanted, and doubts in words."""
+    if brightness not in (None, "measured", "given"):
+        raise ParameterError(f"brightness = {brightness!r}; allowed are 'measured', 'given'")
+    if brightness == "given" or (brightness is None and frames.scale is not None):
+        return frames, []
+    try:
+        return frames.with_brightness(rows, **how), []
+    except ObservationError as error:
+        known = "all the same" if frames.scale is None else "as given"
+        return frames, [
+            f"the frames' brightness cannot be measured and is taken as {known}: {error}"
+        ]
+
+
+def _rows(model, rows, frames, mode):
     if mode == "stokes":
         return rows
     ideal = RowModel(

@@ -131,14 +131,30 @@ class ScienceFrames:
         -------
         ScienceFrames
         """
-        fluxes = np.empty((2, self.source.n_frames, self.source.n_wavelengths))
-        for w in range(self.source.n_wavelengths):
-            for frames in self.source.batches():
-                for beam in (0, 1):
-                    found = self.source.fluxes(beam, frames, slice(w, w + 1))
-                    # as a rule the same pixels lack in all frames, and their ratios stay
-                    fluxes[beam, frames, w] = np.nansum(found.reshape(len(found), -1), axis=1)
+        shape = (2, self.source.n_frames, self.source.n_wavelengths)
+        fluxes, inside = np.empty(shape), _circle(self.source.image_shape)
+        for w in range(shape[2]):
+            fluxes[:, :, w], missing = self._totals(w, inside)
+            # what one frame lacks is left out of all, or they would seem to differ
+            if missing.any(axis=0).sum() != missing.all(axis=0).sum():
+                common = inside.copy()
+                common[inside] = ~missing.any(axis=0)
+                if common.any():
+                    fluxes[:, :, w] = self._totals(w, common)[0]
         return replace(self, scale=frame_brightness(rows, fluxes, **settings))
+
+    def _totals(self, w, pixels):
+        """Return the light of both beams in some pixels, NaN for none; and which pixels lack."""
+        totals = np.empty((2, self.source.n_frames))
+        missing = np.empty((2, self.source.n_frames, int(pixels.sum())), dtype=bool)
+        for frames in self.source.batches():
+            for beam in (0, 1):
+                found = self.source.fluxes(beam, frames, slice(w, w + 1))
+                found = found.reshape(len(found), -1)[:, pixels]
+                lacks = missing[beam, frames] = ~np.isfinite(found)
+                sums = np.where(lacks, 0.0, found).sum(axis=1)
+                totals[beam, frames] = np.where(lacks.all(axis=1), np.nan, sums)
+        return totals, missing.reshape(-1, missing.shape[2])
 
     @classmethod
     def from_arrays(
@@ -307,6 +323,15 @@ class ScienceFrames:
             centre=middle,
             **settings,
         )
+
+
+def _circle(shape):
+    """Return the pixels, in one row, that images show however they are turned."""
+    if len(shape) != 2:
+        return np.ones(int(np.prod(shape, dtype=int)), dtype=bool)
+    half = [(n - 1) / 2 for n in shape]
+    rows, columns = np.indices(shape)
+    return (np.hypot(rows - half[0], columns - half[1]) <= min(shape) / 2).ravel()
 
 
 def _pairs(hwp, positions, names):

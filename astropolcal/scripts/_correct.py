@@ -86,8 +86,8 @@ def _add_solution(parser):
     parser.add_argument(
         "--observable",
         choices=("intensity", "single", "double"),
-        default="intensity",
-        help="what is fitted: the beams (default), or their single or double differences and sums",
+        help="what is fitted: the beams, or their single or double differences and sums "
+        "(default: what the calibration fitted)",
     )
     parser.add_argument(
         "--components", choices=("IQU", "IQUV"), default="IQU", help="default: IQU, V is zero"
@@ -101,9 +101,9 @@ def _add_solution(parser):
     parser.add_argument(
         "--brightness",
         choices=("exposure", "measured"),
-        default="exposure",
-        help="relative brightness of the frames: by their exposure times (default), or by the "
-        "light in the images, for clouds",
+        default="measured",
+        help="relative brightness of the frames: by the light in the images (default), or by "
+        "their exposure times alone",
     )
     parser.add_argument(
         "--max-condition",
@@ -281,19 +281,14 @@ def _radius(arguments):
 
 
 def _corrected(calibration, frames, chain, arguments, provenance):
-    """Return the solution, after the brightness of the frames if that is measured."""
-    from astropolcal.correction import correct, measurement_rows
+    from astropolcal.correction import correct
 
-    # the measured brightness must come from the same model as the solution
-    how = {"chain": chain, "interpolate": arguments.interpolate}
-    if arguments.brightness == "measured":
-        rows = measurement_rows(calibration, frames.positions, frames.wavelength, **how)
-        frames = frames.with_brightness(rows)
     return correct(
         calibration,
         frames,
         mode=arguments.mode,
         observable=arguments.observable,
+        brightness="measured" if arguments.brightness == "measured" else "given",
         components=arguments.components,
         weights="variance" if arguments.weights == "variance" else None,
         max_condition=arguments.max_condition,
@@ -305,7 +300,8 @@ def _corrected(calibration, frames, chain, arguments, provenance):
         cluster=arguments.cluster,
         progress=not arguments.quiet,
         provenance=provenance,
-        **how,
+        chain=chain,
+        interpolate=arguments.interpolate,
     )
 
 

@@ -258,7 +258,10 @@ def test_what_the_user_states_comes_before_the_header(path):
 
 
 def test_frame_that_does_not_say_enough(path):
-    for lacking, stated in (("MJD", {"date": "2025-11-09"}), ("FILTNAME", {"mode": "broadband JHK"})):
+    for lacking, stated in (
+        ("MJD", {"date": "2025-11-09"}),
+        ("FILTNAME", {"mode": "broadband JHK"}),
+    ):
         header = {key: value for key, value in HEADER.items() if key != lacking}
         (word,) = stated
         for refused in (
@@ -298,7 +301,9 @@ def test_dated_change(path):
     recoated = HEADER | {"MJD": 61060.0}
     loaded = load(path, recoated)
     assert loaded.system_mueller(recoated, light="internal").value.shape == (3, 4, 4)
-    with pytest.raises(CalibrationFileError, match="frame 1, .*M3 was coated anew between.*2026-01"):
+    with pytest.raises(
+        CalibrationFileError, match="frame 1, .*M3 was coated anew between.*2026-01"
+    ):
         loaded.system_mueller([HEADER, recoated])
     with pytest.raises(CalibrationFileError, match="the frame.* M3 was coated anew"):
         load(path, date="2026-03-01").system_mueller(positions=POSITIONS)

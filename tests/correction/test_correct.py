@@ -1,15 +1,19 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """A disk and a star through the real chain: exact without noise, pulls of one with it."""
 
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from astropolcal.calibration import with_validity
 from astropolcal.correction import ScienceFrames, correct, derotate
 from astropolcal.exceptions import (
     AstropolcalWarning,
+    CalibrationFileError,
     ObservationError,
     ParameterError,
     WavelengthRangeError,
@@ -138,16 +142,15 @@ def test_pulls_of_the_calibration(calibration, star, charis, seen, track):
     from astropolcal.correction import RowModel
     from astropolcal.correction.systematic import _draws
 
-    _, positions = track()
+    hwp, positions = track()
     model = RowModel(calibration, positions, charis.wavelength)
     pulls = {"q": [], "u": [], "p": []}
     truth = star.stokes[1:] / star.stokes[0]
     for vector in _draws(model, 250, np.random.default_rng(5)):
         rows = model.rows(vector)[..., :3]
         right, left = np.einsum("bwfs,sw->bfw", rows, star.stokes)
-        found = correct(
-            calibration, ScienceFrames.from_arrays(right, left, charis.wavelength, positions)
-        )
+        frames = ScienceFrames.from_arrays(right, left, charis.wavelength, positions, hwp=hwp)
+        found = correct(calibration, frames)
         errors = found.fractional_errors("systematic")
         pulls["q"].append((found.q - truth[0]) / errors["q"])
         pulls["u"].append((found.u - truth[1]) / errors["u"])
@@ -159,13 +162,14 @@ def test_pulls_of_the_calibration(calibration, star, charis, seen, track):
 
 
 def test_errors_stay_apart(calibration, star, charis, track):
-    _, positions = track()
+    hwp, positions = track()
     variance = np.full(star.right.shape, 100.0)
     frames = ScienceFrames.from_arrays(
         star.right,
         star.left,
         charis.wavelength,
         positions,
+        hwp=hwp,
         variance_right=variance,
         variance_left=variance,
     )
@@ -213,7 +217,7 @@ def test_bad_pixels_count_in_the_other_frames(disk_frames, sky, charis):
         assert np.isnan(found.q[9, 1, 1])
         assert np.isfinite(found.q).sum() >= found.q.size - 2
     # one beam alone says something too, if all the intensities count
-    assert np.isfinite(correct(sky, frames).q[6, 3, 4])
+    assert np.isfinite(correct(sky, frames, observable="intensity").q[6, 3, 4])
 
 
 def test_dask_changes_no_number(disk_frames, sky, charis):
@@ -251,10 +255,86 @@ def test_clouds_are_seen_in_the_light_itself(sky, charis, track, scene, seen, sp
     clouds /= clouds.mean(axis=0)
     beams *= clouds.reshape(16, 22, *[1] * (stokes.ndim - 2))
     frames = ScienceFrames.from_arrays(*beams, charis.wavelength, positions)
-    assert np.abs(correct(sky, frames).q - stokes[1] / stokes[0]).max() > 1e-3
+    given = correct(sky, frames, brightness="given")
+    assert np.abs(given.q - stokes[1] / stokes[0]).max() > 1e-3
+    # unless it is known it is measured
+    np.testing.assert_allclose(correct(sky, frames).q, stokes[1] / stokes[0], atol=1e-10)
+    known = dataclasses.replace(frames, scale=clouds.T)
+    np.testing.assert_array_equal(correct(sky, known).q, correct(sky, known, brightness="given").q)
     clear = frames.with_brightness(measurement_rows(sky, positions, charis.wavelength))
     np.testing.assert_allclose(clear.scale, clouds.T, rtol=1e-10)
     np.testing.assert_allclose(correct(sky, clear).q, stokes[1] / stokes[0], atol=1e-10)
+
+
+def test_what_is_fitted_is_what_the_calibration_fitted(calibration, sky, star, charis, seen):
+    right, left = seen(calibration, star.positions, charis.wavelength, star.stokes)
+
+    def frames(**settings):
+        beams = (1.02 * right[:n], left[:n])
+        positions = {name: angle[:n] for name, angle in star.positions.items()}
+        return ScienceFrames.from_arrays(*beams, charis.wavelength, positions, **settings)
+
+    n, truth = 16, star.stokes[1] / star.stokes[0]
+    paired = correct(calibration, frames(hwp=star.hwp))
+    assert paired.observable == "double"
+    # beams of unequal gain cancel in double differences, and nowhere else
+    np.testing.assert_allclose(paired.q, truth, atol=2e-4)
+    with pytest.warns(AstropolcalWarning, match="have none .* their intensities are fitted"):
+        alone = correct(calibration, frames())
+    assert alone.observable == "intensity"
+    assert np.abs(alone.q - truth).max() > 1e-3
+    n = 15
+    with pytest.warns(AstropolcalWarning, match=r"1 of 15 frames have no partner.*frame 14"):
+        assert correct(calibration, frames(hwp=star.hwp[:15])).observable == "double"
+    singles = dataclasses.replace(
+        calibration, settings=calibration.settings | {"observable": "normalized_single_difference"}
+    )
+    n = 16
+    assert correct(singles, frames(hwp=star.hwp)).observable == "single"
+    # a chain that nobody fitted
+    assert correct(sky, frames(hwp=star.hwp)).observable == "double"
+    assert correct(sky, frames()).observable == "intensity"
+
+
+def test_frames_must_say_when_and_how_they_were_taken(calibration, star, charis):
+    dated = with_validity(calibration, valid_from="2025-10-01", mode="broadband JHK")
+
+    def frames(**settings):
+        beams = (star.right, star.left, charis.wavelength, star.positions)
+        return ScienceFrames.from_arrays(*beams, hwp=star.hwp, **settings)
+
+    known = {"date": "2025-10-09", "mode": "Broadband JHK"}
+    found = correct(dated, frames(**known))
+    for settings, words in (
+        (known | {"date": None}, r"frame 0: its date is not known.*ScienceFrames\(..., date=\)"),
+        (known | {"mode": None}, r"frame 0: its mode is not known.*mode='broadband JHK'"),
+        (known | {"date": ["2025-10-09"] * 15 + ["2025-09-09"]}, "frame 15 was taken 2025-09-09"),
+        (known | {"mode": "J"}, "frame 0 is in mode 'J'"),
+        (known | {"date": "2026-03-01"}, "M3 was coated anew between"),
+    ):
+        with pytest.raises(CalibrationFileError, match=words):
+            correct(dated, frames(**settings))
+        if "mode" not in words:
+            again = correct(dated, frames(**settings), any_date=True)
+            np.testing.assert_array_equal(again.stokes, found.stokes)
+    with pytest.warns(AstropolcalWarning, match="0.0 yr from the data of the calibration"):
+        correct(dated, frames(**known), max_age=1 * u.day)
+    with pytest.raises(ParameterError, match="3 values of mode; allowed are one for all"):
+        correct(dated, frames(**known | {"mode": ["J", "H", "K"]}))
+
+
+def test_brightness_that_cannot_be_measured_is_said(star, sky, charis):
+    beams = np.stack([star.right, star.left])
+    beams[:, 5, 3] = 0.0
+    frames = ScienceFrames.from_arrays(*beams, charis.wavelength, star.positions, hwp=star.hwp)
+    with pytest.warns(AstropolcalWarning, match="taken as all the same: frame 5 has no light"):
+        correct(sky, frames)
+    with pytest.raises(ParameterError, match="brightness = 'guessed'"):
+        correct(sky, frames, brightness="guessed")
+    # a flux that is missing is left out, as if the frame were not there
+    beams[:, 5, 3] = np.nan
+    frames = ScienceFrames.from_arrays(*beams, charis.wavelength, star.positions, hwp=star.hwp)
+    np.testing.assert_allclose(correct(sky, frames).q, star.stokes[1] / star.stokes[0], atol=1e-9)
 
 
 def test_a_dark_frame_has_no_brightness(star, sky, charis):
@@ -291,6 +371,7 @@ def test_spectra(calibration, star, charis, track):
         star.left,
         charis.wavelength,
         track()[1],
+        hwp=star.hwp,
         variance_right=ones,
         variance_left=ones,
     )
@@ -357,7 +438,10 @@ def test_a_poor_wavelength_is_flagged(calibration, star, charis, track):
 
 
 def test_open_calibrations_warn(open_calibration, star, charis):
-    frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
+    known = {"hwp": star.hwp, "mode": "broadband JHK"}
+    frames = ScienceFrames.from_arrays(
+        star.right, star.left, charis.wavelength, star.positions, **known
+    )
     with pytest.warns(
         AstropolcalWarning, match="leaves open how Q and U turn.*--prior.*--open-directions"
     ):
@@ -452,7 +536,7 @@ def test_against_numpy_least_squares(star, sky, charis):
         variance_right=variances[0],
         variance_left=variances[1],
     )
-    found = correct(sky, frames, weights="variance")
+    found = correct(sky, frames, weights="variance", brightness="given")
     rows = measurement_rows(sky, star.positions, charis.wavelength)[..., :3]
     for w in range(22):
         sigma = np.sqrt(variances[:, :, w]).ravel()

@@ -137,7 +137,10 @@ def test_mode_is_not_compared_where_the_file_holds_for_any(night, monkeypatch):
 
 def test_frames_that_do_not_say_enough(night, tmp_path):
     bare = {"MJD": None, "FILTNAME": None}
-    for lacking, option in (({"MJD"}, {"any_date": True}), ({"FILTNAME"}, {"filter": "broadband JHK"})):
+    for lacking, option in (
+        ({"MJD"}, {"any_date": True}),
+        ({"FILTNAME"}, {"filter": "broadband JHK"}),
+    ):
         (file,) = night({key: value for key, value in bare.items() if key in lacking})
         with pytest.raises(AstropolcalError, match=r"cube.fits: its \w+ is not known, .*--(an|fi)"):
             chosen(OLD, [file], optics_in=["nbs"])

@@ -134,7 +134,9 @@ def test_a_file_that_does_not_hold_is_refused(night, tmp_path):
     words = ["-o", tmp_path / "out.fits", "-q", "--size", 5, "--radius", 2]
     words = [night / "cubes", "--calibration", tmp_path / "old.asdf", *words]
     words += ["--centre", "69.9,84.7", "--brightness", "measured"]
-    with pytest.raises(AstropolcalError, match=r"2025-10-05T08.*, but .*old\.asdf holds for .*any-date"):
+    with pytest.raises(
+        AstropolcalError, match=r"2025-10-05T08.*, but .*old\.asdf holds for .*any-date"
+    ):
         command(*words)
     assert not (tmp_path / "out.fits").exists()
     command(*words, "--any-date")
@@ -226,7 +228,10 @@ def changed(night, folder, *keywords):
         ([("FILTNAME", "J", "K")], "is in mode 'J', .* in 'K': correct apart"),
         ([("FILTNAME", "J")], "in mode 'J', but .*charis.asdf holds for .*--filter 'broadband"),
         ([("MJD", 60950.5, 60800.5)], "nbs was in the beam in .*, and not in "),
-        ([("MJD", 60800.5), ("FILTNAME", "broadband JHK")], "switcher was installed between the data"),
+        (
+            [("MJD", 60800.5), ("FILTNAME", "broadband JHK")],
+            "switcher was installed between the data",
+        ),
     ],
 )
 def test_frames_of_another_set_up(night, tmp_path, keywords, message):
