@@ -20,6 +20,24 @@ _PART = 0.1
 _ON_SKY = 6
 # open directions that differ in their wavelength only and are told one by one
 _MOST_ALIKE = 3
+# numbers that differ by less than this share of the largest are equal but for rounding
+_EQUAL = 1e-6
+
+
+def ranked(values):
+    """
+    Return the indices of values, largest first; equal ones keep their order.
+
+    Which of two that are equal comes out larger hangs on the processor.
+    """
+    values = np.asarray(values, dtype=float)
+    order = np.argsort(-values, kind="stable")
+    falling, size = values[order], np.abs(values[np.isfinite(values)]).max(initial=0.0)
+    # two infinities are equal, although their difference is not a number
+    with np.errstate(invalid="ignore"):
+        smaller = np.diff(falling, prepend=falling[:1]) < -_EQUAL * size
+    # by groups of equal ones, and by place within a group
+    return order[np.lexsort((order, np.cumsum(smaller)))]
 
 
 def step_of(unit):
@@ -186,7 +204,7 @@ def near_null_directions(free, whitened, level, sky_of):
     condition = found.singular[:1] / singular
     times_large = np.abs(errors) / _large(free)
     bad = (times_large > 1).any(axis=1) | (condition > _CONDITION)
-    leads = np.argmax(times_large, axis=1) if len(errors) else np.zeros(0, dtype=int)
+    leads = np.array([ranked(row)[0] for row in times_large], dtype=int)
     # the sign of a singular vector is arbitrary: the worst parameter goes up
     errors = errors * np.sign(errors[np.arange(len(errors)), leads])[:, None]
     worst = [i for i in np.argsort(singular, kind="stable") if bad[i]]
@@ -213,7 +231,7 @@ def _skies(changes, sky_of):
 
 def _near_null(free, error, times_large, condition, sky):
     """Return one direction: words, what it changes at one standard error, and on sky."""
-    lead = int(np.argmax(times_large))
+    lead = int(ranked(times_large)[0])
     words = f"{_uncertain(free, free.names[lead], error)} at the noise of this fit"
     stem = free.names[lead].split("[")[0]
     much = np.where(times_large > _PART * times_large[lead], error, 0.0)

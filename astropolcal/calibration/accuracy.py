@@ -193,8 +193,9 @@ def _held_out_linearly(measurement, vector, jacobian, weights, labels, groups):
     for rows in np.split(order, ends):
         # (1 - H_g)^-1 r_g without inverting a matrix of the size of the group: H_g = R R^T, and its
         # eigenvalues are those of R^T R, (rank, rank)
-        values, axes = np.linalg.eigh(root[rows].T @ root[rows])
-        seen = root[rows] @ axes
+        own = root[rows]
+        values, axes = np.linalg.eigh(own.T @ own)
+        seen = own @ axes
         # along these the others determine nothing
         alone = values > 1 - _ALONE
         blind = (np.abs(seen[:, alone]) > _STILL).any(axis=1)

@@ -20,6 +20,9 @@ from astropolcal.units import canonical_factor
 
 __all__ = ["Covariance", "full_covariance"]
 
+# share of both standard errors by which a covariance may differ from its transpose: far above
+# rounding, and too little to change anything
+_ASYMMETRY = 1e-6
 # a quantity that changes by less than this share of its slope stands still
 _STILL = 1e-5
 
@@ -70,12 +73,29 @@ class Covariance:
             raise ParameterError(
                 f"covariance of {n} names and {len(self.units)} units has shape {self.matrix.shape}"
             )
-        if not np.allclose(self.matrix, self.matrix.T, rtol=1e-6, atol=1e-30, equal_nan=True):
-            raise ParameterError("a covariance matrix must be symmetric")
+        self._check_symmetry()
         if factor is not None:
             self.factor = self._rows("factor", factor)
         if null is not None:
             self.null = self._rows("null", null)
+
+    def _check_symmetry(self):
+        """Refuse what differs from its transpose by more than a share of both errors."""
+        variances = np.diag(self.matrix)
+        # the parameters have units of their own, and with them the rounding errors
+        stds = np.sqrt(np.where(np.isfinite(variances), np.abs(variances), 0.0))
+        with np.errstate(invalid="ignore", over="ignore"):
+            same = np.abs(self.matrix - self.matrix.T) <= _ASYMMETRY * np.outer(stds, stds)
+        # equal infinities have no difference
+        missing = np.isnan(self.matrix)
+        same |= (self.matrix == self.matrix.T) | (missing & missing.T)
+        if not same.all():
+            row, column = np.argwhere(~same)[0]
+            raise ParameterError(
+                f"a covariance matrix must be symmetric: that of {self.names[row]} and "
+                f"{self.names[column]} is {self.matrix[row, column]:g} and "
+                f"{self.matrix[column, row]:g}"
+            )
 
     def _rows(self, key, rows):
         """Return directions as an array of rows."""
@@ -103,7 +123,7 @@ class Covariance:
         units = [slot.unit for slot in free.slots for _ in range(slot.size)]
         per_unit = np.array([1 / canonical_factor(unit) for unit in units])
         # one factor for the row and one for the column
-        return cls(free.names, units, matrix * per_unit[:, None] * per_unit[None, :])
+        return cls(free.names, units, matrix * np.outer(per_unit, per_unit))
 
     def __len__(self):
         return len(self.names)
@@ -165,8 +185,7 @@ class Covariance:
     @property
     def correlation(self):
         """Correlation matrix, shape (n, n), NaN where not determined."""
-        stds = self.stds
-        return self.matrix / stds[:, None] / stds[None, :]
+        return self.matrix / np.outer(self.stds, self.stds)
 
     def propagate(self, slopes):
         """
@@ -238,7 +257,7 @@ class Covariance:
 
     def _factor_of_matrix(self, steps, known):
         """Return the determined directions of the parameters that have an error."""
-        matrix = self.matrix[np.ix_(known, known)] / steps[known, None] / steps[known]
+        matrix = self.matrix[np.ix_(known, known)] / np.outer(steps[known], steps[known])
         # a symmetric matrix: eigenvectors are the directions, roots of eigenvalues their errors
         variance, vectors = np.linalg.eigh(matrix)
         factor = np.zeros((len(variance), len(self)))

@@ -195,14 +195,17 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     # derivatives to the determined directions, each in units of its standard error
     slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T
     # (n_groups, rank): how far each group alone pulls the solution, in standard errors
-    pulls = [_pull(slopes[labels == g], residuals[labels == g], correction) for g in set(labels)]
-    middle = np.transpose(pulls) @ np.array(pulls)
+    pulls = np.array(
+        [_pull(slopes[labels == g], residuals[labels == g], correction) for g in set(labels)]
+    )
+    # of one array with itself: a product of two copies is symmetric to rounding only
+    middle = pulls.T @ pulls
     if correction == "number":
         n, k, n_groups = len(labels), slopes.shape[1], len(pulls)
         middle *= n_groups / (n_groups - 1) * (n - 1) / max(n - k, 1)
     # priors are taken at their word: their variance is not read from residuals
-    prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T
-    middle += weighting.level**2 * prior.T @ prior
+    prior = weighting.level * whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T
+    middle += prior.T @ prior
     return _sandwich(calibration, whitened, middle)
 
 
@@ -247,7 +250,8 @@ def _sandwich(calibration, whitened, middle):
     known = calibration.covariance
     matrix = np.full((free.size, free.size), np.nan)
     columns = whitened.live[whitened.errors.determined]
-    matrix[np.ix_(columns, columns)] = factor[:, columns].T @ factor[:, columns]
+    determined = factor[:, columns]
+    matrix[np.ix_(columns, columns)] = determined.T @ determined
     return Covariance(known.names, known.units, matrix, factor=factor, null=null)
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from astropolcal.calibration._directions import ranked
 from astropolcal.correction.channels import Channels
 from astropolcal.exceptions import ObservationError, ParameterError
 
@@ -214,7 +215,7 @@ def _solve(rows, weights, components, max_condition):
     n = len(components)
     gain, values, weak = _pseudo_inverse(rows[:, :n], weights, max_condition)
     condition = values[0] / values[-1] if values[-1] > 0 else np.inf
-    words = "; ".join(_in_words(direction, components) for direction in weak)
+    words = "; ".join(_in_words(direction, components) for direction in _led(weak))
     determined = _determined(weak, n)
     if len(weak) and n == 4 and not determined[3]:
         # V is what most often is open: the others are solved as without it
@@ -246,8 +247,18 @@ def _determined(weak, n):
     return np.abs(weak).max(axis=0, initial=0.0) < _SHARE if len(weak) else np.ones(n, dtype=bool)
 
 
+def _led(weak):
+    """Return a basis of the same directions in which one component after the other leads."""
+    # singular vectors of equal values are any basis, and each has any sign: their projector is one
+    projector, basis = weak.T @ weak, []
+    for _ in weak:
+        lead = ranked(np.diag(projector))[0]
+        basis.append(projector[lead] / np.sqrt(projector[lead, lead]))
+        projector = projector - np.outer(basis[-1], basis[-1])
+    return basis
+
+
 def _in_words(direction, components):
-    direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
     parts = [
         f"{value:+.2f} {name}"
         for name, value in zip(components, direction, strict=True)

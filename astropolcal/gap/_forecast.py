@@ -13,6 +13,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy.linalg import qr
 
+from astropolcal.calibration._directions import ranked
 from astropolcal.chain import leaves, remove_optic
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import Roles
@@ -88,9 +89,9 @@ class Known:
         _, singular, right = np.linalg.svd(left, full_matrices=False)
         steps = np.abs(unknown @ right.T) / self.scale[:, None]
         sigmas = _WANTED * singular / steps.max(axis=0)
-        best = int(np.argmax(sigmas))
+        best = int(ranked(sigmas)[0])
         step = steps[:, best]
-        main = [i for i in np.argsort(-step)[:3] if step[i] > 0.3 * step.max()]
+        main = [i for i in ranked(step)[:3] if step[i] > 0.3 * step.max()]
         names = [self.problem.names[i] for i in main]
         return names, float(sigmas[best]), int(np.sum(sigmas > LEAST_GAIN))
 

@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration import accuracy_table, target_accuracies
+from astropolcal.calibration._directions import ranked
 from astropolcal.gap.problem import OPEN, TOUCHES
 from astropolcal.gap.shrinkage import frame_groups, left_out_fits
 
@@ -110,8 +111,8 @@ class Fitted:
             for other, where in self.problem.slices.items()
             if other not in own
         }
-        found = sorted((o for o in others if others[o] > _STRONG), key=lambda o: -others[o])
-        return found[:_MOST_TRADES]
+        found = [name for name, strength in others.items() if strength > _STRONG]
+        return [found[i] for i in ranked([others[name] for name in found])[:_MOST_TRADES]]
 
     def _rows(self, name):
         slices = [self.problem.slices[p.name] for p in self.model.added.get(name) or ()]

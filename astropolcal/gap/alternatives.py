@@ -11,6 +11,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration import Calibration
+from astropolcal.calibration._directions import ranked
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import Candidate, Score
@@ -102,7 +103,7 @@ def _tried(chains, observations, effects, say):
         say(f"trying: {effect.title}")
         trial = nominal_calibration(effect.edit(few[0], context).chains, few[1])
         found.append((_misfit(trial), effect))
-    return sorted(found, key=lambda item: item[0])
+    return [found[i] for i in ranked([-misfit for misfit, _ in found])]
 
 
 def _context(observations):

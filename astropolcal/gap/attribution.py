@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import stats
 
+from astropolcal.calibration._directions import ranked
 from astropolcal.gap.model import effect_tangent
 
 __all__ = [
@@ -139,7 +140,7 @@ def scan(model, effects, *, residual=None, nominal=None, context=None):
             scores.append(Score(effect, statistic, rank, basis, scale))
     for score, p in zip(scores, false_discovery([s.single_p for s in scores]), strict=True):
         score.p_value = p
-    return sorted(scores, key=lambda s: -s.evidence(freedom))
+    return [scores[i] for i in ranked([s.evidence(freedom) for s in scores])]
 
 
 def false_discovery(p_values):
@@ -311,15 +312,19 @@ def contenders(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
         for c in fitted
     ]
     # what is out of its physical limits is no explanation while another one is left
-    fitted.sort(key=lambda c: (not c.physical, -c.evidence))
-    top = fitted[0]
+    top = _best_first(fitted)[0]
     # all are measured by the scatter that the best one leaves
     scale = max(1.0, top.model.fit.chi2 / max(freedom, 1))
     for one in fitted:
         one.gain = (model.fit.chi2 - one.model.fit.chi2) / scale
         one.evidence = one.gain - one.score.rank * np.log(freedom)
-    fitted.sort(key=lambda c: (not c.physical, -c.evidence))
-    return fitted
+    return _best_first(fitted)
+
+
+def _best_first(fitted):
+    # what fits equally well stays in the order of the library
+    fitted = [fitted[i] for i in ranked([c.evidence for c in fitted])]
+    return sorted(fitted, key=lambda c: not c.physical)
 
 
 def _fitted(model, score, freedom):

@@ -15,6 +15,7 @@ from itertools import combinations
 
 import numpy as np
 
+from astropolcal.calibration._directions import ranked
 from astropolcal.chain import stages
 from astropolcal.exceptions import GapError, ParameterError
 from astropolcal.gap._forecast import LEAST_GAIN, MODULATOR, STATES, Foreseen, Known, separation
@@ -339,7 +340,8 @@ def _best(lists, limit):
     found = []
     for rows in lists:
         kinds = {}
-        for _, exposure, entry in sorted(rows, key=lambda row: -row[0]):
+        for i in ranked([row[0] for row in rows]):
+            _, exposure, entry = rows[i]
             kinds.setdefault(exposure.kind, entry)
         found.append(list(kinds.values())[:_SAME_PURPOSE])
     return _in_turn(found, limit)
@@ -348,7 +350,11 @@ def _best(lists, limit):
 def _in_turn(lists, limit):
     # the best of every purpose, then the second of each
     chosen = [one[i] for i in range(limit) for one in lists if i < len(one)]
-    return sorted(chosen[:limit], key=lambda entry: -entry["gain"])
+    return _largest_first(chosen[:limit])
+
+
+def _largest_first(entries):
+    return [entries[i] for i in ranked([entry["gain"] for entry in entries])]
 
 
 def few(entries, limit=4):
@@ -379,7 +385,7 @@ def few(entries, limit=4):
     [5.0, 4.0]
     """
     purposes = {}
-    for entry in sorted(entries, key=lambda entry: -entry["gain"]):
+    for entry in _largest_first(entries):
         # a pair is the same purpose in either order
         found = purposes.setdefault(frozenset(entry["separates"]), {})
         found.setdefault(_exposure(entry), entry)

@@ -14,6 +14,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy import stats
 
+from astropolcal.calibration._directions import ranked
 from astropolcal.gap.channels import CHANNELS
 from astropolcal.gap.patterns import frame_blocks, frame_patterns
 from astropolcal.observations.quality import MAD_TO_SIGMA, robust_curve
@@ -133,6 +134,9 @@ def _shapes(table, channel, observations, wavelength, alpha):
             break
         spectrum = left[:, k] * singular[k] / np.sqrt(m)
         frames = right[k] * np.sqrt(m)
+        # a pair of singular vectors has any sign: the spectrum is positive where it is strongest
+        sign = np.sign(spectrum[ranked(np.abs(spectrum))[0]])
+        spectrum, frames = sign * spectrum, sign * frames
         # the square of a singular value that stands out is that of the signal and n + m of noise
         square = max(singular[k] ** 2 - n - m, 0.0)
         words = _words(spectrum, frames, channel, observations, wavelength)

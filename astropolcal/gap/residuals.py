@@ -20,6 +20,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy import stats
 
+from astropolcal.calibration._directions import ranked
 from astropolcal.exceptions import GapError
 from astropolcal.gap._places import most_uneven, places
 from astropolcal.gap.attribution import ALPHA, false_discovery
@@ -294,8 +295,8 @@ def _sequence(data, terms, null, alpha):
         left.remove(best)
     # what a few patterns explain is a better measure of a small gap than the sum of squares
     data.scale = max(data.scale, sum(one.excess for _, one in taken))
-    found = [(terms[i], tested[i]) for i in left if tested[i].rank]
-    found.sort(key=lambda item: item[1].log_p)
+    left = [i for i in left if tested[i].rank]
+    found = [(terms[left[k]], tested[left[k]]) for k in ranked([-tested[i].log_p for i in left])]
     rows = [_row(term, one, data.scale) for term, one in taken + found]
     return rows, _row(null, whole, data.scale) | {"kind": "place"}
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from astropolcal.calibration._directions import ranked
 from astropolcal.gap.attribution import SAME_EVIDENCE, best_of, choose, contenders, freed, scan
 from astropolcal.gap.shrinkage import held_out
 
@@ -133,7 +134,7 @@ def _looking_ahead(model, scores, *, alpha):
         ends.append((one, *end))
     if not ends:
         return fitted[0]
-    best, next_to, end = max(ends, key=lambda item: _advantage(item[2], model))
+    best, next_to, end = ends[ranked([_advantage(item[2], model) for item in ends])[0]]
     # next to the same second effect: two that are both needed do as well in either order
     best.aliases = [
         one

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration._directions import ranked
 from astropolcal.calibration.harmonics import _POOR, SETS, harmonic_conditions
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import (
@@ -160,7 +161,7 @@ def _weak_rows(finding, known, count):
     count = max(count, min(len(near_null), _MOST_NEAR_NULL))
     rows = []
     for vector, sigma in list(zip(vectors, sigmas, strict=True))[::-1][:count]:
-        vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
+        vector = vector * np.sign(vector[ranked(np.abs(vector))[0]])
         words = _near_null_words(near_null, finding.names, covariance.units, vector)
         name = f"{'badly determined' if words else 'largest error'} {len(rows) + 1}"
         words = words or _weak_words(finding.names, covariance.units, vector, sigma)

@@ -331,7 +331,8 @@ def _common_axis(spectra):
         axes[key] = axis
     first = axes["I"]
     for key, axis in axes.items():
-        if axis.shape != first.shape or not np.allclose(axis.to_value(first.unit), first.value):
+        # without an absolute tolerance, which would be 10 nm for an axis in metres
+        if axis.shape != first.shape or not u.allclose(axis, first, rtol=1e-5):
             raise ObservationError(f"spectrum {key}: is on another spectral axis than I")
     return first
 

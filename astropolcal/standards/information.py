@@ -185,7 +185,8 @@ def _covariance(columns):
     # one frame gives two rows for three or more columns: the missing singular values are zero
     size = np.concatenate([size, np.zeros(columns.shape[1] - len(size))])
     good = size > _RANK * size.max()
-    covariance = (directions[good].T / size[good] ** 2) @ directions[good]
+    half = directions[good] / size[good, None]
+    covariance = half.T @ half
     # a parameter that takes part in an open direction has an infinite error, not that of a
     # pseudo-inverse; null vectors are exact to about the root of the rank tolerance
     lost = np.any(np.abs(directions[~good]) > np.sqrt(_RANK), axis=0)

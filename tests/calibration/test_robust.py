@@ -173,6 +173,9 @@ def test_prior_keeps_its_own_error(make):
         chain[name].theta.prior = Normal(0 * u.deg, 0.1 * u.deg)
     cal = calibrate(chain, make.observe(chain, wavelength=LAM, seed=1), **OPTIONS)
     robust = robust_covariance(cal)
+    # exactly, on every processor
+    for made in (robust, cal.covariance):
+        np.testing.assert_array_equal(made.matrix, made.matrix.T)
     for name in ("hwp.theta", "derotator.theta"):
         assert robust.std(name).to_value(u.deg) == pytest.approx(0.1, rel=0.01)
 

@@ -7,6 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
+from astropolcal.calibration._directions import ranked
 from astropolcal.chain import insert_optic
 from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion, label_of
 from astropolcal.measurement import Tie
@@ -139,6 +140,8 @@ class BandAverage(Effect):
         # the linear retardance moves along one axis of the (H, 45) plane nearly: its main
         # direction
         axis = np.linalg.svd(slopes, full_matrices=False)[2][0]
+        # a singular vector has any sign, and with it the optic would be turned by 90 deg
+        axis *= np.sign(axis[ranked(np.abs(axis))[0]])
         square = (slopes @ axis) ** 2
         keep = np.ones(len(slopes))
         optic = optics.Depolarizer(

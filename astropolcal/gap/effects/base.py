@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import astropy.units as u
 import numpy as np
+from scipy.linalg import helmert
 
 from astropolcal import instruments
 from astropolcal.chain import insert_optic
@@ -189,9 +190,8 @@ class Context:
             return found
         # a constant over the wavelengths is the orientation of the optic, which is known by itself
         if wanted is None:
-            # one value a wavelength, less their mean
-            n = len(found)
-            return np.linalg.svd(found - 1 / n)[0][:, : n - 1]
+            # one value a wavelength, less their mean; singular vectors would be any basis of these
+            return helmert(len(found)).T
         return found[:, 1:]
 
 
