@@ -14,7 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.calibration._directions import declared_step
-from astropolcal.calibration.weighting import Weighting, around, weighting_of
+from astropolcal.calibration.weighting import (
+    Weighting,
+    around,
+    noise_by_dataset,
+    weighting_of,
+)
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor
 
@@ -25,6 +30,8 @@ __all__ = ["Covariance", "full_covariance"]
 _ASYMMETRY = 1e-6
 # a quantity that changes by less than this share of its slope stands still
 _STILL = 1e-5
+# directions that no residual pulls keep this share of the largest error, so that they stay known
+_LEAST = 1e-6
 
 
 class Covariance:
@@ -347,14 +354,17 @@ def full_covariance(calibration):
     if calibration.measurement is None:
         return Covariance(known.names, known.units, known.matrix, null=_open_of_file(calibration))
     weighting = weighting_of(calibration)
-    return covariance_around(
-        calibration.measurement, around(calibration.measurement, weighting), weighting.level
-    )
+    whitened = around(calibration.measurement, weighting)
+    return covariance_around(calibration.measurement, whitened, weighting)
 
 
-def covariance_around(measurement, whitened, level):
+def covariance_around(measurement, whitened, weighting):
     """
     Return the covariance with its directions, of a problem that is decomposed once.
+
+    Where one level of noise weighted the data of several datasets, the residuals of each say how
+    far it scatters, and the covariance is the sandwich of these (White 1980, Econometrica 48,
+    817): a quiet star does not inherit the misfit of a lamp.
 
     Parameters
     ----------
@@ -362,20 +372,46 @@ def covariance_around(measurement, whitened, level):
         The measurement.
     whitened : Whitened
         The problem around its solution.
-    level : float
-        Noise of a datum of weight one; without one there is no error.
+    weighting : Weighting
+        The noise; without any there is no error.
 
     Returns
     -------
     Covariance
     """
-    free = measurement.free
+    free, level = measurement.free, weighting.level
+    sigma = noise_by_dataset(measurement, weighting, whitened)
+    if sigma is not None:
+        # derivatives to the determined directions, each in units of its standard error
+        slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T * sigma[:, None]
+        prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T * level
+        return sandwich(measurement, whitened, slopes.T @ slopes + prior.T @ prior)
     known = Covariance.from_canonical(free, whitened.covariance() * level**2)
     per_unit = whitened.scale / free.factors()
     factor = whitened.factor() * (level * per_unit) if np.isfinite(level) else None
     return Covariance(
         known.names, known.units, known.matrix, factor=factor, null=whitened.null() * per_unit
     )
+
+
+def sandwich(measurement, whitened, middle):
+    """Return the covariance from that of the pulls on the determined directions."""
+    variances, vectors = np.linalg.eigh(middle)
+    stds = np.sqrt(variances.clip(0))
+    # with fewer groups than directions a sum of outer products is singular
+    stds = np.maximum(stds, _LEAST * stds.max(initial=0.0))
+    rows = (stds[:, None] * vectors.T) @ whitened.factor()
+    # back to orthogonal directions, as `Covariance` keeps them
+    _, sizes, principal = np.linalg.svd(rows, full_matrices=False)
+    free = measurement.free
+    units = [slot.unit for slot in free.slots for _ in range(slot.size)]
+    per_unit = whitened.scale / free.factors()
+    factor, null = sizes[:, None] * principal * per_unit, whitened.null() * per_unit
+    matrix = np.full((free.size, free.size), np.nan)
+    columns = whitened.live[whitened.errors.determined]
+    determined = factor[:, columns]
+    matrix[np.ix_(columns, columns)] = determined.T @ determined
+    return Covariance(free.names, units, matrix, factor=factor, null=null)
 
 
 def residual_variance(calibration):

@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration._whitened import decompose
-from astropolcal.calibration.covariance import Covariance
+from astropolcal.calibration.covariance import sandwich
 from astropolcal.calibration.identifiability import physical_scale
 from astropolcal.calibration.resampling import labels_of
 from astropolcal.calibration.weighting import around, weighting_of
@@ -24,8 +24,6 @@ CORRECTIONS = ("leverage", "number")
 _FEWEST_GROUPS = 3
 # a share of a residual below this is what the fit has taken away, and no scatter
 _TAKEN = 1e-6
-# directions that no group pulls keep this share of the largest error, so that they stay known
-_LEAST = 1e-6
 
 
 def standard_errors(calibration, method=None, groups=None):
@@ -206,7 +204,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     # priors are taken at their word: their variance is not read from residuals
     prior = weighting.level * whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T
     middle += prior.T @ prior
-    return _sandwich(calibration, whitened, middle)
+    return sandwich(measurement, whitened, middle)
 
 
 def _labels(measurement, groups):
@@ -233,26 +231,6 @@ def _pull(slopes, residuals, correction):
         grown = np.where(spare > _TAKEN, 1 / np.sqrt(np.maximum(spare, _TAKEN)), 0.0)
         residuals = residuals + left @ ((grown - 1) * (left.T @ residuals))
     return slopes.T @ residuals
-
-
-def _sandwich(calibration, whitened, middle):
-    """Return the covariance from that of the pulls on the determined directions."""
-    variances, vectors = np.linalg.eigh(middle)
-    stds = np.sqrt(variances.clip(0))
-    # with fewer groups than directions the sum of outer products is singular
-    stds = np.maximum(stds, _LEAST * stds.max(initial=0.0))
-    rows = (stds[:, None] * vectors.T) @ whitened.factor()
-    # back to orthogonal directions, as `Covariance` keeps them
-    _, sizes, principal = np.linalg.svd(rows, full_matrices=False)
-    free = calibration.measurement.free
-    per_unit = whitened.scale / free.factors()
-    factor, null = sizes[:, None] * principal * per_unit, whitened.null() * per_unit
-    known = calibration.covariance
-    matrix = np.full((free.size, free.size), np.nan)
-    columns = whitened.live[whitened.errors.determined]
-    determined = factor[:, columns]
-    matrix[np.ix_(columns, columns)] = determined.T @ determined
-    return Covariance(known.names, known.units, matrix, factor=factor, null=null)
 
 
 # ---- as published --------------------------------------------------------------------------

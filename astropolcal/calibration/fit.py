@@ -412,7 +412,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
-        covariance=covariance_around(measurement, whitened, level),
+        covariance=covariance_around(measurement, whitened, measurement.weighting),
         identifiability=finding,
         at_bound=[names[i] for i in np.flatnonzero(whitened.held)],
         datasets=[_record(measurement, i, residuals) for i in range(len(measurement.datasets))],

@@ -339,15 +339,6 @@ def _max_age(max_age, held, instrument):
     return days
 
 
-def instrument_of(calibration):
-    """Return the instrument; None without one, or for a name that somebody chose."""
-    name = calibration.instrument
-    try:
-        return None if name is None else instruments.get(name)
-    except InstrumentError:
-        return None
-
-
 def _dates(calibration):
     """Return the dates of a calibration's data, the oldest first."""
     return sorted(

@@ -128,9 +128,9 @@ def correct(
     Warns
     -----
     AstropolcalWarning
-        If the frames have no pairs, or some have none, where the calibration fitted pairs; if
-        their brightness cannot be measured; if combinations of Stokes parameters are poorly determined at some wavelengths, or the
-        calibration leaves open how they change; or if the calibration is old.
+        If the frames have no pairs, or some have none, where the calibration fitted pairs; their
+        brightness cannot be measured; combinations of Stokes parameters are poorly determined at
+        some wavelengths; the calibration leaves open how they change; or it is old.
 
     Examples
     --------

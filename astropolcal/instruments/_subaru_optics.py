@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What the polarimeters at the Nasmyth focus of Subaru share: site, calibration unit and dated changes."""
+"""What the polarimeters at the Nasmyth focus of Subaru share: site, calibration unit, changes."""
 
 import astropy.units as u
 import numpy as np

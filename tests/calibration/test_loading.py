@@ -302,10 +302,10 @@ def test_dated_change(path):
     loaded = load(path, recoated)
     assert loaded.system_mueller(recoated, light="internal").value.shape == (3, 4, 4)
     with pytest.raises(
-        CalibrationFileError, match="frame 1, .*M3 was coated anew between.*2026-01"
+        CalibrationFileError, match=r"frame 1, .*M3 was coated anew between.*2026-01"
     ):
         loaded.system_mueller([HEADER, recoated])
-    with pytest.raises(CalibrationFileError, match="the frame.* M3 was coated anew"):
+    with pytest.raises(CalibrationFileError, match=r"the frame.* M3 was coated anew"):
         load(path, date="2026-03-01").system_mueller(positions=POSITIONS)
     # the caller may know better
     stated = load(path, recoated, date="2025-11-09")

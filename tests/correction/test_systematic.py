@@ -118,7 +118,7 @@ def test_open_directions_are_counted_in_degrees_of_their_angles(charis, open_cal
     positions, chain = track()[1], open_calibration.chain
     leads = [d["words"].partition(" by ")[0] for d in open_calibration.identifiability.directions]
     data = open_calibration.measurement.datasets[0].observations
-    here = {name: getattr(chain[name[:-6]], "theta").quantity for name in leads}
+    here = {name: chain[name[:-6]].theta.quantity for name in leads}
     flux, found = None, []
     for moved in (None, *leads):
         fix = {name: angle + 0.2 * (name == moved) * u.deg for name, angle in here.items()}

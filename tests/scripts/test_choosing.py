@@ -150,7 +150,7 @@ def test_frames_that_do_not_say_enough(night, tmp_path):
 
 def test_calibration_that_is_old(night):
     early, late = night({"MJD": 60990.0}, {"MJD": 61313.5})
-    with pytest.raises(AstropolcalError, match="M3 was coated anew between .*--any-date"):
+    with pytest.raises(AstropolcalError, match=r"M3 was coated anew between .*--any-date"):
         chosen(OLD, [early, late], optics_in=["nbs"])
     with pytest.warns(AstropolcalWarning, match="0.1 yr from the data"):
         chosen(OLD, [early], optics_in=["nbs"], max_age=0.01)
