@@ -4,6 +4,7 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, is_hypothesis_test, settings
 
@@ -79,6 +80,24 @@ def shared_data():
     if not folder.is_dir():
         pytest.skip(f"reference data are absent: no folder {folder.name!r} beside the repository")
     return folder
+
+
+@pytest.fixture
+def other_svd(monkeypatch):
+    """Function after which singular vectors are others that are as good."""
+    real = np.linalg.svd
+
+    def svd(matrix, full_matrices=True, compute_uv=True, **options):
+        found = real(matrix, full_matrices, compute_uv, **options)
+        if not compute_uv:
+            return found
+        left, singular, right = -found[0], found[1], -found[2]
+        if np.ndim(matrix) == 2 and np.sum(singular > 1e-12 * singular.max()) < len(right) - 1:
+            # of two directions in which nothing changes a mixture is one too
+            right[-2:] = [right[-2] + right[-1], right[-2] - right[-1]] / np.sqrt(2)
+        return left, singular, right
+
+    return lambda: monkeypatch.setattr(np.linalg, "svd", svd)
 
 
 @pytest.fixture(scope="session")

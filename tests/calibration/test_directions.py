@@ -236,6 +236,18 @@ def test_the_worst_comes_first_and_goes_up(free):
     np.testing.assert_allclose(asked[0][1][0], np.deg2rad(7))
 
 
+def test_which_of_two_equal_parameters_leads_does_not_hang_on_rounding(free):
+    for rounding in (-1e-12, 1e-12):
+        # as large a part of the limit of each, in opposite directions
+        vector = _unit(polarizer_theta=-1, hwp_w_sio2=10 + rounding)
+        rows = 100 * np.eye(len(NAMES)) - 99.998 * np.outer(vector, vector)
+        scale = physical_scale(free)
+        found = Whitened(rows / scale[:, None], scale)
+        (direction,) = near_null_directions(free, found, 1.0, lambda changes: [None] * len(changes))
+        assert direction["words"].startswith("polarizer.theta is uncertain by 50 deg")
+        assert direction["parameters"]["hwp.w_sio2"] == pytest.approx(-498, abs=1)
+
+
 def test_a_condition_beyond_ten_thousand_is_told_even_of_small_errors(free):
     errors = np.full(len(NAMES), 1e-6)
     errors[0] = 0.1

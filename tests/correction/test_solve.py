@@ -129,6 +129,17 @@ def test_an_open_mixture_leaves_neither():
     assert "0.71 U" in solution.weak[0]
 
 
+def test_open_components_are_named_the_same_on_every_processor(other_svd):
+    def words():
+        with pytest.raises(ObservationError, match=r"1\.00 U; 1\.00 V;") as refused:
+            estimator(ideal(np.array([0, 45])), components="IQUV")
+        return str(refused.value)
+
+    before = words()
+    other_svd()
+    assert words() == before
+
+
 def test_nearly_open_is_a_matter_of_the_limit():
     rows = ideal(np.array([0, 45, 22.5, 67.5]), 2)
     rows[:, 0, :, 2] /= 100

@@ -168,6 +168,13 @@ def test_all_are_measured_by_the_scatter_of_the_best():
     assert other.gain == pytest.approx(1000 / 4)
 
 
+@pytest.mark.parametrize("rounding", [-1e-9, 0.0, 1e-9])
+def test_what_fits_equally_well_stays_in_the_order_of_the_library(rounding):
+    base = Base(2000.0, {"a": 1000.0, "b": 1000.0 + rounding, "c": 999.0})
+    found = contenders(base, [score(name, 900.0) for name in "abc"])
+    assert names(found) == ["c", "a", "b"]
+
+
 def test_the_impossible_comes_last_though_it_fits_best():
     base = Base(2000.0, {"a": Fitted(1000.0, physical=False), "b": 1400.0})
     first, last = contenders(base, [score("a", 900.0), score("b", 880.0)])

@@ -267,8 +267,11 @@ def test_noise_has_no_remainder():
     assert sum(len(remainder(clean_model(seed))) for seed in range(8)) == 0
 
 
-def test_remainder_of_a_beam_gain():
-    found = remainder(fitted(observed(with_effect("beam_gain", imbalance=0.01))))
+def test_remainder_of_a_beam_gain(other_svd):
+    model = fitted(observed(with_effect("beam_gain", imbalance=0.01)))
+    found = remainder(model)
+    other_svd()
+    np.testing.assert_allclose(remainder(model)[0].spectrum, found[0].spectrum)
     assert found[0].channel == "difference"
     assert found[0].share > 0.8
     assert "constant in the half-wave-plate angle" in found[0].words

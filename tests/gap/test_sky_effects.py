@@ -221,7 +221,7 @@ def test_band_average_is_that_of_many_retarders():
     assert np.abs(one - expected).max() > 10 * np.abs(found - expected).max()
 
 
-def test_depolarizer_of_an_elliptical_retarder_lies_along_its_steep_axis():
+def test_depolarizer_of_an_elliptical_retarder_lies_along_its_steep_axis(other_svd):
     size = WAVELENGTH.size
     steep = 30 * np.tanh(np.linspace(-3, 3, size)) * u.deg
     optic = optics.EllipticalRetarder(
@@ -229,9 +229,10 @@ def test_depolarizer_of_an_elliptical_retarder_lies_along_its_steep_axis():
     )
     chains, data = clean("fringes_drift")
     chain = insert_optic(chains[0], optic, before="wollaston")
-    edit = EFFECTS["dichroic_band_average"].edit([chain], context_of(data))
-    theta = edit.chains[0]["gap_dichroic_band_average"].theta.value
-    assert np.isclose(abs(theta) % 90, 45)
+    for _ in range(2):
+        edit = EFFECTS["dichroic_band_average"].edit([chain], context_of(data))
+        assert edit.chains[0]["gap_dichroic_band_average"].theta.value == pytest.approx(45)
+        other_svd()
 
 
 def test_fringes_whose_phase_drifts_are_a_cosine_and_a_sine():

@@ -191,6 +191,17 @@ def test_spectra_that_do_not_belong_together_are_refused():
         table_from_spectra(spectra | {"w": spectra["q"]})
     with pytest.raises(ObservationError, match="spectrum u: is on another spectral axis"):
         table_from_spectra(spectra | {"u": spectra["u"][:-1]})
+    # 5 nm beside the others, in whatever unit
+    shifted = {
+        key: specutils.Spectrum(
+            flux=one.flux,
+            spectral_axis=one.spectral_axis.to(u.m) + (key == "u") * 5 * u.nm,
+            uncertainty=one.uncertainty,
+        )
+        for key, one in spectra.items()
+    }
+    with pytest.raises(ObservationError, match="spectrum u: is on another spectral axis"):
+        table_from_spectra(shifted)
     bare = specutils.Spectrum(flux=spectra["q"].flux, spectral_axis=spectra["q"].spectral_axis)
     with pytest.raises(ObservationError, match="spectrum q: has no uncertainty"):
         table_from_spectra(spectra | {"q": bare})
