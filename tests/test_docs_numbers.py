@@ -198,12 +198,11 @@ def test_numbers_of_the_law_of_m3(joint_data):
     cal = calibrate(chains, joint_data, cross_validate=False)
     known = cal.parameter_values()
     numbers = [known[f"m3.{name}"] for name in ("m1", "m2", "b1", "b2")]
-    assert "at its bound" in _cell(":math:`m_1")
-    assert numbers[0]["at_bound"]
-    errors = [float(number["std"]) for number in numbers[1:]]
-    assert all(np.isnan(error) or error > 0.9 for error in errors)
-    stated = _numbers(_cell(":math:`m_1").replace(" to ", " "))
-    np.testing.assert_allclose([float(n["value"]) for n in numbers[:2]], stated[:2], atol=0.02)
+    # what ends exactly at its bound has no error
+    assert all(number["at_bound"] or number["std"] > 1 for number in numbers)
+    assert "none determined" in _cell(":math:`m_1")
+    diattenuation = cal.chains[2]["m3"].diattenuation(CHARIS.wavelength)
+    _states(":math:`m_1", 100 * diattenuation[0], 100 * diattenuation[-1])
 
 
 @pytest.mark.slow
