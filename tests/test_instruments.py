@@ -262,7 +262,7 @@ def test_setup_reads_what_is_in_the_beam(meta, expected):
     assert _setup(source="polarized", **meta) == ("polarized", expected)
 
 
-@pytest.mark.parametrize("day", [None, "2025-09-01", "unknown", "05.10.2025", "yesterday"])
+@pytest.mark.parametrize("day", [None, "2025-09-01", "2025-10", " "])
 def test_inconclusive_date_is_an_error(day):
     meta = {} if day is None else {"date": day}
     with pytest.raises(InstrumentError, match="neither nasmyth_beam_switcher nor a conclusive"):

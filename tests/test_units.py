@@ -1,16 +1,27 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Units at the door, floats inside."""
+"""Units at the door, floats inside; numbers and dates as texts write them."""
+
+import datetime
 
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.modeling import Parameter
 from astropy.table import Column, QTable
+from astropy.time import Time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.exceptions import ParameterError
-from astropolcal.units import angle_to_rad, canonical_factor, canonical_unit, length_to_um, to_unit
+from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.units import (
+    angle_to_rad,
+    canonical_factor,
+    canonical_unit,
+    iso_date,
+    length_to_um,
+    plain_number,
+    to_unit,
+)
 
 FINITE = st.floats(-1e6, 1e6)
 ANGLES = (u.deg, u.rad, u.arcmin, u.hourangle, u.mas)
@@ -140,3 +151,66 @@ def test_not_a_number_and_infinity_pass():
 def test_what_is_refused_is_named(call, words):
     with pytest.raises(ParameterError, match=words):
         call()
+
+
+# --- numbers and dates as text --------------------------------------------------------------------
+
+
+def test_numbers_are_written_in_plain_digits():
+    """Python alone takes all of these for numbers."""
+    for text, number in (("1000", 1000.0), (" -1.5e3 ", -1500.0), ("inf", np.inf), (7, 7.0)):
+        assert plain_number(text) == number
+    assert plain_number("12", int) == 12
+    assert plain_number("0.625 \u00b5m", u.Quantity) == 625 * u.nm
+    for text in ("1_000", "\u0661\u0662", "\uff11", "1\u0662.5"):
+        assert float(text) > 0
+        with pytest.raises(ValueError, match="is not written as a plain number"):
+            plain_number(text)
+    with pytest.raises(ValueError, match="is not written as a plain number"):
+        plain_number("\u0661\u0662 nm", u.Quantity)
+
+
+def test_all_spellings_of_a_date_become_one():
+    zone = datetime.timezone(datetime.timedelta(hours=10))
+    for date in (
+        *(
+            "2025-10-05",
+            " 2025-10-5",
+            "20251005",
+            20251005,
+            "60953",
+            60953,
+            np.int64(60953),
+            60953.0,
+        ),
+        datetime.date(2025, 10, 5),
+    ):
+        assert iso_date(date) == "2025-10-05"
+    for moment in (
+        *("2025-10-05T12:00", "2025-10-05 12:00:00", "2025-10-05T12:00:00.0Z", "60953.5", 60953.5),
+        *(datetime.datetime(2025, 10, 5, 12), datetime.datetime(2025, 10, 5, 22, tzinfo=zone)),
+        Time("2025-10-05T12:00:37", scale="tai"),
+    ):
+        assert iso_date(moment) == "2025-10-05T12:00:00.000"
+    # the time of day stays where it was stated
+    assert iso_date("2025-10-05T00:00") == "2025-10-05T00:00:00.000"
+    assert iso_date("2025-10", months=True) == "2025-10"
+    # leap seconds so far off are not known, which is no matter here
+    assert iso_date("2099-12-31") == "2099-12-31"
+
+
+def test_what_is_no_date_is_refused():
+    for date in (
+        *("5 Oct 2025", "05.10.2025", "2025-10-05T25:00", "2025-10-05T24:00", "2025-10-05T09"),
+        *("0000-00-00", "0001-01-01", "2025-13-01", "2025-02-30", "20250230", "18991231", 2025),
+        *("12345", 39999, 100000, "60_953", "2025-10", "2025", "", "unknown", True, "J2025.7"),
+        *("\u0662\u0660\u0662\u0665-10-05", "\uff16\uff10\uff19\uff15\uff13", [], np.nan),
+        Time(["2025-10-05"]),
+    ):
+        with pytest.raises(ParameterError, match="is not a date; allowed are 2025-10-05") as caught:
+            iso_date(date)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(
+        ObservationError, match=r"night: date = '2025-10x' is not a date; .*2025-10,"
+    ):
+        iso_date("2025-10x", "night: date", ObservationError, months=True)

@@ -10,6 +10,7 @@ from astropolcal import instruments
 from astropolcal.exceptions import CalibrationFileError, InstrumentError, ObservationError
 from astropolcal.instruments.keywords import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
 from astropolcal.observations.reading import numeric_column
+from astropolcal.units import plain_number
 
 _SKY = ("right_ascension", "declination")
 # columns that are no angles of a stage, though their values may be numbers
@@ -190,7 +191,7 @@ def _sky(column, values):
     from astropy.coordinates import Angle
 
     try:
-        numbers = [float(value) for value in values]
+        numbers = [plain_number(value) for value in values]
         # plain numbers are degrees, also for the right ascension; sexagesimal ones are hours there
         return numbers * u.deg
     except (TypeError, ValueError):

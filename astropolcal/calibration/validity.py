@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """For what a calibration holds: instrument, mode, dates, optics in the beam; and its hash."""
 
-import re
 import warnings
 from dataclasses import asdict, dataclass, replace
 
@@ -20,11 +19,12 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.instruments import Instrument
+from astropolcal.observations.reading import stated_date
+from astropolcal.units import iso_date
 
 __all__ = ["Validity", "content_hash", "validity_of", "with_validity"]
 
 _STATED = ("mode", "valid_from", "valid_until", "optics_in")
-_DAY = re.compile(r"\d{4}-\d\d(-\d\d)?(T[0-9:.]+)?")
 # how a caller states what headers lack, where a command has no option for it
 _WAYS = {"date": "date= states it", "mode": "mode={}"}
 
@@ -121,16 +121,7 @@ def _moment(value, key):
     """Return a moment as ISO text in UTC, a date alone where it is midnight."""
     if value is None:
         return None
-    try:
-        with warnings.catch_warnings():
-            # leap seconds to come are of no matter here
-            warnings.simplefilter("ignore", ErfaWarning)
-            text = Time(value if isinstance(value, Time) else str(value), scale="utc").utc.isot
-    except Exception as error:  # astropy raises errors of many kinds
-        raise CalibrationFileError(
-            f"{key} = {value!r} is not a date such as 2025-10-05 or 2025-10-05T09:30"
-        ) from error
-    return text.removesuffix("T00:00:00.000")
+    return iso_date(value, key, CalibrationFileError).removesuffix("T00:00:00.000")
 
 
 def optics_sets(optics_in):
@@ -168,7 +159,7 @@ def validity_of(calibration):
     Raises
     ------
     CalibrationFileError
-        If what was stated makes no sense.
+        If what was stated makes no sense, or the date of a dataset is not one.
 
     Examples
     --------
@@ -222,7 +213,6 @@ def check_frames(calibration, frames, name, *, max_age=None, light="sky", ways=N
     ways : dict of str to str, optional
         What the caller can do about a missing ``date`` or ``mode``, and an ``other date``, in
         words.
-
     dates : bool
         Whether the dates matter, or only the mode.
 
@@ -261,8 +251,8 @@ def check_frames(calibration, frames, name, *, max_age=None, light="sky", ways=N
     if held.valid_from and held.valid_from > days[-1]:
         # who states that it holds from a later day on vouches for what changed until then
         changes = [change for change in changes if held.valid_from[:10] < change[1]]
-    for day, label in {moment[:10]: label for moment, label in moments.items()}.items():
-        _check_changes(changes, days, day, f"{label}, {name}", ways["date"])
+    for moment, label in moments.items():
+        _check_changes(changes, days, moment[:10], f"{label}, {name}", ways["date"])
     # (n_moments, n_days), in days
     apart = np.abs((_time(list(moments))[:, None] - _time(days)).to_value(u.day)).min(axis=1)
     limit, worst = _max_age(max_age, held, instrument_of(calibration)), apart.argmax()
@@ -341,9 +331,7 @@ def _max_age(max_age, held, instrument):
 
 def _dates(calibration):
     """Return the dates of a calibration's data, the oldest first."""
-    return sorted(
-        text for record in calibration.datasets if (text := _day(record.meta.get("date")))
-    )
+    return sorted(day for record in calibration.datasets if (day := _first_day(record)))
 
 
 def _time(moments):
@@ -353,17 +341,11 @@ def _time(moments):
         return Time(moments, format="isot", scale="utc")
 
 
-def _day(value):
-    """Return a date of a table's meta in full; None for what is none."""
-    match = _DAY.fullmatch(str(value or "").strip())
-    if match is None:
-        return None
+def _first_day(record):
+    """Return the date of a dataset's meta, with a day; None where there is none."""
+    date = stated_date(record.meta, record.name, CalibrationFileError)
     # a month alone begins on its first day
-    text = match[0] if match[1] or match[2] else f"{match[0]}-01"
-    try:
-        return _moment(text, "date")
-    except CalibrationFileError:
-        return None
+    return f"{date}-01" if date is not None and len(date) == len("2025-10") else date
 
 
 def _optics_of(calibration):

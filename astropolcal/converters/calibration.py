@@ -169,11 +169,12 @@ def _validity(calibration):
     """Return what tells whether a frame may be reduced with the calibration."""
     from astropolcal.calibration.validity import validity_of
     from astropolcal.chain import leaves
+    from astropolcal.observations.reading import stated_date
 
-    dates = {str(record.meta["date"]) for record in calibration.datasets if "date" in record.meta}
+    dates = {stated_date(r.meta, r.name, CalibrationFileError) for r in calibration.datasets}
     return {
         **validity_of(calibration).to_dict(),
-        "dates": sorted(dates),
+        "dates": sorted(dates - {None}),
         "optics_in_beam": [[leaf.name for leaf in leaves(chain)] for chain in calibration.chains],
     }
 

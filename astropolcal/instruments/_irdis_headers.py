@@ -9,6 +9,7 @@ from astropy.time import Time
 
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.observations.pointings import pointing
+from astropolcal.units import plain_number
 
 __all__ = ["frame_table"]
 
@@ -44,7 +45,7 @@ class _Header:
     def number_of(self, key, low=-np.inf):
         text = self.text(key)
         try:
-            value = float(text)
+            value = plain_number(text)
         except ValueError:
             value = np.nan
         if not (np.isfinite(value) and value >= low):

@@ -1,18 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Optics of SPHERE/IRDIS with their published values, one a filter, and the coatings."""
 
-import re
 import warnings
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from astropy.time import Time
 
 from astropolcal import optics
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError
 from astropolcal.instruments._choices import check_choice
+from astropolcal.observations.reading import stated_date
+from astropolcal.units import iso_date
 
 # van Holstein et al. 2020, as distributed with their pipeline; one row a filter
 _DATA = QTable.read(Path(__file__).parents[1] / "data" / "irdis.ecsv", format="ascii.ecsv")
@@ -55,10 +55,7 @@ def check_all_filters(found):
 
 def coating_on(date):
     """Return "before" or "after", the coating on a date."""
-    day = date.utc.isot[:10] if isinstance(date, Time) and date.isscalar else str(date)[:10]
-    if not re.fullmatch(r"\d{4}-[01]\d-[0-3]\d", day):
-        raise InstrumentError(f"date = {date!r}; an ISO date such as {RECOATING} is needed")
-    return "before" if day < RECOATING else "after"
+    return "before" if iso_date(date, error=InstrumentError)[:10] < RECOATING else "after"
 
 
 def stated_coating(observations):
@@ -67,12 +64,13 @@ def stated_coating(observations):
     if stated is not None:
         check_choice(f"{observations.name}: coating", stated, COATINGS)
         return stated
-    if observations.meta.get("date") is None:
+    date = stated_date(observations.meta, observations.name, InstrumentError)
+    if date is None:
         raise InstrumentError(
             f"{observations.name}: neither date nor coating in the table's meta; were the "
             f"telescope's mirrors those 'before' or 'after' {RECOATING}?"
         )
-    return coating_on(observations.meta["date"])
+    return coating_on(date)
 
 
 def coating_of(coating, date):

@@ -12,8 +12,6 @@ both signs turned, (H, 45, R) to (-H, -45, R): an exact mirror solution, with
 the same double differences.
 """
 
-import re
-
 import astropy.units as u
 import numpy as np
 
@@ -34,6 +32,7 @@ from astropolcal.instruments.telescope import (
     telescope,
     tertiary_mirror,
 )
+from astropolcal.observations.reading import stated_date
 
 __all__ = ["CHARIS"]
 
@@ -332,8 +331,9 @@ def _beam_switcher(meta, name):
     stated = _stated(meta, name, "nasmyth_beam_switcher", words)
     if stated is not None:
         return stated
-    day = str(meta.get("date", ""))[:10]
-    by_date = _switcher_by(day) if re.fullmatch(r"\d{4}-\d\d-\d\d", day) else None
+    day = (stated_date(meta, name, InstrumentError) or "")[:10]
+    # a month alone is not conclusive
+    by_date = _switcher_by(day) if len(day) == len("2025-10-01") else None
     if by_date is not None:
         return by_date
     raise InstrumentError(

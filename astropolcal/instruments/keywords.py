@@ -14,6 +14,8 @@ from astropy.io.fits.card import Undefined
 from astropy.time import Time
 from erfa import ErfaWarning
 
+from astropolcal.units import iso_date, plain_number
+
 __all__ = [
     "ANGLES",
     "RANGES",
@@ -157,7 +159,7 @@ def convert(column, value, layout, target):
     """
     factor, offset = layout.transforms.get(column, (1.0, 0.0))
     unit = unit_of(column, layout)
-    return (factor * float(value) + offset) * unit.to(target)
+    return (factor * plain_number(value) + offset) * unit.to(target)
 
 
 def frame_time(header, layout):
@@ -191,12 +193,12 @@ def frame_time(header, layout):
     """
     mjd, date, clock = (look_up([header], key, layout)[1] for key in ("mjd", "date", "time"))
     if mjd is not None:
-        return in_calendar(Time(float(mjd), format="mjd", scale="utc"))
+        return in_calendar(Time(plain_number(mjd), format="mjd", scale="utc"))
     if date is None:
         return None
-    day = str(date).strip()
+    day = iso_date(date)
     if "T" not in day and clock is not None:
-        day = f"{day}T{str(clock).strip()}"
+        day = iso_date(f"{day}T{str(clock).strip()}")
     return in_calendar(Time(day, scale="utc"))
 
 

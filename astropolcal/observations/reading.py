@@ -9,22 +9,34 @@ and columns of Python objects are refused.
 """
 
 import io
+import re
 import textwrap
 import warnings
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.io import ascii
 from astropy.table import QTable, Table
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import check_yaml, one_line, understood
 from astropolcal.observations.wavelengths import stated_wavelength
+from astropolcal.units import iso_date, plain_number
 
-__all__ = ["check_table", "complete_table", "first_bad_row", "numeric_column", "read_ecsv"]
+__all__ = [
+    "check_table",
+    "complete_table",
+    "first_bad_row",
+    "numeric_column",
+    "read_ecsv",
+    "stated_date",
+]
 
 # real headers have 1 to 3 kB; the YAML loader needs seconds for a quarter of a megabyte
 _MAX_HEADER = 2**18
+# a text in which there may be numbers such as 1_000, or digits of another script
+_ODD_NUMBERS = re.compile(r"[0-9]_[0-9]|[^\x00-\x7f]")
 _SINGLE = ("single_difference", "single_sum")
 
 
@@ -65,7 +77,10 @@ def read_ecsv(path):
         _check_header(path, text)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # doubtful units and types are errors below
-            return QTable.read(io.BytesIO(text.encode()), format="ascii.ecsv")
+            table = QTable.read(io.BytesIO(text.encode()), format="ascii.ecsv")
+            if _ODD_NUMBERS.search(text):
+                _check_numbers(path, text)
+        return table
 
 
 def _read_text(path):
@@ -99,6 +114,21 @@ def _check_header(path, text):
         check_yaml(textwrap.dedent("\n".join(lines[1:])), ObservationError)
     except ObservationError as error:
         raise ObservationError(f"{path}: not a readable ECSV table: {error}") from None
+
+
+def _check_numbers(path, text):
+    """Refuse what astropy reads as numbers, as Python does, though no program writes them so."""
+    reader = ascii.get_reader(ascii.Ecsv)
+    reader.read(text)
+    for column in (c for c in reader.cols if c.data.dtype.kind in "iuf" and c.data.ndim == 1):
+        for row, cell in enumerate(column.str_vals):
+            try:
+                plain_number(cell)
+            except ValueError:
+                raise ObservationError(
+                    f"{path}, row {row + 1}: {column.name} = {one_line(cell, 40)}, "
+                    "allowed are numbers such as 1000 or 1e3"
+                ) from None
 
 
 def check_table(table, label, required):
@@ -159,6 +189,42 @@ def _check_plain(column, name, label):
         raise ObservationError(
             f"{label}: column {name} has shape {column.shape}, one value a row is allowed"
         )
+
+
+def stated_date(meta, label, error=ObservationError):
+    """
+    Return the date in the meta of a table.
+
+    Parameters
+    ----------
+    meta : dict
+        Of the table.
+    label : str
+        What to call the table in messages.
+    error : type
+        What to raise.
+
+    Returns
+    -------
+    str or None
+        As `~astropolcal.units.iso_date` returns it, perhaps a month alone; None where the meta
+        have none.
+
+    Raises
+    ------
+    AstropolcalError
+        Of the type given, if there is a date that cannot be understood.
+
+    Examples
+    --------
+    >>> from astropolcal.observations.reading import stated_date
+    >>> stated_date({"date": 60953}, "night.ecsv")
+    '2025-10-05'
+    """
+    value = meta.get("date")
+    if value is None or not str(value).strip():
+        return None
+    return iso_date(value, f"{label}: date in the meta", error, months=True)
 
 
 def complete_table(table, label):

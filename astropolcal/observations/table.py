@@ -16,7 +16,12 @@ from astropolcal.observations.grid import build_grid
 from astropolcal.observations.groups import FrameGroups
 from astropolcal.observations.hashing import hash_columns
 from astropolcal.observations.pairing import PAIRINGS
-from astropolcal.observations.reading import complete_table, numeric_column, read_ecsv
+from astropolcal.observations.reading import (
+    complete_table,
+    numeric_column,
+    read_ecsv,
+    stated_date,
+)
 from astropolcal.observations.selection import masked_grid, some_bins, some_frames
 from astropolcal.observations.variances import beam_variances
 from astropolcal.optics import COORDINATES
@@ -60,7 +65,8 @@ class Observations:
     path : `~pathlib.Path` or None
         The file it was read from.
     meta : dict
-        As in the table.
+        As in the table; a ``date`` in it as ``YYYY-MM-DD``, perhaps with the time of day, or
+        ``YYYY-MM``.
 
     Examples
     --------
@@ -77,6 +83,9 @@ class Observations:
         self.meta = dict(meta)
         self.name = str(name)
         self.path = None if path is None else Path(path)
+        # in one form, as dates are compared as text
+        date = stated_date(self.meta, self._label)
+        self.meta |= {} if date is None else {"date": date}
         # from the grid and not from the file: a mask set later holds for them as well
         self._variances = beam_variances(grid.flux_right, grid.flux_left, grid.errors)
         self._groups = FrameGroups(self, grid.rows.tolist(), self._label)

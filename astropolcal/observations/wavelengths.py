@@ -9,6 +9,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.exceptions import ObservationError
+from astropolcal.units import plain_number
 
 __all__ = ["SAME_WAVELENGTH", "common_wavelengths", "filter_wavelength", "stated_wavelength"]
 
@@ -121,7 +122,7 @@ def stated_wavelength(meta, label):
         except ObservationError as error:
             raise ObservationError(f"{label}: {error}") from None
     try:
-        length = u.Quantity(value)
+        length = plain_number(value, u.Quantity)
         good = length.isscalar and length.to_value(u.um) > 0
     except (TypeError, ValueError, u.UnitsError):
         good = False

@@ -17,7 +17,7 @@ from astropy.coordinates import FK5, SkyCoord
 from astropy.time import Time
 from erfa import ErfaError
 
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.fitscheck import primary_header
 from astropolcal.instruments.keywords import (
@@ -29,6 +29,7 @@ from astropolcal.instruments.keywords import (
     look_up,
     unit_of,
 )
+from astropolcal.units import iso_date, plain_number
 
 __all__ = [
     "FrameHeader",
@@ -256,6 +257,13 @@ def _convert(frame, column, keyword, value, layout):
     if column == "flc_state":
         _add_state(frame, keyword, value, layout)
         return
+    if column == "date":
+        try:
+            frame.values[column] = iso_date(value, keyword)
+        except ParameterError as error:
+            # the time may stand in another keyword
+            frame.doubts.append(f"{error}; it was left out")
+        return
     if column in TEXTS:
         frame.values[column] = " ".join(str(value).split())
         return
@@ -354,7 +362,7 @@ def pointing(values, site):
 
 def _is_number(text):
     try:
-        float(text)
+        plain_number(text)
     except (TypeError, ValueError):
         return False
     return True
@@ -387,8 +395,8 @@ def observation_time(values):
     try:
         if "mjd" in values:
             return in_calendar(Time(values["mjd"], format="mjd", scale="utc"))
-        date = values["date"]
-        date = date if "T" in date else f"{date[:10]}T{values['time']}"
+        date = iso_date(values["date"])
+        date = date if "T" in date else iso_date(f"{date}T{values['time']}", "date and time")
         return in_calendar(Time(date, scale="utc"))
     except KeyError as error:
         raise ObservationError(f"no {error.args[0]} to compute the time from") from None

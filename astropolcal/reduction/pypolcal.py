@@ -19,6 +19,7 @@ from astropy.table import QTable
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import one_line
 from astropolcal.observations import Observations
+from astropolcal.units import plain_number
 
 __all__ = ["read_pypolcal"]
 
@@ -125,7 +126,7 @@ def _numbers(rows, column):
     values = np.empty(len(rows))
     for k, (path, i, row) in enumerate(rows):
         try:
-            values[k] = float(row[column])
+            values[k] = plain_number(row[column])
         except (TypeError, ValueError):
             raise ObservationError(
                 f"{path}, line {i}: {column} = {one_line(row[column], 40)!r}, a number is needed"

@@ -15,6 +15,7 @@ import numpy as np
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
 from astropolcal.fitscheck import primary_header
 from astropolcal.observations import Observations, is_star
+from astropolcal.observations.reading import stated_date
 from astropolcal.reduction._sorting import (
     consistent,
     replace_angles,
@@ -239,6 +240,8 @@ def reduce_run(
     photometry = _photometry(source, instrument)
     if not files:
         raise ObservationError("no files to reduce")
+    # before the work is done: the table would be refused
+    stated_date(meta or {}, "reduced")
     files = instrument.files.frame_files(files)
     task = {
         "layout": instrument.files,

@@ -21,6 +21,7 @@ from astropolcal.scripts._common import (
     say_written,
     write_calibration,
 )
+from astropolcal.units import plain_number
 
 _EPILOG = """\
 examples:
@@ -319,7 +320,7 @@ def _target(text):
 def _quantity(text, part, unit, low, high):
     """Return a number with or without unit, in this one."""
     try:
-        value = u.Quantity(part)
+        value = plain_number(part, u.Quantity)
         # a plain number is in the unit of the option
         value = value.value * unit if value.unit == u.one else value.to(unit)
     except (TypeError, ValueError, u.UnitsError):

@@ -18,6 +18,7 @@ from astropolcal.scripts._common import (
     wrapped,
     write_json,
 )
+from astropolcal.units import plain_number
 
 _EPILOG = """\
 examples:
@@ -74,7 +75,7 @@ def add_parser(commands):
 def _range(text):
     """Return the two numbers of ``LOW:HIGH``."""
     try:
-        low, high = map(float, text.split(":"))
+        low, high = map(plain_number, text.split(":"))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form LOW:HIGH") from None
     return low, high

@@ -15,6 +15,7 @@ import numpy as np
 from astropolcal.chain import find_optic, leaves, remove_optic
 from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
 from astropolcal.files import atomic_path
+from astropolcal.units import plain_number
 
 # what a terminal has that nobody made wider
 _COLUMNS = 80
@@ -63,7 +64,7 @@ def add_edits(parser, *names):
 def angles(text):
     """Return the angles of a comma-separated list, in degree."""
     try:
-        return [float(part) for part in text.split(",")]
+        return [plain_number(part) for part in text.split(",")]
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of angles in degree") from None
 
@@ -75,7 +76,7 @@ def number_or(*words):
         if text in words:
             return text
         try:
-            return float(text)
+            return plain_number(text)
         except ValueError:
             allowed = f"{', '.join(words)} or a number"
             raise argparse.ArgumentTypeError(f"{text!r} is not {allowed}") from None
@@ -355,7 +356,7 @@ def _value(name, parameter, text):
     match = re.fullmatch(r"\s*([-+.\d]+(?:[eE][-+]?\d+)?)\s*([A-Za-z%].*)?", text)
     number, unit = match.groups() if match else ("", None)
     try:
-        value = float(number)
+        value = plain_number(number)
     except ValueError:
         raise ParameterError(f"{name}={text}: not a number") from None
     if unit:

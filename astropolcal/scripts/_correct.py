@@ -19,6 +19,7 @@ from astropolcal.scripts._common import (
     wrapped,
     write_json,
 )
+from astropolcal.units import plain_number
 from astropolcal.words import counted
 
 _EPILOG = """\
@@ -204,7 +205,7 @@ def _add_images(parser):
 
 def _point(text):
     try:
-        x, y = (float(part) for part in text.split(","))
+        x, y = (plain_number(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not X,Y") from None
     return x, y

@@ -15,6 +15,7 @@ from astropolcal.scripts._common import (
     say_written,
     write_json,
 )
+from astropolcal.units import iso_date, plain_number
 
 # what is printed as more than 1
 _ABOVE_ONE = 1.0005
@@ -255,7 +256,7 @@ def _target(text):
 
     try:
         # degrees only: names would ask a server
-        ra, dec = (float(part) for part in text.split(","))
+        ra, dec = (plain_number(part) for part in text.split(","))
         if not np.isfinite([ra, dec]).all():
             raise ValueError
         return SkyCoord(ra, dec, unit=u.deg)
@@ -271,7 +272,7 @@ def _times(text):
     from astropy.time import Time
 
     try:
-        start, end = (Time(part, scale="utc") for part in text.split("/"))
+        start, end = (Time(iso_date(part), scale="utc") for part in text.split("/"))
     except ValueError:
         raise ParameterError(
             f"--night {text}: write START/END in UTC, such as 2025-11-03T08:00/2025-11-03T12:00"

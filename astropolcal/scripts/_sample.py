@@ -18,6 +18,7 @@ from astropolcal.scripts._common import (
     wrapped,
     write_calibration,
 )
+from astropolcal.units import plain_number
 from astropolcal.words import counted
 
 _EPILOG = """\
@@ -96,7 +97,7 @@ def _burn_in(text):
     if text == "auto":
         return None
     try:
-        return int(text)
+        return plain_number(text, int)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor auto") from None
 

@@ -12,6 +12,7 @@ from astropolcal.scripts._common import (
     wrapped,
     write_json,
 )
+from astropolcal.units import plain_number
 from astropolcal.words import counted, did_you_mean
 
 # more stars than this make a figure unreadable
@@ -379,7 +380,7 @@ def _numbers(text, option, count):
     if text is None:
         return None
     try:
-        values = tuple(float(part) for part in text.split(","))
+        values = tuple(plain_number(part) for part in text.split(","))
     except ValueError:
         values = ()
     if len(values) != count or not all(map(math.isfinite, values)):

@@ -10,6 +10,7 @@ import os
 import re
 import sys
 import warnings
+from functools import partial
 
 from astropolcal.version import version
 
@@ -29,10 +30,19 @@ class _OneLineParser(argparse.ArgumentParser):
         super().__init__(*arguments, **settings)
         # argparse itself knows single numbers only, and takes a list for an unknown option
         self._negative_number_matcher = re.compile(r"-\.?\d")
+        for kind in (float, int):
+            self.register("type", kind, partial(_number, kind))
 
     def error(self, message):
         # argparse prints the usage in several lines before its complaint
         self.exit(2, f"astropolcal: error: {message} (see {self.prog} --help)\n")
+
+
+def _number(kind, text):
+    """Return the value of an option whose type is a number, which Python would read too gladly."""
+    from astropolcal.units import plain_number
+
+    return plain_number(text, kind)
 
 
 def build_parser():

@@ -9,7 +9,7 @@ from astropy.time import Time
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations.pointings import offline, pointing
-from astropolcal.units import angle_to_rad
+from astropolcal.units import angle_to_rad, iso_date
 from astropolcal.words import did_you_mean
 
 __all__ = ["offline", "pointing"]
@@ -62,26 +62,24 @@ def night_times(site, night, *, twilight, step):
 
 def _evening_noon(site, night):
     """Return the local mean noon of the date on which the night begins."""
-    text = date_of(night)
-    try:
-        date = Time(text, scale="utc", format="iso", out_subfmt="date")
-        # astropy reads more than dates, such as 2025-11 or a time
-        # of day, and would fill in the rest
-        if date.to_value("iso", "date") != text:
-            raise ValueError
-    except (ValueError, TypeError):
-        raise ParameterError(
-            f"night = {night!r} must be the date of the evening, such as '2025-11-03'"
-        ) from None
-    # a time of its own, which is not printed as a date
+    date = Time(date_of(night), scale="utc")
+    # a time of its own, which is printed to the second
     noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
     # local mean noon is 12 h UTC minus the east longitude
     return noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day
 
 
 def date_of(night):
-    """Return the date of a night as text."""
-    return night.to_value("iso", "date") if isinstance(night, Time) else str(night).strip()
+    """Return the date of the evening as text, or raise."""
+    try:
+        text = iso_date(night.to_value("iso", "date") if isinstance(night, Time) else night)
+        if "T" in text:
+            raise ValueError
+    except ValueError:
+        raise ParameterError(
+            f"night = {night!r} must be the date of the evening, such as '2025-11-03'"
+        ) from None
+    return text
 
 
 def checked(min_altitude, twilight, step):

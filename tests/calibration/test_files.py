@@ -458,6 +458,25 @@ def test_prior_of_an_unknown_kind_is_refused(change, message):
         calibration_from_node(node)
 
 
+def test_unreadable_date_of_an_older_file_is_refused(content, path, monkeypatch):
+    """Such files could be written once; they would hold from any date on."""
+    from astropolcal.calibration import Library, validity_of
+    from astropolcal.converters import calibration as converter
+
+    monkeypatch.setattr(converter, "_checksum", lambda node: node["checksum"])
+    path.write_bytes(replaced(content, b"date: '2025-10-02'", b"date: 2 Oct 2025"))
+    with pytest.raises(
+        CalibrationFileError, match=r"night1: .*'2 Oct 2025' is not a date"
+    ) as caught:
+        Calibration.read(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    with pytest.raises(CalibrationFileError, match=rf"{path}: .*'2 Oct 2025' is not a date"):
+        Library(path.parent).find(date="2025-11-01")
+    # of older files also: what can be read counts, and no date at all is fine
+    path.write_bytes(replaced(content, b"date: '2025-10-02'", b"date: '20250102'"))
+    assert validity_of(Calibration.read(path)).valid_from == "2025-01-02"
+
+
 # ---- with the observations again --------------------------------------------------------
 
 

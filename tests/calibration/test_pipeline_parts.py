@@ -371,8 +371,9 @@ def test_without_limits_every_moment_is_inside():
     [
         (["2025-10-05", "2025-09-30"], "2025-09-30"),
         (["2025-10", None], "2025-10-01"),
-        (["sometime", 5], None),
-        (["2025-13-01", "2025-10-05T09:30"], "2025-10-05T09:30:00.000"),
+        (["20251005", 60952], "2025-10-04"),
+        (["2025-10-06", "2025-10-05T09:30"], "2025-10-05T09:30:00.000"),
+        ([" ", None], None),
         ([], None),
     ],
 )
@@ -380,6 +381,14 @@ def test_start_is_the_first_date_that_is_one(dates, start):
     chain = _several()
     cal = _calibration(*[chain] * len(dates), metas=[{"date": d} for d in dates])
     assert validity_of(cal).valid_from == start
+
+
+def test_date_that_cannot_be_read_does_not_pass_for_any_date():
+    cal = _calibration(
+        _several(), _several(), metas=[{"date": "2025-10-05"}, {"date": "5 Oct 2025"}]
+    )
+    with pytest.raises(CalibrationFileError, match=r"night 1: .*'5 Oct 2025' is not a date"):
+        validity_of(cal)
 
 
 @pytest.mark.parametrize(

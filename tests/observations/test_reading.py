@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Bad tables: one line that names the file, the place and what is allowed."""
 
+import datetime
 import re
 import time
 import warnings
@@ -153,6 +154,45 @@ def test_columns_of_objects_are_refused(tmp_path, table):
     table["extra"] = np.array([{"a": 1}] * len(table), dtype=object)
     with pytest.raises(ObservationError, match="column extra has type object; allowed are numbers"):
         from_file(table, tmp_path)
+
+
+def test_numbers_that_only_python_reads_are_refused(tmp_path, table):
+    """Underscores and digits of other scripts, with either delimiter; texts may have them."""
+    path = tmp_path / "night.ecsv"
+    table["file"] = [f"2025_10_05_{i}.fits" for i in table["frame"]]
+    for delimiter in (" ", ","):
+        table.write(path, format="ascii.ecsv", delimiter=delimiter, overwrite=True)
+        text = path.read_text()
+        assert Observations.read(path).n_frames
+        lines = text.splitlines()
+        cells = lines[-2].split(delimiter)
+        for column in ("frame", "hwp", "flux_right"):
+            place = table.colnames.index(column)
+            for value in ("4_5", "\u0664\u0665", "\uff14"):
+                spoiled = [*cells[:place], value, *cells[place + 1 :]]
+                path.write_text("\n".join([*lines[:-2], delimiter.join(spoiled), lines[-1]]))
+                with pytest.raises(ObservationError) as caught:
+                    Observations.read(path)
+                words = f"{path}, row {len(table) - 1}: {column} = {value}, allowed are numbers"
+                assert str(caught.value).startswith(words)
+
+
+def test_dates_of_the_meta_are_read_or_refused(tmp_path, table):
+    path = tmp_path / "night.ecsv"
+    for date in ("2025-10-05", "20251005", 60953, datetime.date(2025, 10, 5)):
+        table.meta["date"] = date
+        table.write(path, format="ascii.ecsv", overwrite=True)
+        assert Observations.read(path).meta["date"] == "2025-10-05"
+    for date in ("2025-10", None, " "):
+        table.meta["date"] = date
+        assert Observations.from_table(table).meta["date"] == date
+    for date in ("5 Oct 2025", "2025-10-05T25:00", "0000-00-00", 5):
+        table.meta["date"] = date
+        assert repr(date) in refuse(table, "date in the meta = .* is not a date; allowed are 2025")
+        table.write(path, format="ascii.ecsv", overwrite=True)
+        with pytest.raises(ObservationError, match="is not a date") as caught:
+            Observations.read(path)
+        assert str(caught.value).startswith(f"{path}: date")
 
 
 # ---- columns ---------------------------------------------------------------------------------

@@ -81,9 +81,25 @@ def test_alternative_keywords_are_tried_in_turn():
     assert read_header("a.fits", LAYOUT, header=cards).values["date"] == "2025-11-04"
 
 
+def test_date_that_cannot_be_read_is_left_out_and_told():
+    frame = read_header("a.fits", LAYOUT, header=header(**{"UTC-DATE": "5 Oct 2025"}))
+    assert "date" not in frame.values
+    assert frame.errors == []
+    assert frame.doubts[0].startswith("UTC-DATE = '5 Oct 2025' is not a date")
+    frame = read_header("a.fits", LAYOUT, header=header(**{"UTC-DATE": "20251005"}))
+    assert frame.values["date"] == "2025-10-05"
+
+
 @pytest.mark.parametrize(
     ("keyword", "value"),
-    [("ALTITUDE", 95.0), ("ALTITUDE", -3.0), ("RET-ANG1", 1e5), ("D_IMRANG", "x"), ("EXPTIME", 0)],
+    [
+        ("ALTITUDE", 95.0),
+        ("ALTITUDE", "6_0"),
+        ("ALTITUDE", -3.0),
+        ("RET-ANG1", 1e5),
+        ("D_IMRANG", "x"),
+        ("EXPTIME", 0),
+    ],
 )
 def test_impossible_values_are_errors_that_name_the_keyword(keyword, value):
     frame = read_header("a.fits", LAYOUT, header=header(**{keyword: value}))
