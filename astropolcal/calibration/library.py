@@ -5,14 +5,25 @@ Libraries of calibrations: which one holds for a frame.
 A library is a folder of calibration files, or some files. Each says for which
 instrument, mode, optics in the beam and dates it holds, and of those that hold
 the newest is taken. What is ambiguous is an error, never a choice.
+
+An index beside the files of a folder tells what each holds for, so that a look-up
+reads one file of many. It only proposes: what is chosen is read, and has to be what
+the index says.
 """
 
+import errno
+import fnmatch
+import hashlib
+import json
+import os
 import re
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+import stat
+import time
+from contextlib import contextmanager, suppress
 from functools import lru_cache
-from itertools import combinations
-from pathlib import Path
+from importlib.metadata import entry_points
+from itertools import islice
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from astropy.table import Table
@@ -21,6 +32,7 @@ from astropolcal import instruments
 from astropolcal.calibration.files import read_calibration, write_calibration
 from astropolcal.calibration.validity import (
     Validity,
+    _moment,
     beam_words,
     content_hash,
     optics_sets,
@@ -29,13 +41,21 @@ from astropolcal.calibration.validity import (
     with_validity,
 )
 from astropolcal.exceptions import CalibrationFileError, InstrumentError
+from astropolcal.files import atomic_path, one_line
+from astropolcal.version import version as our_version
 
 __all__ = ["Entry", "Library"]
 
-_LOCK = ".lock"
+_LOCK, _INDEX, _INDEX_VERSION = ".lock", ".astropolcal-index.json", 1
+# of the index for each file of the folder; 500 are usual
+_MOST_BYTES = 16_384
+# nanoseconds; a younger file may change once more within the same tick of its file system's clock
+_SETTLED = 2_000_000_000
+_LONGEST_NAME, _LONGEST_SLUG, _MOST_SHOWN = 255, 60, 4
+# what the index keeps of how good a calibration is
+_QUALITY = {"datasets": str, "s_res": float | None, "s_cv": float | None, "converged": bool}
 
 
-@dataclass(frozen=True, eq=False)
 class Entry:
     """
     A file of a library.
@@ -44,8 +64,8 @@ class Entry:
     ----------
     path : `~pathlib.Path`
         The file.
-    calibration : Calibration
-        What it holds.
+    calibration : Calibration or None
+        What it holds; None to read it when it is asked for.
     validity : Validity
         For what it holds.
     content_hash : str
@@ -59,21 +79,38 @@ class Entry:
     'lab'
     """
 
-    path: Path
-    calibration: object
-    validity: Validity
-    content_hash: str
+    def __init__(self, path, calibration, validity, content_hash):
+        self.path, self.validity, self.content_hash = path, validity, content_hash
+        self._calibration, self._quality = calibration, None
+
+    def __repr__(self):
+        return f"<Entry {self.name}: {self.validity}>"
 
     @property
     def name(self):
         """Name of the file."""
         return Path(self.path).name
 
+    @property
+    def calibration(self):
+        """What the file holds; an error if that is not what the entry says."""
+        if self._calibration is None:
+            self._calibration = self._read()
+        return self._calibration
 
-@lru_cache(maxsize=256)
-def _entry(path, modified, size):
-    calibration = read_calibration(path)
-    return Entry(path, calibration, validity_of(calibration), content_hash(calibration))
+    def _read(self):
+        path = Path(self.path)
+        try:
+            calibration, record = _read(path, _state(path))
+        except OSError as error:
+            raise CalibrationFileError(f"{path}: {error.strerror}") from error
+        told = {"validity": self.validity.to_dict(), "content_hash": self.content_hash}
+        if told != {key: record[key] for key in told}:
+            raise CalibrationFileError(
+                f"{path}: holds something else than when the library was read; read the library "
+                f"again, and delete {_INDEX} in it if that does not help"
+            )
+        return calibration
 
 
 class Library:
@@ -92,6 +129,11 @@ class Library:
     problems : dict of `~pathlib.Path` to str
         The others, and why.
 
+    Notes
+    -----
+    What the files of a folder hold for is kept in ``.astropolcal-index.json`` beside them, and only
+    files that have changed are read again. A folder that cannot be written to does without.
+
     Raises
     ------
     CalibrationFileError
@@ -109,28 +151,49 @@ class Library:
     def __init__(self, source):
         one = isinstance(source, (str, Path)) or hasattr(source, "__fspath__")
         self.source = Path(source) if one else None
-        self.entries, self.problems = [], {}
-        for path in self._files(source):
-            try:
-                state = path.stat()
-                # read again only if the file has changed
-                self.entries.append(_entry(path.resolve(), state.st_mtime_ns, state.st_size))
-            except (OSError, CalibrationFileError) as error:
-                reason = " ".join(str(error).split())
-                self.problems[path] = reason.removeprefix(f"{path.resolve()}: ")
-        self.entries.sort(key=_order)
-
-    def _files(self, source):
-        if self.source is None:
-            files = [Path(path) for path in source]
-        elif self.source.is_dir():
-            return sorted(p for p in self.source.glob("*.asdf") if not p.name.startswith("."))
-        else:
-            files = [self.source]
-        for path in files:
+        self._files = [self.source] if one else [Path(path) for path in source]
+        for path in self._files:
             if not path.exists():
                 raise CalibrationFileError(f"{path}: no such file or folder")
-        return files
+        self._scan()
+
+    @property
+    def _folder(self):
+        return self.source if self.source is not None and self.source.is_dir() else None
+
+    def _scan(self, believe=True):
+        """Look through the files; those that the index knows are not read."""
+        folder = self._folder
+        files = [(p, p.resolve()) for p in self._files] if folder is None else _files_of(folder)
+        index = _read_index(folder, len(files)) if folder is not None and believe else {}
+        self.entries, self.problems, known = [], {}, {}
+        for path, target in files:
+            try:
+                entry, record = _looked_at(target, index.get(path.name))
+            except (OSError, CalibrationFileError) as error:
+                reason = " ".join(str(error).split())
+                self.problems[path] = reason.removeprefix(f"{target}: ")
+                continue
+            self.entries.append(entry)
+            if record is not None:
+                known[path.name] = record
+        self.entries.sort(key=_order)
+        if folder is not None and known != index:
+            _write_index(folder, known)
+
+    def _confirmed(self, choose):
+        """Return the entry that is chosen when its file is what the entry says, or None."""
+        # the file may have changed since, and after that the index may be wrong
+        for believe in (True, False, None):
+            entry = choose()
+            try:
+                if entry is not None:
+                    entry.calibration  # noqa: B018
+                return entry
+            except CalibrationFileError:
+                if believe is None:
+                    raise
+                self._scan(believe)
 
     def __len__(self):
         return len(self.entries)
@@ -171,22 +234,28 @@ class Library:
             choice between them is open: their ranges overlap, or what is left out
             here would decide. The message names the files.
         """
+        wanted = {"mode": mode, "optics_in": optics_in, "beam": beam or None, "date": date}
+        return self._confirmed(lambda: self._choice(instrument, wanted))
+
+    def _choice(self, instrument, wanted):
         if self.problems:
             path, reason = next(iter(self.problems.items()))
             raise CalibrationFileError(
                 f"{path}: {reason}; as it might be the one that is needed, remove or repair it"
             )
-        wanted = {"mode": mode, "optics_in": optics_in, "beam": beam or None, "date": date}
-        found = [e for e in self.entries if instrument is None or _same(e, instrument)]
+        found, date = _of_instrument(self.entries, instrument), wanted["date"]
+        # once, as it takes longer than to compare
+        moment = _moment(date, "date")
         words = f"no calibration of {instrument}" if instrument else "no calibration"
         for key, value in wanted.items():
             if value is None or not found:
                 continue
-            kept = [e for e in found if _fits(e.validity, key, value)]
+            fitting = moment if key == "date" else value
+            kept = [e for e in found if _fits(e.validity, key, fitting)]
             if not kept:
                 # of several reasons the date says most: there is a
                 # calibration, but not of that time
-                if date is not None and not any(e.validity.holds(date) for e in found):
+                if date is not None and not any(e.validity.holds(moment) for e in found):
                     key, value = "date", date
                 raise CalibrationFileError(self._lacking(words, key, value, found))
             before, found = found, kept
@@ -194,7 +263,7 @@ class Library:
             raise CalibrationFileError(f"{self._label}: {words}{self._known(self.entries)}")
         newest = self._newest(found, wanted | {"instrument": instrument})
         if date is not None:
-            _check_replaced(newest, before, date)
+            _check_replaced(newest, before, moment)
         return newest
 
     def _lacking(self, words, key, value, found):
@@ -207,25 +276,29 @@ class Library:
     def _known(self, entries):
         if not entries:
             return "; it holds none"
-        shown = "; ".join(f"{entry.name} ({entry.validity})" for entry in entries[-4:])
+        shown = "; ".join(f"{entry.name} ({entry.validity})" for entry in entries[-_MOST_SHOWN:])
         return f"; there {'is' if len(entries) == 1 else 'are'} {shown}"
 
     def _newest(self, found, wanted):
         # a copy of a file is no second opinion
-        found = sorted({e.content_hash: e for e in reversed(found)}.values(), key=_order)
+        found = sorted({e.content_hash: e for e in reversed(found)}.values(), key=_start)
         for key in ("instrument", "mode", "optics_in"):
-            kinds = {getattr(e.validity, key) for e in found}
+            kinds = {getattr(e.validity, key): e for e in reversed(found)}
             if len(kinds) > 1 and wanted[key] is None:
-                names = ", ".join(f"{e.name} ({e.validity})" for e in found)
+                # one of each kind is enough to choose by
+                names = _shown(
+                    [f"{e.name} ({e.validity})" for e in sorted(kinds.values(), key=_order)]
+                )
                 raise CalibrationFileError(
                     f"{self._label}: {names}: say which {key} is meant", argument=key
                 )
         if len(found) > 1 and wanted["date"] is None:
-            names = ", ".join(e.name for e in found)
+            names = _shown([e.name for e in found])
             raise CalibrationFileError(f"{self._label}: {names}: a date is needed to choose")
         *others, newest = found
         for other in others:
-            _check_overlap(other, newest)
+            if _meet(other, newest):
+                raise CalibrationFileError(_overlap(other, newest))
         return newest
 
     def add(self, calibration, name=None, **stated):
@@ -237,7 +310,8 @@ class Library:
         calibration : Calibration
             The calibration.
         name : str, optional
-            Name of the file, by default made of instrument, mode, start and hash.
+            Name of the file, with suffix ``.asdf``; by default it is made of instrument, mode,
+            start and hash.
         **stated
             As for `with_validity`.
 
@@ -249,33 +323,41 @@ class Library:
         Raises
         ------
         CalibrationFileError
-            If the library is no folder, a file of the name exists, or the range overlaps with
-            that of a calibration in it.
+            If the library is no folder, the name is not that of a file in it, a file of the name
+            exists, or the range overlaps with that of a calibration in it.
         """
-        if self.source is None or not self.source.is_dir():
+        if self._folder is None:
             raise CalibrationFileError(f"{self._label}: only a folder can be added to")
         calibration = with_validity(calibration, **stated)
-        new = Entry(Path("new"), calibration, validity_of(calibration), content_hash(calibration))
-        path = self.source / (name or _name(new))
+        held, digest = validity_of(calibration), content_hash(calibration)
+        path = self.source / (_name(held, digest) if name is None else _checked_name(name))
+        new = Entry(path, calibration, held, digest)
         with _locked(self.source):
-            here = Library(self.source)
-            for entry in here.entries:
-                if entry.content_hash == new.content_hash:
-                    return self.source / entry.name
-                _check_pair(entry, replace(new, path=path))
+            self._scan()
+            same = self._confirmed(lambda: self._of_hash(digest))
+            if same is not None:
+                return self.source / same.name
+            for entry in self.entries:
+                _check_pair(entry, new)
             # within the lock, or two writers at once could both find nothing that overlaps
             write_calibration(calibration, path)
-            self.__init__(self.source)
+            self._scan()
         return path
+
+    def _of_hash(self, digest):
+        return next((entry for entry in self.entries if entry.content_hash == digest), None)
 
     def overlaps(self):
         """Return a sentence for each pair of different files that claim the same moment."""
-        found = []
-        for one, other in combinations(self.entries, 2):
-            try:
-                _check_pair(one, other)
-            except CalibrationFileError as error:
-                found.append(str(error))
+        found, entries = [], sorted(self.entries, key=_order)
+        for i, first in enumerate(entries):
+            name = first.validity.instrument
+            for second in islice(entries, i + 1, None):
+                # in the order of instruments and starts: none that follows meets it either
+                if second.validity.instrument != name or not _meet(first, second):
+                    break
+                if _differ(first, second):
+                    found.append(_overlap(first, second))
         return found
 
     def table(self):
@@ -291,7 +373,7 @@ class Library:
         """
         rows = []
         for entry in self.entries:
-            held, cal = entry.validity, entry.calibration
+            held, good = entry.validity, entry._quality or _quality(entry.calibration)
             rows.append(
                 {
                     "name": entry.name,
@@ -300,10 +382,10 @@ class Library:
                     "valid_from": held.valid_from or "",
                     "valid_until": held.valid_until or "",
                     "optics_in": optics_words(held.optics_in).removeprefix("with "),
-                    "datasets": ", ".join(record.name for record in cal.datasets),
-                    "s_res": _worst_median(cal, "s_res"),
-                    "s_cv": _worst_median(cal, "s_cv"),
-                    "converged": cal.converged,
+                    "datasets": good["datasets"],
+                    "s_res": np.nan if good["s_res"] is None else good["s_res"],
+                    "s_cv": np.nan if good["s_cv"] is None else good["s_cv"],
+                    "converged": good["converged"],
                     "content_hash": entry.content_hash,
                 }
             )
@@ -311,16 +393,22 @@ class Library:
 
 
 def _order(entry):
-    held = entry.validity
-    return (held.instrument or "", held.valid_from or "", str(entry.path))
+    return (entry.validity.instrument or "", *_start(entry))
 
 
-def _same(entry, instrument):
-    stated = entry.validity.instrument
+def _start(entry):
+    return (entry.validity.valid_from or "", str(entry.path))
+
+
+def _of_instrument(entries, instrument):
+    if instrument is None:
+        return entries
+    names = {entry.validity.instrument for entry in entries} - {None}
     try:
-        return stated is not None and instruments.get(instrument).answers_to(stated)
+        same = {name for name in names if instruments.get(instrument).answers_to(name)}
     except InstrumentError:
-        return stated is not None and stated.lower() == str(instrument).lower()
+        same = {name for name in names if name.lower() == str(instrument).lower()}
+    return [entry for entry in entries if entry.validity.instrument in same]
 
 
 def _fits(validity, key, value):
@@ -349,35 +437,40 @@ def _alike(one, other):
     return one.instrument == other.instrument and modes and bool(sets)
 
 
+def _differ(one, other):
+    """Return whether two are different ones, of which some frame could choose either."""
+    # a copy under another name chooses the same
+    return one.content_hash != other.content_hash and _alike(one.validity, other.validity)
+
+
 def _check_pair(one, other):
     """Refuse two different files of which some frame could choose neither."""
-    # a copy under another name chooses the same
-    if one.content_hash == other.content_hash or not _alike(one.validity, other.validity):
-        return
     first, second = sorted([one, other], key=_order)
-    end = first.validity.valid_until
+    if _differ(first, second) and _meet(first, second):
+        raise CalibrationFileError(_overlap(first, second))
+
+
+def _meet(first, second):
+    """Return whether two claim a moment both; one without an end makes way for a newer one."""
+    older, newer = first.validity, second.validity
+    if older.valid_until is None:
+        return older.valid_from == newer.valid_from
     # ISO texts in UTC compare as the moments do
-    if end is None or end > (second.validity.valid_from or ""):
-        _check_overlap(first, second)
+    return older.valid_until > (newer.valid_from or "")
 
 
-def _check_overlap(older, newer):
-    """Refuse two that claim a moment both; one without an end makes way for a newer one."""
-    first, second = older.validity, newer.validity
-    if first.valid_until is None and first.valid_from != second.valid_from:
-        return
-    raise CalibrationFileError(
-        f"{older.name} ({first}) and {newer.name} ({second}) overlap: state until when the "
-        "first holds, or remove one of them"
+def _overlap(older, newer):
+    return (
+        f"{older.name} ({older.validity}) and {newer.name} ({newer.validity}) overlap: state "
+        "until when the first holds, or remove one of them"
     )
 
 
-def _check_replaced(entry, others, date):
+def _check_replaced(entry, others, moment):
     """Refuse one without an end that another had replaced which has ended since."""
     held = entry.validity
     if held.valid_until is not None:
         return
-    moment = Validity(valid_from=date).valid_from
     for other in others:
         if (held.valid_from or "") < (other.validity.valid_from or "") <= moment:
             raise CalibrationFileError(
@@ -386,18 +479,172 @@ def _check_replaced(entry, others, date):
             )
 
 
-def _name(entry):
-    held = entry.validity
-    parts = [held.instrument, held.mode, (held.valid_from or "")[:10], entry.content_hash[:8]]
-    slugs = [re.sub(r"[^A-Za-z0-9.-]+", "-", part).strip("-") for part in parts if part]
-    return "_".join(slugs) + ".asdf"
+def _shown(words):
+    """Return the first few in a line."""
+    more = f" and {len(words) - _MOST_SHOWN} more" if len(words) > _MOST_SHOWN else ""
+    return ", ".join(words[:_MOST_SHOWN]) + more
+
+
+def _name(held, digest):
+    parts = [held.instrument, held.mode, (held.valid_from or "")[:10], digest[:8]]
+    slugs = [re.sub(r"[^A-Za-z0-9.-]+", "-", part)[:_LONGEST_SLUG] for part in parts if part]
+    return "_".join(slug.strip("-.") for slug in slugs) + ".asdf"
+
+
+def _checked_name(name):
+    """Return the name of a file to add, refused where it leads out of the folder or is hidden."""
+    good = (
+        isinstance(name, str)
+        # of another system too: a library may be copied there
+        and PureWindowsPath(name).name == name
+        and name.isprintable()
+        and len(os.fsencode(name)) <= _LONGEST_NAME
+        and name.endswith(".asdf")
+        and not name.startswith(".")
+    )
+    if not good:
+        raise CalibrationFileError(
+            f"name = {one_line(repr(name))} cannot be added: allowed are names of files without "
+            f"folder or leading dot, of at most {_LONGEST_NAME} bytes, with suffix .asdf",
+            argument="name",
+        )
+    return name
+
+
+# ---- the index ---------------------------------------------------------------------------
+
+
+def _files_of(folder):
+    """Return the calibration files of a folder, each with where it really is."""
+    try:
+        with os.scandir(folder) as found:
+            links = {file.name: file.is_symlink() for file in found if file.name[0] != "."}
+    except OSError as error:
+        raise CalibrationFileError(f"{folder}: cannot be read: {error.strerror}") from error
+    root = folder.resolve()
+    # to resolve each of them would take longer than all the rest
+    return [
+        (folder / name, (root / name).resolve() if links[name] else root / name)
+        for name in sorted(fnmatch.filter(links, "*.asdf"))
+    ]
+
+
+def _state(path):
+    """Return by what a change of a file is noticed, and whether any change from now on is."""
+    told = os.stat(path)
+    settled = time.time_ns() - max(told.st_mtime_ns, told.st_ctime_ns) > _SETTLED
+    # size and time of change stay where a copy with old times is put in its place
+    return (told.st_size, told.st_mtime_ns, told.st_ctime_ns, told.st_ino, settled)
+
+
+@lru_cache(maxsize=256)
+def _read(path, state):
+    """Return a calibration, and what the index keeps of a file in this state."""
+    calibration = read_calibration(path)
+    return calibration, {
+        "state": list(state),
+        "validity": validity_of(calibration).to_dict(),
+        "content_hash": content_hash(calibration),
+        "quality": _quality(calibration),
+    }
+
+
+def _quality(calibration):
+    return {
+        "datasets": ", ".join(record.name for record in calibration.datasets),
+        "s_res": _worst_median(calibration, "s_res"),
+        "s_cv": _worst_median(calibration, "s_cv"),
+        "converged": bool(calibration.converged),
+    }
 
 
 def _worst_median(calibration, key):
     tables = [r.accuracy for r in calibration.datasets if r.accuracy is not None]
     known = [t[key].value[np.isfinite(t[key].value)] for t in tables if key in t.colnames]
-    # NaN of a column that no dataset fills: there is no accuracy, not a perfect one
-    return max((float(np.median(values)) for values in known if values.size), default=np.nan)
+    # None of a column that no dataset fills: there is no accuracy, not a perfect one
+    return max((float(np.median(values)) for values in known if values.size), default=None)
+
+
+def _looked_at(path, told):
+    """Return the entry of a file, read unless the index tells it, and what the index keeps."""
+    state = _state(path)
+    entry = _entry(path, told, state)
+    if entry is not None:
+        return entry, told
+    record = _read(path, state)[1]
+    keeps = state[-1] and len(json.dumps(record)) <= _MOST_BYTES
+    return _entry(path, record, state), record if keeps else None
+
+
+def _entry(path, record, state):
+    """Return the entry that a record tells of; None if it is of another state, or nonsense."""
+    try:
+        quality, held = record["quality"], Validity(**record["validity"])
+        sound = [isinstance(quality[key], kind) for key, kind in _QUALITY.items()]
+        sound += [isinstance(held.instrument, str | None), isinstance(record["content_hash"], str)]
+        if record["state"] != list(state) or not all(sound):
+            return None
+    except (LookupError, TypeError, CalibrationFileError):
+        return None
+    entry = Entry(path, None, held, record["content_hash"])
+    entry._quality = quality
+    return entry
+
+
+def _read_index(folder, n_files):
+    """Return what the index tells of each file; nothing if it is damaged or of other software."""
+    most = _MOST_BYTES * (n_files + 1)
+    try:
+        with os.fdopen(_open_plain(folder / _INDEX, os.O_RDONLY), "rb") as stream:
+            content = stream.read(most + 1)
+        index = json.loads(content) if len(content) <= most else {}
+        files = index["files"]
+        return files if isinstance(files, dict) and index == _index(files) else {}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return {}
+
+
+def _write_index(folder, files):
+    """Write the index where that is possible; without one, all files are read each time."""
+    path = folder / _INDEX
+    with suppress(OSError, CalibrationFileError):
+        # what somebody put there is left alone
+        if not os.path.lexists(path) or stat.S_ISREG(os.lstat(path).st_mode):
+            with atomic_path(path, error=CalibrationFileError) as temporary:
+                temporary.write_text(json.dumps(_index(files)), encoding="ascii")
+
+
+def _index(files):
+    content = json.dumps(files, sort_keys=True).encode("ascii")
+    return {
+        "version": _INDEX_VERSION,
+        "software": _software(),
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "files": files,
+    }
+
+
+def _software():
+    """Return what decides, besides the files, for what they hold."""
+    known = {*instruments._REGISTRY, *(name for name, *_ in _plugins())}
+    return [our_version, sorted(known), [list(plugin) for plugin in _plugins()]]
+
+
+@lru_cache(maxsize=1)
+def _plugins():
+    points = entry_points(group="astropolcal.instruments")
+    return sorted((p.name, p.value, p.dist.version if p.dist else "") for p in points)
+
+
+def _open_plain(path, flags):
+    """Open a regular file, never what a link leads to, and wait for nothing."""
+    for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"):
+        flags |= getattr(os, name, 0)
+    number = os.open(path, flags, 0o666)
+    if not stat.S_ISREG(os.fstat(number).st_mode):
+        os.close(number)
+        raise OSError(errno.EINVAL, "it is not a regular file")
+    return number
 
 
 @contextmanager
@@ -408,9 +655,14 @@ def _locked(folder):
     except ImportError:
         yield
         return
+    path = folder / _LOCK
     try:
-        with open(folder / _LOCK, "w", encoding="utf-8") as stream:
+        with os.fdopen(_open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND), "ab") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX)
             yield
     except OSError as error:
+        if os.path.lexists(path) and not stat.S_ISREG(os.lstat(path).st_mode):
+            raise CalibrationFileError(
+                f"{path}: is a link or not a regular file; remove it to add to the library"
+            ) from error
         raise CalibrationFileError(f"{folder}: cannot be written: {error.strerror}") from error
