@@ -5,7 +5,9 @@ import dataclasses
 import datetime
 import json
 import multiprocessing
+import os
 import sys
+from itertools import combinations, product
 from pathlib import Path
 
 import astropy.units as u
@@ -15,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import Calibration, calibrate, instruments
+from astropolcal.calibration import library as module
 from astropolcal.calibration.library import Entry, Library
 from astropolcal.calibration.validity import Validity, content_hash, validity_of, with_validity
 from astropolcal.exceptions import CalibrationFileError
@@ -253,6 +256,306 @@ def test_table_says_how_good_they_are(calibration, library):
     assert isinstance(library.entries[0], Entry)
 
 
+# ---- the index ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def known():
+    """Calibrations by the content of their files, and hashes by calibration: what takes long."""
+    return {}, {}
+
+
+@pytest.fixture
+def look(monkeypatch, known):
+    """Look up as a new process does; return the file's name, and which files were read."""
+    # the files of a test are young
+    monkeypatch.setattr(module, "_SETTLED", -(10**12))
+    names, read, (contents, hashes) = [], module.read_calibration, known
+
+    def counted(path):
+        names.append(path.name)
+        content = path.read_bytes()
+        if content not in contents:
+            contents[content] = read(path)
+            hashes[id(contents[content])] = content_hash(contents[content])
+        return contents[content]
+
+    def look(folder, date="2025-02-15"):
+        names.clear()
+        module._read.cache_clear()
+        return Library(folder).find("charis", date=date).name, sorted(names)
+
+    monkeypatch.setattr(module, "read_calibration", counted)
+    monkeypatch.setattr(module, "content_hash", lambda c: hashes.get(id(c)) or content_hash(c))
+    look.read = names
+    return look
+
+
+@pytest.fixture(scope="module")
+def months(calibration, tmp_path_factory):
+    """Content of files that hold for January to April, and one for February in another mode."""
+    folder, base = tmp_path_factory.mktemp("months"), calibration
+    contents = {}
+    for name, month, mode in zip("abcde", (1, 2, 3, 4, 2), (None,) * 4 + ("J",), strict=True):
+        stated = {"valid_from": f"2025-0{month}-01", "valid_until": f"2025-0{month + 1}-01"}
+        path = folder / f"{name}.asdf"
+        with_validity(base, mode=mode, **stated).write(path)
+        contents[path.name] = path.read_bytes()
+    return contents
+
+
+@pytest.fixture
+def folder(months, tmp_path):
+    """January to April."""
+    for name, content in months.items():
+        if name != "e.asdf":
+            (tmp_path / name).write_bytes(content)
+    return tmp_path
+
+
+def told_of(library):
+    """Return all that is told of the files without a look-up."""
+    held = [(e.path, e.validity, e.content_hash) for e in library.entries]
+    return held, [str(row) for row in library.table()], library.overlaps(), library.problems
+
+
+def test_look_up_reads_what_it_chooses_and_what_has_changed(folder, months, look):
+    every = sorted(set(months) - {"e.asdf"})
+    assert look(folder) == ("b.asdf", every)
+    assert look(folder) == ("b.asdf", ["b.asdf"])
+    assert look(folder, "2025-04-02") == ("d.asdf", ["d.asdf"])
+    (folder / "d.asdf").write_bytes(months["e.asdf"])
+    (folder / "c.asdf").unlink()
+    assert look(folder, "2025-01-15") == ("a.asdf", ["a.asdf", "d.asdf"])
+    assert look(folder, "2025-01-15") == ("a.asdf", ["a.asdf"])
+    # what is told of files that are not read is what reading them tells
+    look.read.clear()
+    module._read.cache_clear()
+    told = told_of(Library(folder))
+    assert not look.read
+    (folder / module._INDEX).unlink()
+    assert told_of(Library(folder)) == told
+    assert len(look.read) == 3
+    # an unreadable file is read each time
+    (folder / "d.asdf").write_bytes(b"#ASDF")
+    for _ in range(2):
+        with refused("d.asdf: truncated"):
+            look(folder)
+        assert "d.asdf" in look.read
+
+
+def test_file_in_the_place_of_another_is_noticed(folder, months, look):
+    """Of the same size and time of change, under the same name."""
+    look(folder)
+    path = folder / "a.asdf"
+    old, size = path.stat(), len(months["a.asdf"])
+    new = months["b.asdf"].replace(b"\n...\n", b"\n...\n", 1)
+    assert len(new) == size, "the months have files of the same size"
+    path.write_bytes(new)
+    os.utime(path, ns=(old.st_atime_ns, old.st_mtime_ns))
+    assert path.stat().st_mtime_ns == old.st_mtime_ns
+    with refused("for date 2025-01-15"):
+        look(folder, "2025-01-15")
+
+
+def test_young_files_are_not_relied_on(folder, look, monkeypatch):
+    monkeypatch.setattr(module, "_SETTLED", 10**15)
+    for _ in range(2):
+        assert len(look(folder)[1]) == 4
+    assert not (folder / module._INDEX).exists()
+
+
+def forged(files, name, **changes):
+    return module._index(files | {name: files[name] | changes})
+
+
+def wrong_indexes(files):
+    """Return words and content of indexes that are not what they should be."""
+    good = module._index(files)
+    first = files["a.asdf"]
+    yield "empty", b""
+    yield "cut off", json.dumps(good).encode()[:-20]
+    yield "another year", json.dumps(good).replace("2025-02", "2035-02").encode()
+    yield "no JSON", b"\xff\x00"
+    yield "deep", b"[" * 100_000
+    yield "large", b" " * 10**6 + json.dumps(good).encode()
+    yield "list", b"[]"
+    for key in good:
+        yield f"no {key}", json.dumps({k: v for k, v in good.items() if k != key}).encode()
+        yield f"other {key}", json.dumps(good | {key: 7}).encode()
+    # with a checksum that is right
+    for value in (None, [], 5, "x", {"x": 1}):
+        yield f"file is {value!r}", json.dumps(module._index(files | {"b.asdf": value})).encode()
+        for key in first:
+            content = json.dumps(forged(files, "b.asdf", **{key: value})).encode()
+            yield f"{key} is {value!r}", content
+        for key in set(first["validity"]) - {"instrument"}:
+            held = files["b.asdf"]["validity"] | {key: value}
+            yield f"{key} is {value!r}", json.dumps(forged(files, "b.asdf", validity=held)).encode()
+    for value in (5, [], {}):
+        held = files["b.asdf"]["validity"] | {"instrument": value}
+        yield "no instrument", json.dumps(forged(files, "b.asdf", validity=held)).encode()
+    # each in the place of the other
+    both = forged(files, "a.asdf", validity=files["b.asdf"]["validity"])["files"]
+    yield "exchanged", json.dumps(forged(both, "b.asdf", validity=first["validity"])).encode()
+    yield "hash", json.dumps(forged(files, "b.asdf", content_hash="0" * 64)).encode()
+
+
+def test_wrong_index_chooses_nothing_wrong(folder, look):
+    """And it is written anew."""
+    look(folder)
+    path = folder / module._INDEX
+    right = json.loads(path.read_text())
+    assert set(right["files"]) == {"a.asdf", "b.asdf", "c.asdf", "d.asdf"}
+    for words, content in wrong_indexes(right["files"]):
+        path.write_bytes(content)
+        assert look(folder)[0] == "b.asdf", words
+        assert look(folder, "2025-01-15")[0] == "a.asdf", words
+        assert json.loads(path.read_text())["files"]["b.asdf"] == right["files"]["b.asdf"], words
+
+
+def test_index_of_other_software_is_not_used(folder, look, monkeypatch):
+    look(folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "our_version", "0.0.1")
+        assert len(look(folder)[1]) == 4
+    # an instrument may know the optics in the beam, another version of it others
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_plugins", lambda: [("bench", "bench:Bench", "1.0")])
+        assert len(look(folder)[1]) == 4
+    assert len(look(folder)[1]) == 4
+    assert len(look(folder)[1]) == 1
+
+
+def test_without_a_place_for_the_index(folder, look, monkeypatch, tmp_path_factory):
+    """What stands in its place is left alone; a folder that cannot be written to is no matter."""
+    path, victim = folder / module._INDEX, tmp_path_factory.mktemp("other") / "victim"
+    victim.write_text("mine")
+    for make in (path.mkdir, lambda: os.mkfifo(path), lambda: path.symlink_to(victim)):
+        make()
+        before = path.lstat()
+        assert [len(look(folder)[1]) for _ in range(2)] == [4, 4]
+        assert path.lstat() == before
+        path.rmdir() if path.is_dir() else path.unlink()
+    assert victim.read_text() == "mine"
+
+    def denied(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "replace", denied)
+    assert [look(folder)[0] for _ in range(2)] == ["b.asdf", "b.asdf"]
+    assert {path.suffix for path in folder.iterdir()} == {".asdf"}
+
+
+def test_file_that_changed_after_the_library_was_read(folder, months, look):
+    look(folder)
+    library = Library(folder)
+    (old,) = [entry for entry in library.entries if entry.name == "b.asdf"]
+    module._read.cache_clear()
+    (folder / "b.asdf").write_bytes(months["e.asdf"])
+    with refused("b.asdf: holds something else"):
+        old.calibration  # noqa: B018
+    found = library.find("charis", date="2025-02-15")
+    assert found.validity.mode == validity_of(found.calibration).mode == "J"
+    (folder / "b.asdf").unlink()
+    library = Library(folder)
+    (folder / "b.asdf").write_bytes(months["b.asdf"])
+    (folder / "a.asdf").unlink()
+    with refused("for date 2025-01-15"):
+        library.find("charis", date="2025-01-15")
+    assert library.find("charis", date="2025-02-15").name == "b.asdf"
+
+
+def test_calibration_is_there_only_if_its_file_says_so(calibration, folder, look):
+    """An index that tells of it is not enough to leave it out."""
+    look(folder)
+    path = folder / module._INDEX
+    files = json.loads(path.read_text())["files"]
+    new = with_validity(calibration, valid_from="2025-07-01")
+    path.write_text(json.dumps(forged(files, "a.asdf", content_hash=content_hash(new))))
+    module._read.cache_clear()
+    written = Library(folder).add(new)
+    assert written.name not in files
+    assert content_hash(Calibration.read(written)) == content_hash(new)
+
+
+# ---- what is written ---------------------------------------------------------------------
+
+
+def test_names_that_can_be_added(calibration, library, tmp_path_factory):
+    outside = tmp_path_factory.mktemp("outside")
+    wrong = [str(outside / "x.asdf"), "../x.asdf", f"../{outside.name}/x.asdf", "sub/x.asdf"]
+    wrong += ["..\\x.asdf", "C:x.asdf", "x", "x.fits", ".x.asdf", ".asdf", "", "..", "x.asdf/"]
+    wrong += ["a\0.asdf", "a\n.asdf", "a\x1b[2J.asdf", "\ud800.asdf", "x" * 251 + ".asdf", 5]
+    wrong += ["é" * 126 + ".asdf"]
+    (library.source / "sub").mkdir()
+    for name in wrong:
+        with refused("^name = .*allowed are .*suffix .asdf$"):
+            library.add(calibration, name=name)
+    assert not list(library.source.rglob("*.asdf"))
+    assert not list(outside.iterdir())
+    for i, name in enumerate(("x" * 250 + ".asdf", "Nacht 2025-10-05T09:30 é.asdf")):
+        assert library.add(calibration, name=name, mode=f"{i}").name == name
+    # a name of its own is such a name, whatever the mode is called
+    path = library.add(calibration, mode="../" + "x" * 300)
+    assert path.parent == library.source
+    odd = dataclasses.replace(calibration, settings=calibration.settings | {"instrument": ".lab"})
+    assert library.add(odd).name.startswith("lab_")
+    assert len(Library(library.source)) == 4
+
+
+def test_lock_is_a_file_and_keeps_what_is_in_it(calibration, library, tmp_path_factory):
+    lock, victim = library.source / ".lock", tmp_path_factory.mktemp("other") / "victim"
+    victim.write_text("mine")
+    for make in (
+        lambda: lock.symlink_to(victim),
+        lambda: lock.symlink_to(victim.parent / "new"),
+        lambda: os.mkfifo(lock),
+        lock.mkdir,
+    ):
+        make()
+        with refused(r"\.lock: is a link or not a regular file"):
+            library.add(calibration)
+        lock.rmdir() if not lock.is_symlink() and lock.is_dir() else lock.unlink()
+    assert victim.read_text() == "mine"
+    assert list(victim.parent.iterdir()) == [victim]
+    assert not Library(library.source).entries
+    lock.write_text("1234")
+    library.add(calibration)
+    assert lock.read_text() == "1234"
+
+
+def test_overlaps_are_those_of_all_pairs():
+    dates = (None, "2025-01-01", "2025-03-01T12:00:00.000", "2025-06-01")
+    kinds = product(("charis", None), ("J", "j ", None), (None, [["nbs"], []], ["nbs"]))
+    ranges = [(a, b) for a, b in product(dates, dates) if None in (a, b) or a < b]
+    library = Library([])
+    for i, (kind, (start, end)) in enumerate(product(list(kinds)[::2], ranges[::2])):
+        held = Validity(kind[0], kind[1], start, end, kind[2])
+        library.entries.append(Entry(f"{i:03}.asdf", object(), held, f"{i % 50}"))
+    library.entries.sort(
+        key=lambda e: (e.validity.instrument or "", e.validity.valid_from or "", e.path)
+    )
+    expected = []
+    for pair in combinations(library.entries, 2):
+        try:
+            module._check_pair(*pair)
+        except CalibrationFileError as error:
+            expected.append(str(error))
+    assert 100 < len(expected) < len(library) * (len(library) - 1) / 2
+    assert library.overlaps() == expected
+
+
+def test_one_of_many_open_choices_is_said_in_a_line():
+    library = Library([])
+    for i in range(500):
+        held = Validity("lab", f"mode {i}", "2025-01-01")
+        library.entries.append(Entry(f"{i:03}.asdf", object(), held, str(i)))
+    with refused("000.asdf.*and 496 more: say which mode") as caught:
+        library.find("lab", date="2026-01-01")
+    assert len(str(caught.value)) < 500
+
+
 def write_two(base, folder, number, barrier):
     barrier.wait(60)
     Library(folder).add(base, valid_from=f"20{number}-01-01")
@@ -288,7 +591,11 @@ def test_concurrent_writers(tmp_path):
         ("2011-01-01", "broadband JHK"),
         ("2012-01-01", "broadband JHK"),
     ]
-    assert {p.suffix for p in folder.iterdir() if p.name != ".lock"} == {".asdf"}
+    others = {p.name for p in folder.iterdir() if p.suffix != ".asdf"}
+    assert others == {".lock", ".astropolcal-index.json"}
+    # no writer has left the index of another in pieces
+    index = json.loads((folder / ".astropolcal-index.json").read_text())
+    assert set(index["files"]) <= {e.name for e in library.entries}
 
 
 # ---- versions of the file ----------------------------------------------------------------
