@@ -5,6 +5,7 @@ Speed, by comparison with something that does the same on the same machine.
 Not part of the normal run: ``pytest tests/benchmarks``. How times are compared, `timing` says.
 """
 
+import json
 import os
 import statistics
 import subprocess
@@ -21,7 +22,7 @@ from scipy.optimize import least_squares
 from timing import interleaved, report
 
 from astropolcal import Calibration, calibrate, instruments
-from astropolcal.calibration import BinProblem, search_branches
+from astropolcal.calibration import BinProblem, Library, library, search_branches
 from astropolcal.chain import leaves, system_mueller
 from astropolcal.measurement import Measurement
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -95,9 +96,13 @@ def test_calibration(benchmark, observations):
     assert benchmark.stats.stats.median < 2.0
 
 
-def test_calibration_file(benchmark, observations, tmp_path):
+@pytest.fixture(scope="module")
+def calibration(observations):
+    return calibrate(CHARIS.chain(), observations, cross_validate=False, instrument="charis")
+
+
+def test_calibration_file(benchmark, calibration, tmp_path):
     """Written and read again, with all checks; the goal is 0.4 s."""
-    calibration = calibrate(CHARIS.chain(), observations, cross_validate=False)
     path = tmp_path / "cal.asdf"
 
     def there_and_back():
@@ -106,6 +111,34 @@ def test_calibration_file(benchmark, observations, tmp_path):
 
     assert benchmark(there_and_back).chains[0].submodel_names == calibration.chain.submodel_names
     assert benchmark.stats.stats.min < 0.4
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+def test_look_up_in_a_thousand_calibrations(benchmark, calibration, tmp_path, monkeypatch):
+    """With an index, as a new process does; the file that is chosen is read and compared."""
+    monkeypatch.setattr(library, "_SETTLED", 0)
+    calibration.write(tmp_path / "0000.asdf")
+    content = (tmp_path / "0000.asdf").read_bytes()
+    (true,) = Library(tmp_path).entries
+    files = {}
+    # to write a thousand different ones takes a minute; only the first is read
+    for i in range(1000):
+        path = tmp_path / f"{i:04}.asdf"
+        if i:
+            path.write_bytes(content)
+        held = true.validity.to_dict() | ({"valid_from": f"{2030 + i}-01-01"} if i else {})
+        digest = f"{i:064}" if i else true.content_hash
+        record = {"state": list(library._state(path)), "validity": held, "content_hash": digest}
+        files[path.name] = record | {"quality": true._quality}
+    library._write_index(tmp_path, files)
+
+    def look():
+        library._read.cache_clear()
+        return Library(tmp_path).find("charis", date="2026-03-04T05:06:07")
+
+    assert benchmark(look).name == "0000.asdf"
+    assert json.loads((tmp_path / library._INDEX).read_text())["files"] == files
+    assert benchmark.stats.stats.min < 0.2
 
 
 # --- ratios ----------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import json
 import re
 import tempfile
 import warnings
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -306,6 +307,63 @@ class Loaded(ForgedCalibration):
             assert np.abs(found.value).max() < 1e6
             assert not (found.std < 0).any()
             assert found.covariance.shape[-2:] == (16, 16)
+
+
+class Index(Reader):
+    """Indexes of libraries, half of them with a checksum that was made anew."""
+
+    suffix = ".json"
+    _state = (100, 1, 2, 3, True)
+
+    def seeds(self):
+        from astropolcal.calibration import library
+
+        quality = {"datasets": "night", "s_res": 0.1, "s_cv": None, "converged": True}
+        files = {}
+        for i, optics_in in enumerate((None, [["nbs"], []], [["nbs"]])):
+            held = {"instrument": "bench", "mode": "J", "valid_from": f"202{i}-01-01"}
+            held |= {"valid_until": f"202{i + 2}-05-01T10:00:00.000", "optics_in": optics_in}
+            record = {"state": list(self._state), "validity": held, "content_hash": f"{i}" * 64}
+            files[f"{i}.asdf"] = record | {"quality": quality}
+        return {"index": json.dumps(library._index(files)).encode()}
+
+    def mutate(self, rng, content):
+        kinds = (mutate.mutate_bytes, mutate.mutate_words, mutate.mutate_json, mutate.mutate_json)
+        return self._signed(rng, mutate.some(rng, kinds)(rng, content))
+
+    def _signed(self, rng, content):
+        from astropolcal.calibration import library
+
+        try:
+            files = json.loads(content)["files"]
+            return json.dumps(library._index(files)).encode() if rng.random() < 0.7 else content
+        except (ValueError, LookupError, TypeError, RecursionError):
+            return content
+
+    def read(self, path):
+        from astropolcal.calibration import library
+
+        real, library._INDEX = library._INDEX, path.name
+        try:
+            told = library._read_index(path.parent, 3)
+        finally:
+            library._INDEX = real
+        found = [library._entry(Path(name), one, self._state) for name, one in told.items()]
+        if None in found or not found:
+            raise AstropolcalError("not relied on")
+        return found
+
+    def check(self, found, path):
+        from astropolcal.calibration import Library
+
+        for wanted in ({}, {"date": "2022-02-03"}, {"mode": "J", "optics_in": ["nbs"]}):
+            library = Library([])
+            library.entries = list(found)
+            assert len(library.table()) == len(found)
+            library.overlaps()
+            # the files are not there
+            with suppress(AstropolcalError):
+                raise AssertionError(f"found {library.find('bench', **wanted)}")
 
 
 # ---- tables ------------------------------------------------------------------------
@@ -952,6 +1010,7 @@ READERS = {
     "calibration": CalibrationFile,
     "forged": ForgedCalibration,
     "loaded": Loaded,
+    "index": Index,
     "observations": Table,
     "exported": Exported,
     "spectra": Spectra,
