@@ -188,7 +188,7 @@ def _of_size(entry):
     if strength is not None:
         found.append(f"Its size as a whole is {strength:.0f} standard errors from zero.")
     found.append(
-        "The size is physically possible."
+        f"The size is physically possible{_at_bound(entry)}."
         if entry["physical"]
         else "The size is physically impossible: it stands for something that the library lacks."
     )
@@ -200,6 +200,15 @@ def _of_size(entry):
             f"a part of it {_exchanged(others) if others else 'hardly changes them'}."
         )
     return found
+
+
+def _at_bound(entry):
+    """Return at how many of its values a size is at a bound of the optic, in words."""
+    n = np.sum([np.size(one["value"]) for one in entry["parameters"].values()])
+    at = entry.get("at_bound")
+    if not at:
+        return ""
+    return f": at a bound of the optic{'' if n == 1 else f' at {at} of {n} values'}"
 
 
 def _exchanged(others):

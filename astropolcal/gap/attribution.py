@@ -36,6 +36,8 @@ MOST_REFITTED = 8
 #: An effect fits nearly as well as another if it is this close in evidence.
 SAME_EVIDENCE = 10.0
 _WORTH_A_REFIT = 0.4
+# lowering of chi-square by a full fit that is none
+_LEAST_GAIN = 1.0
 # the first fits end after so many steps; those this close to the best are carried on
 _FIRST_STEPS, _NEARLY = 12, 0.8
 
@@ -306,6 +308,10 @@ def contenders(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
         :most
     ]
     fitted = [_fitted(model, score, freedom) for score in worth]
+    # an effect that data ask for beyond a bound of its optic, where it is absent, does nothing
+    fitted = [c for c in fitted if c.gain > _LEAST_GAIN]
+    if not fitted:
+        return []
     best = max(c.evidence for c in fitted)
     fitted = [
         _polished(model, c, freedom) if c.evidence > min(_NEARLY * best, best - 20) else c

@@ -5,6 +5,7 @@ import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import astropy.units as u
 import numpy as np
 from scipy import stats
 
@@ -14,6 +15,7 @@ from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap.effects import Context
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.mueller import is_physical
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
@@ -229,20 +231,39 @@ class Model:
 
     def is_physical(self, name):
         """
-        Return whether the fitted values of an effect are within its limits.
+        Return whether the fitted values of an effect are possible.
 
-        A parameter that the fit left at its limit at more than one wavelength in
-        ten wants to be beyond it.
+        They are within its limits and the bounds of the optics that have them, whose Mueller
+        matrices are physical. A parameter that the fit left at its limit at more than one
+        wavelength in ten wants to be beyond it.
         """
         vector = self.problem.vector(self.fit.coefficients)
+        low, high = self.problem.free.bounds()
         for parameter in self.added[name]:
-            slot = self.problem.free.by_name[parameter.name]
-            size = np.abs(vector[slot.slice] - parameter.canonical_neutral)
-            size = size / parameter.canonical_limit
+            where = self.problem.free.by_name[parameter.name].slice
+            size = np.abs(vector[where] - parameter.canonical_neutral) / parameter.canonical_limit
             pressed = np.mean(size > 1 - _AT_LIMIT)
             if size.max() > 1 + _AT_LIMIT or pressed > _MOST_PRESSED:
                 return False
-        return True
+            beyond = np.maximum(low - vector, vector - high)[where]
+            if np.any(beyond > _AT_LIMIT * parameter.canonical_limit):
+                return False
+        # bounds that an effect sets itself may be those of no optic
+        matrices = [leaf.mueller(self.problem.wavelength * u.um) for leaf in self._carriers(name)]
+        return all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
+
+    def _carriers(self, name):
+        """Return the optics that have the parameters of an effect, or some that follow these."""
+        own = {parameter.name for parameter in self.added[name]}
+        own |= {target for target, tie in self.problem.ties.items() if tie.source in own}
+        names = {parameter.partition(".")[0] for parameter in own}
+        return [leaf for chain in self.chains for leaf in leaves(chain) if leaf.name in names]
+
+    def at_bound(self, name):
+        """Return how many values of an effect are at a bound of their optic."""
+        at = self.problem.free.at_bounds(self.problem.vector(self.fit.coefficients))
+        slots = [self.problem.free.by_name[p.name] for p in self.added.get(name) or ()]
+        return sum(int(np.sum(at[slot.slice])) for slot in slots)
 
     def impossible(self):
         """Return the names of the effects whose fitted values are out of their limits."""

@@ -9,8 +9,8 @@ one column a coefficient. What is fitted is the flat vector of coefficients.
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import qr, solve_triangular
-from scipy.optimize import lsq_linear
+from scipy.linalg import null_space, qr, solve_triangular
+from scipy.optimize import lsq_linear, nnls
 
 from astropolcal.gap._bases import law_basis, orthonormal
 from astropolcal.gap._noise import expected_fluxes, noise, settings
@@ -33,6 +33,8 @@ _HOLD = 1e-6
 _FIRST_DAMPING, _LEAST_DAMPING, _FREE, _STUCK = 1e-5, 1e-7, 1e-3, 1e3
 # a coefficient closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-9
+# and a value of a law closer than this
+_AT_WALL = 1e-7
 # so often it is guessed which bounds hold; a slope below this share of its terms is none
 _GUESSES, _ROUNDING = 10, 1e-13
 
@@ -59,7 +61,7 @@ class GapProblem:
         default 0: that at which an effect is absent.
     limits : dict of str to float, optional
         The most (canonical) by which a parameter may differ from that value. A
-        parameter that follows a law is not held to it.
+        parameter that follows a law is not held to it, but to the bounds of its optic.
     like : GapProblem, optional
         Another problem of the same data whose noise, lamp and fluxes are taken
         over; by default `settle_noise` must be called.
@@ -135,7 +137,7 @@ class GapProblem:
         """Note the linear map from the coefficients to the flat vector."""
         blocks, self.names, self.slices = [], [], {}
         low, high = self._bounds()
-        self.low, self.high, start = [], [], 0
+        self.low, self.high, start, walls = [], [], 0, []
         for slot in self.free.slots:
             basis = laws.get(slot.name)
             follows = basis is not None and slot.per_wavelength and np.shape(basis)[1] < slot.size
@@ -146,10 +148,23 @@ class GapProblem:
             self.names += [slot.name if k == 1 else f"{slot.name}[{i}]" for i in range(k)]
             self.low += [-np.inf] * k if follows else list(low[slot.slice])
             self.high += [np.inf] * k if follows else list(high[slot.slice])
+            walls += [(self.slices[slot.name], block, slot.canonical_bounds())] * follows
             start += k
         self._blocks = blocks
         self.low, self.high = np.array(self.low), np.array(self.high)
         self.size = start
+        self._walls = self._as_walls(walls)
+
+    def _as_walls(self, laws):
+        """Return the bounds of the values of laws: rows, and what each is at most."""
+        rows, ends = [np.empty((0, self.size))], [np.empty(0)]
+        for where, block, bounds in laws:
+            for sign, end in zip((-1, 1), bounds, strict=True):
+                if np.isfinite(end):
+                    rows.append(np.zeros((len(block), self.size)))
+                    rows[-1][:, where] = sign * block
+                    ends.append(np.full(len(block), sign * end))
+        return np.concatenate(rows), np.concatenate(ends)
 
     def _bounds(self):
         """Return the bounds of the flat vector: those of the chains, or narrower limits."""
@@ -267,7 +282,7 @@ class GapProblem:
         -------
         Fit
         """
-        q = np.clip(self.start if start is None else start, self.low, self.high)
+        q = self._inside(self.start if start is None else start)
         live = np.ones(self.size, dtype=bool) if held is None else ~held
         take = slice(None) if rows is None else rows
         residual, cost = self._cost(q, take)
@@ -295,6 +310,14 @@ class GapProblem:
         # where no step leads down any more, the bottom is reached as well
         return Fit(q, float(residual @ residual), bool(converged or damping >= _STUCK))
 
+    def _inside(self, q):
+        """Return the nearest coefficients within all bounds."""
+        q = np.clip(q, self.low, self.high)
+        rows, room = self._walls[0], self._walls[1] - self._walls[0] @ q
+        if np.all(room > -_AT_WALL):
+            return q
+        return q + _behind_walls(np.eye(self.size), np.zeros(self.size), rows, room)
+
     def _cost(self, q, take):
         # a trial may be where the model is not defined; it is not taken then
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -320,6 +343,10 @@ class GapProblem:
         found = solve_triangular(triangle, wanted, check_finite=False) if n else wanted
         if np.any((found < low) | (found > high)):
             found = _within(triangle, wanted, low, high, found)
+        rows, room = self._walls[0][:, live] / scale, self._walls[1] - self._walls[0] @ q
+        if np.any(rows @ found > room + _AT_WALL):
+            rows = np.concatenate([rows, np.eye(n), -np.eye(n)])
+            found = _behind_walls(triangle, wanted, rows, np.concatenate([room, high, -low]))
         left = matrix @ found - target
         step = np.zeros(self.size)
         step[live] = found / scale
@@ -331,10 +358,12 @@ class GapProblem:
         """
         Return an orthonormal basis of the derivatives, shape (n_rows, rank).
 
-        A coefficient at its bound cannot take anything up and is left out.
+        A coefficient, or a value of a law, at its bound cannot take anything up and is left out.
         """
         inside = (coefficients > self.low + _AT_BOUND) & (coefficients < self.high - _AT_BOUND)
-        return orthonormal(self.jacobian(coefficients)[:, inside])
+        slopes, (rows, ends) = self.jacobian(coefficients)[:, inside], self._walls
+        held = rows[rows @ coefficients > ends - _AT_WALL][:, inside]
+        return orthonormal(slopes @ null_space(held) if len(held) else slopes)
 
     @property
     def n_data(self):
@@ -388,6 +417,29 @@ def _within(triangle, wanted, low, high, found):
     slack = 1e-9 * np.maximum(1.0, np.abs(found))
     found = lsq_linear(triangle, wanted, (low - slack, high + slack), method="bvls").x
     return np.clip(found, low, high)
+
+
+def _behind_walls(triangle, wanted, rows, room):
+    """
+    Return the least squares where no row times the unknowns is above its room.
+
+    Lawson & Hanson (1974), chapter 23: the step from the solution without walls that is the
+    shortest in units of the noise, by non-negative least squares.
+    """
+    real = np.isfinite(room) & rows.any(axis=1)
+    rows, ends = rows[real], room[real]
+    slopes = solve_triangular(triangle, rows.T, trans="T", check_finite=False).T
+    room = ends - slopes @ wanted
+    # lengths about one, lest the last row vanish beside the others
+    unit = np.max(-room / np.linalg.norm(slopes, axis=1))
+    table = np.concatenate([-slopes.T, -room[None] / unit])
+    target = np.zeros(len(table))
+    target[-1] = 1.0
+    left = table @ nnls(table, target, maxiter=30 * len(rows))[0] - target
+    found = solve_triangular(triangle, wanted - unit * left[:-1] / left[-1], check_finite=False)
+    # rounding may carry it through a wall: back towards where it came from, which is within
+    far, slack = rows @ found, ends + _AT_WALL
+    return found * max(0.0, np.min(slack[far > slack] / far[far > slack], initial=1.0))
 
 
 def _triangle(matrix, target):

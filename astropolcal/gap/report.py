@@ -144,6 +144,7 @@ def _cause(diagnosis, i, fitted):
         "parameters": fitted.sizes(cause.name),
         "significance": fitted.significance(cause.name),
         "physical": bool(cause.physical),
+        "at_bound": diagnosis.improved.at_bound(cause.name),
     }
     # what can be exchanged for it is asked only where the size is not told: it costs a
     # decomposition

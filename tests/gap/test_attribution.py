@@ -182,6 +182,13 @@ def test_the_impossible_comes_last_though_it_fits_best():
     assert choose(base, [score("a", 900.0), score("b", 880.0)]).aliases == []
 
 
+def test_what_does_nothing_within_its_bounds_is_no_candidate():
+    """The scan looks at both directions, one of which may be closed."""
+    base = Base(2000.0, {"a": 1999.5, "b": Fitted(1400.0, physical=False)})
+    assert names(contenders(base, [score("a", 900.0), score("b", 880.0)])) == ["b"]
+    assert contenders(base, [score("a", 900.0)]) == []
+
+
 def test_a_fit_that_was_cut_short_is_carried_on_if_it_may_win():
     end = Fitted(1000.0)
     left = {"a": Fitted(1100.0, converged=False, then=end), "b": Fitted(1990.0, converged=False)}

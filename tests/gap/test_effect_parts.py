@@ -256,13 +256,15 @@ def test_words_name_the_plate_where_there_is_no_derotator():
         ((-50, 50), 4.0, 10 * u.deg, (-50.0, 50.0)),
         ((None, 5), 4.0, 10 * u.deg, (None, 14.0)),
         ((-5, None), 4.0, (10 * u.deg).to(u.rad), (-6.0, None)),
+        # as far as the optic itself allows
+        ((-5, 175), 174.0, 10 * u.deg, (-5.0, 180.0)),
     ],
 )
 def test_bounds_leave_room_about_the_value(bounds, value, limit, expected):
     optic = turned()
     optic.theta.bounds, optic.theta = bounds, value * u.deg
     optic.theta.bounds = bounds
-    found = held._around(optic.theta, limit)
+    found = held._around(optic.theta, limit, type(optic).theta.bounds)
     assert [None if x is None else pytest.approx(x) for x in found] == list(expected)
 
 

@@ -32,7 +32,7 @@ from astropolcal.gap.effects import (
     register_effect,
 )
 from astropolcal.gap.model import Model, effect_tangent
-from astropolcal.gap.problem import GapProblem, orthonormal
+from astropolcal.gap.problem import Fit, GapProblem, orthonormal
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 from astropolcal.units import canonical_factor
@@ -395,6 +395,50 @@ def test_sizes_are_within_bounds_and_limits(name):
     for parameter in edit.parameters:
         assert 0 < canonical(parameter.scale) < canonical(parameter.limit)
         assert parameter.name in problem.free.by_name
+
+
+def test_no_effect_is_possible_beyond_the_bounds_of_its_optic():
+    """Half way to the nearer of bound and limit it is, on each side that has room."""
+    for name in SMOOTH:
+        chains, data = clean(name)
+        nominal = GapProblem(chains, data)
+        model = Model(nominal, Fit(nominal.start, 0.0, True))
+        problem, parameters = model.edited(EFFECTS[name], context_of(data))
+        for parameter in parameters:
+            slot = problem.free.by_name[parameter.name]
+            for side, bound in zip((-1, 1), _own_bounds(chains, problem, slot), strict=True):
+                room = np.min(side * (bound - parameter.canonical_neutral))
+                limit = parameter.canonical_limit
+                for size, possible in ((min(room, limit) / 2, True), (room + limit / 5, False)):
+                    if not (np.isfinite(size) and size > 1e-9):
+                        continue
+                    q = _with_value(problem, parameter, side * size)
+                    changed = Model(problem, Fit(q, 0.0, True), {name: parameters})
+                    assert changed.is_physical(name) == possible, (parameter.name, side, size)
+
+
+def _own_bounds(chains, problem, slot):
+    """Return the bounds that the class of an optic gives a parameter, or wider ones of a chain."""
+    optic, key = slot.name.split(".")
+    found = [o for c in chains for o in leaves(c) if o.name == optic and key in o.param_names]
+    leaf = next(o for c in problem.measurement.chains for o in leaves(c) if o.name == optic)
+    # the angle of a rotator may be a lag in frames, for which the effect sets the bounds
+    found.append(leaf if isinstance(leaf, optics.DriftRotator) else type(leaf))
+    lows, highs = zip(*(getattr(owner, key).bounds for owner in found), strict=True)
+    low = min(-np.inf if end is None else end for end in lows)
+    return low * slot.factor, max(np.inf if end is None else end for end in highs) * slot.factor
+
+
+def _with_value(problem, parameter, size):
+    """Return coefficients whose largest value is so far from where the effect is absent."""
+    q, where = problem.start.copy(), problem.slices[parameter.name]
+    slot = problem.free.by_name[parameter.name]
+    step = np.zeros(problem.size)
+    # as constant as the law can be
+    step[where] = problem.coefficients(np.ones(problem.free.size))[where]
+    values = problem.vector(step)[slot.slice]
+    q[where] += step[where] * size / values[np.argmax(np.abs(values))]
+    return q
 
 
 @pytest.mark.parametrize("name", SMOOTH)

@@ -4,7 +4,7 @@
 import gap_data as data
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
@@ -122,10 +122,32 @@ def test_limits_narrow_the_bounds_about_the_neutral_value():
     assert wide.high[wide.slices[EFFICIENCY]].max() <= 1.0
 
 
-def test_a_law_has_no_bounds():
-    found = problem_of(laws={EFFICIENCY: law_basis(data.WAVELENGTH.to_value("um"), 1)})
-    assert np.all(np.isinf(found.high[found.slices[EFFICIENCY]]))
-    assert found.names[found.slices[EFFICIENCY].start] == f"{EFFICIENCY}[0]"
+def test_the_values_of_a_law_are_held_to_the_bounds_of_its_optic():
+    laws = {EFFICIENCY: law_basis(data.WAVELENGTH.to_value("um"), 1)}
+    true = data.chain()
+    true["wollaston"].efficiency = np.linspace(0.98, 0.95, len(data.WAVELENGTH))
+    free = problem_of(data.observed(true), true, laws=laws)
+    values = free.vector(free.fit().coefficients)[free.free.by_name[EFFICIENCY].slice]
+    # coefficients have no bounds of their own
+    assert np.all(np.isinf(free.high[free.slices[EFFICIENCY]]))
+    bound = (values.min() + values.max()) / 2
+    true["wollaston"].efficiency.bounds = (0, bound)
+    held = problem_of(data.observed(true), true, laws=laws, like=free)
+    fit = held.fit()
+    found = held.vector(fit.coefficients)[held.free.by_name[EFFICIENCY].slice]
+    assert fit.converged
+    assert found.max() == pytest.approx(bound, abs=1e-7)
+    # one value of a straight line is at its bound, and takes one direction
+    assert np.sum(found > bound - 1e-7) == 1
+    assert held.tangent(fit.coefficients).shape[1] == held.size - 1
+    # no step along the wall, or away from it, leads down
+    slopes = held.jacobian(fit.coefficients).T @ held.residual(fit.coefficients)
+    where = held.slices[EFFICIENCY]
+    line = laws[EFFICIENCY][np.argmax(found)]
+    along = np.array([-line[1], line[0]])
+    errors = held.errors(fit.coefficients)[where]
+    assert abs(slopes[where] @ along) * np.linalg.norm(errors) < 0.05
+    assert slopes[where] @ line > 0
 
 
 @pytest.mark.parametrize("sigma", [1e-5, 1e3])
@@ -274,6 +296,26 @@ def test_least_squares_within_bounds_are_those_of_scipy(seed, n, room):
     assert np.all((low <= found) & (found <= high))
     squares = [np.sum((triangle @ x - wanted) ** 2) for x in (found, np.clip(other, low, high))]
     assert squares[0] <= squares[1] * (1 + 1e-9) + 1e-15
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12))
+def test_least_squares_behind_walls_are_those_within_bounds(seed, n):
+    """Where the walls are the bounds of the unknowns, some closed, some open."""
+    rng = np.random.default_rng(seed)
+    table = rng.normal(size=(3 * n, n)) @ (np.eye(n) + rng.normal(size=(n, n)))
+    triangle, wanted = module._triangle(
+        table / np.linalg.norm(table, axis=0), rng.normal(size=3 * n)
+    )
+    low, high = -rng.exponential(size=n), rng.exponential(size=n)
+    high[rng.random(n) < 0.3], low[rng.random(n) < 0.3] = 0.0, -np.inf
+    free = np.linalg.solve(triangle, wanted)
+    assume(np.any((free > high) | (free < low)))
+    rows, room = np.concatenate([np.eye(n), -np.eye(n)]), np.concatenate([high, -low])
+    found = module._behind_walls(triangle, wanted, rows, room)
+    assert np.all(rows @ found < room + 2e-7)
+    expected = module._within(triangle, wanted, low, high, free)
+    squares = [np.sum((triangle @ x - wanted) ** 2) for x in (found, expected)]
+    assert squares[0] == pytest.approx(squares[1], rel=1e-5, abs=1e-6)
 
 
 def test_what_is_guessed_wrong_is_left_to_scipy(monkeypatch):

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from astropolcal.gap.effects import Context, get_effect
+from astropolcal.gap.model import Model
+from astropolcal.gap.problem import Fit
 from astropolcal.gap.selection import _CLEARLY, _pushes
 
 DIATTENUATOR = "static_diattenuator"
@@ -49,6 +51,46 @@ def test_one_wavelength_at_the_limit_of_many_is_no_reason(strong, monkeypatch):
     assert model.is_physical(DIATTENUATOR)
     monkeypatch.setattr("astropolcal.gap.model._MOST_PRESSED", 0.1)
     assert not model.is_physical(DIATTENUATOR)
+
+
+def test_a_depolarizer_gains_no_polarization():
+    """What is retained counts from a level that the efficiency takes up: the law stops at one."""
+    name = "anisotropic_depolarizer"
+    model = data.fitted(data.observed(_retaining(np.linspace(1.0, 1.1, 7)), flux=1e8))
+    free = Context(model.context.wavelength, model.context.flux, None)
+    for context in (None, free):
+        added = model.with_effect(get_effect(name), context)
+        slot = added.problem.free.by_name[f"gap_{name}.retained_q"]
+        values = added.problem.vector(added.fit.coefficients)[slot.slice]
+        assert values.max() == pytest.approx(1.0, abs=1e-6)
+        assert added.is_physical(name)
+        assert 0 < added.at_bound(name) < 7
+        assert added.fit.chi2 < 0.02 * model.fit.chi2
+
+
+def test_bounds_that_no_optic_has_do_not_make_a_size_possible():
+    """An effect of a user may set bounds of its own: the Mueller matrix is not one then."""
+
+    class Wide(type(get_effect("anisotropic_depolarizer"))):
+        def build(self, size, anchor, context):
+            optic = super().build(size, anchor, context)
+            optic.retained_q.bounds = (0, 1.5)
+            return optic
+
+    problem, parameters = data.clean_model().edited(Wide())
+    for size, possible in ((0.9, True), (1.1, False)):
+        q = problem.start.copy()
+        q[problem.slices[parameters[0].name]] = size, 0.0, 0.0
+        model = Model(problem, Fit(q, 0.0, True), {Wide.name: parameters})
+        assert model.is_physical(Wide.name) == possible, size
+
+
+def _retaining(share):
+    """Return a chain with a depolarizer, of a low efficiency: there is room for more Q."""
+    true = data.with_effect("anisotropic_depolarizer", retained_q=share)
+    true["gap_anisotropic_depolarizer"].retained_v = share
+    true["wollaston"].efficiency = np.full(len(data.WAVELENGTH), 0.85)
+    return true
 
 
 def test_an_effect_without_a_place_is_left_out():

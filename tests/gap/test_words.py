@@ -195,6 +195,13 @@ def test_words_of_a_cause_say_all_that_is_known():
     assert words.endswith("The size is physically possible.")
 
 
+def test_a_size_at_a_bound_is_said_to_be_there():
+    several = {"g.i": {"value": [1.0, 0.9], "std": [0.01, 0.01], "unit": "", "limit": 1.0}}
+    for parameters, words in ((entry()["parameters"], ""), (several, " at 1 of 2 values")):
+        found = _words.cause(entry(parameters=parameters, at_bound=1), {})
+        assert found.endswith(f"The size is physically possible: at a bound of the optic{words}.")
+
+
 def test_what_is_not_known_of_a_cause_is_left_out():
     words = _words.cause(entry(gap_cv_before_percent=None, significance=None), {})
     assert "Left-out frames" not in words

@@ -71,6 +71,37 @@ class Around(Insertion):
         return Edit(edited, edit.parameters, ties)
 
 
+class Depolarization(Insertion):
+    """
+    A depolarizer by one number, with the losses that go with it.
+
+    One that loses Q alone is not physical: its coherency matrix has a negative eigenvalue.
+    """
+
+    free = {"retained_q": (0.01, 0.5)}
+    #: Shares that are the same as that of Q.
+    alike = ("retained_u", "retained_v")
+    #: Orientation of its axes.
+    theta = 0 * u.deg
+
+    def build(self, size, anchor, context):
+        """Return a depolarizer that keeps everything."""
+        keep = dict.fromkeys((*self.free, *self.alike), np.ones(size))
+        return optics.Depolarizer(**keep, theta=self.theta, name=self.label)
+
+    def edit(self, chains, context):
+        """Return the chains with the depolarizer at zero; see `Effect.edit`."""
+        edit = super().edit(chains, context)
+        (name,) = (parameter.name for parameter in edit.parameters)
+        ties = {f"{self.label}.{key}": Tie(name) for key in self.alike}
+        return Edit(edit.chains, edit.parameters, edit.ties | ties)
+
+    def _freed(self, optic):
+        for key in optic.param_names:
+            getattr(optic, key).fixed = key not in (*self.free, *self.alike)
+        return optic
+
+
 class Discrete(Effect):
     """An alternative without parameters: it is fitted from the start, or not at all."""
 
@@ -153,7 +184,6 @@ class BandAverage(Effect):
         )
         # along the axis nothing is lost
         optic.retained_q.fixed, optic.theta.bounds = True, (None, None)
-        optic.retained_u.bounds = optic.retained_v.bounds = (0.0, 1.5)
         return square / square.max(), insert_optic(chain, optic, after=retarder.name)
 
 

@@ -69,7 +69,7 @@ class _Freed(Effect):
             # where it was held is where the effect is absent
             value = u.Quantity(parameter.value, parameter.unit or u.one)
             parameter.fixed = False
-            parameter.bounds = _around(parameter, limit)
+            parameter.bounds = _around(parameter, limit, getattr(type(optic), key).bounds)
             name = f"{optic.name}.{key}"
             found[name] = EffectParameter(name, scale, limit, neutral=value)
         return found
@@ -79,14 +79,20 @@ def _in_unit(quantity, parameter):
     return u.Quantity(quantity).to_value(parameter.unit or u.one)
 
 
-def _around(parameter, limit):
-    """Return bounds that leave room on both sides of the value, and are no tighter than before."""
+def _around(parameter, limit, possible):
+    """
+    Return bounds that leave room on both sides of the value, and are no tighter than before.
+
+    The room ends where the optic itself has its bounds.
+    """
     room = _in_unit(limit, parameter)
     low, high = parameter.bounds
+    least = -np.inf if possible[0] is None else possible[0]
+    most = np.inf if possible[1] is None else possible[1]
     value = np.asarray(parameter.value)
     return (
-        None if low is None else min(low, float(value.min()) - room),
-        None if high is None else max(high, float(value.max()) + room),
+        None if low is None else min(low, max(least, float(value.min()) - room)),
+        None if high is None else max(high, min(most, float(value.max()) + room)),
     )
 
 

@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.gap.effects._shared import BandAverage, retardance_slopes
+from astropolcal.gap.effects._shared import BandAverage, Depolarization, retardance_slopes
 from astropolcal.gap.effects.base import EffectParameter, Insertion, label_of
 
 __all__ = [
@@ -210,7 +210,7 @@ class StaticDiattenuator(Insertion):
         )
 
 
-class AnisotropicDepolarizer(Insertion):
+class AnisotropicDepolarizer(Depolarization):
     """
     Depolarizer that is not the same for all orientations: a steep retarder averaged over a band.
 
@@ -225,14 +225,10 @@ class AnisotropicDepolarizer(Insertion):
     title = "depolarizer behind the derotator that is not the same for all orientations"
     shows = "Q measured where there is U, with the derotator angle"
     reference = "Harrington et al. 2019, doi:10.1117/1.JATIS.5.3.038001"
-    free = {"retained_q": (0.01, 0.5)}
-
-    def build(self, size, anchor, context):
-        """Return a depolarizer between the axes of the splitter, which keeps everything."""
-        # at 0 deg it would scale what the splitter sees: the efficiency takes that up
-        optic = optics.Depolarizer(retained_q=np.ones(size), theta=22.5 * u.deg, name=self.label)
-        optic.retained_q.bounds = (0.0, 1.5)
-        return optic
+    # at 0 deg it would scale what the splitter sees: the efficiency takes that up
+    theta = 22.5 * u.deg
+    # a retarder averaged over a band keeps what is along its axis, and loses the rest alike
+    alike = ("retained_v",)
 
 
 class DichroicBandAverage(BandAverage):
@@ -271,7 +267,7 @@ class DichroicBandAverage(BandAverage):
         return steep[max(steep)] if steep else None
 
 
-class BeamCrosstalk(Insertion):
+class BeamCrosstalk(Depolarization):
     """
     Light of one beam in the other: less modulation at all angles.
 
@@ -288,13 +284,6 @@ class BeamCrosstalk(Insertion):
     reference = "'t Hart et al. 2021, doi:10.1117/12.2594962"
     absorbed_by = "wollaston.efficiency"
     anchor, side = "splitter", "before"
-    free = {"retained_q": (0.01, 0.5)}
-
-    def build(self, size, anchor, context):
-        """Return a depolarizer that keeps everything."""
-        optic = optics.Depolarizer(retained_q=np.ones(size), name=self.label)
-        optic.retained_q.bounds = (0.0, 1.5)
-        return optic
 
 
 class SplitterOrientation(Insertion):

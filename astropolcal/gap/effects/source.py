@@ -6,6 +6,7 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import leaves, replace_optic
+from astropolcal.gap.effects._shared import Depolarization
 from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion
 
 __all__ = [
@@ -117,7 +118,7 @@ class SourceRotationDrift(Insertion):
         return optics.DriftRotator(mount="sequence", name=self.label)
 
 
-class PolarizerLeak(Insertion):
+class PolarizerLeak(Depolarization):
     """
     Calibration polarizer that lets some of the other polarization through.
 
@@ -134,16 +135,8 @@ class PolarizerLeak(Insertion):
     reference = "'t Hart et al. 2021, doi:10.1117/12.2594962"
     absorbed_by = "wollaston.efficiency"
     anchor = "polarizer"
+    # behind a polarizer a leak is an equal loss of all, whatever the axes
     free = {"retained_q": (0.01, 0.3)}
-
-    def build(self, size, anchor, context):
-        """Return a depolarizer along the polarizer."""
-        optic = optics.Depolarizer(
-            retained_q=np.ones(size), theta=anchor.theta.value * u.deg, name=self.label
-        )
-        # a bound at 1 would leave no room on one side of where the effect is absent
-        optic.retained_q.bounds = (0.0, 1.5)
-        return optic
 
 
 class StandardPolarization(Effect):
