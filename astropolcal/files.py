@@ -11,19 +11,35 @@ import errno
 import os
 import re
 import secrets
+import shutil
+import stat
+import sys
+import tempfile
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
 
-__all__ = ["atomic_path", "check_new", "check_yaml", "one_line", "understood"]
+__all__ = [
+    "append_line",
+    "atomic_path",
+    "check_kind",
+    "check_new",
+    "check_yaml",
+    "one_line",
+    "printable",
+    "understood",
+    "write_bytes",
+]
 
 # a file of ours is 12 levels deep; loaders call themselves at each and die at some thousands
 _DEEPEST = 64
 # how many times over links may repeat what is written, beyond some nodes that do no harm
 _MOST_REPEATS, _FREE_NODES = 10, 10_000
 _LONGEST_REASON = 240
+# bytes of a name that the usual file systems take
+_LONGEST_NAME = 255
 _STALE_SECONDS = 24 * 3600
 _ADVICE = {
     errno.ENOSPC: "free some space or name another folder",
@@ -33,9 +49,16 @@ _ADVICE = {
     errno.EPERM: "name a folder that you may write to",
     errno.EROFS: "name a folder that you may write to",
 }
+_BAD_NAMES = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP)
+_KINDS = {
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
 
 
-def check_new(path, overwrite=False, error=AstropolcalError):
+def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
     """
     Return the path of a file to write, before the work of writing it is done.
 
@@ -47,6 +70,8 @@ def check_new(path, overwrite=False, error=AstropolcalError):
         Whether a file that exists may be replaced.
     error : type
         What to raise.
+    sources : sequence of path-like
+        Files that the content comes from, which must not be replaced in any case.
 
     Returns
     -------
@@ -67,19 +92,35 @@ def check_new(path, overwrite=False, error=AstropolcalError):
     astropolcal.exceptions.AstropolcalError: no/run.ecsv: cannot be written: there is no folder no
     """
     path = Path(path)
-    if path.is_dir():
+    # os.path answers where pathlib raises: the name may be one that no system takes
+    if os.path.isdir(path):
         raise error(f"{path}: is a folder; name a file in it")
-    if path.exists() and not overwrite:
+    if os.path.exists(path) and not overwrite:
         raise error(f"{path}: exists already; overwrite=True replaces it")
-    if not path.parent.is_dir():
+    if not os.path.isdir(path.parent):
         raise error(f"{path}: cannot be written: there is no folder {path.parent}")
+    for source in sources:
+        if _is_same(path, source):
+            raise error(f"{path}: what is to be written was made from this file; name another one")
     return path
+
+
+def _is_same(path, other):
+    try:
+        return os.path.samefile(path, other)
+    except (OSError, ValueError):
+        # one of them is not there
+        return False
 
 
 @contextmanager
 def atomic_path(path, error=AstropolcalError):
     """
-    Give a temporary path beside ``path`` that takes its name in the end.
+    Give a temporary path that takes the place of ``path`` in the end.
+
+    A file that exists keeps its permissions, and a link stays a link: what it points to is
+    replaced. Pipes and devices, such as ``/dev/null``, stay what they are; the content is
+    written to them when the block ends well.
 
     Parameters
     ----------
@@ -91,7 +132,8 @@ def atomic_path(path, error=AstropolcalError):
     Yields
     ------
     `~pathlib.Path`
-        Where to write, with the same suffix. Nothing is there, and nobody else writes there.
+        Where to write, with the same suffix. Nobody else writes there. Nothing is there, or an
+        empty file that only its owner may read, where a file is to be replaced.
 
     Raises
     ------
@@ -112,45 +154,179 @@ def atomic_path(path, error=AstropolcalError):
     path = Path(path)
     if not path.name or "\0" in str(path):
         raise error(f"{str(path)!r}: is no name of a file")
+    try:
+        with (_poured if _is_stream(path) else _replaced)(path) as temporary:
+            yield temporary
+    except OSError as problem:
+        raise error(f"{path}: cannot be written: {_refusal(problem, path)}") from problem
+
+
+@contextmanager
+def _replaced(path):
+    """Give a hidden path beside a file, or what a link to it points to, that takes its name."""
+    path = Path(os.path.realpath(path))
     # by number of the process alone, one that was killed would stand in the way of another
-    mark = f"{os.getpid()}-{secrets.token_hex(4)}"
-    temporary = path.with_name(f".{path.stem[:100]}.{mark}.tmp{path.suffix}")
+    start, end = _hidden(path)
+    temporary = path.with_name(f"{start}{os.getpid()}-{secrets.token_hex(4)}{end}")
     try:
         _remove_stale(path)
+        old = os.stat(path) if path.exists() else None
+        if old is not None:
+            # what only some may read is not for all while it is written
+            os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
         yield temporary
         # else the name could reach the disk before the content
         with open(temporary, "rb+") as stream:
             os.fsync(stream.fileno())
+        if old is not None:
+            _keep_permissions(temporary, old)
         # atomic within a file system, hence the temporary file beside the final one
         os.replace(temporary, path)
         _sync_folder(path.parent)
-    except OSError as problem:
-        raise error(f"{path}: cannot be written: {_refusal(problem, path)}") from problem
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
+def _keep_permissions(path, old):
+    if hasattr(os, "chown"):
+        # group, then owner: the second is for root only
+        for owner in ((-1, old.st_gid), (old.st_uid, -1)):
+            with suppress(OSError):
+                os.chown(path, *owner)
+    os.chmod(path, stat.S_IMODE(old.st_mode))
+
+
+@contextmanager
+def _poured(path):
+    """Give a path elsewhere, whose content goes to a pipe or a device."""
+    with tempfile.TemporaryDirectory() as folder:
+        temporary = Path(folder) / path.name
+        yield temporary
+        number = _standard_stream(path)
+        with (
+            open(temporary, "rb") as source,
+            open(path if number is None else os.dup(number), "wb") as target,
+        ):
+            shutil.copyfileobj(source, target)
+
+
+def _is_stream(path):
+    """Return whether a file is no regular one, or is where our own words go."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        return False
+    return stat.S_IFMT(mode) in _KINDS or _standard_stream(path) is not None
+
+
+def _standard_stream(path):
+    """Return the number of the standard output or error, if a path leads there."""
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+        # closed, or never open
+        with suppress(OSError, AttributeError, ValueError):
+            if os.path.samestat(os.stat(path), os.fstat(number)):
+                stream.flush()
+                return number
+    return None
+
+
+def append_line(path, line, error=AstropolcalError):
+    r"""
+    Append a line to a file, which is on the disk then; all of it or nothing.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; it is made if it does not exist.
+    line : str
+        Without the end of the line.
+    error : type
+        What to raise where the operating system refuses.
+
+    Raises
+    ------
+    AstropolcalError
+        Of the type given.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from astropolcal.files import append_line
+    >>> append_line("night.jsonl", "{}")
+    >>> Path("night.jsonl").read_text()
+    '{}\n'
+    """
+    try:
+        is_new = not os.path.exists(path)
+        with open(path, "ab", buffering=0) as stream:
+            size = stream.seek(0, os.SEEK_END)
+            try:
+                write_bytes(stream.fileno(), f"{line}\n".encode())
+                os.fsync(stream.fileno())
+            except BaseException:
+                with suppress(OSError):
+                    os.remove(path) if is_new else stream.truncate(size)
+                raise
+    except OSError as problem:
+        raise error(f"{path}: cannot be written: {_refusal(problem, Path(path))}") from problem
+
+
+def write_bytes(number, content):
+    """
+    Write all of some bytes to an open file; a disk that fills up takes a part of them.
+
+    Parameters
+    ----------
+    number : int
+        Of the file, as the operating system counts.
+    content : bytes
+        What to write.
+
+    Raises
+    ------
+    OSError
+        If the operating system refuses.
+
+    Examples
+    --------
+    >>> from astropolcal.files import write_bytes
+    >>> with open("note.txt", "wb") as stream:
+    ...     write_bytes(stream.fileno(), b"all of it")
+    """
+    rest = memoryview(content)
+    while rest:
+        rest = rest[os.write(number, rest) :]
+
+
 def _refusal(problem, path):
-    if not path.parent.is_dir():
-        return f"there is no folder {path.parent}"
+    parent = Path(os.path.realpath(path)).parent
+    if not os.path.isdir(parent):
+        return f"there is no folder {parent if os.path.islink(path) else path.parent}"
     reason = problem.strerror or one_line(problem)
     advice = _ADVICE.get(problem.errno)
     return f"{reason}; {advice}" if advice else reason
 
 
+def _hidden(path):
+    """Return how the hidden names of a file begin and end."""
+    suffix = path.suffix if len(os.fsencode(path.suffix)) < 50 else ""
+    # what is left for the stem beside two numbers, in bytes; a character may have four
+    room = _LONGEST_NAME - len(os.fsencode(suffix)) - 30
+    stem = os.fsdecode(os.fsencode(path.stem[:100])[:room])
+    return f".{stem}.", f".tmp{suffix}"
+
+
 def _remove_stale(path):
     """Remove what runs that were killed long ago left of the same file."""
-    ours = re.compile(re.escape(f".{path.stem[:100]}.") + r"\d+(-[0-9a-f]{8})?\.tmp")
+    start, end = map(re.escape, _hidden(path))
+    ours = re.compile(rf"{start}\d+(-[0-9a-f]{{8}})?{end}")
     limit = time.time() - _STALE_SECONDS
     with suppress(OSError):
         for other in os.scandir(path.parent):
-            stem, suffix = os.path.splitext(other.name)
             # somebody else may have removed it meanwhile
             with suppress(OSError):
-                fits = suffix == path.suffix if path.suffix else suffix == ".tmp"
-                stem = stem if path.suffix else other.name
-                if fits and ours.fullmatch(stem) and other.stat().st_mtime < limit:
+                if ours.fullmatch(other.name) and other.stat().st_mtime < limit:
                     os.unlink(other.path)
 
 
@@ -167,12 +343,46 @@ def _sync_folder(folder):
 # ---- what is read ------------------------------------------------------------------
 
 
+def check_kind(path, error=AstropolcalError):
+    """
+    Refuse to read a pipe, a device or a socket, which may have no end.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; it need not exist.
+    error : type
+        What to raise.
+
+    Raises
+    ------
+    AstropolcalError
+        Of the type given.
+
+    Examples
+    --------
+    >>> from astropolcal.files import check_kind
+    >>> check_kind("/dev/null")
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.AstropolcalError: /dev/null: is a device; a regular file is needed
+    """
+    try:
+        kind = _KINDS.get(stat.S_IFMT(os.stat(path).st_mode))
+    except (OSError, ValueError):
+        # what else is wrong with it is for its reader to say
+        return
+    if kind:
+        raise error(f"{path}: is {kind}; a regular file is needed")
+
+
 @contextmanager
-def understood(path, error, words):
+def understood(path, error, words, *, reads=True):
     """
     Turn whatever goes wrong in a reader into one line that names the file.
 
-    Parsers raise errors of every kind for a damaged file. Errors of ours pass unchanged.
+    Parsers raise errors of every kind for a damaged file. Errors of ours pass unchanged. What
+    is no regular file is refused before it is opened, see `check_kind`.
 
     Parameters
     ----------
@@ -182,6 +392,8 @@ def understood(path, error, words):
         What to raise.
     words : str
         What the file is not, such as ``"not a readable FITS file"``.
+    reads : bool
+        Whether the file is going to be read.
 
     Raises
     ------
@@ -198,6 +410,8 @@ def understood(path, error, words):
     ...
     astropolcal.exceptions.ObservationError: night.json: not a journal: KeyError: 'frame'
     """
+    if reads:
+        check_kind(path, error)
     try:
         yield
     except AstropolcalError:
@@ -206,9 +420,10 @@ def understood(path, error, words):
         raise error(f"{path}: no such file") from None
     except IsADirectoryError:
         raise error(f"{path}: is a folder, not a file") from None
-    except PermissionError as problem:
-        raise error(f"{path}: cannot be read: {problem.strerror or problem}") from problem
     except Exception as problem:
+        if isinstance(problem, PermissionError) or getattr(problem, "errno", None) in _BAD_NAMES:
+            reason = getattr(problem, "strerror", None) or one_line(problem)
+            raise error(f"{path}: cannot be read: {reason}") from problem
         raise error(f"{path}: {words}: {one_line(problem)}") from problem
 
 
@@ -220,8 +435,8 @@ def one_line(problem, longest=_LONGEST_REASON):
     ----------
     problem : Exception or object
         The error, whose type is named where its words alone say little, or a text.
-    longest : int
-        Number of characters to keep.
+    longest : int or None
+        Number of characters to keep; None for all.
 
     Returns
     -------
@@ -239,8 +454,33 @@ def one_line(problem, longest=_LONGEST_REASON):
     plain = isinstance(problem, ValueError | OSError) or not isinstance(problem, BaseException)
     if not text or not plain:
         text = f"{type(problem).__name__}: {text}".removesuffix(": ")
-    text = "".join(c if c.isprintable() else "?" for c in text)
-    return text if len(text) <= longest else f"{text[:longest]}..."
+    text = printable(text)
+    return text if longest is None or len(text) <= longest else f"{text[:longest]}..."
+
+
+def printable(text):
+    r"""
+    Return a text without what a terminal or a page would act on; ends of lines stay.
+
+    Control characters, and marks that turn the direction of writing, may stand in names of
+    files and in what these hold.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> from astropolcal.files import printable
+    >>> printable("\x1b[31mnight\u202e.ecsv\n")
+    '?[31mnight?.ecsv\n'
+    """
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in str(text))
 
 
 def check_yaml(text, error=AstropolcalError):

@@ -7,9 +7,14 @@ so that a run writes raw numbers in place and never touches the structure of
 the file. First the new rows of the chain go out and are synced, then a record
 that counts them, in one of two places in turn; a torn record does not match
 its CRC and the other one holds.
+
+HDF5 writes nothing to a disk itself: where that fails it cannot close the file
+any more, and takes the process with it. It makes the structure in memory, and
+says at which bytes the numbers are.
 """
 
 import errno
+import io
 import json
 import os
 import struct
@@ -21,14 +26,18 @@ import numpy as np
 
 from astropolcal.calibration._optional import need
 from astropolcal.exceptions import FitError
-from astropolcal.files import atomic_path, one_line, understood
+from astropolcal.files import atomic_path, check_kind, one_line, understood, write_bytes
 
 _FORMAT = "astropolcal posterior checkpoint 2"
 _KEYS = 624  # words of the state of MT19937
 # steps, CRC of all of them, and what else the state of the generator holds
 _HEAD = struct.Struct("<qIiid")
 _CRC = struct.Struct("<I")
+# the arrays that a run writes to, little-endian whatever the machine, so that it may move
+_WRITTEN = {"chain": np.dtype("<f8"), "log_prob": np.dtype("<f8"), "record": np.dtype("u1")}
 _MOST_WORDS = 2**24
+_BUSY = "is in use by another run"
+_PAGE = 4096
 
 
 class Chain:
@@ -53,7 +62,7 @@ class Chain:
         self.accepted = np.zeros(shape[1], dtype=np.int64)
         self.random_state = None
         self._crc = 0
-        self._file = None
+        self._file, self._places = None, {}
         self._slot = 0
 
     @contextmanager
@@ -83,7 +92,9 @@ class Chain:
             self._continue(h5py, path, found)
         if not (found and resume) or found["capacity"] < len(self.coords):
             self._create(h5py, path, description, arrays)
-        with _opened(h5py, path, "r+") as self._file:
+        with _opened(h5py, path) as file, _intact(path):
+            self._places = {key: _place(h5py, file, key) for key in _WRITTEN}
+        with _held(path) as self._file:
             try:
                 yield self
             finally:
@@ -96,7 +107,7 @@ class Chain:
         shapes = {"chain": self.coords.shape[1:], "log_prob": self.log_prob.shape[1:]}
         if found["accepted"].shape != self.accepted.shape or found["shapes"] != shapes:
             raise FitError(f"{path}: the checkpoint is damaged: it is of {found['shapes']}")
-        with _opened(h5py, path, "r") as file, _intact(path):
+        with _opened(h5py, path) as file, _intact(path):
             crc = self._take(_plain(h5py, file, "chain"), _plain(h5py, file, "log_prob"))
         if crc != found["crc"]:
             raise FitError(f"{path}: the checkpoint is damaged: its steps do not match their CRC")
@@ -117,23 +128,22 @@ class Chain:
 
     def _create(self, h5py, path, description, arrays):
         """Write a file with room for all steps; it takes its name when it is complete."""
-        with atomic_path(path, error=FitError) as temporary, _as_os_errors():
-            with h5py.File(temporary, "w", libver="earliest") as file:
-                file.attrs["format"] = np.bytes_(_FORMAT)
-                text = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
-                file["description"] = text
-                for key, array in arrays.items():
-                    file[f"fixed/{key}"] = array
-                _allocate(h5py, file, "chain", self.coords)[: self.count] = self._done(self.coords)
-                _allocate(h5py, file, "log_prob", self.log_prob)[: self.count] = self._done(
-                    self.log_prob
-                )
-                record = self._record(self._crc)
-                file["record"] = np.stack([record, record])
+        record = self._record(self._crc)
+        memory = _Pages()
+        with h5py.File(memory, "w", libver="earliest") as file:
+            file.attrs["format"] = np.bytes_(_FORMAT)
+            file["description"] = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
+            for key, array in arrays.items():
+                file[f"fixed/{key}"] = array
+            file["record"] = np.stack([record, record])
+            _allocate(h5py, file, "chain", self.coords)
+            _allocate(h5py, file, "log_prob", self.log_prob)
+            self._places = {key: _place(h5py, file, key) for key in _WRITTEN}
+        with atomic_path(path, error=FitError) as temporary:
+            with open(temporary, "wb") as stream:
+                memory.copy_to(stream)
+                self._write_steps(stream.fileno(), slice(0, self.count))
             _take_room(temporary)
-
-    def _done(self, array):
-        return array[: self.count]
 
     def append(self, coords, log_prob, random_state, accepted):
         """Keep a step; bring the file up to date when it is time."""
@@ -148,28 +158,30 @@ class Chain:
         if self._file is None or self.count == self.saved:
             return
         new = slice(self.saved, self.count)
+        number = self._file.fileno()
         try:
-            self._file["chain"][new] = self.coords[new]
-            self._file["log_prob"][new] = self.log_prob[new]
+            self._write_steps(number, new)
             self._sync()
             # once more after a write that failed, so from what is safe
             crc = _crc_of(self.coords[new], self.log_prob[new], self._crc)
-            self._file["record"][self._slot] = self._record(crc)
+            _write_rows(number, self._places["record"], self._slot, self._record(crc)[None])
             self._sync()
         except OSError as error:
             raise FitError(
-                f"{self._file.filename}: cannot be written: {one_line(error)}; its first "
+                f"{self._file.name}: cannot be written: {one_line(error)}; its first "
                 f"{self.saved} steps are safe, the run goes on from there"
             ) from error
         self.saved, self._crc, self._slot = self.count, crc, 1 - self._slot
 
+    def _write_steps(self, number, rows):
+        _write_rows(number, self._places["chain"], rows.start, self.coords[rows])
+        _write_rows(number, self._places["log_prob"], rows.start, self.log_prob[rows])
+
     def _sync(self):
-        self._file.flush()
-        os.fsync(self._file.id.get_vfd_handle())
+        os.fsync(self._file.fileno())
 
     def _record(self, crc):
         """Return count, random state, acceptance and their CRC as bytes."""
-        # little-endian whatever the machine, so that a run may move
         keys = np.zeros(_KEYS, dtype="<u4")
         head = (0, 0, 0.0)
         if self.random_state is not None:
@@ -187,13 +199,71 @@ def _crc_of(coords, log_prob, crc):
     return crc
 
 
-@contextmanager
-def _as_os_errors():
-    """HDF5 tells of a full disk in errors of its own while it closes a file."""
-    try:
-        yield
-    except RuntimeError as error:
-        raise OSError(one_line(error)) from error
+class _Pages(io.RawIOBase):
+    """A file in memory, of which only what is written takes room."""
+
+    def __init__(self):
+        super().__init__()
+        self._pages, self._size, self._at = {}, 0, 0
+
+    def readable(self):
+        return True
+
+    def writable(self):
+        return True
+
+    def seekable(self):
+        return True
+
+    def seek(self, offset, whence=os.SEEK_SET):
+        self._at = offset + {os.SEEK_CUR: self._at, os.SEEK_END: self._size}.get(whence, 0)
+        return self._at
+
+    def truncate(self, size=None):
+        self._size = self._at if size is None else size
+        return self._size
+
+    def write(self, content):
+        content = memoryview(content).cast("B")
+        for page, inside, part in self._parts(len(content)):
+            self._pages.setdefault(page, bytearray(_PAGE))[inside] = content[part]
+        self._at += len(content)
+        self._size = max(self._size, self._at)
+        return len(content)
+
+    def readinto(self, buffer):
+        view = memoryview(buffer).cast("B")[: max(self._size - self._at, 0)]
+        for page, inside, part in self._parts(len(view)):
+            view[part] = self._pages.get(page, bytes(_PAGE))[inside]
+        self._at += len(view)
+        return len(view)
+
+    def _parts(self, size):
+        """Yield the number of each page from here on, and what of it is what of the content."""
+        done = 0
+        while done < size:
+            page, start = divmod(self._at + done, _PAGE)
+            part = min(_PAGE - start, size - done)
+            yield page, slice(start, start + part), slice(done, done + part)
+            done += part
+
+    def copy_to(self, stream):
+        """Write it to a file on a disk, which has holes where nothing was written."""
+        stream.truncate(self._size)
+        for page, content in self._pages.items():
+            stream.seek(page * _PAGE)
+            stream.write(content[: self._size - page * _PAGE])
+        stream.flush()
+
+
+def _write_rows(number, place, first, rows):
+    """Write rows of an array at their place in a file."""
+    offset, kind = place
+    content = np.ascontiguousarray(rows, dtype=kind)
+    # the bytes of one row; there may be none to write
+    size = content[:1].nbytes
+    os.lseek(number, offset + first * size, os.SEEK_SET)
+    write_bytes(number, content.tobytes())
 
 
 def _take_room(path):
@@ -220,12 +290,33 @@ def _allocate(h5py, file, name, like):
 
 
 @contextmanager
-def _opened(h5py, path, mode):
+def _held(path):
+    """Open a checkpoint for the writes of one run; no other one opens it meanwhile."""
     try:
-        file = h5py.File(path, mode, libver="earliest", locking=True)
+        stream = open(path, "rb+", buffering=0)
+    except OSError as error:
+        raise FitError(f"{path}: cannot be written: {error.strerror}") from error
+    with stream:
+        try:
+            import fcntl
+
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise FitError(f"{path}: {_BUSY}") from error
+        except (ImportError, OSError):
+            # a system without such locks: two runs may meet
+            pass
+        yield stream
+
+
+@contextmanager
+def _opened(h5py, path):
+    try:
+        # the lock that h5py takes is refused while another run holds its own
+        file = h5py.File(path, "r", libver="earliest", locking=True)
     except OSError as error:
         busy = isinstance(error, BlockingIOError) or "unable to lock" in str(error)
-        reason = "is in use by another run" if busy else f"is no checkpoint ({one_line(error)})"
+        reason = _BUSY if busy else f"is no checkpoint ({one_line(error)})"
         raise FitError(f"{path}: {reason}") from error
     except Exception as error:
         raise FitError(f"{path}: is no checkpoint ({one_line(error)})") from error
@@ -241,9 +332,10 @@ def _intact(path):
 
 def _read(h5py, path, names=()):
     """Return what a checkpoint holds, its steps not yet; None where there is no file."""
-    if not path.exists():
+    if not os.path.exists(path):
         return None
-    with _opened(h5py, path, "r") as file, _intact(path):
+    check_kind(path, FitError)
+    with _opened(h5py, path) as file, _intact(path):
         if _format_of(h5py, file) != _FORMAT.encode():
             raise FitError(f"{path}: is an HDF5 file but no checkpoint of this version")
         # looked up, not listed: a damaged list may claim any length
@@ -293,6 +385,15 @@ def _parts(name):
     """Return a name and those of the groups it is in."""
     parts = name.split("/")
     return ["/".join(parts[: i + 1]) for i in range(len(parts))]
+
+
+def _place(h5py, file, name):
+    """Return where the numbers of an array begin in the file, and of which type they are."""
+    found, kind = _plain(h5py, file, name), _WRITTEN[name]
+    offset = found.id.get_offset()
+    if found.dtype != kind or offset is None:
+        raise ValueError(f"{name} is of type {found.dtype}, at byte {offset}")
+    return offset, kind
 
 
 def _small(h5py, file, name, kinds):

@@ -177,9 +177,10 @@ def write_mueller(table, path, overwrite=False):
     path = check_new(path, overwrite, CalibrationFileError)
     with atomic_path(path, error=CalibrationFileError) as temporary:
         if kind == ".ecsv":
-            _plain(table).write(temporary, format="ascii.ecsv")
-        else:
-            _hdus(table).writeto(temporary)
+            _plain(table).write(temporary, format="ascii.ecsv", overwrite=True)
+            return
+        with open(temporary, "wb") as stream:
+            _hdus(table).writeto(stream)
 
 
 def _plain(table):

@@ -80,7 +80,7 @@ def write_calibration(calibration, path, overwrite=False):
     True
     """
     path = check_new(path, overwrite, CalibrationFileError)
-    with _speaking_of(path, "cannot be written", "cannot be written: "):
+    with _speaking_of(path, "cannot be written", "cannot be written: ", reads=False):
         content = _to_bytes(calibration)
     with atomic_path(path, error=CalibrationFileError) as temporary:
         temporary.write_bytes(content)
@@ -121,9 +121,6 @@ def read_calibration(path):
     49
     """
     path = Path(path)
-    if not path.is_file():
-        what = "is a folder, not a file" if path.is_dir() else "no such file"
-        raise CalibrationFileError(f"{path}: {what}")
     with _speaking_of(path, "damaged"):
         content = path.read_bytes()
         # cheap checks first: most broken files are truncated or something else
@@ -198,7 +195,7 @@ def _check_ends(content):
 def _check_tree(content):
     """Check text and tags before any object is made, so that nothing unknown is."""
     end = re.search(YAML_END_MARKER_REGEX, content)
-    with _speaking_of("damaged", "its YAML"):
+    with _speaking_of("damaged", "its YAML", reads=False):
         check_yaml(content[: end.end()], CalibrationFileError)
     _check_blocks(content, end.end())
     tree = asdf.util.load_yaml(io.BytesIO(content), tagged=True)
@@ -285,9 +282,9 @@ def _check_array(node, size):
 
 
 @contextmanager
-def _speaking_of(path, words, prefix=""):
+def _speaking_of(path, words, prefix="", reads=True):
     """Turn whatever goes wrong into one line that names the file."""
-    with understood(path, CalibrationFileError, words):
+    with understood(path, CalibrationFileError, words, reads=reads):
         try:
             yield
         except CalibrationFileError as error:

@@ -57,7 +57,7 @@ def write_product(corrected, path, *, overwrite=False, maps=True):
     Raises
     ------
     ObservationError
-        If the file exists or cannot be written.
+        If the file exists or cannot be written, or is one of the frames.
 
     Examples
     --------
@@ -67,14 +67,15 @@ def write_product(corrected, path, *, overwrite=False, maps=True):
     ...
     astropolcal.exceptions.ObservationError: .: is a folder; name a file in it
     """
-    path = check_new(path, overwrite, ObservationError)
+    made_from = [] if corrected is None else corrected.provenance.get("frames", [])
+    path = check_new(path, overwrite, ObservationError, made_from)
     hdus = [fits.PrimaryHDU(corrected.stokes, _header(corrected)), _wavelengths(corrected)]
     hdus += _errors(corrected)
     if maps:
         hdus += _maps(corrected)
     hdus.append(_frames(corrected))
-    with atomic_path(path, ObservationError) as temporary:
-        fits.HDUList(hdus).writeto(temporary, overwrite=True, checksum=True)
+    with atomic_path(path, ObservationError) as temporary, open(temporary, "wb") as stream:
+        fits.HDUList(hdus).writeto(stream, checksum=True)
 
 
 def _header(corrected):

@@ -18,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from astropolcal.exceptions import AstropolcalError, GapError
+from astropolcal.files import append_line, understood
 from astropolcal.gap._bench import UNKNOWN, Bench, Key, Setup, plant
 from astropolcal.gap._outcome import ChallengeResult
 from astropolcal.gap.diagnosis import diagnose
@@ -316,10 +317,13 @@ def _journal(path, settings):
     if path is None:
         return {}
     path = Path(path)
-    if not path.exists() or not path.stat().st_size:
+    text = b""
+    if os.path.exists(path):
+        with understood(path, GapError, "cannot be read"):
+            text = path.read_bytes()
+    if not text:
         _append(path, {"settings": settings})
         return {}
-    text = path.read_bytes()
     whole = text[: text.rfind(b"\n") + 1]
     try:
         first, *others = [json.loads(line) for line in whole.splitlines()]
@@ -335,7 +339,11 @@ def _journal(path, settings):
     if wrong:
         raise GapError(f"{path}: is of other settings ({', '.join(wrong)}); remove it")
     # a run that was killed may have left half a line
-    os.truncate(path, len(whole))
+    if len(whole) < len(text):
+        try:
+            os.truncate(path, len(whole))
+        except OSError as problem:
+            raise GapError(f"{path}: cannot be written: {problem.strerror}") from problem
     return records
 
 
@@ -354,11 +362,5 @@ def _index(record):
 def _append(path, content):
     if path is None:
         return
-    try:
-        with open(path, "ab") as stream:
-            stream.write((json.dumps(content) + "\n").encode())
-            stream.flush()
-            # a record that was reported is on the disk, whatever happens then
-            os.fsync(stream.fileno())
-    except OSError as problem:
-        raise GapError(f"{path}: cannot be written: {problem.strerror}") from problem
+    # a record that was reported is on the disk, whatever happens then
+    append_line(path, json.dumps(content), GapError)

@@ -644,7 +644,7 @@ class Observations:
         try:
             with atomic_path(path, ObservationError) as temporary:
                 # a plain Table gives a header that people can read, unlike a QTable
-                Table(self.to_table()).write(temporary, format="ascii.ecsv")
+                Table(self.to_table()).write(temporary, format="ascii.ecsv", overwrite=True)
         except ObservationError:
             raise
         except Exception as error:  # meta may hold what YAML cannot represent

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Quick look at a reduced run: apertures over images, and the run over time."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -342,7 +343,7 @@ def save_quicklook(reduction, folder):
     astropolcal.exceptions.ObservationError: /nowhere/deep/down: there is no folder /nowhere/deep
     """
     folder = Path(folder)
-    if not folder.parent.is_dir():
+    if not os.path.isdir(folder.parent):
         raise ObservationError(f"{folder}: there is no folder {folder.parent}")
     try:
         folder.mkdir(exist_ok=True)

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Files of simulated cubes: their names, headers and extensions."""
 
+import os
 import re
 
 import astropy.units as u
@@ -15,9 +16,9 @@ from astropolcal.instruments.keywords import TEXTS, unit_of
 
 def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):
     """Return the paths of cube and raw header of every frame."""
-    if not directory.parent.is_dir():
+    if not os.path.isdir(directory.parent):
         raise ObservationError(f"{directory}: there is no folder {directory.parent}")
-    if directory.exists() and not directory.is_dir():
+    if os.path.exists(directory) and not os.path.isdir(directory):
         raise ObservationError(f"{directory}: is a file, not a folder")
     prefix = layout.prefix if prefix is None else prefix
     # eight digits, as the frame numbers of the Subaru archive have
@@ -35,7 +36,7 @@ def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):
     every = [(cube, layout.left_file(cube), header) for cube, header in names]
     # all names before the first file is written: a run is replaced whole or not at all
     for path in (path for group in every for path in group if path is not None):
-        if path.exists():
+        if os.path.exists(path):
             check_new(path, overwrite, ObservationError)
     folder = directory / "raw" if raw else directory
     try:
@@ -85,8 +86,8 @@ def _hdus(header, image, weight, layout):
 
 
 def _save(hdus, path):
-    with atomic_path(path, ObservationError) as temporary:
-        hdus.writeto(temporary, overwrite=True)
+    with atomic_path(path, ObservationError) as temporary, open(temporary, "wb") as stream:
+        hdus.writeto(stream)
 
 
 def header_of(frame, layout):

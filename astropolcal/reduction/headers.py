@@ -6,6 +6,7 @@ An extracted cube may lack keywords that the raw frame of the same number has.
 What is missing, impossible or contradictory is reported for each file.
 """
 
+import os
 import re
 from collections import Counter
 from dataclasses import dataclass, field
@@ -147,7 +148,7 @@ def raw_frames(folder, layout):
     astropolcal.exceptions.ObservationError: nowhere: no such folder
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise ObservationError(f"{folder}: no such folder")
     found = {}
     for path in sorted(folder.iterdir()):

@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from astropolcal.exceptions import ObservationError
+from astropolcal.files import append_line, understood
 from astropolcal.reduction.frames import Frame
 
 __all__ = ["Journal"]
@@ -59,17 +60,16 @@ class Journal:
         self.path = None if path is None else Path(path)
         text = json.dumps(settings, sort_keys=True, default=repr)
         self._settings = hashlib.sha256(text.encode()).hexdigest()[:16]
+        self._is_cut = False
         self._known = {} if self.path is None else self._read()
-        self._stream = None
 
     def _read(self):
-        if not self.path.exists():
+        if not os.path.exists(self.path):
             return {}
-        try:
-            lines = self.path.read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ObservationError(f"{self.path}: cannot be read as a journal: {error}") from None
-        known = {}
+        with understood(self.path, ObservationError, "cannot be read as a journal"):
+            text = self.path.read_text(encoding="utf-8")
+        lines, known = text.splitlines(), {}
+        self._is_cut = not text.endswith("\n") and bool(text)
         for line in lines:
             # a line may have been cut off when a run was stopped
             with suppress(*_DAMAGE):
@@ -95,18 +95,7 @@ class Journal:
         key = self._key(frame.path)
         if self.path is None or key is None:
             return
-        try:
-            if self._stream is None:
-                self._stream = open(self.path, "a", encoding="utf-8")
-                # after a line that was cut off
-                self._stream.write("\n" if self._stream.tell() else "")
-            self._stream.write(json.dumps({"key": key, "frame": frame.to_dict()}) + "\n")
-            self._stream.flush()
-        except OSError as error:
-            raise ObservationError(f"{self.path}: cannot be written: {error.strerror}") from None
-
-    def close(self):
-        """Close the file."""
-        if self._stream is not None:
-            self._stream.close()
-            self._stream = None
+        # a line that was cut off ends here
+        start, self._is_cut = "\n" if self._is_cut else "", False
+        line = json.dumps({"key": key, "frame": frame.to_dict()})
+        append_line(self.path, start + line, ObservationError)

@@ -10,6 +10,7 @@ and ``a`` (parallactic angle and altitude), all angles in degree.
 """
 
 import csv
+import os
 from pathlib import Path
 
 import astropy.units as u
@@ -17,7 +18,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import one_line
+from astropolcal.files import one_line, understood
 from astropolcal.observations import Observations
 from astropolcal.units import plain_number
 
@@ -97,7 +98,7 @@ def read_pypolcal(files, meta=None, *, name=None):
 def _paths(files):
     if isinstance(files, str | Path):
         folder = Path(files)
-        files = sorted(folder.glob("*.csv")) if folder.is_dir() else [folder]
+        files = sorted(folder.glob("*.csv")) if os.path.isdir(folder) else [folder]
         if not files:
             raise ObservationError(f"{folder}: no CSV file in this folder")
     paths = [Path(path) for path in files]
@@ -107,19 +108,17 @@ def _paths(files):
 
 
 def _rows(path):
-    try:
-        with open(path, encoding="utf-8", newline="") as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
-            if missing:
-                raise ObservationError(
-                    f"{path}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}"
-                )
-            return [row for row in reader if any(row.values())]
-    except FileNotFoundError:
-        raise ObservationError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ObservationError(f"{path}: cannot be read as CSV: {error}") from None
+    with (
+        understood(path, ObservationError, "cannot be read as CSV"),
+        open(path, encoding="utf-8", newline="") as stream,
+    ):
+        reader = csv.DictReader(stream, skipinitialspace=True)
+        missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
+        if missing:
+            raise ObservationError(
+                f"{path}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}"
+            )
+        return [row for row in reader if any(row.values())]
 
 
 def _numbers(rows, column):

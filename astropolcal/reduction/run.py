@@ -342,16 +342,13 @@ def _measure_all(files, task, workers, resume, progress):
     # a file that is named twice is measured once
     todo = [path for path in dict.fromkeys(files) if path not in found]
     done = len(found)
-    try:
-        for frame in _results(todo, task, _count(workers, len(todo))):
-            found[frame.path] = frame
-            # at once: a run that is killed keeps what is done
-            journal.add(frame)
-            done += 1
-            if progress is not None:
-                progress(done, len(set(files)))
-    finally:
-        journal.close()
+    for frame in _results(todo, task, _count(workers, len(todo))):
+        found[frame.path] = frame
+        # at once: a run that is killed keeps what is done
+        journal.add(frame)
+        done += 1
+        if progress is not None:
+            progress(done, len(set(files)))
     return [found[path] for path in dict.fromkeys(files)]
 
 

@@ -170,4 +170,4 @@ def write_table(table, path, overwrite=False):
     """
     path = check_new(path, overwrite, ObservationError)
     with atomic_path(path, ObservationError) as temporary:
-        table.write(temporary, format="ascii.ecsv")
+        table.write(temporary, format="ascii.ecsv", overwrite=True)

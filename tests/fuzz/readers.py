@@ -943,7 +943,6 @@ class Journal(Reader):
             cube.write_bytes(Cube().seeds()["plain"])
             journal = Ours(path, {"a": 1})
             journal.add(reduce_frame(str(cube), small_layout()))
-            journal.close()
             return {"one": path.read_bytes()}
 
     def mutate(self, rng, content):

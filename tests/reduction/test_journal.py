@@ -29,7 +29,6 @@ def cube(tmp_path):
 def write(path, frame, **settings):
     journal = Journal(path, settings)
     journal.add(frame)
-    journal.close()
 
 
 def test_frame_comes_back_exactly(cube, tmp_path):
@@ -111,12 +110,12 @@ def test_an_entry_that_is_no_frame_is_ignored(cube, tmp_path, spoil):
 
 def test_what_cannot_be_read_or_written_is_said(cube, tmp_path):
     _, frame = cube
-    with pytest.raises(ObservationError, match="cannot be read as a journal"):
+    with pytest.raises(ObservationError, match="is a folder, not a file"):
         Journal(tmp_path, {})
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ObservationError, match="binary: cannot be read as a journal"):
         Journal(tmp_path / "binary", {})
-    with pytest.raises(ObservationError, match=r"run: cannot be written: No such file"):
+    with pytest.raises(ObservationError, match=r"run: cannot be written: there is no folder"):
         write(tmp_path / "no" / "run", frame)
 
 
