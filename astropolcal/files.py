@@ -21,17 +21,7 @@ from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
 
-__all__ = [
-    "append_line",
-    "atomic_path",
-    "check_kind",
-    "check_new",
-    "check_yaml",
-    "one_line",
-    "printable",
-    "understood",
-    "write_bytes",
-]
+__all__ = ["atomic_path", "check_new", "check_yaml", "one_line", "understood"]
 
 # a file of ours is 12 levels deep; loaders call themselves at each and die at some thousands
 _DEEPEST = 64
@@ -232,31 +222,7 @@ def _standard_stream(path):
 
 
 def append_line(path, line, error=AstropolcalError):
-    r"""
-    Append a line to a file, which is on the disk then; all of it or nothing.
-
-    Parameters
-    ----------
-    path : path-like
-        The file; it is made if it does not exist.
-    line : str
-        Without the end of the line.
-    error : type
-        What to raise where the operating system refuses.
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from astropolcal.files import append_line
-    >>> append_line("night.jsonl", "{}")
-    >>> Path("night.jsonl").read_text()
-    '{}\n'
-    """
+    """Append a line to a file, which is on the disk then; all of it or nothing."""
     try:
         is_new = not os.path.exists(path)
         with open(path, "ab", buffering=0) as stream:
@@ -273,27 +239,7 @@ def append_line(path, line, error=AstropolcalError):
 
 
 def write_bytes(number, content):
-    """
-    Write all of some bytes to an open file; a disk that fills up takes a part of them.
-
-    Parameters
-    ----------
-    number : int
-        Of the file, as the operating system counts.
-    content : bytes
-        What to write.
-
-    Raises
-    ------
-    OSError
-        If the operating system refuses.
-
-    Examples
-    --------
-    >>> from astropolcal.files import write_bytes
-    >>> with open("note.txt", "wb") as stream:
-    ...     write_bytes(stream.fileno(), b"all of it")
-    """
+    """Write bytes to an open file, by its number; a disk that fills up takes a part of them."""
     rest = memoryview(content)
     while rest:
         rest = rest[os.write(number, rest) :]
@@ -344,29 +290,7 @@ def _sync_folder(folder):
 
 
 def check_kind(path, error=AstropolcalError):
-    """
-    Refuse to read a pipe, a device or a socket, which may have no end.
-
-    Parameters
-    ----------
-    path : path-like
-        The file; it need not exist.
-    error : type
-        What to raise.
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given.
-
-    Examples
-    --------
-    >>> from astropolcal.files import check_kind
-    >>> check_kind("/dev/null")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.AstropolcalError: /dev/null: is a device; a regular file is needed
-    """
+    """Refuse to read a pipe, a device or a socket, which may have no end."""
     try:
         kind = _KINDS.get(stat.S_IFMT(os.stat(path).st_mode))
     except (OSError, ValueError):
@@ -451,36 +375,20 @@ def one_line(problem, longest=_LONGEST_REASON):
     "KeyError: 'names'"
     """
     text = " ".join(str(problem).split())
-    plain = isinstance(problem, ValueError | OSError) or not isinstance(problem, BaseException)
-    if not text or not plain:
+    plain = isinstance(problem, ValueError | OSError)
+    if isinstance(problem, BaseException) and not (text and plain):
         text = f"{type(problem).__name__}: {text}".removesuffix(": ")
     text = printable(text)
     return text if longest is None or len(text) <= longest else f"{text[:longest]}..."
 
 
 def printable(text):
-    r"""
-    Return a text without what a terminal or a page would act on; ends of lines stay.
-
-    Control characters, and marks that turn the direction of writing, may stand in names of
-    files and in what these hold.
-
-    Parameters
-    ----------
-    text : str
-        Any text.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> from astropolcal.files import printable
-    >>> printable("\x1b[31mnight\u202e.ecsv\n")
-    '?[31mnight?.ecsv\n'
-    """
-    return "".join(c if c.isprintable() or c == "\n" else "?" for c in str(text))
+    """Return a text without control characters and marks that turn writing; ends of lines stay."""
+    lines = str(text).split("\n")
+    return "\n".join(
+        line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)
+        for line in lines
+    )
 
 
 def check_yaml(text, error=AstropolcalError):

@@ -21,6 +21,7 @@ _CYCLE = np.array([0, 45, 11.25, 56.25, 22.5, 67.5, 33.75, 78.75])
 
 # of unit flux: products of a dozen Mueller matrices in doubles stay far below
 _ROUNDING = 1e-12
+_MOST_ELECTRONS = 1e18
 
 
 def half_wave_plate_cycles(hwp=_CYCLE * u.deg, derotator=45 * u.deg):
@@ -107,8 +108,8 @@ def simulate(
     Raises
     ------
     ParameterError
-        If flux, gain, lamp or noise are not positive or of the wrong shape, the
-        chain gives negative flux, or the seed is none.
+        If flux, gain, lamp or noise are not positive, too large or of the wrong shape,
+        the chain gives negative flux, or the seed is none.
     ChainError
         If the position of a stage is missing in ``frames``.
 
@@ -128,6 +129,7 @@ def simulate(
     scale = entering_flux(flux, lamp, len(frames), len(wavelength))
     # photons arrive in electrons, whatever a camera counts in
     electrons = np.stack([right.T * scale, left.T * scale]) * _positive("gain", gain)
+    check_electrons(electrons)
     # of the expectation: an error from the drawn flux would be too small where that is low
     variance = electrons + _positive("read_noise", read_noise, zero=True) ** 2
     if noise:
@@ -239,7 +241,20 @@ def _positive(name, value, zero=False):
         raise ParameterError(
             f"{name} = {value} must be finite and {'not negative' if zero else 'positive'}"
         )
+    if np.any(value > _MOST_ELECTRONS):
+        raise ParameterError(f"{name} = {value}: allowed is up to {_MOST_ELECTRONS:g}")
     return value
+
+
+def check_electrons(electrons):
+    """Refuse more electrons than can be drawn."""
+    most = np.max(electrons)
+    # numpy draws 64-bit integers
+    if most > _MOST_ELECTRONS:
+        raise ParameterError(
+            f"flux and gain give {most:.3g} electrons at a time; allowed are up to "
+            f"{_MOST_ELECTRONS:g}"
+        )
 
 
 def entering_flux(flux, lamp, n_frames, n_wavelengths):

@@ -325,9 +325,9 @@ def iso_date(value, name="date", error=ParameterError, *, months=False):
 
 
 def _is_iso(value):
-    """Return whether it is in that form already, which astropy takes a hundred times as long for."""
+    """Return whether it has that form already; astropy takes a hundred times as long."""
     if not isinstance(value, str) or not _ISO.fullmatch(value):
-    """Return whether it has that form already: astropy takes a hundred times as long to say so."""
+        return False
     try:
         datetime.datetime.fromisoformat(value)
     except ValueError:

@@ -138,7 +138,8 @@ def calibrate(
     FitError
         If there is nothing to fit, fewer data than free parameters, the
         weights are asked for where the table has no errors, the residuals of a
-        wavelength tell no noise, or the two-step strategy has no polarized source.
+        wavelength tell no noise, a parameter starts outside its bounds, or the two-step
+        strategy has no polarized source.
     ChainError, ObservationError, ParameterError
         If chain and observations do not fit together, or a noise given is not
         a possible one.
@@ -243,6 +244,16 @@ def _check(measurement):
         raise FitError(
             f"{measurement.free.size} free parameters but only {measurement.n_data} data; "
             "fix some, or add frames"
+        )
+    for name in _outside_bounds(measurement):
+        free, i = measurement.free, measurement.free.names.index(name)
+        # fitters tell neither name nor value
+        value, low, high = (
+            x[i] / free.factors()[i] for x in (measurement.vector(), *free.bounds())
+        )
+        unit = free.by_name[name.partition("[")[0]].unit
+        raise FitError(
+            f"{name} starts at {value:.7g}; allowed are {low:.7g} to {high:.7g} {unit or ''}".strip()
         )
 
 

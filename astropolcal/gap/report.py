@@ -16,7 +16,7 @@ from astropy.table import QTable
 from astropolcal import instruments
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, printable
 from astropolcal.gap import _numbers, _words
 from astropolcal.gap.planning import few, plan
 from astropolcal.gap.residuals import locate
@@ -353,7 +353,7 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None, content=None
         version=_version(),
     )
     with atomic_path(path, error=GapError) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(printable(page), encoding="utf-8")
 
 
 def _about(diagnosis):

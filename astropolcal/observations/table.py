@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Table
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import atomic_path, check_new
+from astropolcal.files import atomic_path, check_new, one_line
 from astropolcal.observations.coordinates import frame_coordinate
 from astropolcal.observations.grid import build_grid
 from astropolcal.observations.groups import FrameGroups
@@ -132,7 +132,8 @@ class Observations:
         astropolcal.exceptions.ObservationError: nowhere.ecsv: no such file
         """
         table = read_ecsv(path)
-        name = Path(path).stem if name is None else name
+        # it goes to terminals, pages and figures
+        name = one_line(Path(path).stem, None) if name is None else name
         return cls.from_table(table, name=name, path=path)
 
     @classmethod

@@ -10,6 +10,7 @@ from scipy.special import erf
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.reduction.photometry import BEAMS
 from astropolcal.reduction.wings import HALO_BETA
+from astropolcal.simulation import check_electrons
 
 # three-point Gauss rule over a pixel
 _NODES, _WEIGHTS = np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15), np.array([5.0, 8.0, 5.0]) / 18
@@ -166,6 +167,7 @@ class Detector:
         electrons = self.gain * response * (light + self.background)
         # in adu^2; of the expectation, not of what was drawn, so that weights are unbiased
         variance = (self.excess_noise**2 * electrons + self.read_noise**2) / self.gain**2
+        check_electrons(electrons)
         if self.noise:
             electrons = self._multiplied(rng.poisson(electrons), rng)
             electrons = electrons + self.read_noise * rng.standard_normal(light.shape)

@@ -8,11 +8,12 @@ import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.scripts._common import (
+    Folder,
+    Input,
+    Output,
     add_edits,
     add_json,
     add_quiet,
-    check_folders,
-    check_outputs,
     check_suffix,
     edit_chains,
     instrument_of,
@@ -47,17 +48,22 @@ def add_parser(commands):
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("files", nargs="*", metavar="FILE", help="observation tables (ECSV)")
+    parser.add_argument(
+        "files", nargs="*", metavar="FILE", type=Input, help="observation tables (ECSV)"
+    )
     parser.add_argument(
         "-o",
         "--output",
         metavar="CAL.asdf",
+        type=Output,
         help="write the calibration here; overwritten if it exists",
     )
     parser.add_argument("--instrument", metavar="NAME", help="default: as the tables say")
     _add_model_options(parser)
     _add_accuracy_options(parser)
-    parser.add_argument("--plots", metavar="DIR", help="save the figures in this folder")
+    parser.add_argument(
+        "--plots", metavar="DIR", type=Folder, help="save the figures in this folder"
+    )
     add_json(parser)
     add_quiet(parser)
     parser.set_defaults(run=run)
@@ -135,6 +141,7 @@ def _add_parameter_options(parser):
     parser.add_argument(
         "--start",
         metavar="OLD.asdf",
+        type=Input,
         help="start from this calibration, hold it, and refit only what --free names",
     )
     add_edits(parser, "prior")
@@ -155,6 +162,7 @@ def _add_accuracy_options(parser):
         action="append",
         default=[],
         metavar="FILE",
+        type=Input,
         help="table that is predicted, not fitted; its errors are s_standard. A standard star is "
         "compared with the catalogue, too",
     )
@@ -182,9 +190,7 @@ def run(arguments):
     from astropolcal.observations import get_observable
 
     say = printer(arguments)
-    check_outputs(arguments.output, arguments.json)
     check_suffix("-o", arguments.output, ".asdf")
-    check_folders(arguments.plots)
     _check_start(arguments)
     # raises before any table is read
     get_observable(arguments.observable)

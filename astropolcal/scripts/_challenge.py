@@ -11,10 +11,12 @@ from contextlib import contextmanager
 
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
 from astropolcal.scripts._common import (
+    Continued,
+    Output,
     add_json,
     add_quiet,
-    check_outputs,
     is_quiet,
+    show,
     wrapped,
     write_json,
 )
@@ -63,10 +65,15 @@ def add_parser(commands):
     parser.add_argument("--wavelengths", type=int, default=8, metavar="N", help="default: 8")
     parser.add_argument("--derotator-angles", type=int, default=8, metavar="N", help="default: 8")
     parser.add_argument(
-        "--checkpoint", metavar="FILE", help="append each outcome to this file, and go on from it"
+        "--checkpoint",
+        metavar="FILE",
+        type=Continued,
+        help="append each outcome to this file, and go on from it",
     )
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default: 1")
-    parser.add_argument("--figure", metavar="FILE", help="draw the outcome (PNG, PDF or SVG)")
+    parser.add_argument(
+        "--figure", metavar="FILE", type=Output, help="draw the outcome (PNG, PDF or SVG)"
+    )
     add_json(parser)
     add_quiet(parser)
     parser.set_defaults(run=run)
@@ -85,7 +92,6 @@ def run(arguments):
     """Run the challenges, print how they went and write what was asked for."""
     from astropolcal.gap.challenge import KINDS, Setup, run_challenge
 
-    check_outputs(arguments.json, arguments.figure, arguments.checkpoint)
     # processes are started once for all challenges
     with _workers(arguments.workers) as client:
         result = run_challenge(
@@ -111,7 +117,7 @@ def run(arguments):
 
         save(result.plot(), arguments.figure)
     if not is_quiet(arguments):
-        print(_report(result))
+        show(_report(result))
 
 
 @contextmanager
@@ -134,7 +140,7 @@ def _workers(count):
         yield pool
     except BaseException as problem:
         if isinstance(problem, KeyboardInterrupt):
-            print("astropolcal: stopping ...", file=sys.stderr, flush=True)
+            show("astropolcal: stopping ...", file=sys.stderr)
         pool.shutdown(wait=False, cancel_futures=True)
         for process in set(multiprocessing.active_children()) - set(others):
             process.terminate()
@@ -160,7 +166,7 @@ class _Progress:
         if now - self.said >= _BETWEEN:
             self.said = now
             seconds = f"{now - self.started:3.0f} s"
-            print(f"astropolcal: {seconds}  {done} of {n} challenges", file=sys.stderr, flush=True)
+            show(f"astropolcal: {seconds}  {done} of {n} challenges", file=sys.stderr)
 
 
 def _report(result):

@@ -5,6 +5,7 @@ import argparse
 import json
 import os
 import re
+import stat
 import sys
 import textwrap
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from astropolcal.chain import find_optic, leaves, remove_optic
 from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
-from astropolcal.files import atomic_path
+from astropolcal.files import atomic_path, check_kind, one_line, printable
 from astropolcal.units import plain_number
 
 # what a terminal has that nobody made wider
@@ -41,12 +42,189 @@ _EDITS = {
 }
 
 
+# ---- files that are named -------------------------------------------------------------------
+
+
+class Input(str):
+    """Type of an argument: a file to read, or a folder of calibrations."""
+
+    kinds = re.compile(r"\.asdf$")
+
+
+class Frames(Input):
+    """Type of an argument: a FITS file to read, or a folder of them."""
+
+    kinds = re.compile(r"\.(fits|fit$|fts$)", re.IGNORECASE)
+
+
+class Output(str):
+    """Type of an argument: a file to write; ``-`` is the standard output."""
+
+
+class Continued(Output):
+    """Type of an argument: a file that is read, if it exists, and written further."""
+
+
+class Folder(Output):
+    """Type of an argument: a folder in which files of some kinds are written."""
+
+    kinds = re.compile(r"\.(png|fits)$")
+
+
+def check_paths(arguments):
+    """
+    Refuse files that cannot be read or written, and outputs that are inputs or one another.
+
+    Before anything runs: hours of fitting must not end with a file that cannot be written.
+    """
+    inputs, outputs = _named(arguments, Input), _named(arguments, Output)
+    for _, path in inputs:
+        _check_input(path)
+    for _, path in outputs:
+        (_check_folder if isinstance(path, Folder) else _check_file)(path)
+    replaced = getattr(arguments, "may_replace", {})
+    for number, (option, path) in enumerate(outputs):
+        read = [other for name, other in inputs if name != replaced.get(option)]
+        _check_inputs(option, path, read)
+        for name, other in outputs[:number]:
+            if _collide(path, other) or _collide(other, path):
+                raise AstropolcalError(
+                    f"{_label(option)} {path}: cannot be written beside {_label(name)} {other}, "
+                    "which takes the same name; name another file"
+                )
+
+
+def check_sources(arguments, files):
+    """Refuse outputs that are among files which are read without being named."""
+    for option, path in _named(arguments, Output):
+        _check_inputs(option, path, [Input(file) for file in files])
+
+
+def left_files(files, layout):
+    """Return the files of left beams, which are read with those of the right beams."""
+    if layout is None or not layout.beam_files:
+        return []
+    return [layout.left_file(path) for path in files if layout.beam_files[0] in Path(path).name]
+
+
+def _named(arguments, kind):
+    """Return the options of a kind and their files; one a file, where there may be several."""
+    values = ((option, value) for option, value in vars(arguments).items())
+    several = ((option, v if isinstance(v, list) else [v]) for option, v in values)
+    return [(o, path) for o, v in several for path in v if isinstance(path, kind) and path != "-"]
+
+
+def _label(option):
+    return "-o" if option == "output" else f"--{option.replace('_', '-')}"
+
+
+def _check_input(path):
+    try:
+        os.stat(path)
+    except FileNotFoundError:
+        # its reader says so
+        return
+    except (OSError, ValueError) as problem:
+        raise AstropolcalError(f"{path}: cannot be read: {_reason(problem)}") from None
+    check_kind(path)
+
+
+def _check_file(path):
+    state = _state(path, path)
+    if state is not None and stat.S_ISDIR(state.st_mode):
+        raise AstropolcalError(f"{path}: is a folder, not a file")
+    if state is not None and not stat.S_ISREG(state.st_mode):
+        # a pipe or a device takes what it is given, and no file is made beside it
+        _check_writable(path, path)
+        return
+    # a link stays a link, and what it points to is replaced
+    folder = Path(os.path.realpath(path) if os.path.islink(path) else path).parent
+    if not os.path.isdir(folder):
+        raise AstropolcalError(f"{path}: there is no folder {folder}")
+    _check_writable(path, folder)
+
+
+def _check_folder(path):
+    # it is made later, inside the nearest folder that exists
+    whole = Path(path).absolute()
+    there = next(p for p in [Path(path), *whole.parents] if os.path.exists(p))
+    if not there.is_dir():
+        raise AstropolcalError(f"{there}: is a file, not a folder")
+    for part in whole.parts[len(there.absolute().parts) :]:
+        # names that are too long there
+        _state(path, there / part)
+    _check_writable(path, there)
+
+
+def _state(path, place):
+    """Return what the system says of something to write, None where there is nothing."""
+    try:
+        return os.stat(place)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError) as problem:
+        raise AstropolcalError(f"{path}: cannot be written: {_reason(problem)}") from None
+
+
+def _reason(problem):
+    return getattr(problem, "strerror", None) or f"it is no name of a file ({problem})"
+
+
+def _check_writable(path, place):
+    if not os.access(place, os.W_OK | (os.X_OK if os.path.isdir(place) else 0)):
+        raise AstropolcalError(
+            f"{path}: no permission to write to {place}; name a folder that you may write to"
+        )
+
+
+def _check_inputs(option, path, inputs):
+    """Refuse an output that is an input, or among the files of a folder that is read."""
+    # what is written to a folder is of another kind than what is read from it
+    for other in [] if isinstance(path, Folder) else inputs:
+        if _are_same(path, other):
+            raise AstropolcalError(
+                f"{_label(option)} {path}: would overwrite the input {other}; name another file"
+            )
+        if os.path.isdir(other) and (
+            _is_within(path, other)
+            or any(_are_same(path, e) for e in os.scandir(other) if other.kinds.search(e.name))
+        ):
+            raise AstropolcalError(
+                f"{_label(option)} {path}: is one of the files that are read from {other}; name "
+                "another folder"
+            )
+
+
+def _collide(path, other):
+    """Return whether what is written to one path would be lost, or not be written, for another."""
+    if isinstance(path, Folder):
+        return not isinstance(other, Folder) and _is_within(other, path)
+    # a file is no folder in which another could be
+    inside = os.path.realpath(other).startswith(os.path.realpath(path) + os.sep)
+    return _are_same(path, other) or inside
+
+
+def _is_within(path, folder):
+    """Return whether a file lies in a folder and has a name of the kinds that belong there."""
+    place, name = os.path.split(os.path.realpath(path))
+    return place == os.path.realpath(folder) and bool(folder.kinds.search(name))
+
+
+def _are_same(path, other):
+    """Return whether two names are of one file, which need not exist; devices take everything."""
+    if not os.path.exists(path):
+        return os.path.realpath(path) == os.path.realpath(other)
+    plain = os.path.isfile(path) or os.path.isdir(path)
+    return plain and os.path.exists(other) and os.path.samefile(path, other)
+
+
 # ---- options --------------------------------------------------------------------------------
 
 
 def add_json(parser, what="write a summary"):
     """Add ``--json``."""
-    parser.add_argument("--json", metavar="FILE", help=f"{what} for machines (- for stdout)")
+    meaning = f"{what} for machines (- for stdout)"
+    parser.add_argument("--json", metavar="FILE", type=Output, help=meaning)
 
 
 def add_quiet(parser, meaning="print nothing but warnings and errors"):
@@ -92,49 +270,20 @@ def is_quiet(arguments):
     return arguments.quiet or arguments.json == "-"
 
 
+def show(text, file=None):
+    """Print lines; names of files may hold what a terminal would act on."""
+    print(printable(text), file=file, flush=file is not None)
+
+
 def printer(arguments):
     """Return what prints, or does nothing if that is asked for."""
-    return (lambda *_: None) if is_quiet(arguments) else print
-
-
-def check_outputs(*paths):
-    """Raise before any work is done if a file cannot be written there."""
-    for path in paths:
-        # not asked for, or the standard output
-        if path is None or str(path) == "-":
-            continue
-        path = Path(path)
-        if not path.parent.is_dir():
-            raise AstropolcalError(f"{path}: there is no folder {path.parent}")
-        if path.is_dir():
-            raise AstropolcalError(f"{path}: is a folder, not a file")
-        _check_writable(path, path.parent)
+    return (lambda *_: None) if is_quiet(arguments) else show
 
 
 def check_suffix(option, path, suffix):
     """Raise if a file that is to be written is called what others take for another format."""
     if path is not None and Path(path).suffix.lower() != suffix:
         raise AstropolcalError(f"{option} {path}: the name must end with {suffix}")
-
-
-def check_folders(*paths):
-    """Raise before any work is done if a folder is a file, or cannot be made or written to."""
-    for path in paths:
-        if path is None:
-            continue
-        # the folder is made later, inside the nearest one that exists
-        there = next(p for p in [Path(path), *Path(path).absolute().parents] if p.exists())
-        if not there.is_dir():
-            raise AstropolcalError(f"{there}: is a file, not a folder")
-        _check_writable(path, there)
-
-
-def _check_writable(path, folder):
-    # hours of fitting must not end with a file that cannot be written
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise AstropolcalError(
-            f"{path}: no permission to write to {folder}; name a folder that you may write to"
-        )
 
 
 def wrapped(line, indent=0):
@@ -178,7 +327,7 @@ def write_calibration(calibration, arguments, content):
 def say_written(say, written):
     """Say which files were written, a line each."""
     if written:
-        say("\nWritten: " + "\n         ".join(written))
+        say("\nWritten: " + "\n         ".join(one_line(path, None) for path in written))
 
 
 # ---- inputs ---------------------------------------------------------------------------------

@@ -7,15 +7,21 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.files import one_line
 from astropolcal.scripts._choosing import choose_calibration, configured
 from astropolcal.scripts._common import (
+    Frames,
+    Input,
+    Output,
     add_json,
     add_quiet,
-    check_outputs,
+    check_sources,
     check_suffix,
     cube_files,
     is_quiet,
+    left_files,
     number_or,
+    show,
     wrapped,
     write_json,
 )
@@ -47,28 +53,36 @@ def add_parser(commands):
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "cubes", metavar="CUBES", nargs="+", help="cubes, or folders of them (*.fits)"
+        "cubes", metavar="CUBES", nargs="+", type=Frames, help="cubes, or folders of them (*.fits)"
     )
     parser.add_argument(
         "--calibration",
         metavar="LIB_OR_FILE",
+        type=Input,
         required=True,
         help="a calibration file, or a folder of them, from which the one that holds for the "
         "frames is taken",
     )
-    parser.add_argument("-o", "--output", metavar="OUT.fits", required=True, help=_OUTPUT)
+    parser.add_argument(
+        "-o", "--output", metavar="OUT.fits", type=Output, required=True, help=_OUTPUT
+    )
     _add_solution(parser)
     _add_instrument(parser)
     _add_images(parser)
     _add_errors(parser)
-    parser.add_argument("--spectrum", metavar="OUT.ecsv", help="table of the star in an aperture")
+    parser.add_argument(
+        "--spectrum",
+        metavar="OUT.ecsv",
+        type=Output,
+        help="table of the star in an aperture",
+    )
     parser.add_argument(
         "--radius",
         metavar="PIXELS",
         type=float,
         help="of the aperture (default: 10, or half of a smaller --size)",
     )
-    parser.add_argument("--plot", metavar="FILE", help="figure of the result")
+    parser.add_argument("--plot", metavar="FILE", type=Output, help="figure of the result")
     parser.add_argument("--workers", metavar="N", type=int, help="threads of dask")
     parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of dask.distributed")
     add_json(parser)
@@ -139,7 +153,10 @@ def _add_errors(parser):
 def _add_instrument(parser):
     parser.add_argument("--instrument", metavar="NAME", help="default: that of the calibration")
     parser.add_argument(
-        "--raw", metavar="DIR", help="folder of raw frames, for keywords that the cubes lack"
+        "--raw",
+        metavar="DIR",
+        type=Frames,
+        help="folder of raw frames, for keywords that the cubes lack",
     )
     parser.add_argument(
         "--optics-in",
@@ -216,7 +233,6 @@ def run(arguments):
     from astropolcal import instruments
     from astropolcal.correction import ScienceFrames
 
-    check_outputs(arguments.output, arguments.json, arguments.spectrum, arguments.plot)
     check_suffix("-o", arguments.output, ".fits")
     check_suffix("--spectrum", arguments.spectrum, ".ecsv")
     _check_options(arguments)
@@ -225,6 +241,7 @@ def run(arguments):
     calibration, chain, provenance = choose_calibration(arguments, files)
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
+    check_sources(arguments, left_files(files, instrument.files))
     # one a frame: files of left beams follow those of the right ones
     files = instrument.files.frame_files(files)
     table, centres, scale, left_scale = _headers(files, instrument, arguments)
@@ -430,18 +447,19 @@ def _report(summary, systematic):
     # None where nothing was determined
     condition = [value for value in summary["condition"] if value is not None]
     frames = counted(summary["n_frames"], "frame")
-    print(f"Written: {summary['output']} ({frames}, mode {summary['mode']})")
-    print(f"  calibration: {summary['calibration']}")
+    written, calibration = (one_line(summary[key], None) for key in ("output", "calibration"))
+    show(f"Written: {written} ({frames}, mode {summary['mode']})")
+    show(f"  calibration: {calibration}")
     if condition:
-        print(
+        show(
             f"  condition number of the solution for {summary['components']}: "
             f"{min(condition):.3g} to {max(condition):.3g}"
         )
     for i, words in summary["poorly_determined"].items():
         line = f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}"
-        print(wrapped(line, indent=4))
+        show(wrapped(line, indent=4))
     aperture = summary["aperture"]
-    print(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
+    show(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
     # JSON has null where it is infinite
     unknown = "infinite" if systematic is not None and systematic.is_open else "not known"
     for name, unit, error, words, scale in (
@@ -450,10 +468,10 @@ def _report(summary, systematic):
     ):
         values = _scaled(aperture[name], scale)
         shown = _middle(values, ".2f" if name == "dolp" else ".1f", unit, name == "aolp")
-        print(f"    {words}: {shown}")
+        show(f"    {words}: {shown}")
         for kind, none in (("statistical", "not known"), ("systematic", unknown)):
             values = _scaled(aperture[f"{error}_{kind}"], scale)
-            print(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
+            show(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
 
 
 def _scaled(values, scale):

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.scripts._common import (
+    Input,
+    Output,
     add_edits,
     add_json,
     add_quiet,
-    check_outputs,
     check_suffix,
     edit_chains,
     instrument_of,
@@ -19,6 +20,7 @@ from astropolcal.scripts._common import (
     printer,
     read_datasets,
     say_written,
+    show,
     wrapped,
     write_json,
 )
@@ -56,6 +58,7 @@ def add_parser(commands):
         "files",
         nargs="*",
         metavar="FILE",
+        type=Input,
         help="observation tables (ECSV); before them may stand a calibration (.asdf), whose "
         "model is then the nominal one",
     )
@@ -84,11 +87,15 @@ def _add_model_options(parser):
 def _add_output_options(parser):
     """Add what says what is written."""
     parser.add_argument(
-        "--report", metavar="FILE.html", help="write a page with tables and figures"
+        "--report",
+        metavar="FILE.html",
+        type=Output,
+        help="write a page with tables and figures",
     )
     parser.add_argument(
         "--save",
         metavar="CAL.asdf",
+        type=Output,
         help="calibrate with the effects that were found, and write the calibration",
     )
     add_json(parser)
@@ -102,10 +109,9 @@ def run(arguments):
 
     # needs no table
     if arguments.effects == "help":
-        print(_list_of_effects())
+        show(_list_of_effects())
         return
     say, progress = printer(arguments), None if is_quiet(arguments) else _Progress()
-    check_outputs(arguments.report, arguments.save, arguments.json)
     check_suffix("--save", arguments.save, ".asdf")
     _check_page(arguments.report)
     effects = _effects(arguments.effects)
@@ -133,7 +139,7 @@ class _Progress:
 
     def __call__(self, line):
         text = f"astropolcal: {time.monotonic() - self.started:3.0f} s  {line}"
-        print(wrapped(text, indent=20), file=sys.stderr, flush=True)
+        show(wrapped(text, indent=20), file=sys.stderr)
 
 
 # ---- effects --------------------------------------------------------------------------------

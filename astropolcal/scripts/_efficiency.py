@@ -8,11 +8,13 @@ from astropolcal import instruments
 from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.scripts._common import (
+    Input,
+    Output,
     add_json,
     add_quiet,
-    check_outputs,
     is_quiet,
     say_written,
+    show,
     write_json,
 )
 from astropolcal.units import iso_date, plain_number
@@ -43,13 +45,14 @@ def add_parser(commands):
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("file", nargs="?", metavar="CAL.asdf", help="calibration")
+    parser.add_argument("file", nargs="?", metavar="CAL.asdf", type=Input, help="calibration")
     parser.add_argument("--instrument", metavar="NAME", help="default: that of the file, or charis")
     _add_observation(parser)
     parser.add_argument(
         "-o",
         "--output",
         metavar="FILE",
+        type=Output,
         help="save the figure (PNG, PDF, SVG); with --target that of the derotator offsets",
     )
     add_json(parser)
@@ -94,7 +97,6 @@ def _add_observation(parser):
 
 def run(arguments):
     """Print the table, draw the figure and write what was asked for."""
-    check_outputs(arguments.output, arguments.json)
     tabulated = _is_table_wanted(arguments)
     arguments.altitude = _or(arguments.altitude, 60.0)
     arguments.parallactic = _or(arguments.parallactic, 0.0)
@@ -108,8 +110,8 @@ def run(arguments):
     if arguments.json:
         write_json(content, arguments.json)
     if not is_quiet(arguments):
-        print(_text(content, tabulated))
-        say_written(print, [path for path in (arguments.output, arguments.json) if path])
+        show(_text(content, tabulated))
+        say_written(show, [path for path in (arguments.output, arguments.json) if path])
 
 
 def _is_table_wanted(arguments):

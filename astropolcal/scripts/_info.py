@@ -4,7 +4,14 @@
 from pathlib import Path
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.scripts._common import add_json, add_quiet, printer, wrapped, write_json
+from astropolcal.scripts._common import (
+    Input,
+    add_json,
+    add_quiet,
+    printer,
+    wrapped,
+    write_json,
+)
 from astropolcal.scripts._describing import describe_fits, describe_table, is_observation
 from astropolcal.words import counted
 
@@ -22,6 +29,7 @@ def add_parser(commands):
         "file",
         nargs="?",
         metavar="FILE|DIR",
+        type=Input,
         help="ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product",
     )
     parser.add_argument("--instruments", action="store_true", help="list the instruments only")

@@ -7,16 +7,22 @@ from collections import Counter
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
+from astropolcal.files import one_line
 from astropolcal.scripts._common import (
+    Continued,
+    Folder,
+    Frames,
+    Output,
     add_json,
     add_quiet,
     angles,
-    check_folders,
-    check_outputs,
+    check_sources,
     check_suffix,
     cube_files,
+    left_files,
     number_or,
     printer,
+    show,
     write_json,
 )
 from astropolcal.words import counted
@@ -43,12 +49,13 @@ def add_parser(commands):
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "cubes", metavar="CUBES", nargs="+", help="cubes, or folders of them (*.fits)"
+        "cubes", metavar="CUBES", nargs="+", type=Frames, help="cubes, or folders of them (*.fits)"
     )
     parser.add_argument(
         "-o",
         "--output",
         metavar="OBS.ecsv",
+        type=Output,
         required=True,
         help="the table; overwritten if it exists",
     )
@@ -56,9 +63,14 @@ def add_parser(commands):
     _add_photometry(parser)
     parser.add_argument("--workers", metavar="N", type=int, help="number of processes")
     parser.add_argument(
-        "--resume", metavar="FILE", help="journal of what is done, to go on after a stop"
+        "--resume",
+        metavar="FILE",
+        type=Continued,
+        help="journal of what is done, to go on after a stop",
     )
-    parser.add_argument("--quicklook", metavar="DIR", help="write figures to this folder")
+    parser.add_argument(
+        "--quicklook", metavar="DIR", type=Folder, help="write figures to this folder"
+    )
     add_json(parser)
     add_quiet(parser)
     parser.set_defaults(run=run)
@@ -68,7 +80,10 @@ def _add_meta(parser):
     """Add what says what the cubes are of, beside or in the place of their headers."""
     parser.add_argument("--instrument", metavar="NAME", default="charis", help="default: charis")
     parser.add_argument(
-        "--raw", metavar="DIR", help="folder of raw frames, for keywords that the cubes lack"
+        "--raw",
+        metavar="DIR",
+        type=Frames,
+        help="folder of raw frames, for keywords that the cubes lack",
     )
     parser.add_argument(
         "--source",
@@ -128,11 +143,10 @@ def run(arguments):
     from astropolcal import instruments
     from astropolcal.reduction import reduce_run
 
-    check_outputs(arguments.output, arguments.json, arguments.resume)
     check_suffix("-o", arguments.output, ".ecsv")
-    check_folders(arguments.quicklook)
     files = cube_files(arguments.cubes)
     instrument = instruments.get(arguments.instrument)
+    check_sources(arguments, left_files(files, instrument.files))
     with tqdm(
         total=len(files), desc="reducing", unit="cube", disable=True if arguments.quiet else None
     ) as bar:
@@ -185,23 +199,24 @@ def _quicklook(reduction, folder):
 def _report(reduction, arguments, figures):
     """Say what was done on stdout, and what was left out on stderr."""
     for path, why in list(reduction.problems.items())[:_MAX_LISTED]:
-        print(f"astropolcal: left out: {Path(path).name}: {'; '.join(why)}", file=sys.stderr)
+        line = one_line(f"{Path(path).name}: {'; '.join(why)}", None)
+        show(f"astropolcal: left out: {line}", file=sys.stderr)
     # on stderr also with -q: what was lost is a warning
     more = len(reduction.problems) - _MAX_LISTED
     if more > 0:
         words = f"{counted(more, 'more file')} (--json lists all)"
-        print(f"astropolcal: left out: {words}", file=sys.stderr)
+        show(f"astropolcal: left out: {words}", file=sys.stderr)
     for why, count in _by_reason(reduction.doubts).items():
-        print(f"astropolcal: doubtful: {counted(count, 'file')}: {why}", file=sys.stderr)
+        show(f"astropolcal: doubtful: {counted(count, 'file')}: {why}", file=sys.stderr)
     say, summary = printer(arguments), reduction.summary()
     say(
-        f"Written: {arguments.output} ({counted(summary['n_frames'], 'frame')}, "
+        f"Written: {one_line(arguments.output, None)} ({counted(summary['n_frames'], 'frame')}, "
         f"{summary['n_masked']} of {counted(summary['n_cells'], 'cell')} masked)"
     )
     for reason, count in summary["flags"].items():
         say(f"  masked, {reason}: {counted(count, 'cell')}")
     if figures:
-        say(f"Figures: {arguments.quicklook} ({counted(len(figures), 'file')})")
+        say(f"Figures: {one_line(arguments.quicklook, None)} ({counted(len(figures), 'file')})")
 
 
 def _by_reason(doubts):

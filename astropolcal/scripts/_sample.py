@@ -6,15 +6,19 @@ import sys
 from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError, FitError
+from astropolcal.files import one_line
 from astropolcal.scripts._common import (
+    Continued,
+    Folder,
+    Input,
+    Output,
     add_json,
     add_quiet,
-    check_folders,
-    check_outputs,
     check_suffix,
     printer,
     read_datasets,
     say_written,
+    show,
     wrapped,
     write_calibration,
 )
@@ -45,21 +49,29 @@ def add_parser(commands):
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("calibration", metavar="CAL.asdf", help="calibration file")
+    parser.add_argument("calibration", metavar="CAL.asdf", type=Input, help="calibration file")
     parser.add_argument(
-        "files", nargs="+", metavar="FILE", help="the tables that it was made from (ECSV)"
+        "files",
+        nargs="+",
+        metavar="FILE",
+        type=Input,
+        help="the tables that it was made from (ECSV)",
     )
     parser.add_argument(
         "-o",
         "--output",
         metavar="OUT.asdf",
+        type=Output,
         help="write the calibration with samples here; overwritten if it exists",
     )
     _add_run_options(parser)
-    parser.add_argument("--plots", metavar="DIR", help="save the figures in this folder")
+    parser.add_argument(
+        "--plots", metavar="DIR", type=Folder, help="save the figures in this folder"
+    )
     add_json(parser)
     add_quiet(parser)
-    parser.set_defaults(run=run)
+    # the samples come to what the calibration holds, and nothing of it is lost
+    parser.set_defaults(run=run, may_replace={"output": "calibration"})
 
 
 def _add_run_options(parser):
@@ -85,7 +97,10 @@ def _add_run_options(parser):
     )
     parser.add_argument("--seed", type=int, metavar="N", help="makes the run repeatable")
     parser.add_argument(
-        "--checkpoint", metavar="FILE.h5", help="write the steps here while the run lasts"
+        "--checkpoint",
+        metavar="FILE.h5",
+        type=Continued,
+        help="write the steps here while the run lasts",
     )
     parser.add_argument(
         "--resume", action="store_true", help="go on from the checkpoint, if there is one"
@@ -107,7 +122,6 @@ def run(arguments):
     from astropolcal.calibration import Calibration
 
     say = printer(arguments)
-    check_outputs(arguments.output, arguments.json, arguments.checkpoint)
     check_suffix("-o", arguments.output, ".asdf")
     _check_options(arguments)
     calibration = Calibration.read(arguments.calibration)
@@ -123,7 +137,6 @@ def run(arguments):
 
 def _check_options(arguments):
     """Raise before the long work is done."""
-    check_folders(arguments.plots)
     if arguments.resume and not arguments.checkpoint:
         raise AstropolcalError("--resume needs --checkpoint FILE.h5")
     if arguments.seed is not None and arguments.seed < 0:
@@ -173,9 +186,9 @@ def _sample(calibration, arguments):
         raise _in_options(error) from error
     except KeyboardInterrupt:
         if arguments.checkpoint and Path(arguments.checkpoint).exists():
-            print(
-                f"astropolcal: the steps so far are in {arguments.checkpoint}; the same command "
-                "with --resume goes on",
+            show(
+                f"astropolcal: the steps so far are in {one_line(arguments.checkpoint, None)}; the "
+                "same command with --resume goes on",
                 file=sys.stderr,
             )
         raise

@@ -4,12 +4,14 @@
 import argparse
 
 from astropolcal.exceptions import AstropolcalError
+from astropolcal.files import one_line
 from astropolcal.scripts._common import (
+    Folder,
+    Input,
+    Output,
     add_json,
     add_quiet,
     angles,
-    check_folders,
-    check_outputs,
     check_suffix,
     edit_chains,
     printer,
@@ -60,11 +62,14 @@ def add_parser(commands):
         "-o",
         "--output",
         metavar="OBS.ecsv",
+        type=Output,
         help="the table (required without --cubes; with it, the true fluxes); overwritten if it "
         "exists",
     )
     parser.add_argument("--instrument", metavar="NAME", default="charis", help="default: charis")
-    parser.add_argument("--calibration", metavar="CAL.asdf", help="take the chain from this file")
+    parser.add_argument(
+        "--calibration", metavar="CAL.asdf", type=Input, help="take the chain from this file"
+    )
     _add_angles(parser)
     _add_star(parser)
     _add_cubes(parser)
@@ -150,7 +155,10 @@ def _add_star(parser):
 def _add_cubes(parser):
     group = parser.add_argument_group("image cubes")
     group.add_argument(
-        "--cubes", metavar="DIR", help="write image cubes to this folder, raw headers to DIR/raw"
+        "--cubes",
+        metavar="DIR",
+        type=Folder,
+        help="write image cubes to this folder, raw headers to DIR/raw",
     )
     group.add_argument(
         "--psf",
@@ -175,9 +183,7 @@ def run(arguments):
     """Simulate and write the table, the cubes or both."""
     if not (arguments.output or arguments.cubes):
         raise AstropolcalError("nothing to write: give -o OBS.ecsv, --cubes DIR or both")
-    check_outputs(arguments.output, arguments.json)
     check_suffix("-o", arguments.output, ".ecsv")
-    check_folders(arguments.cubes)
     _check_images(arguments)
     chain, wavelength, meta = _truth(arguments)
     # free and prior mean nothing for what is true
@@ -187,11 +193,11 @@ def run(arguments):
     written = []
     if arguments.cubes:
         paths = _write_cubes(arguments, chain, wavelength, frames)
-        written.append(f"{arguments.cubes} ({counted(len(paths), 'cube')})")
+        written.append(f"{one_line(arguments.cubes, None)} ({counted(len(paths), 'cube')})")
     if arguments.output:
         observations.write(arguments.output, overwrite=True)
         size = counted(observations.n_frames, "frame"), counted(observations.n_bins, "wavelength")
-        written.append(f"{arguments.output} ({' x '.join(size)})")
+        written.append(f"{one_line(arguments.output, None)} ({' x '.join(size)})")
     if arguments.json:
         write_json(_summary(observations, arguments), arguments.json)
     printer(arguments)(f"Written: {', '.join(written)}")

@@ -5,9 +5,9 @@ import math
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.scripts._common import (
+    Output,
     add_json,
     add_quiet,
-    check_outputs,
     printer,
     wrapped,
     write_json,
@@ -63,7 +63,12 @@ def add_parser(commands):
         help=f"how many to list, the best first (default: {_LISTED} of a night, else all)",
     )
     add_json(parser, "write it")
-    add("--plot", metavar="FILE", help="draw altitude and parallactic angle over the night")
+    add(
+        "--plot",
+        metavar="FILE",
+        type=Output,
+        help="draw altitude and parallactic angle over the night",
+    )
     add_quiet(parser)
     parser.set_defaults(run=run)
 
@@ -71,7 +76,6 @@ def add_parser(commands):
 def run(arguments):
     """Print the stars."""
     _check(arguments)
-    check_outputs(arguments.json, arguments.plot)
     # text for people, content for machines, nights for the figure
     text, content, seen, total = (_one if arguments.name else _many)(arguments)
     if arguments.plot:

@@ -35,7 +35,7 @@ class _OneLineParser(argparse.ArgumentParser):
 
     def error(self, message):
         # argparse prints the usage in several lines before its complaint
-        self.exit(2, f"astropolcal: error: {message} (see {self.prog} --help)\n")
+        self.exit(2, f"astropolcal: error: {_one_line(message)} (see {self.prog} --help)\n")
 
 
 def _number(kind, text):
@@ -116,27 +116,40 @@ def main(argv=None):
     0
     """
     try:
-        return _run(argv)
+        status = _run(argv)
+        # what is left in the buffer: at exit it would be too late to say why it is lost
+        sys.stdout.flush()
+        return status
     except KeyboardInterrupt:
         print("astropolcal: interrupted", file=sys.stderr)
         # 128 + SIGINT, as shells have it
         return 130
     except BrokenPipeError:
-        # whoever read our output has gone; do not complain again at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
+        # whoever read our output has gone
+        status = 0
+    except OSError as error:
+        # all files of ours give errors of ours: this is the standard output, such as a full disk
+        where = error.filename or "the standard output"
+        words = _one_line(f"{where}: cannot be written: {error.strerror or error}")
+        print(f"astropolcal: error: {words}", file=sys.stderr)
+        status = 2
+    # do not complain again at exit
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return status
 
 
 def _run(argv):
     """Run the command; return its status unless it is stopped from outside."""
     # here, not above: it loads astropy, and an interruption meanwhile is one of the command
     from astropolcal.exceptions import AstropolcalError
+    from astropolcal.scripts._common import check_paths
 
     with warnings.catch_warnings():
         # a user has no use for file and line of our code
         warnings.showwarning = _show_warning
         try:
             arguments = build_parser().parse_args(argv)
+            check_paths(arguments)
             arguments.run(arguments)
         except AstropolcalError as error:
             print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
@@ -149,7 +162,9 @@ def _run(argv):
 
 
 def _one_line(message):
-    return " ".join(str(message).split())
+    from astropolcal.files import one_line
+
+    return one_line(str(message), None)
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None):
