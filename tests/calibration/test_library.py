@@ -358,11 +358,27 @@ def test_file_in_the_place_of_another_is_noticed(folder, months, look):
         look(folder, "2025-01-15")
 
 
-def test_young_files_are_not_relied_on(folder, look, monkeypatch):
-    monkeypatch.setattr(module, "_SETTLED", 10**15)
-    for _ in range(2):
-        assert len(look(folder)[1]) == 4
-    assert not (folder / module._INDEX).exists()
+def test_index_keeps_nothing_young_or_large(folder, look, monkeypatch):
+    for key, value in (("_SETTLED", 10**15), ("_MOST_BYTES", 100)):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, key, value)
+            for _ in range(2):
+                assert len(look(folder)[1]) == 4
+            assert not (folder / module._INDEX).exists()
+    assert len(look(folder)[1]) == 4
+    assert len(look(folder)[1]) == 1
+
+
+def test_links_to_calibrations(folder, months, look, tmp_path_factory):
+    target = tmp_path_factory.mktemp("elsewhere").resolve() / "x.asdf"
+    target.write_bytes((folder / "b.asdf").read_bytes())
+    (folder / "b.asdf").unlink()
+    (folder / "b.asdf").symlink_to(target)
+    assert look(folder)[0] == "x.asdf"
+    assert look(folder) == ("x.asdf", ["x.asdf"])
+    assert Library(folder).find("charis", date="2025-02-15").path == target
+    target.write_bytes(months["e.asdf"])
+    assert Library(folder).find("charis", date="2025-02-15").validity.mode == "J"
 
 
 def forged(files, name, **changes):
