@@ -42,6 +42,7 @@ from astropolcal.calibration.weighting import (
 )
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
 from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.measurement.parameters import ROUNDING
 from astropolcal.units import to_unit
 from astropolcal.version import version
 
@@ -53,8 +54,6 @@ _MAX_ROUNDS = 4
 _ROBUST_ROUNDS = 50
 # branches are searched in so many groups of frames of a dataset, if it has several times as many
 _FEW, _LONG = 256, 4
-# a fitter without bounds may leave them by this share of a value
-_OUTSIDE = 1e-5
 
 
 def calibrate(
@@ -310,7 +309,7 @@ def _outside_bounds(measurement):
     low, high = measurement.free.bounds()
     vector = measurement.vector()
     # a fitter that minds the bounds ends on them only as exactly as rounding allows
-    slack = _OUTSIDE * np.maximum(1.0, np.abs(vector))
+    slack = ROUNDING * np.maximum(1.0, np.abs(vector))
     outside = (vector < low - slack) | (vector > high + slack)
     return [measurement.free.names[i] for i in np.flatnonzero(outside)]
 

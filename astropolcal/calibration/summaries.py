@@ -397,7 +397,7 @@ def to_dict(calibration, targets=TARGETS):
     49
     """
     settings, fit = calibration.settings, calibration.fit
-    return {
+    content = {
         "instrument": calibration.instrument,
         "observable": settings["observable"],
         "fitter": settings["fitter"],
@@ -409,30 +409,31 @@ def to_dict(calibration, targets=TARGETS):
         "n_data": fit["n_data"],
         "n_free": len(calibration.covariance),
         "rank": calibration.identifiability.rank,
-        "lack_of_fit": _plain(fit.get("lack_of_fit") or []),
-        "outliers": _plain(fit.get("outliers") or []),
+        "lack_of_fit": fit.get("lack_of_fit") or [],
+        "outliers": fit.get("outliers") or [],
         "datasets": [
-            _dataset(record) | {"masked": _plain(reasons)}
+            _dataset(record) | {"masked": reasons}
             for record, reasons in zip(calibration.datasets, _masked(calibration), strict=True)
         ],
         "left_out": what_is_left_out(calibration),
-        "stars": [_plain(entry) for entry in fit.get("stars", [])],
-        "mirrors": _plain(mirrors(calibration)),
+        "stars": fit.get("stars", []),
+        "mirrors": mirrors(calibration),
         "standards": [_standard(entry) for entry in fit.get("standards", [])],
         "targets": [_target(table) for table in target_accuracies(calibration, targets)],
         "parameters": {
             name: _parameter(entry) for name, entry in calibration.parameter_values().items()
         },
-        "open_on_sky": _plain(open_on_sky(calibration)),
+        "open_on_sky": open_on_sky(calibration),
         "null_directions": calibration.identifiability.directions,
         "near_null_directions": calibration.identifiability.near_null,
         "sampling": list(calibration.identifiability.sampling),
         "mirror_solutions": list(calibration.identifiability.mirrors),
         "at_bound": list(calibration.at_bound),
         "posterior": calibration.posterior and calibration.posterior.report(),
-        "stages": [_plain(stage) for stage in calibration.stages],
+        "stages": calibration.stages,
         "provenance": dict(calibration.provenance),
     }
+    return _plain(content)
 
 
 def _dataset(record):

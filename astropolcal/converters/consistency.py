@@ -4,8 +4,10 @@
 import astropy.units as u
 import numpy as np
 
+from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
-from astropolcal.measurement.parameters import FreeParameters, parameter_table
+from astropolcal.files import one_line
+from astropolcal.measurement.parameters import ROUNDING, FreeParameters, parameter_table
 
 __all__ = ["check_calibration"]
 
@@ -27,8 +29,8 @@ def check_calibration(calibration):
     ------
     CalibrationFileError
         If the sizes of the parameters do not fit the wavelengths, covariance
-        or identifiability are not those of the free parameters, a value is far
-        outside its bounds, datasets of one optic disagree, or the numbers of
+        or identifiability are not those of the free parameters, a value is
+        outside of its bounds, datasets of one optic disagree, or the numbers of
         chains and datasets differ.
 
     Examples
@@ -58,7 +60,7 @@ def check_calibration(calibration):
         free = FreeParameters(calibration.chains, len(wavelength), calibration.ties)
     except AstropolcalError as error:
         raise CalibrationFileError(str(error)) from None
-    _check_values(calibration.chains)
+    _check_values(calibration.chains, free)
     _check_shared(calibration.chains, free)
     _check_covariance(calibration.covariance, free)
     _check_identifiability(calibration.identifiability, free.names)
@@ -66,29 +68,25 @@ def check_calibration(calibration):
     _check_words(calibration, free.names)
 
 
-def _check_values(chains):
-    """Refuse values that only damage can explain."""
-    for name, parameters in parameter_table(chains).items():
-        for parameter in parameters:
-            low, high = _allowed(parameter.bounds)
+def _check_values(chains, free):
+    """Refuse values that no fit gives, whatever the checksum says."""
+    for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+        for key in leaf.param_names:
+            name, parameter = f"{leaf.name}.{key}", getattr(leaf, key)
+            bounds = [parameter.bounds]
+            if name not in free.by_name:
+                # the bounds of a fit do not matter to what is held or tied, those of the optic do
+                bounds.append(getattr(type(leaf), key).bounds)
+            low = min(-_LARGEST if low is None else low for low, _ in bounds)
+            high = max(_LARGEST if high is None else high for _, high in bounds)
             value = np.asarray(parameter.value, dtype=float)
-            if not np.all((value >= low) & (value <= high)):
+            slack = ROUNDING * np.maximum(np.abs(value), 1.0)
+            # written so that NaN is refused
+            if not np.all((value >= low - slack) & (value <= high + slack)):
                 raise CalibrationFileError(
-                    f"{name} = {parameter.value}, which is far outside of its bounds "
-                    f"{tuple(parameter.bounds)}; from {low:g} to {high:g} can be stored"
+                    f"{name} = {one_line(parameter.value)} is outside of its bounds, "
+                    f"{low:g} to {high:g}"
                 )
-
-
-def _allowed(bounds):
-    """Return the range of values that can be, which is wider than the bounds of a fit."""
-    low, high = bounds
-    # a fitter without bounds leaves them now and then, a parameter that is held may be anywhere,
-    # but neither by more than the distance between them
-    one = next((bound for bound in bounds if bound is not None), 0.0)
-    slack = max(abs(one), 1.0) if low is None or high is None or high == low else high - low
-    lowest = -_LARGEST if low is None else max(low - slack, -_LARGEST)
-    highest = _LARGEST if high is None else min(high + slack, _LARGEST)
-    return lowest, highest
 
 
 def _check_shared(chains, free):
@@ -134,6 +132,20 @@ def _check_identifiability(finding, names):
         found = np.shape(getattr(finding, key))
         if found != shape:
             raise CalibrationFileError(f"{key} have shape {found}, expected {shape}")
+    if not _finite([finding.singular_values, finding.null_vectors]):
+        raise CalibrationFileError("identifiability: its numbers must be finite")
+    for direction in (*finding.directions, *finding.near_null):
+        if not _finite(direction):
+            raise CalibrationFileError(
+                f"identifiability: the numbers of {one_line(direction['words'], 60)!r} must be finite"
+            )
+
+
+def _finite(value):
+    """Return whether all numbers of a tree are."""
+    if isinstance(value, dict | list | tuple):
+        return all(map(_finite, value.values() if isinstance(value, dict) else value))
+    return value is None or isinstance(value, str) or bool(np.isfinite(value).all())
 
 
 def _check_fit(fit):

@@ -96,6 +96,9 @@ def posterior_from_node(node):
         key: np.array(value) if hasattr(value, "__array__") else value
         for key, value in parts["convergence"].items()
     }
+    # that of what did not move is not a number
+    if np.isinf(found["times"]).any():
+        raise CalibrationFileError("posterior: times must be finite")
     parts |= {"settings": plain(parts["settings"]), "convergence": found, "burn_in": None}
     try:
         return Posterior.from_dict(parts)

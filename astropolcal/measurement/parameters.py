@@ -23,6 +23,8 @@ __all__ = ["FreeParameters", "Slot", "Tie", "parameter_table"]
 
 # a parameter closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-5
+#: Share of a value, or of one, by which rounding alone may take it beyond a bound.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
