@@ -17,7 +17,7 @@ from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError
 from astropolcal.instruments import CHARIS, Instrument, SkyLaw
 from astropolcal.measurement import FreeParameters, Measurement
-from astropolcal.observations import Observations
+from astropolcal.observations import Observations, is_star
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 N_BINS = 22
@@ -274,6 +274,19 @@ def test_word_that_is_not_understood_is_an_error(key):
     meta = {"date": "2025-10-05", key: "perhaps"}
     with pytest.raises(InstrumentError, match=f"night: {key} is 'perhaps'; allowed are"):
         _setup(source="polarized", **meta)
+
+
+def test_spelling_of_a_source_does_not_matter():
+    """And a standard star of which nothing else is said is a star of unknown polarization."""
+    for spelling, source in (
+        *(("standard star", "star"), ("Standard_Star", "star"), ("standard-star ", "star")),
+        *(("STAR", "star"), ("Unpolarized_standard-star", "unpolarized standard star")),
+        ("POLARIZED", "polarized"),
+    ):
+        table = _observations([1.2] * u.um, date="2025-10-05", source=spelling)
+        for name in ("charis", "irdis", "vampires"):
+            assert instruments.get(name).setup(table)[0] == source
+        assert is_star(spelling) == ("star" in source)
 
 
 @pytest.mark.parametrize("source", ["moon", "unpolarized_standard", None])

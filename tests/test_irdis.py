@@ -8,6 +8,7 @@ import asdf
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable, Table
 from astropy.time import Time
@@ -26,7 +27,7 @@ from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, check_effe
 from astropolcal.gap.effects import roles as roles_module
 from astropolcal.instruments import IRDIS
 from astropolcal.measurement import Measurement
-from astropolcal.observations import Observations
+from astropolcal.observations import Observations, pointing
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 IRDIS_ = IRDIS()
@@ -416,6 +417,42 @@ def test_pupil_tracking_adds_half_the_offset_of_the_pupil():
     assert difference.to_value(u.deg) == pytest.approx(135.99 / 2)
 
 
+@pytest.mark.parametrize("mode", ["FIELD", "PUPIL"])
+def test_angles_of_the_start_alone_are_taken_and_told(mode):
+    """What is lost is how far the stages turn until the middle, which the other laws tell."""
+    start = {"ESO INS4 DROT2 BEGIN": None, "ESO INS4 DROT2 START": 10.0} | {
+        f"ESO INS4 DROT{i} END": None for i in (2, 3)
+    }
+    cards = {"ESO INS4 COMB ROT": mode, "ESO DET NDIT": 100}
+    with pytest.warns(AstropolcalWarning) as caught:
+        table = IRDIS_.frame_table([header(**cards), header(**cards, **start)])
+    np.testing.assert_allclose(table["hwp_true"][1].to_value(u.deg), 160.0 - 152.15)
+    offset = {"FIELD": 0.0, "PUPIL": 135.99 / 2}[mode]
+    np.testing.assert_allclose(table["derotator"].to_value(u.deg), [0.1 + offset, 10 + offset])
+    target = SkyCoord(83.8 * u.deg, -24 * u.deg)
+    times = Time(57438.3, format="mjd") + [0, 0.5 * (100 * 16.938 + 2.4)] * u.s
+    change = {
+        key: np.diff(np.unwrap(angle.to_value(u.deg), period=360))[0]
+        for key, angle in zip(
+            ("altitude", "parallactic"), pointing(target, times, IRDIS_.location), strict=True
+        )
+    }
+    laws = {
+        "hwp_true": IRDIS_.sky_law.plate_law(mode.lower()),
+        "derotator": IRDIS_.sky_law.derotator_law(mode.lower()),
+    }
+    assert len(caught) == 2
+    for warning, (column, keyword) in zip(
+        caught, {"hwp_true": "DROT3", "derotator": "DROT2"}.items(), strict=True
+    ):
+        words = str(warning.message)
+        assert words.startswith(f"no keyword ESO INS4 {keyword} END in 1 frame of 2, the first")
+        lost = abs(laws[column] @ np.array([change["parallactic"], change["altitude"]]))
+        assert lost > 0.1
+        assert words.endswith(f"it turns by up to {lost:.2g} deg")
+        assert warning.filename == __file__
+
+
 def test_internal_frames_have_no_sky():
     absent = dict.fromkeys(("ESO TEL PARANG START", "ESO OCS DPI H2RT STOKES", "RA"))
     table = IRDIS_.frame_table([header(**absent)])
@@ -426,7 +463,11 @@ def test_internal_frames_have_no_sky():
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
-        ({"ESO INS4 DROT3 END": None}, ObservationError, "frame 1: no keyword ESO INS4 DROT3 END"),
+        (
+            {"ESO INS4 DROT3 BEGIN": None, "ESO INS4 DROT3 END": None},
+            ObservationError,
+            "frame 1: no keyword ESO INS4 DROT3 BEGIN",
+        ),
         ({"ESO TEL ALT": "high"}, ObservationError, "frame 1: ESO TEL ALT = 'high'; a number"),
         ({"EXPTIME": -1.0}, ObservationError, "frame 1: EXPTIME = '-1.0'; .* at least 0"),
         ({"ESO INS4 COMB ROT": "NONE"}, ObservationError, "allowed are FIELD, PUPIL"),

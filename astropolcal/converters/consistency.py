@@ -136,9 +136,8 @@ def _check_identifiability(finding, names):
         raise CalibrationFileError("identifiability: its numbers must be finite")
     for direction in (*finding.directions, *finding.near_null):
         if not _finite(direction):
-            raise CalibrationFileError(
-                f"identifiability: the numbers of {one_line(direction['words'], 60)!r} must be finite"
-            )
+            words = one_line(direction["words"], 60)
+            raise CalibrationFileError(f"identifiability: numbers of {words!r} must be finite")
 
 
 def _finite(value):

@@ -1,15 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Headers of SPHERE/IRDIS frames: angles, times and filters in the middle of the exposures."""
 
+import warnings
+
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from astropy.time import Time
 
-from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.exceptions import AstropolcalWarning, InstrumentError, ObservationError
 from astropolcal.observations.pointings import pointing
 from astropolcal.units import plain_number
+from astropolcal.words import counted
 
 __all__ = ["frame_table"]
 
@@ -61,7 +64,7 @@ class _Header:
         return float(np.rad2deg(np.angle(np.exp(1j * ends).sum())))
 
 
-def frame_table(headers, location, filters):
+def frame_table(headers, location, filters, law):
     """
     Return the table of frames from their headers, see `astropolcal.instruments.IRDIS`.
 
@@ -73,6 +76,8 @@ def frame_table(headers, location, filters):
         Site of the telescope.
     filters : dict of str to `~astropy.units.Quantity`
         Central wavelength of every filter with coefficients.
+    law : SkyLaw
+        How plate and derotator follow the sky.
 
     Returns
     -------
@@ -83,10 +88,15 @@ def frame_table(headers, location, filters):
     ObservationError, InstrumentError
         If a header cannot be used; the message names frame and keyword.
 
+    Warns
+    -----
+    AstropolcalWarning
+        If the stages are known at the start of an exposure only.
+
     Examples
     --------
     >>> from astropolcal.instruments._irdis_headers import frame_table
-    >>> frame_table([], None, {})
+    >>> frame_table([], None, {}, None)
     Traceback (most recent call last):
     ...
     astropolcal.exceptions.ObservationError: no headers were given, at least one is needed
@@ -108,6 +118,7 @@ def frame_table(headers, location, filters):
             )
     (band,), (tracking,) = shared
     rows = [_row(frame, tracking, location if stars[0] else None) for frame in frames]
+    _warn_of_starts(frames, [row.pop("motion") for row in rows], tracking, law)
     table = QTable({key: [row[key] for row in rows] for key in rows[0]})
     table["wavelength"] = np.full(len(rows), 1.0) * filters[band]
     table.meta = {"filter": band, "date": str(table["time"][0])[:10]}
@@ -131,10 +142,7 @@ def _tracking(frame, star):
 
 
 def _row(frame, tracking, location):
-    angles = {
-        column: frame.mean_angle(f"{keyword} BEGIN", f"{keyword} END")
-        for column, keyword in _STAGES.items()
-    }
+    angles = {column: _stage(frame, keyword) for column, keyword in _STAGES.items()}
     angles["hwp_true"] = (angles["hwp_true"] - _PLATE_ZERO) % 360
     # the image turns by twice the derotator
     angles["derotator"] += 0.5 * _PUPIL_OFFSET if tracking == "pupil" else 0.0
@@ -142,19 +150,52 @@ def _row(frame, tracking, location):
     # EXPTIME is the light of one DIT, without its read-out
     seconds = ndit * (dit + _READ_OUT) + _START
     start = Time(frame.number_of("MJD-OBS", 0.0), format="mjd", scale="utc")
-    middle = start + 0.5 * seconds * u.s
+    middle, motion = start + 0.5 * seconds * u.s, (0.0, 0.0)
     if location is not None:
         angles["parallactic"] = frame.mean_angle(_PARALLACTIC, "ESO TEL PARANG END")
-        angles["altitude"] = _altitude(frame, Time([start, middle]), location)
+        motion = _motion(frame, Time([start, middle]), location)
+        # of the start: an offset of what is computed cancels in the change
+        angles["altitude"] = frame.number_of("ESO TEL ALT", 0.0) + motion[1]
     commanded = _COMMANDED[frame.text(_STOKES, _COMMANDED)] if _STOKES in frame else None
     angles["hwp"] = angles["hwp_true"] if commanded is None else commanded
-    row = {"frame": frame.number} | {key: value * u.deg for key, value in angles.items()}
+    row = {"frame": frame.number, "motion": motion} | {
+        key: value * u.deg for key, value in angles.items()
+    }
     return row | {"exposure_time": dit * ndit * u.s, "time": middle.isot}
 
 
-def _altitude(frame, times, location):
-    """Return the altitude in the middle: that in the header and the change since the start."""
+def _motion(frame, times, location):
+    """Return by how much parallactic angle and altitude change from one time to the other."""
     target = SkyCoord(frame.number_of("RA"), frame.number_of("DEC", -90.0), unit=u.deg)
-    # an offset of the computed altitude from that of the header cancels in the difference
-    start, middle = pointing(target, times, location)[0].to_value(u.deg)
-    return frame.number_of("ESO TEL ALT", 0.0) + float(middle - start)
+    altitude, parallactic = (
+        np.diff(angle.to_value(u.deg))[0] for angle in pointing(target, times, location)
+    )
+    return float((parallactic + 180) % 360 - 180), float(altitude)
+
+
+def _stage(frame, keyword):
+    """Return the mean angle of a stage, or that of the start where there is no other."""
+    first, last = f"{keyword} BEGIN", f"{keyword} END"
+    if first not in frame and f"{keyword} START" in frame:
+        first = f"{keyword} START"
+    return frame.mean_angle(first, last if last in frame else first)
+
+
+def _warn_of_starts(frames, motions, tracking, law):
+    """Say which angles are those of the start, and by how much the middle differs."""
+    for column, keyword in _STAGES.items():
+        few = [i for i, frame in enumerate(frames) if f"{keyword} END" not in frame]
+        if not few:
+            continue
+        on_sky = (0.0, 0.0)
+        if tracking is not None:
+            on_sky = (law.plate_law if column == "hwp_true" else law.derotator_law)(tracking)
+        lost = max(abs(np.dot(on_sky, motions[i])) for i in few)
+        warnings.warn(
+            f"no keyword {keyword} END in {counted(len(few), 'frame')} of {len(frames)}, the first "
+            f"is frame {few[0]}: {column} is that of the start; until the middle of the exposure "
+            f"it turns by up to {lost:.2g} deg",
+            AstropolcalWarning,
+            # _warn_of_starts, frame_table of this module, that of the instrument: who called it
+            stacklevel=4,
+        )

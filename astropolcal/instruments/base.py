@@ -24,6 +24,7 @@ from astropolcal.observations import (
 )
 from astropolcal.observations.coordinates import angle_change
 from astropolcal.observations.pointings import location_of
+from astropolcal.observations.quality import plain_source
 
 __all__ = ["Instrument"]
 
@@ -182,8 +183,8 @@ class Instrument(ABC):
         observations : Observations
             The dataset.
         spellings : dict of str to str, optional
-            How tables may spell the sources, in lower case, which is then all the same; by
-            default as in ``sources``.
+            What tables may call the sources; by default as in ``sources``. Case, hyphens and
+            underscores do not matter, and a ``"standard star"`` is a ``"star"``.
 
         Returns
         -------
@@ -202,13 +203,13 @@ class Instrument(ABC):
         >>> instruments.get("charis").source_of(table)
         'polarized'
         """
-        known = {name: name for name in self.sources} if spellings is None else spellings
-        stated = observations.source
-        word = stated if spellings is None else str(stated).strip().lower()
+        allowed = {name: name for name in self.sources} if spellings is None else spellings
+        known = {plain_source(word): name for word, name in allowed.items()}
+        word = plain_source(observations.source)
         if word not in known:
             raise InstrumentError(
-                f"{observations.name}: source {stated!r} in the table's meta; "
-                f"allowed are {', '.join(known) or 'none'}"
+                f"{observations.name}: source {observations.source!r} in the table's meta; "
+                f"allowed are {', '.join(allowed) or 'none'}"
             )
         return known[word]
 

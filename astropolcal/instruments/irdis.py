@@ -317,6 +317,12 @@ class IRDIS(Instrument):
         InstrumentError
             If the filter has no coefficients.
 
+        Warns
+        -----
+        AstropolcalWarning
+            If plate or derotator are known at the start of an exposure only (``BEGIN`` or
+            ``START`` without ``END``), with how far they turn until its middle.
+
         Notes
         -----
         Angles are the circular means of begin and end; ``hwp_true`` is that of ``ESO INS4
@@ -336,7 +342,8 @@ class IRDIS(Instrument):
         >>> table["derotator"].round(6), table.meta["filter"]
         (<Quantity [1.] deg>, 'H')
         """
-        table = frame_table(list(headers), self.location, dict(zip(FILTERS, CENTRES, strict=True)))
+        filters = dict(zip(FILTERS, CENTRES, strict=True))
+        table = frame_table(list(headers), self.location, filters, self.sky_law)
         days = {self.coating_on(time) for time in table["time"]}
         if len(days) > 1:
             raise InstrumentError(

@@ -7,6 +7,7 @@ reason says how many there are and which. See also `astropolcal.observations.mas
 single cells while a table is read.
 """
 
+import re
 import warnings
 
 import astropy.units as u
@@ -24,6 +25,7 @@ __all__ = [
     "mask_incomplete_cycles",
     "mask_saturated",
     "mask_unstable_lamp",
+    "plain_source",
     "robust_curve",
 ]
 
@@ -55,8 +57,33 @@ def is_star(source):
     >>> is_star("unpolarized standard star"), is_star("unpolarized"), is_star(None)
     (True, False, False)
     """
-    words = (source or "").lower().replace("-", " ").split()
+    words = plain_source(source).split()
     return "star" in words or "sky" in words
+
+
+def plain_source(source):
+    """
+    Return a table's source as instruments spell it.
+
+    Parameters
+    ----------
+    source : str or None
+        The entry ``source`` of its meta.
+
+    Returns
+    -------
+    str
+        In lower case, with single spaces for hyphens and underscores; ``"star"`` for
+        ``"standard star"``, of which nobody says how polarized it is.
+
+    Examples
+    --------
+    >>> from astropolcal.observations.quality import plain_source
+    >>> plain_source("Unpolarized_standard-star"), plain_source("standard star")
+    ('unpolarized standard star', 'star')
+    """
+    words = re.sub(r"[\s_-]+", " ", (source or "").lower()).strip()
+    return "star" if words == "standard star" else words
 
 
 # ---- cycles of the half-wave plate ---------------------------------------------------------------

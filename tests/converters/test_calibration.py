@@ -358,7 +358,7 @@ def test_numbers_of_the_identifiability_are_finite(cal, node):
         {"near_null": [{"words": "near", "parameters": {}, "sky": {"dolp_percent": [np.nan]}}]},
     ):
         cal.identifiability = dataclasses.replace(finding, **change)
-        with pytest.raises(CalibrationFileError, match="identifiability: .* must be finite"):
+        with pytest.raises(CalibrationFileError, match=r"identifiability: .* must be finite"):
             check_calibration(cal)
     again = calibration_from_node(sealed(node | {"fit": node["fit"] | {"seconds": np.inf}}))
     assert json.loads(json.dumps(again.to_dict(), allow_nan=False))["seconds"] is None
