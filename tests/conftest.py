@@ -2,6 +2,7 @@
 """Fixtures and settings common to all tests."""
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,36 @@ def _few_examples(test):
         known = getattr(test, "_hypothesis_internal_use_settings", None) or settings.default
         few = settings(known, max_examples=min(known.max_examples, FEW_EXAMPLES))
         test._hypothesis_internal_use_settings = few
+
+
+@pytest.fixture(autouse=True)
+def warnings_of_a_fresh_process():
+    """What is said once in a process is said once in each test."""
+    module = sys.modules.get("astropolcal.observations.pointings")
+    if module is not None:
+        module._SAID.clear()
+
+
+@pytest.fixture
+def no_network(monkeypatch):
+    """Fail where a table would be fetched, as astropy does by itself from old ones."""
+    from astropy.time import core
+    from astropy.utils import iers
+
+    def refuse(*arguments, **options):
+        raise AssertionError("the network was asked")
+
+    def check():
+        assert not iers.conf.auto_download, "new leap seconds may be fetched"
+
+    monkeypatch.setattr(iers.iers, "download_file", refuse)
+    # astropy looks for leap seconds once in a process, this check in every conversion
+    monkeypatch.setattr(core, "_check_leapsec", check, raising=False)
+    # in days, the least that is allowed: what comes with astropy is older than that in most places
+    with iers.conf.set_temp("auto_max_age", 10), iers.conf.set_temp("auto_download", True):
+        yield
+        assert iers.conf.auto_download
+        assert iers.conf.auto_max_age == 10
 
 
 @pytest.fixture(scope="session")

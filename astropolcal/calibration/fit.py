@@ -252,7 +252,8 @@ def _check(measurement):
         )
         unit = free.by_name[name.partition("[")[0]].unit
         raise FitError(
-            f"{name} starts at {value:.7g}; allowed are {low:.7g} to {high:.7g} {unit or ''}".strip()
+            f"{name} starts at {value:.7g}, allowed are {low:.7g} to {high:.7g}"
+            f"{'' if unit is None else f' {unit}'}"
         )
 
 

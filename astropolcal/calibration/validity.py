@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 import astropy.units as u
 import numpy as np
 from astropy.time import Time
-from erfa import ErfaWarning
 
 from astropolcal import instruments
 from astropolcal.chain import leaves
@@ -19,6 +18,7 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.instruments import Instrument
+from astropolcal.observations.pointings import offline
 from astropolcal.observations.reading import stated_date
 from astropolcal.units import iso_date
 
@@ -336,8 +336,7 @@ def _dates(calibration):
 
 def _time(moments):
     """Return ISO texts as `~astropy.time.Time`, without a word on leap seconds to come."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ErfaWarning)
+    with offline():
         return Time(moments, format="isot", scale="utc")
 
 

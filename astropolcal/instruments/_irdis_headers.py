@@ -10,7 +10,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from astropolcal.exceptions import AstropolcalWarning, InstrumentError, ObservationError
-from astropolcal.observations.pointings import pointing
+from astropolcal.observations.pointings import offline, pointing
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
@@ -149,8 +149,10 @@ def _row(frame, tracking, location):
     dit, ndit = frame.number_of("EXPTIME", 0.0), frame.number_of("ESO DET NDIT", 1.0)
     # EXPTIME is the light of one DIT, without its read-out
     seconds = ndit * (dit + _READ_OUT) + _START
-    start = Time(frame.number_of("MJD-OBS", 0.0), format="mjd", scale="utc")
-    middle, motion = start + 0.5 * seconds * u.s, (0.0, 0.0)
+    with offline():
+        start = Time(frame.number_of("MJD-OBS", 0.0), format="mjd", scale="utc")
+        middle, motion = start + 0.5 * seconds * u.s, (0.0, 0.0)
+        moment = middle.isot
     if location is not None:
         angles["parallactic"] = frame.mean_angle(_PARALLACTIC, "ESO TEL PARANG END")
         motion = _motion(frame, Time([start, middle]), location)
@@ -161,7 +163,7 @@ def _row(frame, tracking, location):
     row = {"frame": frame.number, "motion": motion} | {
         key: value * u.deg for key, value in angles.items()
     }
-    return row | {"exposure_time": dit * ndit * u.s, "time": middle.isot}
+    return row | {"exposure_time": dit * ndit * u.s, "time": moment}
 
 
 def _motion(frame, times, location):

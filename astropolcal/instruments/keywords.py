@@ -6,14 +6,12 @@ Shared by all that reads headers: the reduction of cubes, the prediction for a s
 instruments whose frames tell more than a column.
 """
 
-import warnings
-
 import astropy.units as u
 from astropy.io.fits import VerifyError
 from astropy.io.fits.card import Undefined
 from astropy.time import Time
-from erfa import ErfaWarning
 
+from astropolcal.observations.pointings import offline
 from astropolcal.units import iso_date, plain_number
 
 __all__ = [
@@ -199,7 +197,8 @@ def frame_time(header, layout):
     day = iso_date(date)
     if "T" not in day and clock is not None:
         day = iso_date(f"{day}T{str(clock).strip()}")
-    return in_calendar(Time(day, scale="utc"))
+    with offline():
+        return in_calendar(Time(day, scale="utc"))
 
 
 def in_calendar(time):
@@ -229,8 +228,7 @@ def in_calendar(time):
     >>> in_calendar(Time(60982.5, format="mjd")).isot
     '2025-11-03T12:00:00.000'
     """
-    with warnings.catch_warnings():
-        # years long before UTC was made are doubtful, but are years
-        warnings.simplefilter("ignore", ErfaWarning)
+    # years long before UTC was made are doubtful, but are years
+    with offline():
         time.tai, time.isot  # noqa: B018
     return time

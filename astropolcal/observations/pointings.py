@@ -15,10 +15,12 @@ import astropy.units as u
 import numpy as np
 from astropy.time import Time
 from astropy.utils import iers
+from astropy.utils.data import download_file
 from astropy.utils.exceptions import AstropyWarning
 from erfa import ErfaWarning
 
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
+from astropolcal.files import one_line
 from astropolcal.observations.coordinates import clock
 from astropolcal.observations.reading import numeric_column
 from astropolcal.units import angle_to_rad
@@ -35,9 +37,13 @@ _WHEN = {"start": 0.5, "middle": 0.0, "end": -0.5}
 _MOST_NODES = 32
 
 
+# what was warned of in this process: the same holds for every frame and every star
+_SAID = set()
+
+
 @contextmanager
 def offline():
-    """Use the Earth orientation that astropy brings along; never the network."""
+    """Use the tables of leap seconds and of the Earth's rotation at hand; never the network."""
     with (
         # a calibration must not depend on a server, nor wait for one
         iers.conf.set_temp("auto_download", False),
@@ -45,18 +51,57 @@ def offline():
         iers.conf.set_temp("iers_degraded_accuracy", "warn"),
         warnings.catch_warnings(),
     ):
-        # a second of time is 15 arcsec, which does not matter here
+        # of what matters `_warn_of_uncovered` warns
         warnings.simplefilter("ignore", AstropyWarning)
         warnings.simplefilter("ignore", ErfaWarning)
         yield
+
+
+@contextmanager
+def online():
+    """Use new tables of the Earth's rotation from the network, for the time of a ``with`` block."""
+    urls = [iers.conf.iers_auto_url, iers.conf.iers_auto_url_mirror]
+    try:
+        path = download_file(urls[0], sources=urls, cache="update", show_progress=False)
+        table = iers.IERS_A.read(path)
+    except (OSError, ValueError) as error:
+        raise AstropolcalError(
+            f"tables of the Earth's rotation cannot be had from {' or '.join(urls)}: "
+            f"{one_line(error)}"
+        ) from None
+    with iers.earth_orientation_table.set(table):
+        yield
+
+
+def _warn_of_uncovered(time):
+    """Warn once of times for which the difference of UT1 and UTC is not known."""
+    with offline():
+        days = iers.earth_orientation_table.get()["MJD"].value[[0, -1]]
+        mjd, (first, last) = time.utc.mjd, Time(days, format="mjd").isot
+    for uncovered, words in (
+        (mjd < days[0], f"before {first[:10]}, where the tables of the Earth's rotation begin"),
+        (mjd > days[1], f"after {last[:10]}, where the tables of the Earth's rotation end"),
+    ):
+        if np.any(uncovered) and words not in _SAID:
+            _SAID.add(words)
+            # 0.9 s of time are 13.5 arcsec of hour angle
+            warnings.warn(
+                f"times {words}: UT1 is taken as UTC. As long as leap seconds keep the two within "
+                "0.9 s, the altitude is good to 0.004 deg, and the parallactic angle to 0.004 deg "
+                "over the sine of the zenith distance, 0.2 deg at 1 deg from the zenith. Newer "
+                "tables come with astropy-iers-data, or over the network with --online",
+                AstropolcalWarning,
+                stacklevel=3,
+            )
 
 
 def pointing(coord, time, location):
     """
     Return altitude and parallactic angle of a target.
 
-    Refraction is left out. Nothing is downloaded: for times that the Earth-rotation tables
-    at hand do not cover, the angles are good to a few arcseconds.
+    Refraction is left out. Nothing is downloaded: the tables of the Earth's rotation are those
+    that are installed (``astropy-iers-data``), or those that were given to
+    `astropy.utils.iers.earth_orientation_table`.
 
     Parameters
     ----------
@@ -71,6 +116,12 @@ def pointing(coord, time, location):
     -------
     altitude, parallactic : `~astropy.units.Quantity`
         Degree; the parallactic angle is between -180 and 180 deg, positive in the west.
+
+    Warns
+    -----
+    AstropolcalWarning
+        Once in a process, if the tables do not cover the times: UT1 is then taken as UTC. Leap
+        seconds keep the two within 0.9 s, which is 0.004 deg of hour angle.
 
     Examples
     --------
@@ -88,6 +139,7 @@ def pointing(coord, time, location):
 
     with offline():
         seen = coord.transform_to(HADec(obstime=time, location=location))
+    _warn_of_uncovered(time)
     hour, dec = seen.ha.rad, seen.dec.rad
     latitude = location.to_geodetic().lat.rad
     # spherical triangle of pole, zenith and star
@@ -203,7 +255,8 @@ def _times(observations):
     if isinstance(column, Time):
         return column
     try:
-        return Time(np.asarray(column).astype(str), scale="utc")
+        with offline():
+            return Time(np.asarray(column).astype(str), scale="utc")
     except ValueError:
         return None
 

@@ -25,6 +25,7 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.observations import Observations, tracked
+from astropolcal.observations.pointings import offline
 from astropolcal.reduction._checks import choice, number, per_wavelength, pixels
 from astropolcal.reduction._cube_files import file_names, header_of, write_cube
 from astropolcal.reduction._images import Detector, Scene
@@ -402,7 +403,8 @@ def _with_headers(frames, layout, source, exposure_time, start):
     if "time" not in frames.colnames:
         # start of each frame: one follows the other
         before = np.cumsum(frames["exposure_time"]) - frames["exposure_time"]
-        frames["time"] = Time(start) + before
+        with offline():
+            frames["time"] = Time(start) + before
     return frames
 
 

@@ -17,16 +17,16 @@ from astropolcal.reduction.apertures import evenly_lit, measure_internal
 from astropolcal.reduction.beams import match_beams
 from astropolcal.reduction.errors import detector_of
 from astropolcal.reduction.headers import (
+    add_pointing,
     not_of_instrument,
     observation_time,
-    pointing,
     read_header,
     tracking_error,
 )
 from astropolcal.reduction.photometry import Photometry
 from astropolcal.reduction.stars import measure_stars
 
-__all__ = ["Frame", "open_cube", "reduce_frame"]
+__all__ = ["Frame", "check_stars", "open_cube", "reduce_frame"]
 
 _ARRAYS = (
     *("flux", "variance", "covariance", "scale", "scale_err"),
@@ -286,8 +286,6 @@ def _check_header(frame, layout, source):
         if column not in values and not _complained(frame, layout.keywords[column])
     ]
     _add_time(values)
-    if source == "star":
-        _check_star(frame, layout)
 
 
 def _complained(frame, keyword):
@@ -304,21 +302,36 @@ def _add_time(values):
         values["date"] = observation_time(values).isot[:10]
 
 
-def _check_star(frame, layout):
+def check_stars(frames, layout):
+    """
+    Compute the angles of the sky that headers lack, and check that the plates followed it.
+
+    Parameters
+    ----------
+    frames : list of Frame
+        Of stars; what is wrong or odd is added to their ``errors`` and ``doubts``.
+    layout : FileLayout
+        Of the instrument.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.frames import Frame, check_stars
+    >>> frame = Frame("CRSA00170808_cube.fits", values={"hwp": 0.0})
+    >>> check_stars([frame], instruments.get("charis").files)
+    >>> frame.errors
+    ['no keyword PARANG and ALTITUDE in its header, and no date to compute the time from']
+    """
+    # what could not be opened says nothing
+    frames = [frame for frame in frames if frame.values]
+    add_pointing(frames, layout)
+    for frame in frames:
+        if {"parallactic", "altitude"} <= frame.values.keys():
+            _check_tracking(frame, layout)
+
+
+def _check_tracking(frame, layout):
     values = frame.values
-    missing = [name for name in ("parallactic", "altitude") if name not in values]
-    if missing and not any(_complained(frame, layout.keywords[name]) for name in missing):
-        try:
-            found = dict(
-                zip(("altitude", "parallactic"), pointing(values, layout.site), strict=True)
-            )
-        except ObservationError as error:
-            names = " and ".join(layout.keywords[name] for name in missing)
-            frame.errors.append(f"no keyword {names} in its header, and {error}")
-            return
-        # a header value goes before a computed one
-        values.update({name: found[name] for name in missing})
-        frame.doubts.append(f"{' and '.join(missing)} computed from the coordinates and the time")
     # a plate that did not follow the sky spoils a frame without any other sign
     off = tracking_error(values, layout)
     if off is None:

@@ -30,10 +30,13 @@ from astropolcal.instruments.keywords import (
     look_up,
     unit_of,
 )
+from astropolcal.observations import pointing as sky_pointing
+from astropolcal.observations.pointings import location_of, offline
 from astropolcal.units import iso_date, plain_number
 
 __all__ = [
     "FrameHeader",
+    "add_pointing",
     "check_sequence",
     "frame_number",
     "not_of_instrument",
@@ -324,10 +327,9 @@ def pointing(values, site):
     ObservationError
         If something is missing or cannot be understood.
 
-    Notes
-    -----
-    UT1 is taken as UTC, which is right within 0.9 s: 0.004 deg of hour angle.
-    Refraction is left out.
+    See Also
+    --------
+    astropolcal.observations.pointing : what computes them.
 
     Examples
     --------
@@ -336,6 +338,56 @@ def pointing(values, site):
     >>> [round(angle, 1) for angle in pointing(values, (-155.4761, 19.8255, 4139.0))]
     [75.9, -44.9]
     """
+    (angles,) = _pointings([_target(values, site)], site)
+    return angles
+
+
+def add_pointing(frames, layout, needed=True):
+    """
+    Compute the angles of the sky that headers lack, of all frames at once.
+
+    Parameters
+    ----------
+    frames : list of FrameHeader or Frame
+        Those that lack ``altitude`` or ``parallactic`` get them, and a doubt that says so.
+    layout : FileLayout
+        With ``site``.
+    needed : bool
+        Whether it is an error of a frame if they cannot be computed.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.headers import FrameHeader, add_pointing
+    >>> values = {"right_ascension": "05:05:05", "declination": "+10:00:00", "mjd": 60250.5}
+    >>> frame = FrameHeader("CRSA00170808_cube.fits", values=values)
+    >>> add_pointing([frame], instruments.get("charis").files)
+    >>> round(frame.values["altitude"], 1)
+    75.9
+    """
+    found = []
+    for frame in frames:
+        missing = [name for name in ("parallactic", "altitude") if name not in frame.values]
+        words = [layout.keywords[name] for name in missing]
+        if not missing or any(error.startswith(tuple(words)) for error in frame.errors):
+            continue
+        try:
+            found.append((frame, missing, _target(frame.values, layout.site)))
+        except ObservationError as error:
+            if needed:
+                frame.errors.append(f"no keyword {' and '.join(words)} in its header, and {error}")
+    angles = _pointings([target for *_, target in found], layout.site)
+    for (frame, missing, _), (altitude, parallactic) in zip(found, angles, strict=True):
+        known = {"altitude": altitude, "parallactic": parallactic}
+        # a header value goes before a computed one
+        frame.values.update({name: known[name] for name in missing})
+        frame.doubts.append(f"{' and '.join(missing)} computed from the coordinates and the time")
+
+
+def _target(values, site):
+    """Return right ascension and declination (degree, J2000) and the time that a header states."""
+    if not site:
+        raise ObservationError("no site of the telescope to compute the pointing from")
     time = observation_time(values)
     try:
         ra, dec = values["right_ascension"], values["declination"]
@@ -345,20 +397,18 @@ def pointing(values, site):
         raise ObservationError(f"no {error.args[0]} to compute the pointing from") from None
     except (ValueError, TypeError, u.UnitsError) as error:
         raise ObservationError(f"right ascension and declination: {one_line(error)}") from None
-    # not by observations.pointing: that is good to arcseconds, but takes seconds at its first call,
-    # which every process of a reduction would wait for
-    here = coordinate.transform_to(FK5(equinox=time))
-    longitude, latitude = np.deg2rad(site[:2])
-    time.delta_ut1_utc = 0.0
-    hour = time.sidereal_time("mean", longitude * u.rad).rad - here.ra.rad
-    # spherical triangle of pole, zenith and star, all of the equator of date
-    sin_alt = np.sin(latitude) * np.sin(here.dec.rad)
-    sin_alt += np.cos(latitude) * np.cos(here.dec.rad) * np.cos(hour)
-    parallactic = np.arctan2(
-        np.sin(hour),
-        np.cos(here.dec.rad) * np.tan(latitude) - np.sin(here.dec.rad) * np.cos(hour),
-    )
-    return float(np.rad2deg(np.arcsin(sin_alt))), float(np.rad2deg(parallactic))
+    return coordinate.ra.deg, coordinate.dec.deg, time.mjd
+
+
+def _pointings(targets, site):
+    """Return altitude and parallactic angle of each, in degree."""
+    if not targets:
+        return []
+    # all at once, as the transformation costs the same for one
+    ra, dec, mjd = np.array(targets, dtype=float).T
+    coordinate = SkyCoord(ra, dec, unit=u.deg, frame=FK5(equinox="J2000"))
+    angles = sky_pointing(coordinate, Time(mjd, format="mjd", scale="utc"), location_of(site))
+    return list(zip(*(angle.to_value(u.deg).tolist() for angle in angles), strict=True))
 
 
 def _is_number(text):
@@ -398,7 +448,8 @@ def observation_time(values):
             return in_calendar(Time(values["mjd"], format="mjd", scale="utc"))
         date = iso_date(values["date"])
         date = date if "T" in date else iso_date(f"{date}T{values['time']}", "date and time")
-        return in_calendar(Time(date, scale="utc"))
+        with offline():
+            return in_calendar(Time(date, scale="utc"))
     except KeyError as error:
         raise ObservationError(f"no {error.args[0]} to compute the time from") from None
     except (ValueError, ErfaError) as error:

@@ -22,7 +22,7 @@ from astropolcal.reduction._sorting import (
     set_aside,
     without_repeats,
 )
-from astropolcal.reduction.frames import Frame, reduce_frame
+from astropolcal.reduction.frames import Frame, check_stars, reduce_frame
 from astropolcal.reduction.headers import raw_frames
 from astropolcal.reduction.journal import Journal
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
@@ -250,6 +250,9 @@ def reduce_run(
         "options": options,
     }
     frames = _measure_all(files, task, workers, resume, progress)
+    if photometry == "star":
+        # here and not in the processes that measure: one table of the Earth's rotation for all
+        check_stars(frames, instrument.files)
     reduction = Reduction(instrument, photometry, options=options)
     # copies before sequences: a copy would look like an angle too often
     frames = _with_state(set_aside(frames, reduction), reduction)
@@ -336,7 +339,9 @@ def _nothing(count, problems):
 def _measure_all(files, task, workers, resume, progress):
     """Return the frames of all files in their order, from the journal or measured now."""
     settings = {name: repr(task[name]) for name in ("layout", "source", "options")}
-    journal = Journal(resume, settings | {"raw": task["raw"] is not None})
+    # frames of an older journal hold angles that were checked already
+    settings |= {"raw": task["raw"] is not None, "checked": False}
+    journal = Journal(resume, settings)
     found = {path: journal.done(path) for path in files}
     found = {path: frame for path, frame in found.items() if frame is not None}
     # a file that is named twice is measured once

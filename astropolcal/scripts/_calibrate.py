@@ -13,6 +13,7 @@ from astropolcal.scripts._common import (
     Output,
     add_edits,
     add_json,
+    add_online,
     add_quiet,
     check_suffix,
     edit_chains,
@@ -65,6 +66,7 @@ def add_parser(commands):
         "--plots", metavar="DIR", type=Folder, help="save the figures in this folder"
     )
     add_json(parser)
+    add_online(parser)
     add_quiet(parser)
     parser.set_defaults(run=run)
 

@@ -232,6 +232,15 @@ def add_quiet(parser, meaning="print nothing but warnings and errors"):
     parser.add_argument("-q", "--quiet", action="store_true", help=meaning)
 
 
+def add_online(parser):
+    """Add ``--online``, which `astropolcal.scripts.main` obeys."""
+    parser.add_argument(
+        "--online",
+        action="store_true",
+        help="fetch new tables of the Earth's rotation; by default the network is not used",
+    )
+
+
 def add_edits(parser, *names):
     """Add options that edit the model and may be given several times."""
     for name in names:

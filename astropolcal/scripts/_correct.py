@@ -14,6 +14,7 @@ from astropolcal.scripts._common import (
     Input,
     Output,
     add_json,
+    add_online,
     add_quiet,
     check_sources,
     check_suffix,
@@ -86,6 +87,7 @@ def add_parser(commands):
     parser.add_argument("--workers", metavar="N", type=int, help="threads of dask")
     parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of dask.distributed")
     add_json(parser)
+    add_online(parser)
     add_quiet(parser)
     parser.set_defaults(run=run)
 
@@ -332,7 +334,7 @@ def _headers(files, instrument, arguments):
 
     layout = instrument.files
     raw = None if arguments.raw is None else raw_frames(arguments.raw, layout)
-    found = [_frame(file, layout, raw, arguments.centre) for file in files]
+    found = _frames(files, layout, raw, arguments.centre)
     table = QTable()
     for name in _ANGLES:
         # an angle that no header has is no column at all
@@ -360,30 +362,28 @@ def _headers(files, instrument, arguments):
     return table, centres, exposure / np.median(exposure) if differ else None, left
 
 
-def _frame(file, layout, raw, centre):
-    """Return what is known of a file; refuse one that cannot be used."""
-    from astropolcal.reduction.frames import reduce_frame
-    from astropolcal.reduction.headers import not_of_instrument, pointing, read_header
+def _frames(files, layout, raw, centre):
+    """Return what is known of the files; refuse one that cannot be used."""
+    from astropolcal.reduction.frames import check_stars, reduce_frame
+    from astropolcal.reduction.headers import add_pointing, not_of_instrument, read_header
 
     if centre is None:
         # finds the star, which takes the time of this step
-        frame = reduce_frame(file, layout, source="star", raw=raw)
+        frames = [reduce_frame(file, layout, source="star", raw=raw) for file in files]
+        check_stars(frames, layout)
     else:
-        frame = read_header(file, layout, raw=raw)
-        if not {"parallactic", "altitude"} <= set(frame.values):
-            try:
-                found = pointing(frame.values, layout.site)
-                frame.values.update(zip(("altitude", "parallactic"), found, strict=True))
-            except ObservationError:
-                # whether they are needed depends on the calibration
-                pass
-    foreign = not_of_instrument(frame.values, layout)
-    if foreign:
-        raise ObservationError(f"{file}: {foreign}")
-    if frame.errors:
-        hint = "; --raw names a folder of raw frames" if raw is None and layout.raw_columns else ""
-        raise ObservationError(f"{file}: {'; '.join(frame.errors)}{hint}")
-    return frame
+        frames = [read_header(file, layout, raw=raw) for file in files]
+        # whether they are needed depends on the calibration
+        add_pointing(frames, layout, needed=False)
+    for file, frame in zip(files, frames, strict=True):
+        foreign = not_of_instrument(frame.values, layout)
+        if foreign:
+            raise ObservationError(f"{file}: {foreign}")
+        if frame.errors:
+            raw_hint = "; --raw names a folder of raw frames"
+            hint = raw_hint if raw is None and layout.raw_columns else ""
+            raise ObservationError(f"{file}: {'; '.join(frame.errors)}{hint}")
+    return frames
 
 
 def _position_angles(table, arguments):

@@ -12,6 +12,7 @@ from astropolcal.scripts._common import (
     Output,
     add_edits,
     add_json,
+    add_online,
     add_quiet,
     check_suffix,
     edit_chains,
@@ -99,6 +100,7 @@ def _add_output_options(parser):
         help="calibrate with the effects that were found, and write the calibration",
     )
     add_json(parser)
+    add_online(parser)
     add_quiet(parser)
 
 

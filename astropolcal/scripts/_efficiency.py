@@ -11,6 +11,7 @@ from astropolcal.scripts._common import (
     Input,
     Output,
     add_json,
+    add_online,
     add_quiet,
     is_quiet,
     say_written,
@@ -56,6 +57,7 @@ def add_parser(commands):
         help="save the figure (PNG, PDF, SVG); with --target that of the derotator offsets",
     )
     add_json(parser)
+    add_online(parser)
     add_quiet(parser)
     parser.set_defaults(run=run)
 
@@ -273,15 +275,19 @@ def _times(text):
     """Return moments over the observation."""
     from astropy.time import Time
 
+    from astropolcal.observations.pointings import offline
+
     try:
-        start, end = (Time(iso_date(part), scale="utc") for part in text.split("/"))
+        with offline():
+            start, end = (Time(iso_date(part), scale="utc") for part in text.split("/"))
+            moments = start + (end - start) * np.linspace(0, 1, 25)
     except ValueError:
         raise ParameterError(
             f"--night {text}: write START/END in UTC, such as 2025-11-03T08:00/2025-11-03T12:00"
         ) from None
     if end < start:
         raise ParameterError(f"--night {text}: ends before it starts; write START/END")
-    return start + (end - start) * np.linspace(0, 1, 25)
+    return moments
 
 
 def _draw(arguments, instrument, chain, grid, best=None):

@@ -14,6 +14,7 @@ from astropolcal.scripts._common import (
     Frames,
     Output,
     add_json,
+    add_online,
     add_quiet,
     angles,
     check_sources,
@@ -72,6 +73,7 @@ def add_parser(commands):
         "--quicklook", metavar="DIR", type=Folder, help="write figures to this folder"
     )
     add_json(parser)
+    add_online(parser)
     add_quiet(parser)
     parser.set_defaults(run=run)
 

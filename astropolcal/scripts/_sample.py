@@ -13,6 +13,7 @@ from astropolcal.scripts._common import (
     Input,
     Output,
     add_json,
+    add_online,
     add_quiet,
     check_suffix,
     printer,
@@ -69,6 +70,7 @@ def add_parser(commands):
         "--plots", metavar="DIR", type=Folder, help="save the figures in this folder"
     )
     add_json(parser)
+    add_online(parser)
     add_quiet(parser)
     # the samples come to what the calibration holds, and nothing of it is lost
     parser.set_defaults(run=run, may_replace={"output": "calibration"})

@@ -7,6 +7,7 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.scripts._common import (
     Output,
     add_json,
+    add_online,
     add_quiet,
     printer,
     wrapped,
@@ -69,6 +70,7 @@ def add_parser(commands):
         type=Output,
         help="draw altitude and parallactic angle over the night",
     )
+    add_online(parser)
     add_quiet(parser)
     parser.set_defaults(run=run)
 

@@ -10,6 +10,7 @@ import os
 import re
 import sys
 import warnings
+from contextlib import nullcontext
 from functools import partial
 
 from astropolcal.version import version
@@ -147,10 +148,13 @@ def _run(argv):
     with warnings.catch_warnings():
         # a user has no use for file and line of our code
         warnings.showwarning = _show_warning
+        # leap seconds to come: what matters of them is said once, where angles are computed
+        warnings.filterwarnings("ignore", message="ERFA function")
         try:
             arguments = build_parser().parse_args(argv)
             check_paths(arguments)
-            arguments.run(arguments)
+            with _earth(arguments):
+                arguments.run(arguments)
         except AstropolcalError as error:
             print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
             return 2
@@ -159,6 +163,15 @@ def _run(argv):
             print(f"astropolcal: error: not enough memory: {words}", file=sys.stderr)
             return 2
     return 0
+
+
+def _earth(arguments):
+    """Return in what to run a command that may ask for new tables of the Earth's rotation."""
+    if not getattr(arguments, "online", False):
+        return nullcontext()
+    from astropolcal.observations.pointings import online
+
+    return online()
 
 
 def _one_line(message):

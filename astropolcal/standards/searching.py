@@ -16,6 +16,7 @@ from astropolcal.standards._sky import (
     location,
     night_table,
     night_times,
+    offline,
     pointing,
 )
 from astropolcal.standards.catalogues import check_kind, get, names
@@ -221,7 +222,8 @@ def _add_night(found, seen):
         ranges = u.Quantity([getattr(s, name) for s in seen] or np.zeros((0, 2)), u.deg)
         found[f"{name}_min"], found[f"{name}_max"] = ranges[:, 0], ranges[:, 1]
     found["hours"] = u.Quantity([s.hours for s in seen] or [], u.h)
-    found["transit"] = np.array([s.transit.iso[:16] for s in seen], dtype=str)
+    with offline():
+        found["transit"] = np.array([s.transit.iso[:16] for s in seen], dtype=str)
     errors = np.array([s.information(FRAMES).diattenuation for s in seen], dtype=float)
     excess = found["magnitude"].value - _REFERENCE_MAGNITUDE
     found["m3_error"], found["m3_score"] = errors, errors * 10 ** (0.2 * excess)

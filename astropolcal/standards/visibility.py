@@ -139,8 +139,7 @@ def observability(
     """
     Return when a star can be observed in a night, and at which angles.
 
-    No file is fetched from the network; the Earth orientation is that of the
-    installed astropy, which is good to an arcminute far into the future.
+    No file is fetched from the network, see `astropolcal.observations.pointing`.
 
     Parameters
     ----------

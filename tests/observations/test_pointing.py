@@ -9,7 +9,7 @@ from astropy.time import Time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations import (
     Observations,
     example_table,
@@ -68,9 +68,16 @@ def test_parallactic_angle_is_positive_in_the_west():
     assert np.all((parallactic.value > 0) == ~rising)
 
 
-def test_times_far_in_the_future_do_not_ask_the_network():
-    altitude, _ = pointing(STAR, Time("2028-06-01T08:00"), SUBARU)
-    assert -90 <= altitude.to_value(u.deg) <= 90
+def test_an_unknown_rotation_of_the_earth_does_what_the_warning_says(no_network):
+    """The largest difference of UT1 and UTC changes the angles by no more than is stated."""
+    times = Time(61900.0 + np.linspace(0, 1, 97), format="mjd")
+    with pytest.warns(AstropolcalWarning, match=r"0\.004 deg over the sine of the zenith"):
+        altitude, parallactic = pointing(STAR, times, SUBARU)
+    # only once
+    later = pointing(STAR, Time(times.mjd + 0.9 / 86400, format="mjd"), SUBARU)
+    turned = (later[1] - parallactic + 180 * u.deg) % (360 * u.deg) - 180 * u.deg
+    assert np.abs(later[0] - altitude).max() < 0.004 * u.deg
+    assert np.abs(turned * np.cos(altitude)).max() < 0.004 * u.deg
 
 
 @pytest.mark.parametrize(

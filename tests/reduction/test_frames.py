@@ -9,7 +9,7 @@ from reduction_lab import HEADER, expose, write_cube
 from astropolcal import instruments
 from astropolcal.exceptions import ObservationError
 from astropolcal.reduction import reduce_run
-from astropolcal.reduction.frames import Frame, _check_header, open_cube, reduce_frame
+from astropolcal.reduction.frames import Frame, _check_header, check_stars, open_cube, reduce_frame
 from astropolcal.reduction.headers import not_of_instrument, observation_time
 
 LAYOUT = instruments.get("charis").files
@@ -207,6 +207,7 @@ def starred(*, without=(), **changes):
     values = {k: v for k, v in (SKY | changes).items() if k not in without}
     frame = Frame("CRSA00000001.fits", 1, values)
     _check_header(frame, LAYOUT, "star")
+    check_stars([frame], LAYOUT)
     return frame
 
 

@@ -1,18 +1,21 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Runs: what is left out and why, resuming, processes, the table, other people's tables."""
 
+import warnings
 from dataclasses import replace
 
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable
+from astropy.time import Time
 from reduction_lab import Small, expose, pair, reduce_frame_or_die, star_image, write_cube
 
 from astropolcal import instruments
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
-from astropolcal.observations import Observations
+from astropolcal.observations import Observations, pointing
 from astropolcal.reduction import read_pypolcal, reduce_cubes, reduce_run
 from astropolcal.reduction.apertures import rectangles
 from astropolcal.reduction.cubes import simulate_cubes
@@ -77,6 +80,28 @@ def test_star_run(tmp_path, small):
     np.testing.assert_allclose(obs.flux_right, 2e5, rtol=0.01)
     table = reduction.photometry
     assert {"x_right", "fwhm_left", "background_right"} <= set(table.colnames)
+
+
+def test_pointing_of_a_run_is_computed_without_the_network(tmp_path, small, no_network):
+    """Headers without angles: one warning where the Earth's rotation is not known, not one each."""
+    place = {"RA": "05:05:05", "DEC": "+10:00:00", "drop": ("PARANG", "ALTITUDE", "RET-POS1")}
+    dates = {"1990-11-03": (48198.5, True), "2026-12-05": (61379.5, True)}
+    for date, (mjd, covered) in (dates | {"2031-11-03": (63173.5, False)}).items():
+        folder = tmp_path / date
+        folder.mkdir()
+        paths = star_frames(folder, 3, UTC__DATE=date, MJD=mjd, **place)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            frames = reduce_run(paths, small, source="star").frames
+        assert [str(w.message).split(":")[0][:11] for w in caught] == ["times after"] * (
+            not covered
+        )
+        star = SkyCoord("05:05:05", "+10:00:00", unit=(u.hourangle, u.deg), frame="fk5")
+        altitude, parallactic = pointing(star, Time(mjd, format="mjd"), small.location)
+        for frame in frames:
+            assert frame.values["altitude"] == pytest.approx(altitude.value, abs=1e-9)
+            assert frame.values["parallactic"] == pytest.approx(parallactic.value, abs=1e-9)
+            assert "parallactic and altitude computed" in frame.doubts[0]
 
 
 def test_unpolarized_source_is_recognized_and_a_statement_wins(tmp_path, small):

@@ -25,7 +25,7 @@ def told(monkeypatch):
         files = [f"CRSA{i:08d}_cube.fits" for i in range(len(frames))]
         known = dict(zip(files, frames, strict=True))
         monkeypatch.setattr(
-            _correct, "_frame", lambda file, *_: FrameHeader(file, values=dict(known[file]))
+            _correct, "_frames", lambda *_: [FrameHeader(f, values=dict(known[f])) for f in files]
         )
         return _headers(files, CHARIS, SimpleNamespace(raw=None, centre=centre))
 
@@ -76,13 +76,13 @@ def test_frames_are_as_bright_as_their_exposures(told, seconds, scale):
 
 
 def test_star_that_is_not_found_names_the_file(monkeypatch):
-    def frame(file, *_):
+    def frame(file):
         x = np.full((2, 3), np.nan if "1_cube" in file else 70.0)
         found = FrameHeader(file, values={"hwp": 0.0})
         found.photometry = SimpleNamespace(x=x, y=x + 15.0)
         return found
 
-    monkeypatch.setattr(_correct, "_frame", frame)
+    monkeypatch.setattr(_correct, "_frames", lambda files, *_: [frame(file) for file in files])
     files = [f"CRSA0000000{i}_cube.fits" for i in range(3)]
     arguments = SimpleNamespace(raw=None, centre=None)
     words = "CRSA00000001_cube.fits: the star was not found; give its place with --centre"

@@ -10,7 +10,9 @@ from astropy.table import QTable
 
 from astropolcal import standards
 from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.observations import pointings
 from astropolcal.scripts import _standards
+from astropolcal.scripts.main import main
 
 NIGHT = ["--site", "subaru", "--night", "2025-11-03"]
 
@@ -239,3 +241,40 @@ def test_what_is_of_the_band_needs_no_note(capsys):
     assert len(lines) == 2
     assert " H " in lines[1]
     assert "*" not in lines[1]
+
+
+@pytest.mark.filterwarnings("always")
+def test_a_far_night_is_warned_of_in_one_line(capsys, no_network):
+    for options in (["--limit", "2"], ["HD 7927"]):
+        pointings._SAID.clear()
+        assert main(["standards", *options, "--site", "subaru", "--night", "2031-11-03"]) == 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("astropolcal: warning: times after ")
+
+
+def test_new_tables_are_fetched_where_that_is_asked_for(capsys, monkeypatch):
+    from astropy.utils import iers
+    from astropy_iers_data import IERS_A_FILE
+
+    asked, usual = [], iers.earth_orientation_table.get()
+    command = ["standards", "HD 7927", "--site", "subaru", "--night", "2025-11-03", "--online"]
+
+    def fetch(url, **options):
+        asked.append(url)
+        return IERS_A_FILE
+
+    def refuse(url, **options):
+        raise OSError("no route to the host")
+
+    monkeypatch.setattr(pointings, "download_file", fetch)
+    used = []
+    monkeypatch.setattr(
+        pointings, "_warn_of_uncovered", lambda _: used.append(iers.earth_orientation_table.get())
+    )
+    assert main(command) == 0
+    assert asked == [iers.conf.iers_auto_url]
+    assert used[0] is not usual
+    assert iers.earth_orientation_table.get() is usual
+    monkeypatch.setattr(pointings, "download_file", refuse)
+    assert main(command) == 2
+    assert "no route to the host" in capsys.readouterr().err

@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Altitudes and parallactic angles over a night, and the search that uses them."""
 
+import warnings
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -125,18 +127,16 @@ def test_information_of_the_night():
             seen.information(bad)
 
 
-def test_no_file_is_fetched_and_settings_are_put_back(monkeypatch):
-    from astropy.utils import data, iers
-
-    def refuse(*arguments, **options):
-        raise AssertionError("the network was asked")
-
-    monkeypatch.setattr(data, "download_file", refuse)
-    monkeypatch.setattr(iers.iers, "download_file", refuse)
-    before = iers.conf.auto_download
-    # beyond the table of Earth orientation
-    standards.observability("HD 293396", "subaru", "2041-11-03")
-    assert iers.conf.auto_download == before
+def test_no_file_is_fetched_and_an_unknown_rotation_of_the_earth_is_said_once(no_network):
+    for night, covered in (("1990-11-03", True), ("2026-12-05", True), ("2041-11-03", False)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            standards.observability("HD 293396", "subaru", night)
+            standards.search(kind="unpolarized", site="subaru", night=night)
+        found = [str(warning.message) for warning in caught]
+        assert len(found) == (not covered), found
+        # 0.9 s are 13.5 arcsec
+        assert all("0.004 deg" in text for text in found)
 
 
 @pytest.mark.parametrize(
