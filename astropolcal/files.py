@@ -249,6 +249,9 @@ def _refusal(problem, path):
     parent = Path(os.path.realpath(path)).parent
     if not os.path.isdir(parent):
         return f"there is no folder {parent if os.path.islink(path) else path.parent}"
+    # libraries raise errors of their own from that of the system
+    while problem.errno is None and isinstance(problem.__context__, OSError):
+        problem = problem.__context__
     reason = problem.strerror or one_line(problem)
     advice = _ADVICE.get(problem.errno)
     return f"{reason}; {advice}" if advice else reason

@@ -252,7 +252,7 @@ def check_electrons(electrons):
     # numpy draws 64-bit integers
     if most > _MOST_ELECTRONS:
         raise ParameterError(
-            f"flux and gain give {most:.3g} electrons at a time; allowed are up to "
+            f"flux and gain give {most:.3g} electrons in a frame, allowed are up to "
             f"{_MOST_ELECTRONS:g}"
         )
 

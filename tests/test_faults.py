@@ -2,16 +2,23 @@
 """Full disks, killed processes, unwritable folders, and several writers at once."""
 
 import errno
+import gc
 import json
 import multiprocessing
 import os
+import re
 import resource
+import shlex
+import shutil
 import signal
+import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import walk_packages
 
 import astropy.units as u
 import numpy as np
@@ -19,6 +26,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import astropolcal
 from astropolcal import Calibration, Observations
 from astropolcal.calibration import Library, _checkpoint, load, mueller_table, write_mueller
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError, FitError, GapError
@@ -234,6 +242,186 @@ def test_long_names_can_be_written(tmp_path):
     assert path.read_text() == "x"
 
 
+# ---- commands that cannot write, as processes of their own -----------------------------
+
+OLD = "what was there"
+STAR = "--source star --hwp 0,45,22.5,67.5 --derotator 60 --altitude 70 --parallactic 20"
+# what a command says where a disk is full, files may have 100 bytes, a folder is locked
+REASONS = {
+    "full": "cannot be written: No space left on device",
+    "limited": "cannot be written: File too large",
+    "locked": "no permission to write to",
+}
+CORRECT = "correct cubes --raw cubes/raw --calibration cal.asdf --size 5 --optics-in nbs"
+# calls of each command, and its outputs: {old} exists, {new} does not, {spare} can be written
+COMMANDS = {
+    "calibrate few.ecsv --derotator linear": ["-o {old}.asdf", "--json {old}", "--plots {folder}"],
+    "sample few.asdf few.ecsv --parameters hwp.w_sio2 --walkers 4 --steps 20": [
+        "-o {old}.asdf",
+        "--json {old}",
+        "--checkpoint {new}",
+    ],
+    "diagnose few.ecsv --effects beam_gain --derotator linear": [
+        "--report {old}.html",
+        "--save {old}.asdf",
+        "--json {old}",
+    ],
+    f"{CORRECT} --any-date": [
+        "-o {old}.fits",
+        "-o {spare}.fits --spectrum {old}.ecsv",
+        "-o {spare}.fits --plot {old}.png",
+        "-o {spare}.fits --json {old}",
+    ],
+    "reduce cubes --raw cubes/raw --source star": [
+        "-o {old}.ecsv",
+        "-o {spare}.ecsv --resume {new}",
+        "-o {spare}.ecsv --quicklook {folder}",
+        "-o {spare}.ecsv --json {old}",
+    ],
+    "simulate --derotator 45 --hwp 0,45": [
+        "-o {old}.ecsv",
+        "--cubes {folder}",
+        "-o {spare}.ecsv --json {old}",
+    ],
+    "challenge -n 1 --kinds none --wavelengths 5 --derotator-angles 3": [
+        "--checkpoint {new}",
+        "--figure {old}.png",
+        "--json {old}",
+    ],
+    "efficiency": ["-o {old}.png", "--json {old}"],
+    "standards 'HD 293396' --site subaru --night 2025-11-03": ["--plot {old}.png"],
+    "standards": ["--json {old}"],
+    "info few.ecsv": ["--json {old}"],
+}
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """A folder with what the commands read."""
+    from astropolcal import calibrate, instruments
+    from astropolcal.scripts.main import main
+    from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+    folder, charis = tmp_path_factory.mktemp("desk"), instruments.get("charis")
+    frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    meta = charis.published_meta() | {"yjh50_dichroic": "out"}
+    for name, rows in (("few", [9, 12, 16]), ("cal", slice(None))):
+        wavelength = charis.wavelength[rows]
+        chain = charis.chain("polarized", ["nbs"], derotator="linear", wavelength=wavelength)
+        data = simulate(chain, wavelength, frames, seed=5, meta=meta, name=name)
+        data.write(folder / f"{name}.ecsv")
+        calibrate(chain, data, instrument="charis").write(folder / f"{name}.asdf")
+    cubes = f"simulate -q --cubes {folder / 'cubes'} {STAR} --flux 2e6 --without dichroic"
+    assert main(cubes.split()) == 0
+    return folder
+
+
+def contents(folder):
+    return {path.name: path.read_bytes()[:100] for path in folder.rglob("*") if path.is_file()}
+
+
+@contextmanager
+def spoiled(kind, folder, old):
+    """Let an old file be in a folder that has no room for another, or cannot be written to."""
+    folder.mkdir()
+    mount = {"full": "-t tmpfs -o size=8k tmpfs", "locked": f"--bind {folder}"}.get(kind)
+    if mount:
+        subprocess.run(["mount", *mount.split(), folder], check=True)
+    if old:
+        (folder / old).write_text(OLD)
+    if kind == "full":
+        with suppress(OSError), open(folder / "rest", "wb", buffering=0) as stream:
+            while stream.write(b"x" * 512):
+                pass
+    if kind == "locked":
+        subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)
+    owner = os.getpid()
+    try:
+        yield
+    finally:
+        # not by a process that was forked meanwhile and comes to its end
+        if os.getpid() == owner:
+            if mount:
+                subprocess.run(["umount", folder], check=True)
+            shutil.rmtree(folder)
+
+
+def forked(kind, words):
+    """Run a command in a process that ends like any other; return its status and complaint."""
+    from astropolcal.scripts.main import main
+
+    read, write = os.pipe()
+    number = os.fork()
+    if not number:
+        os.dup2(write, 2)
+        if kind == "limited":
+            hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+        raise SystemExit(main(words))
+    os.close(write)
+    with open(read) as stream:
+        complaint = stream.read()
+    return os.waitstatus_to_exitcode(os.waitpid(number, 0)[1]), complaint
+
+
+def serve(desk, *kinds):
+    """Run all commands, where mounts are nobody else's; print how each of them ended."""
+    from astropolcal.scripts.main import main
+
+    os.chdir(desk)
+    # loaded once, for all processes
+    ours = [name for _, name, _ in walk_packages(astropolcal.__path__, "astropolcal.")]
+    for name in [*ours, "arviz_stats.base", "emcee", "h5py", "jinja2", "photutils.detection"]:
+        with suppress(ImportError):
+            import_module(name)
+    main("calibrate few.ecsv -q --derotator linear -o spare.asdf --plots spare".split())
+    # else each of them looks at all objects once more when it ends
+    gc.freeze()
+    print(json.dumps([[kind, *ended] for kind in kinds for ended in ends(kind, Path("place"))]))
+
+
+def ends(kind, folder):
+    """Yield words, status and complaint of each command, and whether the folder is as before."""
+    names = {"old": folder / "old", "new": folder / "new", "folder": folder, "spare": "spare"}
+    for command, options in COMMANDS.items():
+        # the limit is one of all files
+        for option in (o for o in options if kind != "limited" or "{spare}" not in o):
+            old = re.search(r"\{(old)\}(\.\w+)?", option)
+            with spoiled(kind, folder, old and f"old{old[2] or ''}"):
+                before, words = contents(folder), f"{command} -q {option.format(**names)}"
+                yield words, *forked(kind, shlex.split(words)), contents(folder) == before
+
+
+@pytest.mark.parametrize("kinds", [["full", "locked"], ["limited"]], ids=" ".join)
+def test_commands_that_cannot_write(kinds, desk):
+    space = [] if kinds == ["limited"] else ["unshare", "-m" if os.geteuid() == 0 else "-rm"]
+    if space:
+        trial = [*space, "mount", "-t", "tmpfs", "tmpfs", desk]
+        if not shutil.which("unshare") or subprocess.run(trial, capture_output=True).returncode:
+            pytest.skip("this system lets nobody mount file systems of his own")
+    serving = [*space, sys.executable, __file__, desk, *kinds]
+    done = subprocess.run(serving, capture_output=True, text=True, timeout=300)
+    assert not done.returncode, done.stderr
+    for kind, words, status, complaint, is_same in json.loads(done.stdout):
+        if words.startswith("sample") and not (find_spec("emcee") and find_spec("h5py")):
+            continue
+        lines = [x for x in complaint.splitlines() if not x.startswith("astropolcal: warning: ")]
+        assert (status, len(lines)) == (2, 1), (kind, words, complaint)
+        assert lines[0].startswith("astropolcal: error: "), (kind, words, lines)
+        assert REASONS[kind] in lines[0], (kind, words, lines)
+        assert is_same, (kind, words)
+
+
+def test_standard_output_on_a_full_disk():
+    command = [sys.executable, "-m", "astropolcal.scripts.main", "info", "--instruments"]
+    with open("/dev/full", "wb") as stream:
+        done = subprocess.run(command, stdout=stream, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "astropolcal: error: the standard output: cannot be written: No space left on device\n"
+    )
+
+
 # ---- killed processes --------------------------------------------------------------
 
 
@@ -431,3 +619,7 @@ def test_json_is_written_whole(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json({"a": float("nan")}, path)
     assert json.loads(path.read_text()) == {"a": 1}
+
+
+if __name__ == "__main__":
+    serve(*sys.argv[1:])

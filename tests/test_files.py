@@ -1,9 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Files appear complete or not at all, and what is read may be anything."""
 
+import contextlib
 import errno
 import os
+import socket
+import subprocess
+import sys
+import threading
 import time
+from pathlib import Path
 
 import pytest
 import yaml
@@ -11,7 +17,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError, ObservationError
-from astropolcal.files import atomic_path, check_new, check_yaml, one_line, understood
+from astropolcal.files import (
+    append_line,
+    atomic_path,
+    check_new,
+    check_yaml,
+    one_line,
+    printable,
+    understood,
+)
 
 
 def test_the_file_appears_when_the_block_ends(tmp_path):
@@ -126,6 +140,151 @@ def test_refusals_say_what_to_do(tmp_path, number, words):
     assert str(caught.value) == f"{path}: cannot be written: {words}"
 
 
+# ---- what is there already -------------------------------------------------------------
+
+
+def write(path, text):
+    """Write a file; return what was under the temporary name at first, and its permissions."""
+    with atomic_path(path) as temporary:
+        there = temporary.exists()
+        mode = temporary.stat().st_mode & 0o777 if there else None
+        temporary.write_text(text)
+    return there, mode
+
+
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path):
+    path = tmp_path / "note.txt"
+    old = os.umask(0o027)
+    try:
+        # a new one has those that any new file has
+        assert write(path, "first") == (False, None)
+        assert path.stat().st_mode & 0o777 == 0o640
+        for mode in (0o600, 0o644, 0o664, 0o444):
+            path.chmod(mode)
+            # not even for a moment may others read what is private
+            assert write(path, f"{mode:o}") == (True, 0o600)
+            assert path.stat().st_mode & 0o777 == mode
+            assert path.read_text() == f"{mode:o}"
+    finally:
+        os.umask(old)
+    assert [other.name for other in tmp_path.iterdir()] == ["note.txt"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give files away")
+def test_a_file_that_is_replaced_keeps_its_owner(tmp_path):
+    path = tmp_path / "note.txt"
+    path.write_text("old")
+    os.chown(path, 1234, 1235)
+    write(path, "new")
+    state = path.stat()
+    assert (state.st_uid, state.st_gid, path.read_text()) == (1234, 1235, "new")
+
+
+def test_a_link_stays_a_link(tmp_path):
+    folder = tmp_path / "far"
+    folder.mkdir()
+    (folder / "old.txt").write_text("old")
+    (tmp_path / "old.txt").symlink_to("far/old.txt")
+    (tmp_path / "chain.txt").symlink_to("old.txt")
+    (tmp_path / "dangling.txt").symlink_to("far/new.txt")
+    (tmp_path / "nowhere.txt").symlink_to("no/new.txt")
+    (tmp_path / "loop.txt").symlink_to("loop.txt")
+    for name, target in (("old", "old"), ("chain", "old"), ("dangling", "new")):
+        write(tmp_path / f"{name}.txt", name)
+        assert (tmp_path / f"{name}.txt").is_symlink()
+        assert (folder / f"{target}.txt").read_text() == name
+    assert sorted(path.name for path in folder.iterdir()) == ["new.txt", "old.txt"]
+    for name, words in (("nowhere", "there is no folder .*no$"), ("loop", "symbolic links")):
+        with pytest.raises(AstropolcalError, match=words):
+            write(tmp_path / f"{name}.txt", "x")
+        assert (tmp_path / f"{name}.txt").is_symlink()
+    # each name of a file that has several is a file of its own
+    os.link(folder / "old.txt", folder / "hard.txt")
+    write(folder / "hard.txt", "hard")
+    assert (folder / "old.txt").read_text() == "chain"
+
+
+def test_devices_and_pipes_stay_what_they_are(tmp_path):
+    path, got = tmp_path / "pipe.txt", []
+    os.mkfifo(path)
+    reader = threading.Thread(target=lambda: got.append(path.read_text()))
+    reader.start()
+    write(path, "all of it" * 20_000)
+    reader.join(10)
+    assert got == ["all of it" * 20_000]
+    assert path.is_fifo()
+    write("/dev/null", "x")
+    assert Path("/dev/null").is_char_device()
+    assert [other.name for other in tmp_path.iterdir()] == ["pipe.txt"]
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
+def test_a_device_that_takes_nothing():
+    with pytest.raises(AstropolcalError, match=r"/dev/full: cannot be written: No space left"):
+        write("/dev/full", "x")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/stdout"), reason="no such device")
+def test_the_standard_output_gets_both_what_is_written_and_what_is_printed(tmp_path):
+    """As a pipe, and as a file that the shell has opened, by either of its names."""
+    code = (
+        "import sys; from astropolcal.files import atomic_path\nprint('before')\n"
+        "with atomic_path(sys.argv[1]) as t:\n    t.write_text('written\\n')\nprint('after')"
+    )
+    out = tmp_path / "out.txt"
+    for name in ("/dev/stdout", str(out)):
+        with open(out, "wb") as stream:
+            subprocess.run([sys.executable, "-c", code, name], stdout=stream, check=True)
+        assert out.read_text() == "before\nwritten\nafter\n"
+    done = subprocess.run([sys.executable, "-c", code, "/dev/stdout"], capture_output=True)
+    assert done.stdout == b"before\nwritten\nafter\n"
+
+
+@pytest.mark.parametrize("name", ["é" * 120 + ".txt", "💥" * 63, "a." + "b" * 253, "x" * 255])
+def test_names_as_long_as_the_system_takes(tmp_path, name):
+    path = tmp_path / name
+    for text in ("first", "second"):
+        write(path, text)
+        assert path.read_text() == text
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_names_that_no_system_takes(tmp_path):
+    for name in ("n" * 256, "é" * 128):
+        with pytest.raises(AstropolcalError, match=f"{name}: cannot be written: File name too"):
+            write(tmp_path / name, "x")
+        assert check_new(tmp_path / name) == tmp_path / name
+        with (
+            pytest.raises(ObservationError, match=f"{name}: cannot be read: File name too long"),
+            understood(name, ObservationError, "no journal"),
+        ):
+            open(name)
+
+
+def test_lines_are_appended_as_a_whole(tmp_path, monkeypatch):
+    path = tmp_path / "run.jsonl"
+    write_some, room = os.write, [10]
+
+    def small_disk(number, content):
+        part = min(len(content), room[0])
+        if not part:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        room[0] -= part
+        return write_some(number, content[:part])
+
+    monkeypatch.setattr(os, "write", small_disk)
+    with pytest.raises(ObservationError, match=r"run\.jsonl: cannot be written: No space left"):
+        append_line(path, "more than there is room for", ObservationError)
+    assert not path.exists()
+    room[0] = 10
+    append_line(path, "{}")
+    with pytest.raises(ObservationError, match="free some space"):
+        append_line(path, "too much again", ObservationError)
+    assert path.read_text() == "{}\n"
+    with pytest.raises(ObservationError, match="there is no folder"):
+        append_line(tmp_path / "no" / "x", "", ObservationError)
+
+
 # ---- a new file ------------------------------------------------------------------------
 
 
@@ -142,6 +301,16 @@ def test_a_file_that_cannot_be_new(tmp_path, name, overwrite, words):
     with pytest.raises(CalibrationFileError, match=words) as caught:
         check_new(tmp_path / name, overwrite, CalibrationFileError)
     assert str(caught.value).startswith(str(tmp_path / name))
+
+
+def test_a_file_that_the_content_comes_from(tmp_path):
+    for name in ("there.txt", "other.txt"):
+        (tmp_path / name).write_text("x")
+    (tmp_path / "link.txt").symlink_to("there.txt")
+    sources = [tmp_path / "there.txt", tmp_path / "no.txt", "a\0b"]
+    with pytest.raises(ObservationError, match="was made from this file"):
+        check_new(tmp_path / "link.txt", True, ObservationError, sources)
+    assert check_new(tmp_path / "other.txt", True, sources=sources) == tmp_path / "other.txt"
 
 
 @pytest.mark.parametrize(("name", "overwrite"), [("there.txt", True), ("new.txt", False)])
@@ -176,6 +345,23 @@ def test_whatever_goes_wrong_is_one_line(problem, words):
     assert str(caught.value).startswith(f"a.json: {words}")
 
 
+def test_what_may_have_no_end_is_not_opened(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with socket.socket(socket.AF_UNIX) as ears:
+        with contextlib.chdir(tmp_path):
+            ears.bind("socket")
+        for path, kind in (
+            (tmp_path / "pipe", "a pipe"),
+            (tmp_path / "socket", "a socket"),
+            ("/dev/zero", "a device"),
+        ):
+            with (
+                pytest.raises(ObservationError, match=f"{path}: is {kind}; a regular file"),
+                understood(path, ObservationError, "no journal"),
+            ):
+                pytest.fail("was opened")
+
+
 def test_errors_of_ours_and_interrupts_pass():
     with pytest.raises(CalibrationFileError, match=r"^as it is$"):
         with understood("a.json", ObservationError, "no journal"):
@@ -203,10 +389,16 @@ def test_the_cause_is_kept_where_it_may_be_needed():
         ("é 💥", 240, "é 💥"),
         ("abcdef", 6, "abcdef"),
         ("abcdefg", 6, "abcdef..."),
+        ("a\n" * 300, None, "a " * 299 + "a"),
+        ("", 240, ""),
     ],
 )
 def test_one_line(said, longest, line):
     assert one_line(said, longest) == line
+
+
+def test_lines_stay_and_what_moves_the_cursor_does_not():
+    assert printable("é 💥\n\n b\r\x1b[2J\x07\u202e\udc80\n") == "é 💥\n\n b??[2J???\n"
 
 
 # ---- YAML ------------------------------------------------------------------------------

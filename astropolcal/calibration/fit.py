@@ -246,6 +246,8 @@ def _check(measurement):
         )
     for name in _outside_bounds(measurement):
         free, i = measurement.free, measurement.free.names.index(name)
+        unit, factor = free.by_name[name.partition("[")[0]].unit or "", free.factors()[i]
+        value, low, high = (x[i] / factor for x in (measurement.vector(), *free.bounds()))
         # fitters tell neither name nor value
         value, low, high = (
             x[i] / free.factors()[i] for x in (measurement.vector(), *free.bounds())

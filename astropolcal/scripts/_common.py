@@ -78,7 +78,7 @@ def check_paths(arguments):
     Before anything runs: hours of fitting must not end with a file that cannot be written.
     """
     inputs, outputs = _named(arguments, Input), _named(arguments, Output)
-    for _, path in inputs:
+    for _, path in [*inputs, *_named(arguments, Continued)]:
         _check_input(path)
     for _, path in outputs:
         (_check_folder if isinstance(path, Folder) else _check_file)(path)
@@ -120,7 +120,8 @@ def _label(option):
 
 def _check_input(path):
     try:
-        os.stat(path)
+        if stat.S_ISDIR(os.stat(path).st_mode):
+            os.listdir(path)
     except FileNotFoundError:
         # its reader says so
         return
@@ -187,7 +188,7 @@ def _check_inputs(option, path, inputs):
             )
         if os.path.isdir(other) and (
             _is_within(path, other)
-            or any(_are_same(path, e) for e in os.scandir(other) if other.kinds.search(e.name))
+            or any(_are_same(path, p) for p in Path(other).iterdir() if other.kinds.search(p.name))
         ):
             raise AstropolcalError(
                 f"{_label(option)} {path}: is one of the files that are read from {other}; name "

@@ -23,11 +23,15 @@ from astropolcal.exceptions import (
 )
 from astropolcal.observations import example_table
 from astropolcal.scripts._common import (
+    Continued,
+    Folder,
+    Frames,
+    Input,
+    Output,
     _normal,
     _value,
     angles,
-    check_folders,
-    check_outputs,
+    check_paths,
     cube_files,
     edit_chains,
     instrument_of,
@@ -36,6 +40,7 @@ from astropolcal.scripts._common import (
     printer,
     read_datasets,
     say_written,
+    show,
     wrapped,
     write_json,
 )
@@ -65,12 +70,20 @@ def chains():
 # ---- places to write to ----------------------------------------------------------------
 
 
+def check(*paths, **others):
+    """Check outputs that are given as options of any names, and others by name."""
+    given = {f"out{i}": path for i, path in enumerate(paths)}
+    check_paths(SimpleNamespace(**given, **others))
+
+
 def test_good_places_for_files(tmp_path, monkeypatch):
     (tmp_path / "old.json").write_text("old")
-    check_outputs(tmp_path / "new.json", tmp_path / "old.json", None, "-")
+    (tmp_path / "link.json").symlink_to("dangling.json")
+    names = ("new.json", "old.json", "link.json")
+    check(*(Output(tmp_path / name) for name in names), Output("-"), Output("-"), none=None)
     monkeypatch.chdir(tmp_path)
-    check_outputs("new.json", "./old.json")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["old.json"]
+    check(Output("new.json"), Output("./old.json"), Output("/dev/null"), Output("/dev/null"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "old.json"]
 
 
 @pytest.mark.parametrize(
@@ -80,19 +93,23 @@ def test_good_places_for_files(tmp_path, monkeypatch):
         (".", "is a folder, not a file"),
         ("note.txt/x.json", "there is no folder .*note.txt"),
         ("locked/x.json", "locked/x.json: no permission to write to .*locked; name a folder that"),
+        ("to_locked.json", "to_locked.json: no permission to write to .*locked"),
+        ("n" * 256, "nnn: cannot be written: File name too long"),
+        ("a\0b", "cannot be written: it is no name of a file .embedded null byte"),
     ],
 )
 def test_bad_places_for_files(tmp_path, locked, place, words):
     (tmp_path / "note.txt").write_text("")
+    (tmp_path / "to_locked.json").symlink_to("locked/new.json")
     with pytest.raises(AstropolcalError, match=words):
-        check_outputs(tmp_path / "good.json", tmp_path / place)
+        check(Output(tmp_path / "good.json"), Output(tmp_path / place))
 
 
 def test_good_places_for_folders(tmp_path, monkeypatch):
     (tmp_path / "old").mkdir()
-    check_folders(tmp_path / "old", tmp_path / "new", tmp_path / "a" / "b" / "c", None)
+    check(*(Folder(tmp_path / name) for name in ("old", "new", "a/b/c")))
     monkeypatch.chdir(tmp_path)
-    check_folders("new", "a/b")
+    check(Folder("new"), Folder("a/b"))
     # only looked at, not made
     assert [p.name for p in tmp_path.iterdir()] == ["old"]
 
@@ -105,20 +122,81 @@ def test_good_places_for_folders(tmp_path, monkeypatch):
         ("locked", "locked: no permission to write to .*locked"),
         ("locked/figures", "locked/figures: no permission to write to .*locked; name a folder"),
         ("locked/figures/all", "locked/figures/all: no permission"),
+        ("new/" + "n" * 256, "nnn: cannot be written: File name too long"),
+        ("new/a\0b", "cannot be written: it is no name of a file"),
     ],
 )
 def test_bad_places_for_folders(tmp_path, locked, place, words):
     (tmp_path / "note.txt").write_text("")
     with pytest.raises(AstropolcalError, match=words):
-        check_folders(tmp_path / place)
+        check(Folder(tmp_path / place))
+
+
+def test_what_cannot_be_an_input(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for place, words in (
+        ("pipe", "pipe: is a pipe; a regular file is needed"),
+        ("/dev/zero", "/dev/zero: is a device; a regular file is needed"),
+        ("n" * 256, "nnn: cannot be read: File name too long"),
+        ("a\0b", "cannot be read: it is no name of a file"),
+    ):
+        with pytest.raises(AstropolcalError, match=words):
+            check(files=[Input(tmp_path), Input(tmp_path / place)])
+    # its reader says what is wanted
+    check(file=Input(tmp_path / "no.ecsv"))
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write to any folder")
 def test_what_the_system_forbids_is_found_before_the_work(tmp_path):
     (tmp_path / "locked").mkdir(mode=0o500)
-    for check, place in ((check_outputs, "locked/x.json"), (check_folders, "locked/figures")):
+    for path in (Output(tmp_path / "locked" / "x.json"), Folder(tmp_path / "locked" / "figures")):
         with pytest.raises(AstropolcalError, match="no permission to write to"):
-            check(tmp_path / place)
+            check(path)
+
+
+# ---- outputs that are inputs, or one another -------------------------------------------
+
+
+def test_outputs_that_would_overwrite_something(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("run.ecsv", "cubes/a.fits", "cubes/b.FIT", "lib/one.asdf", "elsewhere.fits"):
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text("x")
+    Path("link.ecsv").symlink_to("run.ecsv")
+    Path("dangling.json").symlink_to("new.json")
+    Path("folder").symlink_to("cubes", target_is_directory=True)
+    os.link("run.ecsv", "hard.ecsv")
+    os.link("cubes/a.fits", "hard.fits")
+    Path("cubes/far.fits").symlink_to("../elsewhere.fits")
+    table, frames, library = Input("run.ecsv"), Frames("cubes"), Input("lib")
+    taken = [
+        (table, ["run.ecsv", "./lib/../run.ecsv", "link.ecsv", "hard.ecsv", tmp_path / "run.ecsv"]),
+        (frames, ["cubes/a.fits", "folder/a.fits", "cubes/b.FIT", "hard.fits", "elsewhere.fits"]),
+        # the next run would take them for frames
+        (frames, ["cubes/new.fits", "folder/new.fits.gz"]),
+        (library, ["lib/one.asdf", "lib/new.asdf"]),
+    ]
+    for source, outputs in taken:
+        for path in outputs:
+            with pytest.raises(AstropolcalError, match=f"^--json {path}: .*{source}"):
+                check(files=[Input("other.ecsv"), source], json=Output(path))
+    for path in ("cubes/run.ecsv", "cubes/raw/a.fits", "new.fits", "lib/one.json"):
+        Path(path).parent.mkdir(exist_ok=True)
+        check(files=[table, frames, library], json=Output(path), plots=Folder("cubes"))
+    for one, other in (
+        (Output("x"), Output("./x")),
+        (Output("new.json"), Output("dangling.json")),
+        (Output("run.ecsv"), Output("hard.ecsv")),
+        (Output("x.png"), Folder("x.png")),
+        (Output("x"), Folder("x/figures")),
+        (Output("cubes/residuals.png"), Folder("folder")),
+        (Continued("x.h5"), Output("x.h5")),
+    ):
+        for first, second in ((one, other), (other, one)):
+            with pytest.raises(AstropolcalError, match=f"^-o {second}: .* --json {first}"):
+                check(json=first, output=second)
+    # what a command goes on with is no input that it would overwrite
+    check(files=[table], resume=Continued("old.h5"), output=Output("x"), plots=Folder("figures"))
 
 
 # ---- what is printed and written -------------------------------------------------------
@@ -147,9 +225,9 @@ def test_json_is_complete_or_not_there(tmp_path, capsys):
 
 
 def test_files_are_listed_a_line_each(capsys):
-    say_written(print, ["a.asdf", "b.json"])
-    say_written(print, [])
-    assert capsys.readouterr().out == "\nWritten: a.asdf\n         b.json\n"
+    say_written(show, ["a.asdf", "b\n\x1b[2J.json"])
+    say_written(show, [])
+    assert capsys.readouterr().out == "\nWritten: a.asdf\n         b ?[2J.json\n"
 
 
 def test_lines_break_at_80_columns_and_words_stay_whole():

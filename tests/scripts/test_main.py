@@ -2,6 +2,7 @@
 """The command itself: exit status, one line of complaint, and what -q leaves."""
 
 import argparse
+import os
 import re
 import sys
 import warnings
@@ -11,6 +12,7 @@ import pytest
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.scripts import main as module
+from astropolcal.scripts._common import Continued, Folder, Input, Output
 from astropolcal.scripts.main import build_parser, main
 
 (COMMANDS,) = (
@@ -160,6 +162,112 @@ def test_words_that_look_like_options_are_no_values(argv, capsys):
 def test_no_option_looks_like_a_negative_number():
     for parser in COMMANDS.values():
         assert not [o for o in parser._option_string_actions if re.match(r"-\.?\d", o)]
+
+
+# ---- files that are named ------------------------------------------------------------------
+
+
+def files_of(command, kind):
+    """Return the arguments of a command that name files of a kind."""
+    return [
+        a
+        for a in COMMANDS[command]._actions
+        if isinstance(a.type, type) and issubclass(a.type, kind)
+    ]
+
+
+def words_of(command, given):
+    """Return a command line with files that are given by argument, and others where needed."""
+    words = [command]
+    for action in COMMANDS[command]._actions:
+        value = given.get(action.dest, f"{action.dest}.txt" if action.required else None)
+        if value is not None:
+            words += [*action.option_strings[-1:], value]
+    return words
+
+
+def test_every_argument_that_names_a_file_says_what_it_does_with_it():
+    named = re.compile(r"FILE|DIR|CUBES|\.(asdf|ecsv|fits|html|h5)$")
+    for command, parser in COMMANDS.items():
+        told = {action.dest for action in files_of(command, (Input, Output))}
+        assert told == {a.dest for a in parser._actions if named.search(str(a.metavar))}, command
+
+
+def refused(capsys, words):
+    """Run a command that is refused; return its one line of complaint."""
+    assert main(words) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("astropolcal: error: ")
+    return err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_output_is_an_input_or_another_output(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    inputs, outputs = files_of(command, Input), files_of(command, Output)
+    for action in [*inputs, *outputs]:
+        if action.type is not Folder:
+            (tmp_path / f"{action.dest}.txt").write_text(action.dest)
+    before = {path: path.read_text() for path in tmp_path.iterdir()}
+    for action in outputs:
+        others = [other for other in [*inputs, *outputs] if other is not action]
+        # samples are added to a calibration
+        may = COMMANDS[command].get_default("may_replace") or {}
+        for other in (a for a in others if may.get(action.dest) != a.dest):
+            same = f"{other.dest}.txt"
+            given = {action.dest: same, other.dest: same}
+            assert same in refused(capsys, words_of(command, given))
+    assert {path: path.read_text() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_nothing_is_read_that_is_no_regular_file(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    for action in files_of(command, (Input, Continued)):
+        for path, words in (("pipe", "is a pipe"), ("/dev/zero", "is a device")):
+            assert f"{path}: {words}" in refused(capsys, words_of(command, {action.dest: path}))
+    for action in files_of(command, (Input, Output)):
+        for name in ("n" * 256, "a\0b"):
+            err = refused(capsys, words_of(command, {action.dest: name}))
+            assert "too long" in err or "no name of a file" in err
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_names_are_shown_without_what_a_terminal_acts_on(desk, capsys):
+    odd = "\x1b[31m\r\x07\u202eodd\nastropolcal: error: forged"
+    calls = [
+        "simulate -o {}.ecsv --json {}.json --derotator 45,70,95 --without dichroic",
+        "simulate --cubes {} --source star --hwp 0,45,22.5,67.5 --derotator 60 --altitude 70"
+        " --parallactic 20 --flux 2e6 --without dichroic",
+        "calibrate {}.ecsv -o {}.asdf --derotator linear",
+        "diagnose {}.ecsv --effects beam_gain --derotator linear --report {}.html",
+        "info {}.ecsv",
+        "info {}.asdf",
+        "info {}",
+        "reduce {} --raw {}/raw --source star -o {}r.ecsv",
+        "correct {} --raw {}/raw --calibration {}.asdf -o {}.fits --size 11 --any-date"
+        " --optics-in nbs",
+        "info {}.fits",
+    ]
+    wrong = ["info {}.no", "calibrate {}no", "simulate -o {}.txt", "reduce {}no -o {}", "{}"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(desk)
+        for words in [*calls, *wrong]:
+            try:
+                status = main([word.replace("{}", odd) for word in words.split()])
+            except SystemExit as stop:
+                status = stop.code
+            assert status == (2 if words in wrong else 0), capsys.readouterr().err
+            out, err = capsys.readouterr()
+            lines = (out + err).split("\n")
+            assert all(line.isprintable() for line in lines), words
+            assert not [line for line in lines if line.startswith("astropolcal: error: forged")]
+        page = (desk / f"{odd}.html").read_text()
+        assert all(line.isprintable() for line in page.split("\n"))
+        assert "odd astropolcal: error: forged" in page
 
 
 # ---- quiet -------------------------------------------------------------------------------
