@@ -24,18 +24,21 @@ _MOST_ALIKE = 3
 _EQUAL = 1e-6
 
 
-def ranked(values):
+def ranked(values, equal=None):
     """
     Return the indices of values, largest first; equal ones keep their order.
 
-    Which of two that are equal comes out larger hangs on the processor.
+    Which of two that are equal comes out larger hangs on the processor. Equal are by default
+    those that differ by rounding.
     """
     values = np.asarray(values, dtype=float)
+    if equal is None:
+        equal = _EQUAL * np.abs(values[np.isfinite(values)]).max(initial=0.0)
     order = np.argsort(-values, kind="stable")
-    falling, size = values[order], np.abs(values[np.isfinite(values)]).max(initial=0.0)
+    falling = values[order]
     # two infinities are equal, although their difference is not a number
     with np.errstate(invalid="ignore"):
-        smaller = np.diff(falling, prepend=falling[:1]) < -_EQUAL * size
+        smaller = np.diff(falling, prepend=falling[:1]) < -equal
     # by groups of equal ones, and by place within a group
     return order[np.lexsort((order, np.cumsum(smaller)))]
 

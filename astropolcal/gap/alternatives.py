@@ -27,6 +27,8 @@ _WRONG_SIGN = 0.02
 _WRONG_SHARE, _ABOVE_NOISE = 0.3, 3.0
 # an alternative must lower the residuals to this share, and those within a tenth are aliases
 _FAR_BETTER, _ALIKE = 0.5, 1.1
+# fits of what gives the same data end with misfits that differ by a smaller share
+_EQUAL = 1e-3
 _FEW = 5
 
 
@@ -103,7 +105,8 @@ def _tried(chains, observations, effects, say):
         say(f"trying: {effect.title}")
         trial = nominal_calibration(effect.edit(few[0], context).chains, few[1])
         found.append((_misfit(trial), effect))
-    return [found[i] for i in ranked([-misfit for misfit, _ in found])]
+    misfits = np.array([misfit for misfit, _ in found])
+    return [found[i] for i in ranked(-misfits, _EQUAL * misfits.min())]
 
 
 def _context(observations):

@@ -35,6 +35,8 @@ ALPHA = 0.01
 MOST_REFITTED = 8
 #: An effect fits nearly as well as another if it is this close in evidence.
 SAME_EVIDENCE = 10.0
+#: Fits of what gives the same data end with evidences that differ by less.
+EQUAL_EVIDENCE = 0.1
 _WORTH_A_REFIT = 0.4
 # lowering of chi-square by a full fit that is none
 _LEAST_GAIN = 1.0
@@ -142,7 +144,7 @@ def scan(model, effects, *, residual=None, nominal=None, context=None):
             scores.append(Score(effect, statistic, rank, basis, scale))
     for score, p in zip(scores, false_discovery([s.single_p for s in scores]), strict=True):
         score.p_value = p
-    return [scores[i] for i in ranked([s.evidence(freedom) for s in scores])]
+    return [scores[i] for i in ranked([s.evidence(freedom) for s in scores], EQUAL_EVIDENCE)]
 
 
 def false_discovery(p_values):
@@ -329,7 +331,7 @@ def contenders(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
 
 def _best_first(fitted):
     # what fits equally well stays in the order of the library
-    fitted = [fitted[i] for i in ranked([c.evidence for c in fitted])]
+    fitted = [fitted[i] for i in ranked([c.evidence for c in fitted], EQUAL_EVIDENCE)]
     return sorted(fitted, key=lambda c: not c.physical)
 
 

@@ -13,7 +13,15 @@ from dataclasses import replace
 import numpy as np
 
 from astropolcal.calibration._directions import ranked
-from astropolcal.gap.attribution import SAME_EVIDENCE, best_of, choose, contenders, freed, scan
+from astropolcal.gap.attribution import (
+    EQUAL_EVIDENCE,
+    SAME_EVIDENCE,
+    best_of,
+    choose,
+    contenders,
+    freed,
+    scan,
+)
 from astropolcal.gap.shrinkage import held_out
 
 __all__ = ["REMAINDER", "select"]
@@ -134,7 +142,8 @@ def _looking_ahead(model, scores, *, alpha):
         ends.append((one, *end))
     if not ends:
         return fitted[0]
-    best, next_to, end = ends[ranked([_advantage(item[2], model) for item in ends])[0]]
+    evidence = [_advantage(item[2], model) for item in ends]
+    best, next_to, end = ends[ranked(evidence, EQUAL_EVIDENCE)[0]]
     # next to the same second effect: two that are both needed do as well in either order
     best.aliases = [
         one

@@ -5,10 +5,18 @@ Effects withheld from models of real data, each with a known answer.
 Five to eight of the 22 wavelengths are enough to see them, and keep the tests short.
 """
 
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from astropolcal import instruments
+from astropolcal import calibrate, instruments
+from astropolcal.calibration import robust_covariance
 from astropolcal.chain import leaves, remove_optic
 from astropolcal.gap import diagnose
 from astropolcal.gap.alternatives import thinned
@@ -80,3 +88,50 @@ def test_lamp_that_is_unstable_is_not_blamed_on_the_optics(shared_data):
     assert len(turned) == 8
     assert worst["channel"] == "sum"
     assert worst["words"].startswith("lamp unstable at derotator 45 deg")
+
+
+# ---- another processor -------------------------------------------------------------------------
+
+
+def numbers(shared_data):
+    """What a calibration, its errors and a diagnosis find in Dataset 3, as JSON holds it."""
+    data = observed(shared_data, "dataset3_polarized_2025-10-05")
+    chains = CHARIS.chains_for(data)
+    fix = {"hwp.theta": None, "derotator.theta": None}
+    cal = calibrate(chains, data, fix=fix, cross_validate=False)
+    wrong = [remove_optic(chain, "nbs") for chain in chains]
+    effects = [*sorted(PARITY), "beam_gain", "derotator_diattenuation", "dichroic_j_band"]
+    found = diagnose(*thinned(wrong, data, 3), effects=[*effects, "static_retarder"])
+    return {
+        "values": (cal.measurement.vector() / cal.measurement.free.factors()).tolist(),
+        "errors": cal.covariance.stds.tolist(),
+        "robust errors": robust_covariance(cal).stds.tolist(),
+        "causes": [[cause.name, *cause.aliases] for cause in found.causes],
+        "explained": [cause.explained for cause in found.causes],
+        "gaps": [found.gap_before_percent, found.gap_after_percent],
+    }
+
+
+@pytest.mark.skipif(
+    platform.machine().lower() not in ("x86_64", "amd64"),
+    reason="the kernels of OpenBLAS that the test compares are those of x86-64",
+)
+def test_numbers_and_causes_are_those_of_another_processor(shared_data):
+    """Prescott's kernels, which run everywhere, against those that OpenBLAS takes here."""
+    code = "import json, sys, test_real as t; print(json.dumps(t.numbers(t.Path(sys.argv[1]))))"
+    paths = filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")])
+    environment = {"OPENBLAS_CORETYPE": "Prescott", "PYTHONPATH": os.pathsep.join(paths)}
+    printed = subprocess.run(
+        [sys.executable, "-c", code, str(shared_data)],
+        env=os.environ | environment,
+        stdout=subprocess.PIPE,
+        check=True,
+    ).stdout
+    own, other = numbers(shared_data), json.loads(printed)
+    assert len(own["causes"][0]) == 3
+    assert other["causes"] == own["causes"]
+    # measured: 1e-12 of the errors; what is at its bound has none
+    moved = np.subtract(other["values"], own["values"]) / np.nan_to_num(own["errors"], nan=1.0)
+    assert np.abs(moved).max() < 1e-6
+    for key in ("errors", "robust errors", "explained", "gaps"):
+        np.testing.assert_allclose(other[key], own[key], rtol=1e-6, err_msg=key)
