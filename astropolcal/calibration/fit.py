@@ -249,14 +249,12 @@ def _check(measurement):
         unit, factor = free.by_name[name.partition("[")[0]].unit or "", free.factors()[i]
         value, low, high = (x[i] / factor for x in (measurement.vector(), *free.bounds()))
         # fitters tell neither name nor value
-        value, low, high = (
-            x[i] / free.factors()[i] for x in (measurement.vector(), *free.bounds())
-        )
-        unit = free.by_name[name.partition("[")[0]].unit
-        raise FitError(
-            f"{name} starts at {value:.7g}, allowed are {low:.7g} to {high:.7g}"
-            f"{'' if unit is None else f' {unit}'}"
-        )
+        allowed = f"{low:.7g} to {high:.7g} {unit}".strip()
+        raise FitError(f"{name} starts at {value:.7g}; allowed are {allowed}")
+    vector, inside = measurement.vector(), np.clip(measurement.vector(), *measurement.free.bounds())
+    # fitters refuse a start that is outside by a rounding error, too
+    if (vector != inside).any():
+        measurement.parameters = inside
 
 
 def _run(measurement, weighting, fitter):
