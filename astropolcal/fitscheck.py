@@ -4,7 +4,8 @@ What a FITS file claims to hold, looked at before astropy opens it.
 
 A header without an end, or one that claims a billion axes, keeps astropy busy for minutes, and
 what is packed may be immense. `check_fits` goes from header to header as Sec. 4.4.1 of the FITS
-standard 4.0 describes; what else is wrong is left for astropy to say.
+standard 4.0 describes, and adds up what has a checksum on its way; what else is wrong is left for
+astropy to say.
 """
 
 import bz2
@@ -15,6 +16,8 @@ import math
 import os
 import re
 from contextlib import contextmanager
+
+import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.files import understood
@@ -41,6 +44,10 @@ _MOST_CLAIMED = 999
 _MOST_UNPACKED, _UNPACKED_SHARE = 2**28, 100
 _CHUNK = 2**20
 _CLAIM = re.compile(rb"(BITPIX|GROUPS|NAXIS\d{0,3}|PCOUNT|GCOUNT|TFIELDS) *= *([+-]?\d{1,70}|T)\b")
+# DATASUM and CHECKSUM (Sec. 4.4.2.7); a blank value stands for none
+_SUM = re.compile(rb"(DATASUM|CHECKSUM) *= *'? *([^' /]*)")
+# ones' complement sums of words of 32 bits are equal modulo this number
+_ONES = 2**32 - 1
 _PACKINGS = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ": lzma.open}
 _NEEDS_MEMORY = (b"\xfd7zXZ",)
 
@@ -171,8 +178,8 @@ def check_fits(path, error=AstropolcalError, *, count=MOST_HDUS, whole=False):
     ------
     AstropolcalError
         Of the type given, if the file is missing or no FITS file, a header has no end, claims
-        negative sizes or more axes or columns than the standard allows, or what is packed is
-        immense.
+        negative sizes or more axes or columns than the standard allows, what is packed is
+        immense, or a ``DATASUM`` or ``CHECKSUM`` does not match.
 
     Examples
     --------
@@ -189,7 +196,7 @@ def check_fits(path, error=AstropolcalError, *, count=MOST_HDUS, whole=False):
         size, packing = os.path.getsize(path), _packing(file)
         if packing is None:
             _check_begin(file, path, error)
-            _walk(file, count, whole, end=size)
+            _walk(file, path, error, count, whole, end=size)
             return
         if packing in _NEEDS_MEMORY:
             # how much its unpacking takes is the choice of who packed it
@@ -197,7 +204,9 @@ def check_fits(path, error=AstropolcalError, *, count=MOST_HDUS, whole=False):
             file.seek(0)
         with _PACKINGS[packing](file) as stream:
             _check_begin(stream, path, error)
-            _walk(stream, count, whole, most=max(_MOST_UNPACKED, _UNPACKED_SHARE * size))
+            _walk(
+                stream, path, error, count, whole, most=max(_MOST_UNPACKED, _UNPACKED_SHARE * size)
+            )
 
 
 def _packing(file):
@@ -220,35 +229,70 @@ def _check_begin(stream, path, error):
     stream.seek(0)
 
 
-def _walk(stream, count, whole, **limits):
+def _walk(stream, path, error, count, whole, **limits):
     """Go from header to header, as far as they can be understood."""
     # headers come one by one: where the next begins is known from the sizes in the one before
     for number in range(count):
         claims = _header(stream, number)
-        if claims is None or number + 1 == count < MOST_HDUS:
+        if claims is None:
             return
-        if not _skip(stream, _data_size(claims), **limits):
-            if whole:
+        size = _data_size(claims)
+        if number + 1 == count < MOST_HDUS:
+            # of data that are not read the sum is what the header says
+            wrong = _wrong_sum(claims, None if size else 0)
+        else:
+            there, data = _skip(stream, size, bool(claims["sums"]), **limits)
+            if not there and whole:
                 raise ValueError(f"truncated: the data of HDU {number} are not whole")
+            if not there:
+                return
+            wrong = _wrong_sum(claims, data)
+        if wrong:
+            raise error(
+                f"{path}: {wrong} in HDU {number}: it was changed after it was written, is "
+                "damaged, or has the header of another file"
+            )
+        if number + 1 == count < MOST_HDUS:
             return
     if stream.read(1):
         raise ValueError(f"more than {MOST_HDUS} HDUs")
 
 
+def _wrong_sum(claims, data):
+    """Return which checksum does not match header and data, of which the sum may not be known."""
+    stated, checksum = (claims["sums"].get(key, "") for key in ("DATASUM", "CHECKSUM"))
+    good = stated.isdecimal()
+    if stated and not (good and data in (None, int(stated) % _ONES)):
+        return f"DATASUM = {stated!r} does not match the data"
+    data = int(stated) % _ONES if good else data
+    if checksum and data is not None and (claims["own"] + data) % _ONES:
+        return f"CHECKSUM = {checksum!r} does not match"
+    return ""
+
+
+def _sum(content):
+    """Return the ones' complement sum of big-endian words of 32 bits."""
+    return int(np.frombuffer(content, ">u4").sum(dtype=np.uint64)) % _ONES
+
+
 def _header(stream, number):
-    """Return the sizes that a header claims; None if there is no header any more."""
-    claims = {}
+    """Return what a header claims of sizes and sums, and its own sum; None if there is none."""
+    claims, sums, own = {}, {}, 0
     for _ in range(MOST_BLOCKS):
         block = stream.read(_BLOCK)
         if len(block) < _BLOCK:
             return None
+        own += _sum(block)
         for place in range(0, _BLOCK, _CARD):
             # to astropy a card such as "END = 0" is none
             if block[place : place + _CARD] == _END:
-                return claims
+                return claims | {"sums": sums, "own": own}
             found = _CLAIM.match(block, place, place + _CARD)
             if found:
                 _add(claims, found[1].decode(), found[2], number)
+            found = _SUM.match(block, place, place + _CARD)
+            if found and found[2]:
+                sums.setdefault(found[1].decode(), found[2].decode("latin-1"))
     raise ValueError(f"header {number} has no end within {MOST_BLOCKS * _BLOCK // _CARD} cards")
 
 
@@ -275,16 +319,19 @@ def _data_size(claims):
     return -(-bits // (8 * _BLOCK)) * _BLOCK
 
 
-def _skip(stream, size, end=None, most=None):
-    """Pass over data; return whether they are there."""
+def _skip(stream, size, summed, end=None, most=None):
+    """Pass over data; return whether they are there, and their sum if it is wanted."""
     target = stream.tell() + size
-    if end is not None:
-        stream.seek(min(target, end))
-        return target <= end
-    if target > most:
+    if most is not None and target > most:
         # before it is done: unpacking a gigabyte of zeros takes seconds
         raise ValueError(f"it would unpack to {target} bytes, up to {most} are allowed")
-    while stream.tell() < target:
-        if not stream.read(min(_CHUNK, target - stream.tell())):
-            return False
-    return True
+    if end is not None and not summed:
+        stream.seek(min(target, end))
+        return target <= end, None
+    total = 0
+    while (left := target - stream.tell()) > 0:
+        chunk = stream.read(min(_CHUNK, left))
+        if not chunk or len(chunk) % 4:
+            return False, None
+        total += _sum(chunk) if summed else 0
+    return True, total % _ONES

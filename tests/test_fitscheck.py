@@ -5,6 +5,7 @@ import bz2
 import gzip
 import io
 import lzma
+import re
 import time
 import warnings
 import zipfile
@@ -90,6 +91,43 @@ GOOD = {
     "compressed image": of_astropy(fits.CompImageHDU(np.arange(900, dtype="i4").reshape(30, 30))),
     "random groups": groups(),
 }
+
+
+# ---- checksums ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("packer", PACKERS)
+def test_checksums_that_do_not_match_are_refused(tmp_path, packer):
+    """Each bit counts, in all kinds of HDUs; without the keywords, or a value, nothing does."""
+    buffer = io.BytesIO()
+    image = np.arange(2000, dtype="i2").reshape(40, 50)
+    hdus = [fits.ImageHDU(image), fits.CompImageHDU(image), fits.ImageHDU(image.astype("u2"))]
+    hdus = [fits.PrimaryHDU(), *hdus, fits.BinTableHDU(np.array([(1, 2.0)], dtype="i4,f8"))]
+    fits.HDUList(hdus).writeto(buffer, checksum=True)
+    good = buffer.getvalue()
+    path = stored(tmp_path, PACKERS[packer](good))
+    check_fits(path, ObservationError, whole=True)
+    with fits.open(io.BytesIO(good)) as opened:
+        places = [(i, h.fileinfo()) for i, h in enumerate(opened)]
+    for number, info in places:
+        for place, keyword, read in (
+            (info["datLoc"] + 1, "DATASUM = '.*' does not match the data", None),
+            (info["datLoc"] - 1, "CHECKSUM = '.*' does not match", number + 1),
+        ):
+            # the primary HDU has no data
+            if read is None and not info["datSpan"]:
+                continue
+            spoiled = bytearray(good)
+            spoiled[place] ^= 2
+            stored(tmp_path, PACKERS[packer](bytes(spoiled)))
+            refused(path, f"{keyword} in HDU {number}: it was changed")
+            if read is not None:
+                refused(path, f"{keyword} in HDU {number}", count=read)
+    blank = re.sub(rb"(?<=M= ')[^']{16}|(?<=M = ')\d*", lambda m: b" " * len(m[0]), good)
+    absent = good.replace(b"CHECKSUM=", b"CHECKSUN=").replace(b"DATASUM =", b"DATASUN =")
+    for content in (blank, absent):
+        assert content != good
+        check_fits(stored(tmp_path, PACKERS[packer](content)), ObservationError, whole=True)
 
 
 # ---- files that are good ---------------------------------------------------------------

@@ -230,9 +230,8 @@ def read_product(path):
         open_fits(path, whole=True) as stream,
         warnings.catch_warnings(),
     ):
-        # a wrong checksum is found when the data are read, and only warned of
         warnings.simplefilter("error", AstropyUserWarning)
-        with fits.open(stream, checksum=True, memmap=False) as hdus:
+        with fits.open(stream, memmap=False) as hdus:
             return _read(path, hdus)
 
 

@@ -6,6 +6,8 @@ Shared by all that reads headers: the reduction of cubes, the prediction for a s
 instruments whose frames tell more than a column.
 """
 
+from itertools import product
+
 import astropy.units as u
 from astropy.io.fits import VerifyError
 from astropy.io.fits.card import Undefined
@@ -22,6 +24,7 @@ __all__ = [
     "frame_time",
     "in_calendar",
     "look_up",
+    "stated",
     "unit_of",
 ]
 
@@ -79,16 +82,38 @@ def look_up(headers, column, layout):
     >>> look_up([{"D_IMRPAD": "N/A"}, {layout.keywords["hwp"]: 45.0}], "hwp", layout)[1]
     45.0
     """
-    if column not in layout.keywords:
-        return None, None
-    for header in headers:
-        for keyword in (layout.keywords[column], *layout.alternatives.get(column, ())):
-            value = _read(header, keyword)
-            if value is None or isinstance(value, Undefined):
-                continue
-            if str(value).strip().lower() not in _MISSING:
-                return keyword, value
-    return layout.keywords[column], None
+    return next(stated(headers, column, layout), (layout.keywords.get(column), None))
+
+
+def stated(headers, column, layout):
+    """
+    Yield all keywords that hold a value for a column, and the values, as `look_up` finds them.
+
+    Parameters
+    ----------
+    headers, column, layout
+        As for `look_up`.
+
+    Yields
+    ------
+    keyword : str
+    value : object
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments.keywords import stated
+    >>> layout = instruments.get("vampires").files
+    >>> list(stated([{"U_HWPANG": 45.0, "RET-ANG1": 0.0}], "hwp", layout))
+    [('RET-ANG1', 0.0), ('U_HWPANG', 45.0)]
+    """
+    keywords = (layout.keywords.get(column), *layout.alternatives.get(column, ()))
+    for header, keyword in product(headers, filter(None, keywords)):
+        value = _read(header, keyword)
+        if value is None or isinstance(value, Undefined):
+            continue
+        if str(value).strip().lower() not in _MISSING:
+            yield keyword, value
 
 
 def unit_of(column, layout):

@@ -8,6 +8,7 @@ McIntosh et al. 2026; 't Hart et al. 2021, Proc. SPIE 11833: rectangles that
 keep clear of the edges of the field stop.
 """
 
+import warnings
 from functools import lru_cache
 
 import numpy as np
@@ -22,6 +23,11 @@ __all__ = ["evenly_lit", "measure_internal", "rectangles"]
 _BACKGROUNDS = ("none", "outside")
 # a background pixel is this far, in pixels, from both rectangles
 _CLEAR = 12.0
+# a pixel is far off its neighbours with twice their light, and so many standard deviations and
+# electrons more: where electrons are rare and multiplied, single ones are far off what is around
+_FACTOR, _SIGMAS, _ELECTRONS = 2.0, 10.0, 30.0
+# one pixel in so many tells the level of a rectangle
+_SAMPLED = 5
 # a rectangle whose median pixel has less than this part of the mean one holds a star
 _EVEN = 0.5
 
@@ -95,7 +101,8 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
     """
     Measure both beams of an internal source in all slices of a cube.
 
-    Pixels without a value are left out, and the sum is scaled to the full area.
+    Pixels without a value are left out, and the sum is scaled to the full area. So are single
+    pixels far off their eight neighbours, such as hot ones and those hit by a cosmic ray.
 
     Parameters
     ----------
@@ -149,7 +156,10 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
     ):
         cut = cube[:, rows, columns]
         known = None if good is None else good[:, rows, columns]
-        total, area, kept = _weighted(cut, known, weights)
+        single = _outliers(cut, known, weights, detector.of(beam))
+        result.outliers += int(single.sum())
+        used = known if not single.any() else ~single if known is None else known & ~single
+        total, area, kept = _weighted(cut, used, weights)
         scale = area / np.where(kept > 0, kept, 1.0)
         result.flux[beam] = total * scale - level * area
         own = detector.of(beam)
@@ -222,6 +232,42 @@ def _weighted(cut, known, weights):
         return flat @ w, area, np.full(len(cut), area)
     known = known.reshape(len(cut), -1)
     return np.where(known, flat, 0.0) @ w, area, known @ w
+
+
+def _outliers(cut, known, weights, detector):
+    """Return the single pixels that are far off their neighbours."""
+    values = cut if known is None else np.where(known, cut, np.nan)
+    level, spread = _median(values[:, weights > 0][:, ::_SAMPLED])
+    # first those far off the others of their slice: only of these the neighbours are looked at
+    low, high = (limit[:, None, None] for limit in _limits(level, spread, detector))
+    with np.errstate(invalid="ignore"):
+        found = ((values > high) | (values < low)) & (weights > 0)
+    k, rows, columns = places = np.nonzero(found)
+    if k.size:
+        padded = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
+        steps = [step for step in np.ndindex(3, 3) if step != (1, 1)]
+        around = np.stack([padded[k, rows + y, columns + x] for y, x in steps], axis=1)
+        low, high = _limits(_median(around)[0], spread[k], detector)
+        # false where no neighbour has a value
+        found[places] = (values[places] > high) | (values[places] < low)
+    return found
+
+
+def _limits(level, spread, detector):
+    """Return between which values pixels are like those around them."""
+    reach = _SIGMAS * np.sqrt(spread**2 + detector.variance(level))
+    high = np.maximum(_FACTOR * level, level + reach + _ELECTRONS / detector.gain)
+    # there may be less light, down to none
+    return np.minimum(level, 0.0) - reach, high
+
+
+def _median(pixels):
+    """Return the median of each row and its robust standard deviation, NaN without a value."""
+    with warnings.catch_warnings():
+        # of rows in which nothing is known
+        warnings.simplefilter("ignore", RuntimeWarning)
+        level = np.nanmedian(pixels, axis=1)
+        return level, MAD_TO_SIGMA * np.nanmedian(np.abs(pixels - level[:, None]), axis=1)
 
 
 def _peak(cut, known, weights):

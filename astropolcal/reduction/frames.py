@@ -153,6 +153,9 @@ def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
             frame.unit = detector.unit.to_string()
             measure = measure_stars if source == "star" else measure_internal
             frame.photometry = measure(cube, good, detector, layout, **(options or {}))
+            if frame.photometry.outliers:
+                frame.values["outliers"] = frame.photometry.outliers
+                frame.doubts.append("single pixels far off their neighbours were left out")
             if source == "internal":
                 frame.values["light"] = "even" if evenly_lit(cube, good, layout) else "uneven"
     except ObservationError as error:
@@ -286,6 +289,13 @@ def _check_header(frame, layout, source):
         if column not in values and not _complained(frame, layout.keywords[column])
     ]
     _add_time(values)
+    # of stars `check_stars` looks
+    on_plate = tracking_error(values, layout, on_sky=False) if source != "star" else None
+    if abs(on_plate or 0.0) > layout.tracking_tolerance:
+        frame.doubts.append(
+            f"{layout.keywords['hwp_true']} and {layout.keywords['hwp']} differ by more than "
+            f"{layout.tracking_tolerance:g} deg, though the plate does not follow the sky"
+        )
 
 
 def _complained(frame, keyword):

@@ -28,6 +28,7 @@ from astropolcal.instruments.keywords import (
     convert,
     in_calendar,
     look_up,
+    stated,
     unit_of,
 )
 from astropolcal.observations import pointing as sky_pointing
@@ -210,7 +211,29 @@ def read_header(path, layout, *, header=None, raw=None):
         keyword, value = look_up(headers, column, layout)
         if value is not None:
             _convert(frame, column, keyword, value, layout)
+        if column in ANGLES and column in frame.values:
+            _compare(frame, column, stated(headers, column, layout), layout)
     return frame
+
+
+def _compare(frame, column, found, layout):
+    """Say which keywords give another angle than the first one."""
+    (first, _), *others = found
+    for keyword, value in others:
+        try:
+            angle = convert(column, value, layout, u.deg)
+        except (TypeError, ValueError):
+            continue
+        # half a turn is none for a half-wave plate, and a derotator
+        if not abs(_half_turn(angle - frame.values[column])) <= layout.tracking_tolerance:
+            where = f"{keyword} of the raw frame" if keyword == first else keyword
+            frame.doubts.append(
+                f"{first} and {where} differ by more than {layout.tracking_tolerance:g} deg"
+            )
+
+
+def _half_turn(angle):
+    return (angle + 90.0) % 180.0 - 90.0
 
 
 def not_of_instrument(values, layout):
@@ -456,7 +479,7 @@ def observation_time(values):
         raise ObservationError(f"time: {one_line(error)}") from None
 
 
-def tracking_error(values, layout):
+def tracking_error(values, layout, *, on_sky=True):
     """
     Return how far the half-wave plate is from where the tracking law puts it.
 
@@ -466,6 +489,8 @@ def tracking_error(values, layout):
         ``hwp``, ``hwp_true``, ``parallactic`` and ``altitude`` in degree.
     layout : FileLayout
         With ``tracking``.
+    on_sky : bool
+        Whether the plate follows the sky; for an internal source it stands still.
 
     Returns
     -------
@@ -481,14 +506,13 @@ def tracking_error(values, layout):
     >>> tracking_error(values, instruments.get("charis").files)
     0.0
     """
-    names = ("hwp", "hwp_true", "parallactic", "altitude")
-    if not all(name in values for name in names):
+    laws = zip(("parallactic", "altitude"), layout.tracking, strict=True)
+    law = {"hwp": 1.0} | (dict(laws) if on_sky else {})
+    if not all(name in values for name in ("hwp_true", *law)):
         return None
-    hwp, true, parallactic, altitude = (values[name] for name in names)
-    on_parallactic, on_altitude = layout.tracking
-    law = hwp + on_parallactic * parallactic + on_altitude * altitude
     # adding a whole number of turns to the parallactic angle shifts the law by half turns
-    return float((true - law + 90.0) % 180.0 - 90.0)
+    off = values["hwp_true"] - sum(factor * values[name] for name, factor in law.items())
+    return float(_half_turn(off))
 
 
 def check_sequence(hwp, derotator, layout, tolerance=0.5):

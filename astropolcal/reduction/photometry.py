@@ -34,6 +34,9 @@ class Photometry:
         Level that was subtracted from each pixel.
     reasons : list of str
         Why a slice cannot be used, empty where it can; length W.
+    outliers : int
+        Pixels that were left out of the apertures of an internal source, as they are far off
+        their neighbours.
 
     Examples
     --------
@@ -56,6 +59,7 @@ class Photometry:
     radius: np.ndarray
     background: np.ndarray
     reasons: list
+    outliers: int = 0
 
     @classmethod
     def empty(cls, n_wavelengths):

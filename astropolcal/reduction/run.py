@@ -120,6 +120,7 @@ class Reduction:
             "n_frames": len(self.frames),
             "n_cells": cells,
             "n_masked": sum(self.flags.values()),
+            "n_outliers": sum(frame.values.get("outliers", 0) for frame in self.frames),
             "flags": self.flags,
             "problems": self.problems,
             "doubts": self.doubts,

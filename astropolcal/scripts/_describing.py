@@ -147,6 +147,7 @@ def _describe_frame(path, header, hdus):
     if values:
         lines.append(f"  header: {', '.join(f'{key} {_short(v)}' for key, v in values.items())}")
     lines += [f"  problem: {words}" for words in (frame.errors if frame else [])]
+    lines += [f"  doubtful: {words}" for words in (frame.doubts if frame else [])]
     content = {"file": str(path), "type": kind, "instrument": name, "hdus": hdus}
     return lines, content | {"header": {key: _plain(value) for key, value in values.items()}}
 
@@ -159,7 +160,7 @@ def _known_frame(path, header, hdus):
     """Return the instrument of a file, what it reads in the header, and the kind of file."""
     from astropolcal import instruments
     from astropolcal.exceptions import AstropolcalError
-    from astropolcal.reduction.headers import read_header
+    from astropolcal.reduction.headers import read_header, tracking_error
 
     shapes = {tuple(hdu["shape"]) for hdu in hdus}
     name = _instrument(header, shapes)
@@ -169,6 +170,10 @@ def _known_frame(path, header, hdus):
         # the mode tells which shape a cube has
         layout = instruments.get(name).configured(header).files
         frame = read_header(path, layout, header=header)
+        off = [tracking_error(frame.values, layout, on_sky=sky) for sky in (True, False)]
+        if None not in off and min(map(abs, off)) > layout.tracking_tolerance:
+            names = " and ".join(layout.keywords[key] for key in ("hwp", "hwp_true"))
+            frame.doubts.append(f"{names} agree neither on sky nor with the internal source")
     except AstropolcalError:
         return name, None, f"FITS file of {name}"
     is_cube = bool(_cube_shapes(layout) & shapes)

@@ -133,8 +133,8 @@ def test_chain_of_one_wavelength_is_that_of_a_grid_of_one(name):
 
 def test_source_of_a_table():
     assert BENCH.source_of(night(source="star")) == "star"
-    with pytest.raises(InstrumentError, match=r"night: source 'Star' in .*allowed are polarized"):
-        BENCH.source_of(night(source="Star"))
+    with pytest.raises(InstrumentError, match=r"night: source 'Stars' in .*allowed are polarized"):
+        BENCH.source_of(night(source="Stars"))
     with pytest.raises(InstrumentError, match="night: source None"):
         BENCH.source_of(night())
 

@@ -105,6 +105,36 @@ def test_complex_shapes_are_refused(small, tmp_path):
         opened(path, small.files)
 
 
+def test_checksums_that_do_not_match_are_found_wherever_files_are_read(small, tmp_path, flat_cube):
+    """A bit of the data, or a letter of the header, of cubes, raw frames and any FITS file."""
+    from astropolcal.correction.sources import CubeFiles
+    from astropolcal.scripts._describing import describe_fits
+
+    path = tmp_path / "CRSA00000001_cube.fits"
+    write_cube(path, flat_cube)
+    with fits.open(path) as hdus:
+        hdus.writeto(path, overwrite=True, checksum=True)
+    raw = {1: tmp_path / "CRSA00000001.fits"}
+    good = path.read_bytes()
+    for place, keyword in ((-4000, "DATASUM"), (good.index(b"HD 293396"), "CHECKSUM")):
+        spoiled = bytearray(good)
+        spoiled[place] ^= 1
+        path.write_bytes(spoiled)
+        raw[1].write_bytes(spoiled)
+        (error,) = reduce_frame(path, small.files).errors
+        assert error.startswith(f"{keyword} = ")
+        for read in (describe_fits, lambda p: CubeFiles([p], [(131, 116), (71, 86)], 21)):
+            with pytest.raises(ObservationError, match=f"{path}: {keyword} = .* does not match"):
+                read(path)
+    # of a raw frame only the header counts
+    cube = write_cube(tmp_path / "x_00000001_cube.fits", flat_cube, drop=["RET-ANG1"])
+    assert reduce_frame(cube, small.files, raw=raw).errors[0].startswith("raw frame: ")
+    path.write_bytes(good)
+    raw[1].write_bytes(good)
+    assert reduce_frame(path, small.files).errors == []
+    assert reduce_frame(cube, small.files, raw=raw).errors == []
+
+
 # ---- headers ---------------------------------------------------------------------------
 
 
@@ -222,6 +252,15 @@ def test_plate_off_the_tracking_law(hwp_true, off):
     errors = starred(hwp_true=hwp_true).errors
     words = f"RET-POS1 = {hwp_true:g} deg is {off} deg off the tracking law; up to 1 deg is allowed"
     assert errors == ([] if off is None else [words])
+
+
+@pytest.mark.parametrize(("hwp_true", "same"), [(0.9, True), (179.5, True), (80.0, False)])
+def test_plate_of_an_internal_source_stands_where_it_was_sent(hwp_true, same):
+    frame = Frame("CRSA00000001.fits", 1, SKY | {"hwp_true": hwp_true})
+    _check_header(frame, LAYOUT, "internal")
+    assert frame.errors == []
+    words = "RET-POS1 and RET-ANG1 differ by more than 1 deg, though the plate does not follow"
+    assert [doubt.startswith(words) for doubt in frame.doubts] == [True] * (not same)
 
 
 def test_unknown_plate_angle_is_a_doubt():

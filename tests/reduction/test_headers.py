@@ -108,6 +108,15 @@ def test_impossible_values_are_errors_that_name_the_keyword(keyword, value):
     assert str(value) in frame.errors[0]
 
 
+def test_keywords_of_one_angle_have_to_agree():
+    layout = replace(LAYOUT, alternatives=LAYOUT.alternatives | {"hwp": ("U_HWPANG", "OLD")})
+    for other, same in ((0.5, True), (180.0, True), (45.0, False), ("unavailable", True)):
+        frame = read_header("a.fits", layout, header=header(U_HWPANG=other, OLD="x"))
+        assert frame.values["hwp"] == 0.0
+        words = ["RET-ANG1 and U_HWPANG differ by more than 1 deg"]
+        assert frame.doubts == ([] if same else words)
+
+
 def test_raw_frame_of_the_same_number_gives_what_the_cube_lacks(tmp_path):
     raw = tmp_path / "raw"
     raw.mkdir()
@@ -119,8 +128,12 @@ def test_raw_frame_of_the_same_number_gives_what_the_cube_lacks(tmp_path):
     cards = fits.Header({"PARANG": 1.0, "ALTITUDE": 60.0})
     frame = read_header("CRSA00000007_cube.fits", LAYOUT, header=cards, raw=found)
     assert frame.values["hwp"] == 33.75
-    # what the cube has itself stays
+    # what the cube has itself stays, and is compared
     assert frame.values["altitude"] == 60.0
+    assert frame.doubts == [
+        f"{keyword} and {keyword} of the raw frame differ by more than 1 deg"
+        for keyword in ("PARANG", "ALTITUDE")
+    ]
     lost = read_header("CRSA00000009_cube.fits", LAYOUT, header=cards, raw=found)
     assert lost.errors == ["no raw frame of number 9"]
     nameless = read_header("cube.fits", LAYOUT, header=cards, raw=found)

@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Photometry of both sources against known fluxes; every flag made to happen."""
 
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -69,6 +71,49 @@ def test_internal_flags(flat_cube):
     cube[2] = -1.0
     reasons = measure_internal(cube, good, DETECTOR, LAYOUT).reasons
     assert reasons == ["left aperture masked", "saturated", "no light", ""]
+
+
+@pytest.mark.parametrize("level", [5.0, 130.0, 3000.0])
+@pytest.mark.parametrize("value", [39_000.0, 5 * 3000.0, -20_000.0])
+def test_single_pixels_far_off_their_neighbours_are_left_out(level, value):
+    """One of a slice and one in all slices, also where others have no value."""
+    clean = expose(np.full((201, 201), level), LAYOUT, seed=4)
+    whole = measure_internal(clean, None, DETECTOR, LAYOUT)
+    for beam, (rows, columns, weights) in enumerate(
+        rectangles(LAYOUT.internal_apertures, (201, 201))
+    ):
+        direct = (clean[:, rows, columns] * weights).sum(axis=(1, 2), dtype=float)
+        np.testing.assert_allclose(whole.flux[beam], direct, rtol=1e-6)
+    assert whole.outliers == 0
+    hot = clean.copy()
+    hot[1, 90, 75] = hot[:, 120, 131] = value
+    good = np.random.default_rng(5).random(clean.shape) > 0.02
+    for known in (None, good | (hot != clean)):
+        found = measure_internal(hot, known, DETECTOR, LAYOUT)
+        assert found.outliers == 1 + len(clean)
+        expected = measure_internal(clean, known, DETECTOR, LAYOUT)
+        # within 0.1 %, or a tenth of what noise does
+        error = np.abs(found.flux - expected.flux)
+        assert (error < np.maximum(1e-3 * expected.flux, 0.1 * np.sqrt(expected.variance))).all()
+        assert not found.failed.any()
+
+
+def test_structure_of_the_light_is_not_left_out():
+    """Stars of three pixels, slopes, the pattern of lenslets, and single multiplied electrons."""
+    y, x = np.indices((201, 201))
+    rng = np.random.default_rng(6)
+    star = star_image(pair(LAYOUT), fwhm=3.0)
+    images = [star, 10.0 + x * y / 20, 400.0 * (1 + 0.2 * rng.standard_normal(star.shape))]
+    cubes = [expose(image, LAYOUT, seed=7) for image in images]
+    layout = replace(
+        LAYOUT, keywords=LAYOUT.keywords | {"em_gain": "EMGAIN"}, gain=4.5, read_noise=90.0
+    )
+    multiplied = detector_of(layout, values={"em_gain": 300.0})
+    electrons = rng.poisson(0.05, (4, 201, 201))
+    counted = rng.gamma(np.maximum(electrons, 1e-12)) / multiplied.gain
+    noise = multiplied.read_noise * rng.standard_normal(counted.shape)
+    for cube, detector in [*((cube, DETECTOR) for cube in cubes), (counted + noise, multiplied)]:
+        assert measure_internal(cube, None, detector, LAYOUT).outliers == 0
 
 
 def test_background_outside_the_beams_and_what_it_lets_them_share():

@@ -43,7 +43,7 @@ def flat_frames(folder, angles=(*CYCLE, 90.0), derotator=45.0, start=1):
     for i, hwp in enumerate(angles):
         cube = expose(np.full((201, 201), 400.0), LAYOUT, seed=start + i)
         path = folder / f"CRSA{start + i:08d}_cube.fits"
-        paths.append(write_cube(path, cube, RET__ANG1=hwp, D_IMRANG=derotator))
+        paths.append(write_cube(path, cube, RET__ANG1=hwp, RET__POS1=hwp, D_IMRANG=derotator))
     return paths
 
 
@@ -226,6 +226,20 @@ def test_frames_of_another_star_pickoff_or_source_are_left_out(tmp_path, small):
     }
 
 
+def test_hot_pixels_are_counted_and_told(tmp_path, small):
+    paths = flat_frames(tmp_path, CYCLE)
+    clean = reduce_run(paths, small)
+    assert (clean.summary()["n_outliers"], clean.doubts) == (0, {})
+    with fits.open(paths[2], mode="update") as hdus:
+        hdus[1].data[:, 90, 75] = 39_000.0
+    found = reduce_run(paths, small)
+    assert found.summary()["n_outliers"] == len(small.wavelength)
+    assert found.doubts == {str(paths[2]): ["single pixels far off their neighbours were left out"]}
+    np.testing.assert_allclose(
+        found.observations.flux_left, clean.observations.flux_left, rtol=1e-3
+    )
+
+
 def test_a_star_is_no_internal_source(tmp_path, small):
     lamp = flat_frames(tmp_path, CYCLE)
     (tmp_path / "sky").mkdir()
@@ -236,7 +250,9 @@ def test_a_star_is_no_internal_source(tmp_path, small):
     }
     # nothing else to compare it with
     alone = reduce_run([star], small)
-    assert "as that of a star" in alone.doubts[str(star)][0]
+    tracked, light = alone.doubts[str(star)]
+    assert tracked.startswith("RET-POS1 and RET-ANG1 differ by more than 1 deg")
+    assert "as that of a star" in light
 
 
 def test_lamp_is_no_star_and_says_so_without_warnings(tmp_path, small):

@@ -118,6 +118,16 @@ def test_raw_header_is_no_cube(tmp_path, capsys):
     assert "problem: ALTITUDE = 99.0, allowed are -90 to 90 deg" in text or "problem: ALT" in text
 
 
+@pytest.mark.parametrize(("true", "doubtful"), [(45.0, False), (125.0, False), (60.0, True)])
+def test_plate_that_is_nowhere_it_should_be_is_doubtful(tmp_path, capsys, true, doubtful):
+    """It stands at 45 deg for the internal source, and at 45 + 20 / 2 + 70 deg on sky."""
+    angles = {"RET-ANG1": 45.0, "RET-POS1": true, "PARANG": 20.0, "ALTITUDE": 70.0}
+    header = fits.Header({"INSTRUME": "CHARIS"} | angles)
+    fits.PrimaryHDU(header=header).writeto(tmp_path / "CRSA00000001.fits")
+    text, _ = told(tmp_path / "CRSA00000001.fits", capsys)
+    assert ("doubtful: RET-ANG1 and RET-POS1 agree neither" in text) == doubtful
+
+
 @pytest.mark.parametrize("name", ["x.fits", "x.fits.gz", "x.bin"])
 def test_any_fits_file_is_listed(tmp_path, capsys, name):
     hdus = [fits.PrimaryHDU(np.zeros((2, 3))), fits.ImageHDU(np.zeros(5, "i2"), name="SPEC")]
