@@ -26,6 +26,12 @@ def _fit(problem, **options):
     return calibrate(problem[0], problem[1], search=False, cross_validate=False, **options)
 
 
+def _moved(cal, vector):
+    """How far a vector is from the fit, in standard errors."""
+    change = vector - cal.measurement.vector()
+    return np.abs(change / cal.measurement.free.factors() / cal.covariance.stds).max()
+
+
 @pytest.fixture(scope="module")
 def cal(problem):
     return _fit(problem)
@@ -42,7 +48,7 @@ def test_the_solution_is_its_own_refit(cal):
     refit = Refit(cal)
     vector, chi2, arrived = refit.fit(refit.solution)
     assert arrived
-    np.testing.assert_allclose(vector, refit.solution, atol=1e-6)
+    assert _moved(cal, vector) < 1e-4
     assert chi2 == pytest.approx(np.sum(cal.residuals**2), rel=1e-6)
 
 
@@ -126,7 +132,7 @@ def test_a_start_beyond_a_bound_is_taken_back(cal):
     start[slot] = 1.0 + 1e-9
     vector, _, arrived = refit.fit(start)
     assert arrived
-    np.testing.assert_allclose(vector, refit.solution, atol=1e-5)
+    assert _moved(cal, vector) < 1e-4
 
 
 def test_a_parameter_that_moves_nothing_has_step_one(problem):

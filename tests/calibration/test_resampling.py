@@ -92,7 +92,8 @@ def test_a_datum_that_counts_twice_is_two_data(white, make):
     """Counts of two everywhere leave the solution and double chi-square."""
     refit = Refit(white)
     vector, chi2, _ = refit.fit(refit.solution, np.full(white.measurement.n_data, 2.0))
-    np.testing.assert_allclose(vector, refit.solution, rtol=1e-4, atol=1e-6)
+    moved = np.abs(vector - refit.solution) / white.measurement.free.factors()
+    assert (moved < 1e-2 * white.covariance.stds).all()
     assert chi2 == pytest.approx(2 * np.sum(white.residuals**2))
 
 
