@@ -186,7 +186,9 @@ def test_open_directions_stay_open(make):
     cal = calibrate(chain, make.observe(chain, wavelength=LAM, seed=1), **OPTIONS)
     robust = robust_covariance(cal)
     np.testing.assert_array_equal(np.isnan(robust.stds), np.isnan(cal.covariance.stds))
-    np.testing.assert_allclose(robust.null, cal.covariance.null)
+    # the same directions, of which any basis may come out
+    both = np.concatenate([robust.null, cal.covariance.null])
+    assert len(robust.null) == np.linalg.matrix_rank(both, tol=1e-6) == 2
     slopes = np.eye(len(robust))[[robust.names.index("hwp.theta")]]
     assert np.isinf(robust.propagate(slopes)[0, 0])
     known = robust.names.index("hwp.w_sio2")
