@@ -8,7 +8,6 @@ McIntosh et al. 2026; 't Hart et al. 2021, Proc. SPIE 11833: rectangles that
 keep clear of the edges of the field stop.
 """
 
-import warnings
 from functools import lru_cache
 
 import numpy as np
@@ -236,18 +235,21 @@ def _weighted(cut, known, weights):
 
 def _outliers(cut, known, weights, detector):
     """Return the single pixels that are far off their neighbours."""
-    values = cut if known is None else np.where(known, cut, np.nan)
-    level, spread = _median(values[:, weights > 0][:, ::_SAMPLED])
+    sample = (slice(None), *(index[::_SAMPLED] for index in np.nonzero(weights)))
+    level, spread = _robust(cut[sample], None if known is None else known[sample])
     # first those far off the others of their slice: only of these the neighbours are looked at
     low, high = (limit[:, None, None] for limit in _limits(level, spread, detector))
-    with np.errstate(invalid="ignore"):
-        found = ((values > high) | (values < low)) & (weights > 0)
+    kind = np.result_type(cut, np.float32)
+    found = ((cut > high.astype(kind)) | (cut < low.astype(kind))) & (weights > 0)
+    if known is not None:
+        found &= known
     k, rows, columns = places = np.nonzero(found)
     if k.size:
+        values = np.asarray(cut if known is None else np.where(known, cut, np.nan), dtype=float)
         padded = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
         steps = [step for step in np.ndindex(3, 3) if step != (1, 1)]
         around = np.stack([padded[k, rows + y, columns + x] for y, x in steps], axis=1)
-        low, high = _limits(_median(around)[0], spread[k], detector)
+        low, high = _limits(_median(around, ~np.isnan(around)), spread[k], detector)
         # false where no neighbour has a value
         found[places] = (values[places] > high) | (values[places] < low)
     return found
@@ -261,13 +263,19 @@ def _limits(level, spread, detector):
     return np.minimum(level, 0.0) - reach, high
 
 
-def _median(pixels):
-    """Return the median of each row and its robust standard deviation, NaN without a value."""
-    with warnings.catch_warnings():
-        # of rows in which nothing is known
-        warnings.simplefilter("ignore", RuntimeWarning)
-        level = np.nanmedian(pixels, axis=1)
-        return level, MAD_TO_SIGMA * np.nanmedian(np.abs(pixels - level[:, None]), axis=1)
+def _robust(pixels, known):
+    """Return the median of each row and its robust standard deviation, infinite without a value."""
+    level = _median(pixels, known)
+    with np.errstate(invalid="ignore"):
+        return level, MAD_TO_SIGMA * _median(np.abs(pixels - level[:, None]), known)
+
+
+def _median(pixels, known):
+    # nanmedian takes ten times as long; of no value the infinite ones are left
+    number = np.full(len(pixels), pixels.shape[1]) if known is None else known.sum(axis=1)
+    ordered = np.sort(pixels if known is None else np.where(known, pixels, np.inf), axis=1)
+    row = np.arange(len(pixels))
+    return (ordered[row, (number - 1) // 2] + ordered[row, number // 2]) / 2.0
 
 
 def _peak(cut, known, weights):

@@ -217,18 +217,17 @@ def read_header(path, layout, *, header=None, raw=None):
 
 
 def _compare(frame, column, found, layout):
-    """Say which keywords give another angle than the first one."""
+    """Say which other keywords give another angle than the first one."""
     (first, _), *others = found
-    for keyword, value in others:
+    for keyword, value in ((k, v) for k, v in others if k != first):
         try:
             angle = convert(column, value, layout, u.deg)
         except (TypeError, ValueError):
             continue
         # half a turn is none for a half-wave plate, and a derotator
         if not abs(_half_turn(angle - frame.values[column])) <= layout.tracking_tolerance:
-            where = f"{keyword} of the raw frame" if keyword == first else keyword
             frame.doubts.append(
-                f"{first} and {where} differ by more than {layout.tracking_tolerance:g} deg"
+                f"{first} and {keyword} differ by more than {layout.tracking_tolerance:g} deg"
             )
 
 
