@@ -227,8 +227,10 @@ def test_nothing_is_read_that_is_no_regular_file(command, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
     for action in files_of(command, (Input, Continued)):
-        for path, words in (("pipe", "is a pipe"), ("/dev/zero", "is a device")):
-            assert f"{path}: {words}" in refused(capsys, words_of(command, {action.dest: path}))
+        assert "pipe: is a pipe" in refused(capsys, words_of(command, {action.dest: "pipe"}))
+    for action in files_of(command, Input):
+        err = refused(capsys, words_of(command, {action.dest: "/dev/zero"}))
+        assert "/dev/zero: is a device" in err
     for action in files_of(command, (Input, Output)):
         for name in ("n" * 256, "a\0b"):
             err = refused(capsys, words_of(command, {action.dest: name}))

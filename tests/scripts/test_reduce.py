@@ -12,6 +12,7 @@ from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.observations import Observations
 from astropolcal.reduction.cubes import simulate_cubes
 from astropolcal.scripts import _reduce
+from astropolcal.scripts._common import check_paths
 from astropolcal.simulation import half_wave_plate_cycles
 
 
@@ -19,6 +20,7 @@ def command(*words):
     parser = argparse.ArgumentParser()
     _reduce.add_parser(parser.add_subparsers())
     arguments = parser.parse_args(["reduce", *map(str, words)])
+    check_paths(arguments)
     arguments.run(arguments)
 
 
