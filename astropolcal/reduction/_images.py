@@ -75,6 +75,15 @@ class Scene:
         """Return the place in the right and in the left beam."""
         return np.asarray(left) + self.offset, np.asarray(left)
 
+    def peak(self):
+        """Return the largest share of a beam's light in a pixel, one value a wavelength or one."""
+        if self.source != "star":
+            return 1 / self.area
+        # in the middle of a pixel it is the largest
+        box = tuple(slice(0, size) for size in self.shape[1:])
+        middle = np.array(self.shape[:0:-1]) // 2
+        return self._star(box, middle, self.fwhm).max(axis=(1, 2))
+
     def light(self, fluxes, centre, widening):
         """Return the image of both beams, in the unit of the fluxes."""
         image = np.zeros(self.shape)

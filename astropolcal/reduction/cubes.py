@@ -8,6 +8,7 @@ field; both are seen through the field stop, of which the beam splitter makes
 two images.
 """
 
+import inspect
 import warnings
 from pathlib import Path
 
@@ -31,9 +32,13 @@ from astropolcal.reduction._cube_files import file_names, header_of, write_cube
 from astropolcal.reduction._images import Detector, Scene
 from astropolcal.simulation import entering_flux, expected_fluxes, simulate
 
-__all__ = ["both_states", "simulate_cubes", "true_observations"]
+__all__ = ["both_states", "simulate_cubes", "true_observations", "usual_flux"]
 
 _SOURCES, _PROFILES = ("internal", "star"), ("moffat", "gaussian")
+# what describes the image of a star
+_STAR = ("psf", "fwhm", "beta", "halo", "halo_fwhm", "margin")
+# share of the saturation that a default may fill: there is room for better seeing, uneven pixels
+_FILLED = 0.5
 
 
 def simulate_cubes(
@@ -45,7 +50,7 @@ def simulate_cubes(
     wavelength=None,
     source="internal",
     stokes=(1.0, 0.0, 0.0, 0.0),
-    flux=1e7,
+    flux=None,
     lamp=None,
     psf="moffat",
     fwhm=5.0,
@@ -103,7 +108,8 @@ def simulate_cubes(
     flux : float or array_like
         Flux that enters the chain, in adu; scalar or one value a wavelength. Of
         the internal source, what enters through an area as large as an aperture of
-        the layout.
+        the layout. By default 1e7, or what lights the brightest pixel to half of the
+        saturation where that is less.
     lamp : array_like, optional
         Relative brightness of the source in each frame.
     psf : {"moffat", "gaussian"}
@@ -199,12 +205,17 @@ def simulate_cubes(
     choice("psf", psf, _PROFILES)
     frames = _with_headers(frames, layout, source, exposure_time, start)
     n_wavelengths, n_frames = _count(layout, wavelength), len(frames)
-    beams = _beam_fluxes(chain, wavelength, frames, source, flux=flux, lamp=lamp, stokes=stokes)
     star = {"source": source, "psf": psf, "fwhm": fwhm, "beta": beta, "margin": margin}
-    scene = _scene(layout, n_wavelengths, halo=halo, halo_fwhm=halo_fwhm, **star)
+    star |= {"halo": halo, "halo_fwhm": halo_fwhm}
+    scene = _scene(layout, n_wavelengths, **star)
     how = _read_out(frames, layout)
     limit = how.saturation if saturate else np.inf
     level = per_wavelength("background", background, n_wavelengths)[:, None, None]
+    light = {"lamp": lamp, "stokes": stokes}
+    if flux is None:
+        images = star | light | {"background": background}
+        flux = usual_flux(chain, instrument, frames, wavelength=wavelength, **images)
+    beams = _beam_fluxes(chain, wavelength, frames, source, flux=flux, **light)
     detector = _detector(how, gain, read_noise, background=level, saturation=limit, noise=noise)
     # a generator for each frame, so that a frame is the same however many are simulated
     *seeds, of_pixels, of_star = map(
@@ -230,6 +241,67 @@ def simulate_cubes(
     if brightest > how.saturation and not saturate:
         _warn_of_saturation(brightest, how)
     return [cube for cube, _ in names]
+
+
+def usual_flux(
+    chain,
+    instrument,
+    frames,
+    most=1e7,
+    *,
+    wavelength=None,
+    source="internal",
+    stokes=(1.0, 0.0, 0.0, 0.0),
+    lamp=None,
+    background=0.0,
+    **star,
+):
+    """
+    Return the flux of cubes for which none is given.
+
+    Parameters
+    ----------
+    chain, instrument, frames, wavelength, source, stokes, lamp, background, **star
+        As for `simulate_cubes`; ``star`` are ``psf``, ``fwhm``, ``beta``, ``halo``,
+        ``halo_fwhm`` and ``margin``.
+    most : float
+        What is taken as long as the brightest pixel stays below half of the saturation.
+
+    Returns
+    -------
+    float
+        In adu.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.reduction.cubes import usual_flux
+    >>> from astropolcal.simulation import half_wave_plate_cycles
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(hwp=[0, 45] * u.deg)
+    >>> usual_flux(charis.published(), charis, frames)
+    10000000.0
+    """
+    instrument, wavelength, _ = _of_mode(instrument, wavelength)
+    layout = _layout(instrument)
+    n = _count(layout, wavelength)
+    frames = _with_headers(frames, layout, source, 1 * u.s, "2025-01-01")
+    usual = inspect.signature(simulate_cubes).parameters
+    star = {name: usual[name].default for name in _STAR} | star
+    share = _scene(layout, n, source=source, **star).peak()
+    light = _beam_fluxes(chain, wavelength, frames, source, flux=1.0, lamp=lamp, stokes=stokes)
+    room = _FILLED * _read_out(frames, layout).saturation
+    room = room - per_wavelength("background", background, n)
+    if np.any(room <= 0):
+        # no flux is low enough, which is warned of later
+        return most
+    brightest = np.max(light.max(axis=(0, 1)) * share / room)
+    if most * brightest <= 1:
+        return most
+    # two digits, rounded down
+    digit = 10.0 ** (np.floor(-np.log10(brightest)) - 1)
+    return float(np.floor(1 / (brightest * digit)) * digit)
 
 
 def _scene(layout, n_wavelengths, *, source, psf, fwhm, beta, halo, halo_fwhm, margin):

@@ -357,8 +357,8 @@ def pointing(values, site):
     --------
     >>> from astropolcal.reduction.headers import pointing
     >>> values = {"right_ascension": "05:05:05", "declination": "+10:00:00", "mjd": 60250.5}
-    >>> [round(angle, 1) for angle in pointing(values, (-155.4761, 19.8255, 4139.0))]
-    [75.9, -44.9]
+    >>> [round(angle) for angle in pointing(values, (-155.4761, 19.8255, 4139.0))]
+    [76, -45]
     """
     (angles,) = _pointings([_target(values, site)], site)
     return angles

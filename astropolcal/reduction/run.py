@@ -262,7 +262,7 @@ def reduce_run(
     if photometry == "internal" and not keep_repeats:
         frames = without_repeats(frames, reduction)
     if not frames:
-        raise ObservationError(_nothing(len(files), reduction.problems))
+        raise ObservationError(_nothing(len(files), reduction.problems) + _hint(task, reduction))
     reduction.frames = frames
     _doubt_light(frames)
     reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
@@ -332,6 +332,16 @@ def _nothing(count, problems):
     more = f" (and {len(rest)} more)" if rest else ""
     none = "the file cannot be used" if count == 1 else f"none of the {count} files can be used"
     return f"{none}: {first}{more}"
+
+
+def _hint(task, reduction):
+    """Return where to look for keywords that cubes do not have, if nobody has looked there."""
+    known = map(task["layout"].keywords.get, task["layout"].raw_columns)
+    lacking = tuple(f"no keyword {keyword} " for keyword in known if keyword)
+    every = (why for reasons in reduction.problems.values() for why in reasons)
+    if task["raw"] is not None or not any(why.startswith(lacking) for why in every):
+        return ""
+    return "; give the folder of the raw frames, which may have them (raw, --raw DIR)"
 
 
 # --- all files -------------------------------------------------------------------

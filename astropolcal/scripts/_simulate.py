@@ -31,7 +31,7 @@ examples:
   astropolcal simulate -o run.ecsv --derotator 45,70,95 --fix hwp.w_sio2=1.66mm
   astropolcal simulate -o true.ecsv --cubes lamp        image cubes, raw headers
   astropolcal simulate --cubes star --source star --altitude 67,64 \\
-      --parallactic 24,30 --derotator 97 --fix star.q=0.01 --flux 1e6
+      --parallactic 24,30 --derotator 97 --fix star.q=0.01
 """
 
 _PSF = "moffat"
@@ -114,9 +114,9 @@ def _add_noise(parser):
     parser.add_argument(
         "--flux",
         type=float,
-        default=EXAMPLE["flux"],
         metavar="ADU",
-        help="flux that enters, per wavelength (default: %(default)g)",
+        help=f"flux that enters, per wavelength (default: {EXAMPLE['flux']:g}; cubes: less where "
+        "the brightest pixel would be above half of the saturation)",
     )
     parser.add_argument(
         "--gain",
@@ -189,6 +189,8 @@ def run(arguments):
     # free and prior mean nothing for what is true
     (chain,) = edit_chains([chain], without=arguments.without, fix=arguments.fix)
     frames = _frames(arguments, chain)
+    if arguments.flux is None:
+        arguments.flux = _usual_flux(arguments, chain, wavelength, frames)
     observations = _table(arguments, chain, wavelength, frames, _meta(meta, arguments))
     written = []
     if arguments.cubes:
@@ -238,6 +240,24 @@ def _frames(arguments, chain):
             frames[name] = np.linspace(ends[0], ends[-1], len(frames)) * u.deg
     # a modulator alternates within each setting of the plate
     return both_states(frames) if "flc_state" in stages(chain) else frames
+
+
+def _usual_flux(arguments, chain, wavelength, frames):
+    """Return the flux where none is given."""
+    if not arguments.cubes:
+        return EXAMPLE["flux"]
+    from astropolcal import instruments
+    from astropolcal.reduction.cubes import usual_flux
+
+    return usual_flux(
+        chain,
+        instruments.get(arguments.instrument),
+        frames,
+        EXAMPLE["flux"],
+        wavelength=wavelength,
+        source=arguments.source,
+        **{name: getattr(arguments, name) for name in ("psf", "fwhm", "halo", "background")},
+    )
 
 
 def _table(arguments, chain, wavelength, frames, meta):

@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Simulated cubes: what is in the images and headers, and what comes back out of them."""
 
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from astropolcal.exceptions import (
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.reduction import _images
-from astropolcal.reduction.cubes import simulate_cubes, true_observations
+from astropolcal.reduction.cubes import simulate_cubes, true_observations, usual_flux
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.25, 1.65, 2.15] * u.um
@@ -296,6 +298,27 @@ def test_saturation_is_an_option(tmp_path):
         paths = write_star(tmp_path, fwhm=2.0)
     assert image(paths[0]).max() > 5000
     assert image(write_star(tmp_path, fwhm=2.0, saturate=True, first=20)[0]).max() == 5000
+
+
+def test_without_a_flux_no_pixel_is_saturated(tmp_path, monkeypatch):
+    options = {"flux": None, "noise": False}
+    stars = (
+        {},
+        {"fwhm": 2.0},
+        {"psf": "moffat", "halo": 0.3},
+        {"background": 1e3},
+        {"lamp": [1, 3, 2, 1]},
+    )
+    for i, star in enumerate(stars):
+        brightest = max(image(p).max() for p in write_star(tmp_path / str(i), **options, **star))
+        # the star need not be in the middle of a pixel, where it is brightest
+        assert 0.3 * 5000 < brightest <= 0.5 * 5000, star
+    brightest = max(image(path).max() for path in write(tmp_path / "lamp", **options))
+    assert 0.45 * 5000 < brightest <= 0.5 * 5000
+    # as much as without a limit
+    frames = sky_frames()
+    monkeypatch.setattr(Small, "files", replace(Small.files, saturation=np.inf))
+    assert usual_flux(sky_chain(), SMALL, frames, 3e6, source="star") == 3e6
 
 
 def test_extinguished_beam_is_dark_not_an_error(tmp_path):

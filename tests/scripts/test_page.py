@@ -57,7 +57,6 @@ def test_the_table_has_no_option_that_is_gone(sections, command):
 @pytest.mark.parametrize(
     ("command", "option", "stated"),
     [
-        ("simulate", "--flux", "(4e6)"),
         ("simulate", "--seed", "(20251005)"),
         ("simulate", "--fwhm", "(5)"),
         ("sample", "--steps", "by default 5000"),

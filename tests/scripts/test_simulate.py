@@ -2,6 +2,7 @@
 """astropolcal simulate: image cubes and stars."""
 
 import json
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -114,3 +115,31 @@ def test_cubes_are_not_written_over_others(tmp_path, capsys):
     assert simulated(*argv) == 0
     assert simulated(*argv) == 2
     assert "exists" in capsys.readouterr().err
+
+
+# an internal source and an unpolarized star do not tell where north is
+@pytest.mark.filterwarnings("ignore:the calibration leaves open")
+@pytest.mark.parametrize(
+    ("name", "derotator"), [("charis", "50,65,80,95"), ("vampires", "45,60,90")]
+)
+def test_the_defaults_of_one_command_are_good_input_for_the_next(
+    tmp_path, monkeypatch, name, derotator
+):
+    monkeypatch.chdir(tmp_path)
+    cycle, own = ["--hwp", "0,45,22.5,67.5"], ["--instrument", name]
+    raw = {"charis": lambda folder: ["--raw", f"{folder}/raw"]}.get(name, lambda folder: [])
+    assert simulated("--cubes", "lamp", *own, *cycle, "--derotator", derotator) == 0
+    assert main(["reduce", "lamp", *raw("lamp"), *own, "-o", "lamp.ecsv"]) == 0
+    assert simulated("--cubes", "star", *own, *STAR, "--derotator", "97") == 0
+    assert main(["reduce", "star", *raw("star"), *own, "--source", "star", "-o", "star.ecsv"]) == 0
+    layout = instruments.get(name).files
+    for source in ("lamp", "star"):
+        assert not Observations.read(f"{source}.ecsv").mask.any()
+        cubes = Path(source).glob("*.fits")
+        brightest = max(np.nanmax(fits.getdata(path, layout.cube_extension)) for path in cubes)
+        # of a star the noise of the brightest pixel is a percent
+        assert brightest < 0.55 * layout.saturation
+    assert main(["calibrate", "lamp.ecsv", "star.ecsv", "--json", "c.json", "-o", "cal.asdf"]) == 0
+    assert json.loads(Path("c.json").read_text())["converged"]
+    raw = raw("star")
+    assert main(["correct", "star", *raw, *own, "--calibration", "cal.asdf", "-o", "c.fits"]) == 0
