@@ -32,7 +32,7 @@ from astropolcal.reduction._cube_files import file_names, header_of, write_cube
 from astropolcal.reduction._images import Detector, Scene
 from astropolcal.simulation import entering_flux, expected_fluxes, simulate
 
-__all__ = ["both_states", "simulate_cubes", "true_observations", "usual_flux"]
+__all__ = ["both_states", "simulate_cubes", "true_observations"]
 
 _SOURCES, _PROFILES = ("internal", "star"), ("moffat", "gaussian")
 # what describes the image of a star
@@ -214,7 +214,7 @@ def simulate_cubes(
     light = {"lamp": lamp, "stokes": stokes}
     if flux is None:
         images = star | light | {"background": background}
-        flux = usual_flux(chain, instrument, frames, wavelength=wavelength, **images)
+        flux = _usual_flux(chain, instrument, frames, wavelength=wavelength, **images)
     beams = _beam_fluxes(chain, wavelength, frames, source, flux=flux, **light)
     detector = _detector(how, gain, read_noise, background=level, saturation=limit, noise=noise)
     # a generator for each frame, so that a frame is the same however many are simulated
@@ -243,7 +243,7 @@ def simulate_cubes(
     return [cube for cube, _ in names]
 
 
-def usual_flux(
+def _usual_flux(
     chain,
     instrument,
     frames,
@@ -256,33 +256,7 @@ def usual_flux(
     background=0.0,
     **star,
 ):
-    """
-    Return the flux of cubes for which none is given.
-
-    Parameters
-    ----------
-    chain, instrument, frames, wavelength, source, stokes, lamp, background, **star
-        As for `simulate_cubes`; ``star`` are ``psf``, ``fwhm``, ``beta``, ``halo``,
-        ``halo_fwhm`` and ``margin``.
-    most : float
-        What is taken as long as the brightest pixel stays below half of the saturation.
-
-    Returns
-    -------
-    float
-        In adu.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.cubes import usual_flux
-    >>> from astropolcal.simulation import half_wave_plate_cycles
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(hwp=[0, 45] * u.deg)
-    >>> usual_flux(charis.published(), charis, frames)
-    10000000.0
-    """
+    """Return the flux of cubes for which none is given, at most so much; ``star``: of `_STAR`."""
     instrument, wavelength, _ = _of_mode(instrument, wavelength)
     layout = _layout(instrument)
     n = _count(layout, wavelength)

@@ -190,7 +190,7 @@ def run(arguments):
     (chain,) = edit_chains([chain], without=arguments.without, fix=arguments.fix)
     frames = _frames(arguments, chain)
     if arguments.flux is None:
-        arguments.flux = _usual_flux(arguments, chain, wavelength, frames)
+        arguments.flux = _flux(arguments, chain, wavelength, frames)
     observations = _table(arguments, chain, wavelength, frames, _meta(meta, arguments))
     written = []
     if arguments.cubes:
@@ -242,14 +242,14 @@ def _frames(arguments, chain):
     return both_states(frames) if "flc_state" in stages(chain) else frames
 
 
-def _usual_flux(arguments, chain, wavelength, frames):
+def _flux(arguments, chain, wavelength, frames):
     """Return the flux where none is given."""
     if not arguments.cubes:
         return EXAMPLE["flux"]
     from astropolcal import instruments
-    from astropolcal.reduction.cubes import usual_flux
+    from astropolcal.reduction.cubes import _usual_flux
 
-    return usual_flux(
+    return _usual_flux(
         chain,
         instruments.get(arguments.instrument),
         frames,

@@ -637,9 +637,11 @@ class Star(Cube):
         return {"star": _written(fits.HDUList(hdus).writeto, self.suffix)}
 
     def read(self, path):
-        from astropolcal.reduction.frames import reduce_frame
+        from astropolcal.reduction.frames import check_stars, reduce_frame
 
-        return reduce_frame(str(path), small_layout(), source="star")
+        frame = reduce_frame(str(path), small_layout(), source="star")
+        check_stars([frame], small_layout())
+        return frame
 
 
 class Cameras(Cube):

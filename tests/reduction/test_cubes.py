@@ -24,7 +24,7 @@ from astropolcal.exceptions import (
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.reduction import _images
-from astropolcal.reduction.cubes import simulate_cubes, true_observations, usual_flux
+from astropolcal.reduction.cubes import _usual_flux, simulate_cubes, true_observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.25, 1.65, 2.15] * u.um
@@ -318,7 +318,7 @@ def test_without_a_flux_no_pixel_is_saturated(tmp_path, monkeypatch):
     # as much as without a limit
     frames = sky_frames()
     monkeypatch.setattr(Small, "files", replace(Small.files, saturation=np.inf))
-    assert usual_flux(sky_chain(), SMALL, frames, 3e6, source="star") == 3e6
+    assert _usual_flux(sky_chain(), SMALL, frames, 3e6, source="star") == 3e6
 
 
 def test_extinguished_beam_is_dark_not_an_error(tmp_path):
