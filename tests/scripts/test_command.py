@@ -15,7 +15,7 @@ from astropy.table import QTable
 import astropolcal
 from astropolcal import Calibration, Observations, instruments
 from astropolcal.scripts._simulate import EXAMPLE
-from astropolcal.scripts.main import build_parser, main
+from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 EXAMPLE_FILE = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
@@ -271,9 +271,11 @@ def test_simulate_refuses_nonsense(capsys, tmp_path, arguments, complaint):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_example_settings_are_the_defaults():
-    defaults = build_parser().parse_args(["simulate", "-o", "x"])
-    assert {key: getattr(defaults, key) for key in EXAMPLE} == EXAMPLE
+def test_example_settings_are_the_defaults(tmp_path, capsys):
+    command = ["simulate", "-o", str(tmp_path / "run.ecsv"), "--derotator", "45", "--hwp", "0,45"]
+    assert main([*command, "--json", "-"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert {key: summary[key] for key in EXAMPLE} == EXAMPLE
 
 
 # ---- info and the process -----------------------------------------------------------------
