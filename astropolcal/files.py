@@ -295,8 +295,9 @@ def _sync_folder(folder):
 def check_kind(path, error=AstropolcalError):
     """Refuse to read a pipe, a device or a socket, which may have no end."""
     try:
-        kind = _KINDS.get(stat.S_IFMT(os.stat(path).st_mode))
-    except (OSError, ValueError):
+        # a number would be an open file
+        kind = _KINDS.get(stat.S_IFMT(os.stat(os.fspath(path)).st_mode))
+    except (OSError, TypeError, ValueError):
         # what else is wrong with it is for its reader to say
         return
     if kind:

@@ -60,6 +60,9 @@ _BOUNDS = {
     "paper": {"horizontal": (-360, 0), "diagonal": (-360, 0), "circular": (0, 360)},
 }
 
+# the only one with polarimetry
+_MODE = "broadband JHK"
+
 # The Nasmyth beam switcher came between the two calibration runs of 2025
 _NBS_ABSENT_UNTIL, _NBS_PRESENT_FROM = "2025-07-31", "2025-10-01"
 # how the meta of a table say that an optional optic is out
@@ -260,7 +263,7 @@ class CHARIS(Instrument):
         """Return the meta of a table taken with the chain of `published`."""
         return {
             "instrument": "SCExAO/CHARIS",
-            "mode": "broadband JHK",
+            "mode": _MODE,
             "source": "polarized",
             "yjh50_dichroic": "in",
             "nasmyth_beam_switcher": "installed",
@@ -299,6 +302,10 @@ class CHARIS(Instrument):
         if _beam_switcher(meta, name):
             present.append("nbs")
         return source, tuple(present)
+
+    def mode_header(self, wavelength):
+        """Return the keyword of the mode, see the method of `Instrument`."""
+        return {self.files.keywords["filter"]: _MODE}
 
     def meta_without(self, names):
         """Return what `setup` reads of optics that are out of the beam."""
