@@ -188,6 +188,17 @@ def test_write_that_fails_once_spoils_no_checkpoint(tmp_path, monkeypatch):
     reader.check(reader.read(path), path)
 
 
+@needs_h5py
+def test_limit_below_the_size_of_a_checkpoint(tmp_path):
+    """HDF5 could not close such a file, and would take the process with it in the end."""
+    path, reader = tmp_path / "chain.h5", Checkpoint()
+    reader._run(path, 2)
+    for size in (0, 100):
+        with files_up_to(size), pytest.raises(FitError, match="its first 2 steps are safe"):
+            reader._run(path, 8)
+    reader.check(reader.read(path), path)
+
+
 def test_full_disk_while_a_challenge_is_appended(tmp_path):
     path, settings = tmp_path / "run.jsonl", {"seed": 1}
     _journal(path, settings)

@@ -82,6 +82,8 @@ def check_paths(arguments):
         _check_input(path)
     for _, path in outputs:
         (_check_folder if isinstance(path, Folder) else _check_file)(path)
+    for option, path in _named(arguments, Frames):
+        inputs += [(option, left) for left in _left_files(path)]
     replaced = getattr(arguments, "may_replace", {})
     for number, (option, path) in enumerate(outputs):
         read = [other for name, other in inputs if name != replaced.get(option)]
@@ -94,17 +96,16 @@ def check_paths(arguments):
                 )
 
 
-def check_sources(arguments, files):
-    """Refuse outputs that are among files which are read without being named."""
-    for option, path in _named(arguments, Output):
-        _check_inputs(option, path, [Input(file) for file in files])
+def _left_files(path):
+    """Return the files of left beams that are read with a file of a right beam."""
+    from astropolcal import instruments
 
-
-def left_files(files, layout):
-    """Return the files of left beams, which are read with those of the right beams."""
-    if layout is None or not layout.beam_files:
-        return []
-    return [layout.left_file(path) for path in files if layout.beam_files[0] in Path(path).name]
+    layouts = (instruments.get(name).files for name in instruments.names())
+    return [
+        Input(layout.left_file(path))
+        for layout in layouts
+        if layout is not None and layout.beam_files and layout.beam_files[0] in Path(path).name
+    ]
 
 
 def _named(arguments, kind):

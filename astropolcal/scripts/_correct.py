@@ -16,11 +16,9 @@ from astropolcal.scripts._common import (
     add_json,
     add_online,
     add_quiet,
-    check_sources,
     check_suffix,
     cube_files,
     is_quiet,
-    left_files,
     number_or,
     show,
     wrapped,
@@ -243,7 +241,6 @@ def run(arguments):
     calibration, chain, provenance = choose_calibration(arguments, files)
     instrument = instruments.get(arguments.instrument or calibration.instrument or "charis")
     instrument = configured(instrument, files)
-    check_sources(arguments, left_files(files, instrument.files))
     # one a frame: files of left beams follow those of the right ones
     files = instrument.files.frame_files(files)
     table, centres, scale, left_scale = _headers(files, instrument, arguments)

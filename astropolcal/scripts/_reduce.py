@@ -17,10 +17,8 @@ from astropolcal.scripts._common import (
     add_online,
     add_quiet,
     angles,
-    check_sources,
     check_suffix,
     cube_files,
-    left_files,
     number_or,
     printer,
     show,
@@ -148,7 +146,6 @@ def run(arguments):
     check_suffix("-o", arguments.output, ".ecsv")
     files = cube_files(arguments.cubes)
     instrument = instruments.get(arguments.instrument)
-    check_sources(arguments, left_files(files, instrument.files))
     with tqdm(
         total=len(files), desc="reducing", unit="cube", disable=True if arguments.quiet else None
     ) as bar:

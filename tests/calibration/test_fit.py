@@ -288,6 +288,25 @@ def test_nothing_to_fit_is_refused(few):
         calibrate(fixed, data)
 
 
+def test_start_outside_its_bounds_is_named(few):
+    chain, _, data = few
+    assert calibrate(chain, data, cross_validate=False).converged
+    for optic, key, value, words in (
+        ("hwp", "theta", 9, r"hwp\.theta starts at 9; allowed are -5 to 5 deg"),
+        ("wollaston", "efficiency", 1.5, r"wollaston\.efficiency.* at 1\.5; allowed are 0 to 1$"),
+    ):
+        wrong = chain.copy()
+        parameter = getattr(wrong[optic], key)
+        parameter.fixed, parameter.value = False, np.full(np.shape(parameter.value), value)
+        for fitter in (None, LMLSQFitter()):
+            with pytest.raises(FitError, match=words):
+                calibrate(wrong, data, fitter=fitter)
+    # by a rounding error alone
+    wrong = chain.copy()
+    wrong["hwp"].theta.fixed, wrong["hwp"].theta.value = False, 5 + 1e-9
+    assert calibrate(wrong, data, cross_validate=False).converged
+
+
 def test_more_parameters_than_data_are_refused(make):
     chain = make.chain("elliptical", fixed=False, wavelength=FEW)
     data = make.observe(chain, make.frames([45] * u.deg), FEW, seed=1)

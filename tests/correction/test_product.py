@@ -105,6 +105,17 @@ def test_a_spectrum_without_errors(sky, charis, star, tmp_path):
     assert fits.getheader(tmp_path / "star.fits")["CTYPE2"] == "STOKES"
 
 
+def test_none_of_its_frames_is_replaced(corrected, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "CRSA00000003_cube.fits").write_text("a frame")
+    (tmp_path / "link.fits").symlink_to("CRSA00000003_cube.fits")
+    for name in ("CRSA00000003_cube.fits", "link.fits"):
+        with pytest.raises(ObservationError, match=f"{name}: .*was made from this file"):
+            corrected.write(tmp_path / name, overwrite=True)
+    assert (tmp_path / "CRSA00000003_cube.fits").read_text() == "a frame"
+    corrected.write(tmp_path / "CRSA00000099_cube.fits")
+
+
 def test_a_file_is_not_replaced_unasked(corrected, path):
     before = path.read_bytes()
     with pytest.raises(ObservationError, match="exists already"):

@@ -195,6 +195,10 @@ def test_outputs_that_would_overwrite_something(tmp_path, monkeypatch):
         for first, second in ((one, other), (other, one)):
             with pytest.raises(AstropolcalError, match=f"^-o {second}: .* --json {first}"):
                 check(json=first, output=second)
+    # files of left beams are read with those of the right ones, which are named
+    with pytest.raises(AstropolcalError, match=r"^--json a_cam2\.fits: would overwrite"):
+        check(cubes=[Frames("a_cam1.fits")], json=Output("a_cam2.fits"))
+    check(cubes=[Frames("a_cam1.fits")], json=Output("b_cam2.fits"))
     # what a command goes on with is no input that it would overwrite
     check(files=[table], resume=Continued("old.h5"), output=Output("x"), plots=Folder("figures"))
 
