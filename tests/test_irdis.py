@@ -469,6 +469,7 @@ def test_internal_frames_have_no_sky():
             "frame 1: no keyword ESO INS4 DROT3 BEGIN",
         ),
         ({"ESO TEL ALT": "high"}, ObservationError, "frame 1: ESO TEL ALT = 'high'; a number"),
+        ({"ESO TEL ALT": "6_2"}, ObservationError, "frame 1: ESO TEL ALT = '6_2'; a number"),
         ({"EXPTIME": -1.0}, ObservationError, "frame 1: EXPTIME = '-1.0'; .* at least 0"),
         ({"ESO INS4 COMB ROT": "NONE"}, ObservationError, "allowed are FIELD, PUPIL"),
         ({"ESO TEL PARANG START": None}, ObservationError, "frame 1: no keyword ESO TEL PARANG"),

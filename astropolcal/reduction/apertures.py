@@ -233,6 +233,8 @@ def _weighted(cut, known, weights):
     return np.where(known, flat, 0.0) @ w, area, known @ w
 
 
+# damaged pixels may be beyond all numbers, and are then infinitely far off
+@np.errstate(over="ignore", invalid="ignore")
 def _outliers(cut, known, weights, detector):
     """Return the single pixels that are far off their neighbours."""
     sample = (slice(None), *(index[::_SAMPLED] for index in np.nonzero(weights)))
@@ -266,8 +268,7 @@ def _limits(level, spread, detector):
 def _robust(pixels, known):
     """Return the median of each row and its robust standard deviation, infinite without a value."""
     level = _median(pixels, known)
-    with np.errstate(invalid="ignore"):
-        return level, MAD_TO_SIGMA * _median(np.abs(pixels - level[:, None]), known)
+    return level, MAD_TO_SIGMA * _median(np.abs(pixels - level[:, None]), known)
 
 
 def _median(pixels, known):

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Runs: what is left out and why, resuming, processes, the table, other people's tables."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -226,6 +227,11 @@ def test_frames_of_another_star_pickoff_or_source_are_left_out(tmp_path, small):
     }
 
 
+def test_date_that_would_spoil_the_table_is_refused_before_the_work(tmp_path, small):
+    with pytest.raises(ObservationError, match=r"reduced: date in the meta = 'May' is not a date"):
+        reduce_run([tmp_path / "nowhere.fits"], small, meta={"date": "May"})
+
+
 def test_hot_pixels_are_counted_and_told(tmp_path, small):
     paths = flat_frames(tmp_path, CYCLE)
     clean = reduce_run(paths, small)
@@ -424,9 +430,12 @@ def test_pypolcal_tables(tmp_path):
 
 
 def test_pypolcal_errors_name_file_and_line(tmp_path):
-    path = write_csv(tmp_path / "bin0.csv", 1159.5614, values=["x, 45.0, ?, 1,1,1,1,1,1,1159.5614"])
-    with pytest.raises(ObservationError, match=r"bin0.csv, line 6: RET-ANG1 = '\?'"):
-        read_pypolcal(path)
+    for angle in ("1_0", "?"):
+        row = f"x, 45.0, {angle}, 1,1,1,1,1,1,1159.5614"
+        path = write_csv(tmp_path / "bin0.csv", 1159.5614, values=[row])
+        words = f"bin0.csv, line 6: RET-ANG1 = '{angle}', a number"
+        with pytest.raises(ObservationError, match=re.escape(words)):
+            read_pypolcal(path)
     row = path.read_text().splitlines()[1]
     with pytest.raises(ObservationError, match=r"line 6: .* is given already in .*line 2"):
         read_pypolcal(write_csv(tmp_path / "twice.csv", 1159.5614, values=[row]))
