@@ -141,14 +141,19 @@ def atomic_path(path, error=AstropolcalError):
     ...     (Path(folder) / "note.txt").read_text()
     'all of it'
     """
-    path = Path(path)
-    if not path.name or "\0" in str(path):
-        raise error(f"{str(path)!r}: is no name of a file")
+    path = _named(path, error)
     try:
         with (_poured if _is_stream(path) else _replaced)(path) as temporary:
             yield temporary
     except OSError as problem:
         raise error(f"{path}: cannot be written: {_refusal(problem, path)}") from problem
+
+
+def _named(path, error):
+    path = Path(path)
+    if not path.name or "\0" in str(path):
+        raise error(f"{str(path)!r}: is no name of a file")
+    return path
 
 
 @contextmanager
@@ -179,12 +184,12 @@ def _replaced(path):
 
 
 def _keep_permissions(path, old):
-    if hasattr(os, "chown"):
-        # group, then owner: the second is for root only
-        for owner in ((-1, old.st_gid), (old.st_uid, -1)):
-            with suppress(OSError):
-                os.chown(path, *owner)
-    os.chmod(path, stat.S_IMODE(old.st_mode))
+    # as far as the file system has them; to give a file away is for root only
+    with suppress(AttributeError, OSError):
+        os.chown(path, -1, old.st_gid)
+        os.chown(path, old.st_uid, -1)
+    with suppress(OSError):
+        os.chmod(path, stat.S_IMODE(old.st_mode))
 
 
 @contextmanager
@@ -223,6 +228,7 @@ def _standard_stream(path):
 
 def append_line(path, line, error=AstropolcalError):
     """Append a line to a file, which is on the disk then; all of it or nothing."""
+    path = _named(path, error)
     try:
         is_new = not os.path.exists(path)
         with open(path, "ab", buffering=0) as stream:
@@ -232,10 +238,10 @@ def append_line(path, line, error=AstropolcalError):
                 os.fsync(stream.fileno())
             except BaseException:
                 with suppress(OSError):
-                    os.remove(path) if is_new else stream.truncate(size)
+                    os.remove(os.path.realpath(path)) if is_new else stream.truncate(size)
                 raise
     except OSError as problem:
-        raise error(f"{path}: cannot be written: {_refusal(problem, Path(path))}") from problem
+        raise error(f"{path}: cannot be written: {_refusal(problem, path)}") from problem
 
 
 def write_bytes(number, content):
@@ -262,7 +268,7 @@ def _hidden(path):
     suffix = path.suffix if len(os.fsencode(path.suffix)) < 50 else ""
     # what is left for the stem beside two numbers, in bytes; a character may have four
     room = _LONGEST_NAME - len(os.fsencode(suffix)) - 30
-    stem = os.fsdecode(os.fsencode(path.stem[:100])[:room])
+    stem = os.fsencode(path.stem[:100])[:room].decode(errors="ignore")
     return f".{stem}.", f".tmp{suffix}"
 
 

@@ -93,8 +93,9 @@ def save_all(calibration, folder):
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise AstropolcalError(f"{folder}: cannot be created: {error.strerror or error}") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise AstropolcalError(f"{folder}: cannot be created: {reason}") from error
     paths = []
     for name, draw in _figures(calibration):
         try:

@@ -41,8 +41,9 @@ def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):
     folder = directory / "raw" if raw else directory
     try:
         folder.mkdir(exist_ok=True, parents=True)
-    except OSError as error:
-        raise ObservationError(f"{folder}: cannot be made: {error.strerror}") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ObservationError(f"{folder}: cannot be made: {reason}") from error
     return names
 
 

@@ -82,7 +82,7 @@ class Journal:
     def _key(self, path):
         try:
             state = os.stat(path)
-        except OSError:
+        except (OSError, ValueError):
             return None
         return f"{Path(path).resolve()}|{state.st_size}|{state.st_mtime_ns}|{self._settings}"
 

@@ -83,7 +83,8 @@ def check_paths(arguments):
     for _, path in outputs:
         (_check_folder if isinstance(path, Folder) else _check_file)(path)
     for option, path in _named(arguments, Frames):
-        inputs += [(option, left) for left in _left_files(path)]
+        if os.path.isfile(path):
+            inputs += [(option, left) for left in _left_files(path)]
     replaced = getattr(arguments, "may_replace", {})
     for number, (option, path) in enumerate(outputs):
         read = [other for name, other in inputs if name != replaced.get(option)]
@@ -139,6 +140,8 @@ def _check_file(path):
         # a pipe or a device takes what it is given, and no file is made beside it
         _check_writable(path, path)
         return
+    if state is not None and isinstance(path, Continued):
+        _check_writable(path, path)
     # a link stays a link, and what it points to is replaced
     folder = Path(os.path.realpath(path) if os.path.islink(path) else path).parent
     if not os.path.isdir(folder):
@@ -187,10 +190,7 @@ def _check_inputs(option, path, inputs):
             raise AstropolcalError(
                 f"{_label(option)} {path}: would overwrite the input {other}; name another file"
             )
-        if os.path.isdir(other) and (
-            _is_within(path, other)
-            or any(_are_same(path, p) for p in Path(other).iterdir() if other.kinds.search(p.name))
-        ):
+        if os.path.isdir(other) and (_is_within(path, other) or _holds(other, path)):
             raise AstropolcalError(
                 f"{_label(option)} {path}: is one of the files that are read from {other}; name "
                 "another folder"
@@ -204,6 +204,12 @@ def _collide(path, other):
     # a file is no folder in which another could be
     inside = os.path.realpath(other).startswith(os.path.realpath(path) + os.sep)
     return _are_same(path, other) or inside
+
+
+def _holds(folder, path):
+    """Return whether an existing file is, by any name, one of those that belong in a folder."""
+    names = (name for name in os.listdir(folder) if folder.kinds.search(name))
+    return os.path.isfile(path) and any(_are_same(path, os.path.join(folder, n)) for n in names)
 
 
 def _is_within(path, folder):

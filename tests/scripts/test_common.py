@@ -196,6 +196,7 @@ def test_outputs_that_would_overwrite_something(tmp_path, monkeypatch):
             with pytest.raises(AstropolcalError, match=f"^-o {second}: .* --json {first}"):
                 check(json=first, output=second)
     # files of left beams are read with those of the right ones, which are named
+    Path("a_cam1.fits").write_text("x")
     with pytest.raises(AstropolcalError, match=r"^--json a_cam2\.fits: would overwrite"):
         check(cubes=[Frames("a_cam1.fits")], json=Output("a_cam2.fits"))
     check(cubes=[Frames("a_cam1.fits")], json=Output("b_cam2.fits"))
