@@ -42,6 +42,7 @@ def test_table_has_a_row_a_frame_and_wavelength(loaded, table):
 
 def test_one_frame_from_its_header(loaded):
     header = {"MJD": 60988.5, "RET-ANG1": 22.5, "D_IMRANG": 60.0, "INSTRUME": "CHARIS"}
+    header["FILTNAME"] = "broadband JHK"
     one = mueller_table(loaded, header, light="internal")
     assert len(one) == 3
     assert one["hwp"].to_value(u.deg) == pytest.approx([22.5] * 3)
