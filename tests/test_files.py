@@ -204,6 +204,7 @@ def test_a_link_stays_a_link(tmp_path):
     assert (folder / "old.txt").read_text() == "chain"
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
 def test_a_pipe_stays_a_pipe(tmp_path):
     path, got = tmp_path / "pipe.txt", []
     os.mkfifo(path)
@@ -357,6 +358,7 @@ def test_whatever_goes_wrong_is_one_line(problem, words):
     assert str(caught.value).startswith(f"a.json: {words}")
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
 def test_what_may_have_no_end_is_not_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with socket.socket(socket.AF_UNIX) as ears:
