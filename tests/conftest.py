@@ -5,7 +5,6 @@ import os
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, is_hypothesis_test, settings
 
@@ -116,6 +115,9 @@ def shared_data():
 @pytest.fixture
 def other_svd(monkeypatch):
     """Function after which singular vectors are others that are as good."""
+    # not above: the number of threads has to be set before
+    import numpy as np
+
     real = np.linalg.svd
 
     def svd(matrix, full_matrices=True, compute_uv=True, **options):

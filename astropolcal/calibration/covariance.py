@@ -192,7 +192,8 @@ class Covariance:
     @property
     def correlation(self):
         """Correlation matrix, shape (n, n), NaN where not determined."""
-        return self.matrix / np.outer(self.stds, self.stds)
+        stds = self.stds
+        return self.matrix / np.outer(stds, stds)
 
     def propagate(self, slopes):
         """
