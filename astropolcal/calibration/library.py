@@ -41,7 +41,7 @@ from astropolcal.calibration.validity import (
     with_validity,
 )
 from astropolcal.exceptions import CalibrationFileError, InstrumentError
-from astropolcal.files import atomic_path, one_line
+from astropolcal.files import atomic_path, check_kind, one_line
 from astropolcal.version import version as our_version
 
 __all__ = ["Entry", "Library"]
@@ -153,8 +153,10 @@ class Library:
         self.source = Path(source) if one else None
         self._files = [self.source] if one else [Path(path) for path in source]
         for path in self._files:
-            if not path.exists():
-                raise CalibrationFileError(f"{path}: no such file or folder")
+            # os.path answers where pathlib raises: the name may be one that no system takes
+            if not os.path.exists(path):
+                raise CalibrationFileError(f"{one_line(path)}: no such file or folder")
+            check_kind(path, CalibrationFileError)
         self._scan()
 
     @property

@@ -236,8 +236,11 @@ def test_library_of_files_and_of_one(calibration, library, tmp_path):
     assert Library(str(path)).find().path == path.resolve()
     with refused("only a folder can be added to"):
         Library(path).add(calibration)
-    with refused("no such file or folder"):
-        Library(tmp_path / "nowhere")
+    for name in ("nowhere", "n" * 300, "a\0b"):
+        with refused("no such file or folder"):
+            Library(tmp_path / name)
+    with refused("is a device"):
+        Library(os.devnull)
 
 
 def test_changed_file_is_read_again(calibration, library):
