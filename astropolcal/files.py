@@ -316,7 +316,7 @@ def understood(path, error, words, *, reads=True):
     Turn whatever goes wrong in a reader into one line that names the file.
 
     Parsers raise errors of every kind for a damaged file. Errors of ours pass unchanged. What
-    is no regular file is refused before it is opened, see `check_kind`.
+    is no regular file is refused before it is opened, see ``check_kind``.
 
     Parameters
     ----------

@@ -279,7 +279,7 @@ def iso_date(value, name="date", error=ParameterError, *, months=False):
 
     Parameters
     ----------
-    value : str, number, `datetime.date`, `datetime.datetime` or `~astropy.time.Time`
+    value : str, number, ``datetime.date``, ``datetime.datetime`` or `~astropy.time.Time`
         In UTC: ``YYYY-MM-DD``, perhaps with a time of day, ``YYYYMMDD``, or a Modified Julian
         Date of five digits and perhaps a fraction.
     name : str
