@@ -236,8 +236,8 @@ def _walk(stream, path, error, count, whole, **limits):
         claims = _header(stream, number)
         if claims is None:
             return
-        size = _data_size(claims)
-        if number + 1 == count < MOST_HDUS:
+        size, last = _data_size(claims), number + 1 == count < MOST_HDUS
+        if last:
             # of data that are not read the sum is what the header says
             wrong = _wrong_sum(claims, None if size else 0)
         else:
@@ -252,7 +252,7 @@ def _walk(stream, path, error, count, whole, **limits):
                 f"{path}: {wrong} in HDU {number}: it was changed after it was written, is "
                 "damaged, or has the header of another file"
             )
-        if number + 1 == count < MOST_HDUS:
+        if last:
             return
     if stream.read(1):
         raise ValueError(f"more than {MOST_HDUS} HDUs")

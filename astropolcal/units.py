@@ -316,7 +316,7 @@ def iso_date(value, name="date", error=ParameterError, *, months=False):
             # leap seconds of years far off are not known, and do not matter here
             warnings.simplefilter("ignore", ErfaWarning)
             return _iso_date(_date_text(value), months)
-    except ValueError:
+    except Exception:  # astropy raises errors of many kinds
         month = "2025-10, " if months else ""
         raise error(
             f"{name} = {one_line(repr(value), 60)} is not a date; allowed are 2025-10-05, "

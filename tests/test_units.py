@@ -205,7 +205,8 @@ def test_what_is_no_date_is_refused():
         *("0000-00-00", "0001-01-01", "2025-13-01", "2025-02-30", "20250230", "18991231", 2025),
         *("12345", 39999, 100000, "60_953", "2025-10", "2025", "", "unknown", True, "J2025.7"),
         *("\u0662\u0660\u0662\u0665-10-05", "\uff16\uff10\uff19\uff15\uff13", [], np.nan),
-        Time(["2025-10-05"]),
+        *(Time(["2025-10-05"]), Time("2025-10-05", scale="local"), datetime.time(12)),
+        datetime.datetime(1, 1, 1, tzinfo=datetime.timezone(datetime.timedelta(hours=10))),
     ):
         with pytest.raises(ParameterError, match="is not a date; allowed are 2025-10-05") as caught:
             iso_date(date)
