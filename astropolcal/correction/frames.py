@@ -146,14 +146,17 @@ class ScienceFrames:
     def _totals(self, w, pixels):
         """Return the light of both beams in some pixels, NaN for none; and which pixels lack."""
         totals = np.empty((2, self.source.n_frames))
-        missing = np.empty((2, self.source.n_frames, int(pixels.sum())), dtype=bool)
+        missing = np.zeros((2, self.source.n_frames, int(pixels.sum())), dtype=bool)
         for frames in self.source.batches():
             for beam in (0, 1):
                 found = self.source.fluxes(beam, frames, slice(w, w + 1))
                 found = found.reshape(len(found), -1)[:, pixels]
-                lacks = missing[beam, frames] = ~np.isfinite(found)
-                sums = np.where(lacks, 0.0, found).sum(axis=1)
-                totals[beam, frames] = np.where(lacks.all(axis=1), np.nan, sums)
+                sums = found.sum(axis=1)
+                if not np.isfinite(sums).all():
+                    lacks = missing[beam, frames] = ~np.isfinite(found)
+                    sums = np.where(lacks, 0.0, found).sum(axis=1)
+                    sums[lacks.all(axis=1)] = np.nan
+                totals[beam, frames] = sums
         return totals, missing.reshape(-1, missing.shape[2])
 
     @classmethod
