@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from astropolcal import Observations, calibrate
 from astropolcal.calibration import with_validity
-from astropolcal.correction import ScienceFrames, correct, derotate
+from astropolcal.correction import ScienceFrames, correct, derotate, sky_chain
 from astropolcal.exceptions import (
     AstropolcalWarning,
     CalibrationFileError,
@@ -563,3 +564,36 @@ def test_systematic_errors_against_those_of_double_differences(calibration, char
     theirs = derived_sky(calibration, 0.1, -0.04, plus, chain=charis.on_sky(calibration.chain)).std
     np.testing.assert_allclose(ours["q"], theirs[:, 0], rtol=0.02)
     np.testing.assert_allclose(ours["u"], theirs[:, 1], rtol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*unstable lamp")
+def test_claims_agree_with_what_is_left_of_real_standards(shared_data, charis):
+    """Unpolarized stars that the calibration was fitted to: nothing should be left."""
+    folder = shared_data / "data" / "charis"
+    for names, most in (
+        (("dataset3_polarized_2025-10-05", "dataset4_unpolarized_2025-10-05",
+          "hd293396_unpolarized_standard_2025-11-03"), 6e-4),
+        (("dataset1_polarized_2025-07-15", "hd35532_unpolarized_standard"), 3.5e-4),
+    ):  # fmt: skip
+        tables = [charis.prepare(Observations.read(folder / f"{name}.ecsv")) for name in names]
+        fitted = calibrate(charis.chains_for(tables), tables, instrument="charis")
+        star = tables[-1]
+        frames = ScienceFrames.from_arrays(
+            star.flux_right,
+            star.flux_left,
+            star.wavelength,
+            dict(charis.positions(star, sky_chain(fitted))),
+            hwp=star.frames["hwp"],
+            date=star.meta.get("date", "2025-07-15"),
+            mode=star.meta["mode"],
+        )
+        found = correct(fitted, frames)
+        left = np.sqrt(np.mean(found.q**2 + found.u**2))
+        errors = found.fractional_errors("systematic")
+        claimed = np.sqrt(np.mean(errors["q"] ** 2 + errors["u"] ** 2))
+        assert left < most
+        assert 1 / 1.5 < left / claimed < 1.5
+        # unequal gains of the beams, and what else is the same in both frames of a pair
+        plain = correct(fitted, frames, observable="intensity")
+        assert np.sqrt(np.mean(plain.q**2 + plain.u**2)) > 2 * left
