@@ -42,6 +42,7 @@ OPTIC_MODULES = {
     "PolarizedSource": "sources",
     "PowerLawMirror": "mirrors",
     "Rotator": "rotators",
+    "StarSource": "sources",
     "StrayLight": "fluxes",
     "TwoLayerWaveplate": "retarders",
     "VectorDiattenuator": "polarizers",

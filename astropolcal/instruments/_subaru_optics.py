@@ -5,6 +5,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
+from astropolcal.instruments.telescope import mounted
 
 #: Longitude, latitude (deg) and height (m) of the Subaru Telescope.
 SITE = (-155.4761, 19.8255, 4139.0)
@@ -28,4 +29,4 @@ def polarizer():
 
 def fold_mirror(size):
     """Return the mirror that polarizes the lamp where the polarizer is out."""
-    return optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror")
+    return mounted(optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror"))

@@ -16,6 +16,7 @@ from astropolcal.exceptions import (
     InstrumentError,
 )
 from astropolcal.observations import is_star
+from astropolcal.units import to_unit
 
 __all__ = [
     "INTERNAL",
@@ -23,6 +24,7 @@ __all__ = [
     "STARS",
     "behind_telescope",
     "k_mirror",
+    "mounted",
     "published_mirror",
     "star_options",
     "star_source",
@@ -46,8 +48,18 @@ _FILM_START = 60 * u.nm
 _DEROTATOR_FILM = 262.56 * u.nm
 # what measured silver films differ by from one another (n by far more than k)
 _N_SPREAD, _K_SPREAD = 0.5, 0.1
-# no catalogue polarization is known better than this, so that no datum weighs without limit
-_LEAST_ERROR = 1e-4
+# how far optics that are bolted to their place stand from their nominal orientation
+_MOUNTING = 0.3 * u.deg
+# q and u of an unpolarized star of which no source states an error
+_UNPOLARIZED = 1e-3
+# Share by which the degree of polarized stars departs from the law: beyond 1.5 um it falls with a
+# power of the wavelength, slower than the law (Martin & Whittet 1990, ApJ 357, 113).
+_DEPARTURE = 0.2
+# Departures of a star's q and u hang together over a factor of two in the wavelength. The first
+# three terms of a process with a squared exponential correlation of length L in its logarithm have
+# normal coefficients of widths 1, 1 / L and 1 / (sqrt(2) L^2).
+_LENGTH = np.log(2)
+_WIDTHS = {"": 1.0, "_slope": 1 / _LENGTH, "_curvature": 1 / (np.sqrt(2) * _LENGTH**2)}
 
 
 def tertiary_mirror(model, wavelength, name="m3"):
@@ -70,6 +82,7 @@ def tertiary_mirror(model, wavelength, name="m3"):
     Returns
     -------
     Optic
+        Its orientation has a normal prior, see `mounted`.
 
     Examples
     --------
@@ -82,20 +95,21 @@ def tertiary_mirror(model, wavelength, name="m3"):
     if model == "power law":
         bounds = {key: (0.5 * start, 2 * start) for key, start in _START.items()}
         # the bounds of the paper, half to twice its start
-        return optics.PowerLawMirror(name=name, bounds=bounds, **_START)
+        return mounted(optics.PowerLawMirror(name=name, bounds=bounds, **_START))
     if model == "metal":
         free = dict.fromkeys(("film_thickness", "n_scale", "k_scale"), False)
         bounds = {"film_thickness": (0, 500), "n_scale": (0.05, 20), "k_scale": (0.5, 2)}
         mirror = optics.MetalMirror(
             material="silver", film_thickness=_FILM_START, name=name, fixed=free, bounds=bounds
         )
-        return _with_metal_priors(mirror)
-    return optics.DiattenuatorRetarder(
+        return mounted(_with_metal_priors(mirror))
+    mirror = optics.DiattenuatorRetarder(
         diattenuation=np.full(wavelength.size, 0.01),
         retardance=optics.PowerLawMirror(**_PUBLISHED).retardance(wavelength),
         name=name,
         fixed={"retardance": True},
     )
+    return mounted(mirror)
 
 
 def k_mirror(*, fixed, bounds, **settings):
@@ -191,6 +205,37 @@ def _normal(mean, std):
     return norm(mean, std)
 
 
+def mounted(optic, tolerance=_MOUNTING):
+    """
+    Return an optic whose orientation is known as well as its mounting.
+
+    A calibration then finds ``theta`` with a normal prior around its present value, in place of
+    taking it as exact.
+
+    Parameters
+    ----------
+    optic : Optic
+        The optic; it is changed.
+    tolerance : `~astropy.units.Quantity`
+        Standard deviation of the prior.
+
+    Returns
+    -------
+    Optic
+        The same.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.instruments.telescope import mounted
+    >>> float(mounted(optics.Diattenuator(name="fold_mirror")).theta.prior.std())
+    0.3
+    """
+    spread = tolerance.to_value(optic.theta.unit)
+    optic.theta.fixed, optic.theta.prior = False, _normal(float(optic.theta.value), spread)
+    return optic
+
+
 def star_source(source, wavelength, name="star", target=None):
     """
     Return the source optic of a star.
@@ -198,19 +243,20 @@ def star_source(source, wavelength, name="star", target=None):
     Parameters
     ----------
     source : str
-        ``"unpolarized standard star"`` is one of zero polarization, fixed. Of any other
-        star q and u are free, one a wavelength.
+        ``"unpolarized standard star"``: q and u are zero with the error of the catalogue, or
+        0.1 % where no source states one; they may change smoothly with the wavelength.
+        ``"polarized standard star"``: a Serkowski law with the errors of the catalogue. Both are
+        normal priors of free parameters. Of any other star q and u are free at each wavelength.
     wavelength : `~astropy.units.Quantity`
         Grid.
     name : str
         Name of the optic.
     target : str, optional
-        Name of the star. What the catalogue of standards knows of it, at wavelengths where it
-        does, gives start and prior of a polarized star.
+        Name of the star in the catalogue of standards.
 
     Returns
     -------
-    PolarizedSource
+    StarSource or PolarizedSource
 
     Raises
     ------
@@ -228,24 +274,73 @@ def star_source(source, wavelength, name="star", target=None):
     >>> import astropy.units as u
     >>> from astropolcal.instruments.telescope import star_source
     >>> star = star_source("polarized standard star", [1.25, 1.65] * u.um, target="HD 30675")
-    >>> star.u.value.round(3).tolist()
+    >>> q, stokes_u = star.stokes([1.25, 1.65] * u.um)
+    >>> stokes_u.round(3).tolist()
     [0.016, 0.009]
     """
     if target and source.endswith("standard star"):
         _check_standard(source, target)
     if source == "unpolarized standard star":
-        return optics.PolarizedSource(name=name, fixed={"q": True, "u": True})
-    known = _catalogued(target, wavelength)
+        return _unpolarized_star(wavelength, name, target)
+    if source == "polarized standard star" and target:
+        return _polarized_star(wavelength, name, target)
     zero = np.zeros(wavelength.size)
-    if known is None:
-        return optics.PolarizedSource(q=zero, u=zero, name=name)
-    star = optics.PolarizedSource(q=known.q, u=known.u, name=name)
-    if known.covariance is not None:
-        for i, key in enumerate(("q", "u")):
-            error = np.sqrt(np.asarray(known.covariance)[..., i, i])
-            mean = np.asarray(getattr(known, key))
-            getattr(star, key).prior = _normal(mean, np.maximum(error, _LEAST_ERROR))
+    return optics.PolarizedSource(q=zero, u=zero, name=name)
+
+
+def _unpolarized_star(wavelength, name, target):
+    """Return a star whose q and u are zero as far as the catalogue knows."""
+    try:
+        error = standards.get(target).uncertainty() if target else _UNPOLARIZED
+    except AstropolcalError:
+        error = _UNPOLARIZED
+    values = {
+        f"{key}{suffix}": (0.0, error * w) for key in "qu" for suffix, w in _smooth(wavelength)
+    }
+    return _with_priors(name, _middle(wavelength), values)
+
+
+def _polarized_star(wavelength, name, target):
+    """Return a star with the interstellar polarization of the catalogue."""
+    law, errors = standards.get(target).interstellar()
+    longest, middle = law.lambda_max.quantity, _middle(wavelength)
+    # the catalogue's change of the angle is one per wavelength, here it is one per logarithm
+    per_log = (middle - longest) / np.log(middle / longest)
+    departure = _DEPARTURE * law(middle).to_value(u.one)
+    values = {
+        "p_max": (law.p_max.value, errors["p_max"]),
+        "lambda_max": (longest, errors["lambda_max"]),
+        "K": (law.K.value, errors["K"]),
+        "theta": (law.theta.quantity, errors["theta"]),
+        "rotation": (law.rotation.quantity * per_log, errors["rotation"] * per_log),
+    }
+    # the degree may depart from the law; its angle is better known than that
+    values |= {f"q{suffix}": (0.0, departure * w) for suffix, w in _smooth(wavelength)}
+    return _with_priors(name, middle, values)
+
+
+def _with_priors(name, reference, values):
+    """Return a star with normal priors: parameter to mean and standard deviation."""
+    star = optics.StarSource(
+        name=name,
+        reference=reference,
+        fixed={key: key not in values for key in optics.StarSource.param_names},
+        **{key: mean for key, (mean, _) in values.items()},
+    )
+    for key, numbers in values.items():
+        parameter = getattr(star, key)
+        # a prior is one of the value in the unit of the parameter
+        parameter.prior = _normal(*(float(to_unit(x, parameter.unit, key)) for x in numbers))
     return star
+
+
+def _middle(wavelength):
+    return np.sqrt(wavelength.min() * wavelength.max())
+
+
+def _smooth(wavelength):
+    """Return the terms of a smooth departure: at one wavelength no slope, at two no curvature."""
+    return list(_WIDTHS.items())[: wavelength.size]
 
 
 def _check_standard(source, target):
@@ -269,16 +364,6 @@ def _check_standard(source, target):
             f"{target} is {known.kind} according to the catalogue, but the table's source is "
             f"{source!r}"
         )
-
-
-def _catalogued(target, wavelength):
-    """Return the Stokes parameters of the catalogue, None where it has none."""
-    if not target:
-        return None
-    try:
-        return standards.get(target).stokes(wavelength)
-    except AstropolcalError:
-        return None
 
 
 def behind_telescope(chain, name):

@@ -31,7 +31,7 @@ from astropolcal.optics.polarizers import (
 )
 from astropolcal.optics.retarders import EllipticalRetarder, LinearRetarder, TwoLayerWaveplate
 from astropolcal.optics.rotators import Rotator
-from astropolcal.optics.sources import PolarizedSource
+from astropolcal.optics.sources import PolarizedSource, StarSource
 
 __all__ = [
     "COORDINATES",
@@ -60,6 +60,7 @@ __all__ = [
     "PolarizedSource",
     "PowerLawMirror",
     "Rotator",
+    "StarSource",
     "StrayLight",
     "TwoLayerWaveplate",
     "VectorDiattenuator",
@@ -93,6 +94,7 @@ OPTICS = {
         PolarizedSource,
         PowerLawMirror,
         Rotator,
+        StarSource,
         StrayLight,
         TwoLayerWaveplate,
         VectorDiattenuator,

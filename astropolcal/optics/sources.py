@@ -1,13 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Sources of known or unknown polarization, such as standard stars."""
 
+import astropy.units as units
 import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.optics._matrices import blank
 from astropolcal.optics.core import Optic
 
-__all__ = ["PolarizedSource"]
+__all__ = ["PolarizedSource", "StarSource"]
 
 
 class PolarizedSource(Optic):
@@ -59,3 +60,171 @@ def _unit_element(row, q, u):
     out = blank(q, u)
     out[..., row, 0] = 1.0
     return np.asarray(out)
+
+
+class StarSource(PolarizedSource):
+    r"""
+    Star whose polarization follows a smooth law in wavelength.
+
+    .. math::
+
+        q + i u = p_\mathrm{max} \exp\left[-K \ln^2(\lambda_\mathrm{max} / \lambda)
+                  + 2 i \rho \ln(\lambda / \lambda_\mathrm{max})\right] + a + b x + c x^2,
+                  \qquad x = \ln(\lambda / \lambda_0)
+
+    The first part is interstellar (Serkowski, Mathewson & Ford 1975, ApJ 196, 261,
+    doi:10.1086/153410), along ``theta`` but for its rotation :math:`\rho`. The second,
+    with :math:`a = \mathtt{q} + i\,\mathtt{u}` and so on, is what else a star has: all of it for
+    one that is unpolarized as far as anyone knows, the departure from the law for others.
+    Bounds of single parameters do not keep every sum possible; priors do.
+
+    Parameters
+    ----------
+    q, u : float
+        Further q and u at the reference wavelength.
+    p_max : float
+        Largest degree of the interstellar polarization.
+    lambda_max : `~astropy.units.Quantity`
+        Wavelength at which it is reached.
+    K : float
+        Width of the law.
+    rotation : `~astropy.units.Quantity`
+        Change of the angle per unit of the natural logarithm of the wavelength.
+    q_slope, u_slope, q_curvature, u_curvature : float
+        Changes of ``q`` and ``u`` with the logarithm of the wavelength and its square.
+    reference : `~astropy.units.Quantity`
+        The wavelength :math:`\lambda_0` at which ``q`` and ``u`` hold; fixed.
+    theta : `~astropy.units.Quantity`
+        Angle of the interstellar polarization at ``lambda_max``, and of the axis of q.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import StarSource
+    >>> star = StarSource(p_max=0.04, theta=45 * u.deg, name="star")
+    >>> q, stokes_u = star.stokes(550 * u.nm)
+    >>> round(float(q), 6), round(float(stokes_u), 6)
+    (0.0, 0.04)
+    """
+
+    p_max = Parameter(default=0.0, bounds=(0, 0.7), description="largest interstellar degree")
+    lambda_max = Parameter(
+        default=550.0,
+        unit=units.nm,
+        bounds=(100, 2500),
+        fixed=True,
+        description="wavelength of the largest interstellar polarization",
+    )
+    K = Parameter(default=0.923, bounds=(0, 5), fixed=True, description="width of the law")
+    rotation = Parameter(
+        default=0.0,
+        unit=units.deg,
+        bounds=(-90, 90),
+        fixed=True,
+        description="change of the angle per unit of the logarithm of the wavelength",
+    )
+    q_slope = Parameter(default=0.0, bounds=(-1, 1), description="slope of q in the logarithm")
+    u_slope = Parameter(default=0.0, bounds=(-1, 1), description="slope of u in the logarithm")
+    q_curvature = Parameter(default=0.0, bounds=(-1, 1), description="curvature of q")
+    u_curvature = Parameter(default=0.0, bounds=(-1, 1), description="curvature of u")
+    reference = Parameter(
+        default=1000.0,
+        unit=units.nm,
+        bounds=(100, 10000),
+        fixed=True,
+        description="wavelength at which q and u hold",
+    )
+
+    def stokes(self, wavelength):
+        """
+        Return q and u of the star.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Shape (n_wavelengths,) or a scalar.
+
+        Returns
+        -------
+        q, u : `~numpy.ndarray`
+        """
+        matrix = self.mueller(wavelength)
+        return matrix[..., 1, 0], matrix[..., 2, 0]
+
+    def loosened(self, wavelength):
+        """
+        Return the source with the q and u that the law has at each wavelength, held.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Shape (n_wavelengths,).
+
+        Returns
+        -------
+        PolarizedSource
+        """
+        upright = self.with_parameters(theta=0 * units.deg)
+        upright.mount = None
+        q, u = upright.stokes(wavelength)
+        loose = PolarizedSource(
+            q=q,
+            u=u,
+            theta=self.theta.quantity,
+            fixed={"q": True, "u": True},
+            **super()._settings(),
+        )
+        for key in ("fixed", "bounds", "prior"):
+            setattr(loose.theta, key, getattr(self.theta, key))
+        return loose
+
+    def _dispersion(self, wavelength):
+        return np.asarray(wavelength)
+
+    def _matrix(self, wavelength, q, u, *law):
+        degree, angle, *_ = _interstellar(wavelength, *law[:4])
+        x, (q1, u1, q2, u2) = np.log(wavelength / law[8]), law[4:8]
+        return super()._matrix(
+            wavelength,
+            q + q1 * x + q2 * x**2 + degree * np.cos(2 * angle),
+            u + u1 * x + u2 * x**2 + degree * np.sin(2 * angle),
+        )
+
+    def _derivatives(self, wavelength, q, u, *law):
+        (_, longest, width, rotation), slopes, reference = law[:4], law[4:8], law[8]
+        degree, angle, log, shape = _interstellar(wavelength, *law[:4])
+        x = np.log(wavelength / reference)
+        # changes of q + iu, in the order of the parameters
+        along = np.exp(2j * angle)
+        slope, curvature = slopes[0] + 1j * slopes[1], slopes[2] + 1j * slopes[3]
+        changes = (
+            1.0,
+            1j,
+            shape * along,
+            # the logarithm grows by 1 / lambda_max, and the angle falls by rotation times that
+            -2 * (width * log + 1j * rotation) * degree * along / longest,
+            -(log**2) * degree * along,
+            -2j * log * degree * along,
+            x,
+            1j * x,
+            x**2,
+            1j * x**2,
+            # x falls by 1 / reference
+            -(slope + 2 * curvature * x) / reference,
+        )
+        shape = np.broadcast(wavelength, q, u, *law).shape
+        return tuple(_column(np.broadcast_to(change, shape)) for change in changes)
+
+
+def _interstellar(wavelength, p_max, lambda_max, width, rotation):
+    """Return degree and angle, the logarithm of lambda_max over the wavelength, and the shape."""
+    log = np.log(lambda_max / wavelength)
+    shape = np.exp(-width * log**2)
+    return p_max * shape, -rotation * log, log, shape
+
+
+def _column(change):
+    out = blank(change)
+    out[..., 1, 0] = change.real
+    out[..., 2, 0] = change.imag
+    return out

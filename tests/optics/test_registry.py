@@ -88,6 +88,16 @@ def polarized_source(q, u):
     return light[..., :, None] * np.array([1.0, 0, 0, 0])
 
 
+def star_source(p_max, lambda_max, K, rotation, reference, **departure):
+    ratio = (lambda_max / WAVELENGTH).to_value(u.one)
+    chi = (-rotation * np.log(ratio)).to_value(u.rad)
+    light = p_max * np.exp(-K * np.log(ratio) ** 2) * np.exp(2j * chi)
+    x = np.log((WAVELENGTH / reference).to_value(u.one))
+    for key, power in (("{}", 0), ("{}_slope", 1), ("{}_curvature", 2)):
+        light = light + (departure[key.format("q")] + 1j * departure[key.format("u")]) * x**power
+    return polarized_source(light.real, light.imag)
+
+
 def coated(metal, reflections, incidence, film_thickness, n_scale, k_scale):
     """Diattenuator-retarder of metal mirrors, wavelength by wavelength and in a row."""
     index = get_material(metal).index(WAVELENGTH).value
@@ -378,6 +388,18 @@ CASES = {
         incidence=st.floats(2, 80),
     ),
     "Rotator": case(optics.Rotator, lambda: mueller.rotation_matrix(0 * u.deg)),
+    "StarSource": case(
+        optics.StarSource,
+        star_source,
+        p_max=st.floats(0, 0.1),
+        lambda_max=st.floats(400, 800),
+        K=st.floats(0.5, 1.5),
+        rotation=st.floats(-20, 20),
+        reference=st.floats(800, 2000),
+        **dict.fromkeys(
+            ("q", "u", "q_slope", "u_slope", "q_curvature", "u_curvature"), st.floats(-0.1, 0.1)
+        ),
+    ),
     "TwoLayerWaveplate": case(
         optics.TwoLayerWaveplate,
         lambda w_sio2, w_mgf2: mueller.linear_retarder(two_layer_retardance(w_sio2, w_mgf2)),
