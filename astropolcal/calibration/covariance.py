@@ -14,12 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.calibration._directions import declared_step
-from astropolcal.calibration.weighting import (
-    Weighting,
-    around,
-    noise_by_dataset,
-    weighting_of,
-)
+from astropolcal.calibration._scatter import Scatter
+from astropolcal.calibration.weighting import Weighting, around, weighting_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor
 
@@ -363,9 +359,9 @@ def covariance_around(measurement, whitened, weighting):
     """
     Return the covariance with its directions, of a problem that is decomposed once.
 
-    Where one level of noise weighted the data of several datasets, the residuals of each say how
-    far it scatters, and the covariance is the sandwich of these (White 1980, Econometrica 48,
-    817): a quiet star does not inherit the misfit of a lamp.
+    It is the sandwich (White 1980, Econometrica 48, 817) of how the residuals scatter and hang
+    together at the wavelengths, pairs and settings of each dataset; where residuals do not tell
+    it, that of independent data.
 
     Parameters
     ----------
@@ -380,13 +376,16 @@ def covariance_around(measurement, whitened, weighting):
     -------
     Covariance
     """
+    scatter = Scatter(measurement, weighting, whitened)
+    if not (scatter.is_known and weighting.is_known):
+        return white_covariance(measurement, whitened, weighting)
+    prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T * weighting.level
+    return sandwich(measurement, whitened, scatter.middle() + prior.T @ prior)
+
+
+def white_covariance(measurement, whitened, weighting):
+    """Return the covariance of independent data with the noise that the fit assumed."""
     free, level = measurement.free, weighting.level
-    sigma = noise_by_dataset(measurement, weighting, whitened)
-    if sigma is not None:
-        # derivatives to the determined directions, each in units of its standard error
-        slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T * sigma[:, None]
-        prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T * level
-        return sandwich(measurement, whitened, slopes.T @ slopes + prior.T @ prior)
     known = Covariance.from_canonical(free, whitened.covariance() * level**2)
     per_unit = whitened.scale / free.factors()
     factor = whitened.factor() * (level * per_unit) if np.isfinite(level) else None

@@ -294,27 +294,6 @@ def _rms(values):
     return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
 
 
-def noise_by_dataset(measurement, weighting, whitened):
-    """
-    Return the noise of each datum as the residuals of its own dataset show it.
-
-    None where the noise was stated, or known by wavelength, or there is one dataset: then the
-    weights of the fit have it.
-    """
-    if weighting.choice is not None or not weighting.is_known or len(measurement.datasets) < 2:
-        return None
-    squares, spare = measurement.residuals() ** 2, 1 - whitened.leverage
-    numbers, _, rows = data_by_wavelength(measurement)
-    sigma = np.empty(measurement.n_data)
-    for number in np.unique(numbers):
-        own = np.concatenate([row for row, n in zip(rows, numbers, strict=True) if n == number])
-        freedom = spare[own].sum()
-        level = np.sqrt(squares[own].sum() / freedom) if freedom >= 1 else weighting.level
-        # parameters of its own may follow a small dataset closely
-        sigma[own] = max(level, _FLOOR * weighting.level)
-    return sigma
-
-
 # ---- from residuals ---------------------------------------------------------------------
 
 

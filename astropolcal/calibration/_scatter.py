@@ -1,0 +1,251 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+r"""
+How residuals scatter and hang together, and what this does to the errors.
+
+What a model gets wrong is not independent from datum to datum: neighbouring wavelengths of a pair
+of frames depart alike, and so do the pairs at one setting of the derotator. Errors that count all
+data as independent are too small then. Here the residuals of each dataset have the covariance
+
+.. math:: V = S \left( \sum_k \tau_k\, C_k \otimes L_k \right) S .
+
+S is the scatter at each wavelength. C is the correlation of pairs of frames: of a pair with itself,
+or of the pairs at one setting, where an error of Stokes q and u goes with :math:`\cos 4\theta` and
+:math:`\sin 4\theta` of the half-wave plate. L is that of wavelengths: none, over a tenth of their
+logarithm, or all. The shares :math:`\tau` are those for which products of residuals have the values
+that are found, after what the fit took away (MINQUE: Rao 1971, J. Multivariate Anal. 1, 257,
+doi:10.1016/0047-259X(71)90001-7).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from astropolcal.calibration.groups import leave_out_groups
+from astropolcal.calibration.steps import kind_of_source
+
+# over which misfits of neighbouring wavelengths hang together, in the logarithm of the wavelength:
+# the correlation falls to 0.7 from one bin of CHARIS to the next, as it does in Datasets 1 and 3
+_LENGTH = 0.1
+# no wavelength counts as less noisy than this share of the median of its dataset
+_FLOOR = 0.1
+# fewer degrees of freedom than this tell no scatter
+_LEAST_FREEDOM = 1.0
+# fewer settings do not tell an error of theirs from the parameters
+_FEWEST_SETTINGS = 3
+# a part of which the fit leaves less than this share is not seen in the residuals
+_LEFT = 0.05
+
+
+@dataclass(eq=False)
+class _Part:
+    """Residuals of one dataset: where they are among pairs and wavelengths, and their scatter."""
+
+    rows: slice
+    pair: np.ndarray
+    bin: np.ndarray
+    patterns: np.ndarray
+    kernels: tuple
+    amplitude: np.ndarray
+    shares: np.ndarray = None
+
+    def dense(self, columns):
+        """Return columns as an array of pairs, wavelengths and columns; masked data are zero."""
+        out = np.zeros((len(self.patterns), len(self.kernels[0]), columns.shape[1]))
+        out[self.pair, self.bin] = columns
+        return out
+
+    def components(self):
+        """Yield whether pairs of a setting hang together, and the correlation of wavelengths."""
+        yield from ((False, kernel) for kernel in self.kernels)
+        if self.patterns.shape[1]:
+            yield from ((True, kernel) for kernel in self.kernels[1:])
+
+    def halves(self, columns):
+        """Return, for each component, columns before and behind its matrix, to be multiplied."""
+        dense = self.dense(columns)
+        seen = np.tensordot(self.patterns, dense, axes=(0, 0))
+        for together, kernel in self.components():
+            before = seen if together else dense
+            yield before, kernel @ before
+
+    def applied(self, columns):
+        """Return the matrix of each component times columns."""
+        for (together, _), (_, behind) in zip(self.components(), self.halves(columns), strict=True):
+            if together:
+                behind = np.tensordot(self.patterns, behind, axes=(1, 0))
+            yield behind[self.pair, self.bin]
+
+    def overlaps(self):
+        """Return the traces of the products of two components, shape (n, n)."""
+        present = self.dense(np.ones((len(self.pair), 1)))[..., 0]
+        alone = present.T @ present
+        # the square of the correlation of the pairs at a setting
+        setting = [self.patterns[:, i::2] for i in (0, 1)] if self.patterns.shape[1] else []
+        together = np.zeros_like(alone)
+        for i, first in enumerate(setting):
+            for second in setting[i:]:
+                crossed = (first * second).T @ present
+                together += (1 if second is first else 2) * crossed.T @ crossed
+        parts = list(self.components())
+        return np.array(
+            [[np.sum(k * m * (together if a and b else alone)) for b, m in parts] for a, k in parts]
+        )
+
+
+class Scatter:
+    """
+    Covariance of the residuals of a fit.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Fitted.
+    weighting : Weighting
+        The noise that its fit assumed; only its pattern counts.
+    whitened : Whitened
+        The problem around the solution.
+    """
+
+    def __init__(self, measurement, weighting, whitened):
+        self.measurement = measurement
+        weight = 1.0 if weighting.weight is None else weighting.weight
+        self._level = 1.0 / weight * np.ones(measurement.n_data)
+        residuals = measurement.residuals() * weight
+        #: Derivatives of the data to the determined directions, each one standard error long.
+        self.slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T
+        groups = leave_out_groups(measurement)
+        self.parts = [
+            self._part(i, groups, residuals, whitened.leverage)
+            for i in range(len(measurement.datasets))
+        ]
+        for part in self.parts:
+            part.shares = self._shares(part, residuals[part.rows])
+
+    @property
+    def is_known(self):
+        """Whether the residuals of all datasets tell how they scatter."""
+        return all(np.isfinite(part.amplitude).all() for part in self.parts)
+
+    def _part(self, i, groups, residuals, leverage):
+        dataset, rows = self.measurement.datasets[i], self.measurement.segments[i]
+        bins, group = self.measurement.bins[rows], groups[rows]
+        log = np.log(self.measurement.wavelength)
+        distance = np.abs(log[:, None] - log)
+        return _Part(
+            rows,
+            dataset.group_of_datum,
+            bins,
+            _patterns(dataset, group - group.min()),
+            (np.eye(log.size), np.exp(-distance / _LENGTH), np.ones_like(distance)),
+            _amplitude(bins, residuals[rows], 1 - leverage[rows]),
+        )
+
+    def _shares(self, part, residuals):
+        """Solve for the shares with which products of residuals are as large as they are."""
+        scaled = (residuals / part.amplitude)[:, None]
+        found = np.array([np.sum(a * b) for a, b in part.halves(scaled)])
+        slopes = self.slopes[part.rows]
+        up, down = slopes * part.amplitude[:, None], slopes / part.amplitude[:, None]
+        # what a component of the scatter (columns) adds to a product of residuals (rows):
+        # tr(A M B M) with M = 1 - U U^T, the residuals of a fit
+        full = part.overlaps()
+        before = [matrix / part.amplitude[:, None] for matrix in part.applied(down)]
+        behind = [matrix * part.amplitude[:, None] for matrix in part.applied(up)]
+        inner = [(slopes.T @ a, slopes.T @ b) for a, b in zip(before, behind, strict=True)]
+        seen = full - 2 * np.array([[np.sum(a * b) for b in behind] for a in before])
+        seen += np.array([[np.sum(a * b.T) for _, b in inner] for a, _ in inner])
+        size = np.diag(full)
+        told = np.diag(seen) > _LEFT * size
+        shares = np.zeros(len(size))
+        if told.any() and np.isfinite(seen).all():
+            norm = np.sqrt(size[told])
+            shares[told] = nnls(seen[np.ix_(told, told)] / norm[:, None], found[told] / norm)[0]
+        # nothing is told: independent data
+        return shares if shares.any() else np.eye(len(size))[0]
+
+    def middle(self):
+        """Return the covariance of the pulls of the residuals on the determined directions."""
+        total = np.zeros((self.slopes.shape[1],) * 2)
+        for part in self.parts:
+            scaled = self.slopes[part.rows] * part.amplitude[:, None]
+            for share, (before, behind) in zip(part.shares, part.halves(scaled), strict=True):
+                if share:
+                    total += share * np.tensordot(before, behind, axes=((0, 1), (0, 1)))
+        # a product of two arrays is symmetric to rounding only
+        return (total + total.T) / 2
+
+    def at_settings(self, i):
+        """
+        Return the error of q and of u that all pairs at a setting share, per wavelength.
+
+        Parameters
+        ----------
+        i : int
+            Number of the dataset.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Standard deviation, shape (n_wavelengths,); NaN where the dataset has no data.
+        """
+        part = self.parts[i]
+        together = [flag for flag, _ in part.components()]
+        share = np.sqrt(part.shares[together].sum())
+        found = np.full(len(part.kernels[0]), np.nan)
+        found[part.bin] = share * part.amplitude * self._level[part.rows]
+        return found
+
+
+def _patterns(dataset, group):
+    """Return how an error of q and u at each setting shows in the pairs, (n_pairs, 2 n_groups)."""
+    count = int(group.max()) + 1
+    if count < _FEWEST_SETTINGS:
+        return np.zeros((len(dataset.frames), 0))
+    of_pair = np.zeros(len(dataset.frames), dtype=int)
+    of_pair[dataset.group_of_datum] = group
+    plate = dataset.positions.get("hwp")
+    angle = np.zeros(len(of_pair)) if plate is None else 4 * plate[0]
+    member = of_pair[:, None] == np.arange(count)
+    out = np.empty((len(of_pair), 2 * count))
+    # q and u of each setting next to each other
+    out[:, 0::2], out[:, 1::2] = member * np.cos(angle)[:, None], member * np.sin(angle)[:, None]
+    return out
+
+
+def _amplitude(bins, residuals, spare):
+    """Return the rms of the residuals at the wavelength of each, for the freedom left there."""
+    total, freedom = np.sum(residuals**2), spare.sum()
+    whole = np.sqrt(total / freedom) if freedom >= _LEAST_FREEDOM else np.nan
+    levels = {}
+    for b in np.unique(bins):
+        own = bins == b
+        left = spare[own].sum()
+        levels[b] = np.sqrt(np.sum(residuals[own] ** 2) / left) if left >= _LEAST_FREEDOM else whole
+    floor = _FLOOR * np.median(list(levels.values()))
+    return (
+        np.array([max(levels[b], floor) for b in bins]) if total > 0 else np.full(len(bins), np.nan)
+    )
+
+
+def model_error(measurement, scatter):
+    """
+    Return the error of the model at a setting that it has not seen, for `Calibration.fit`.
+
+    ``relative_percent`` multiplies the polarization, from sources that are fully polarized;
+    ``absolute_percent`` does not depend on it, from all others. Both are standard errors of Stokes
+    q and u per wavelength; zero, and named in ``missing``, where no dataset tells.
+    """
+    squares = {"relative": [], "absolute": []}
+    for i, dataset in enumerate(measurement.datasets):
+        polarized = kind_of_source(dataset.observations.source) == "polarized"
+        squares["relative" if polarized else "absolute"].append(scatter.at_settings(i) ** 2)
+    found = {"wavelength_nm": (1e3 * measurement.wavelength).tolist(), "missing": []}
+    for key, rows in squares.items():
+        known = np.isfinite(rows) if rows else np.zeros((1, measurement.wavelength.size), bool)
+        count = known.sum(axis=0)
+        total = np.where(known, rows if rows else 0.0, 0.0).sum(axis=0)
+        found[f"{key}_percent"] = (100 * np.sqrt(total / np.maximum(count, 1))).tolist()
+        if not count.any():
+            found["missing"].append(key)
+    return found
