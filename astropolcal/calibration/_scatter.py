@@ -33,6 +33,8 @@ _FLOOR = 0.1
 _LEAST_FREEDOM = 1.0
 # fewer settings do not tell an error of theirs from the parameters
 _FEWEST_SETTINGS = 3
+# shares below so many times their error under independence count as chance
+_CHANCE = 2.0
 # a part of which the fit leaves less than this share is not seen in the residuals
 _LEFT = 0.05
 
@@ -157,10 +159,14 @@ class Scatter:
         seen += np.array([[np.sum(a * b.T) for _, b in inner] for a, _ in inner])
         size = np.diag(full)
         told = np.diag(seen) > _LEFT * size
-        shares = np.zeros(len(size))
-        if told.any() and np.isfinite(seen).all():
-            norm = np.sqrt(size[told])
-            shares[told] = nnls(seen[np.ix_(told, told)] / norm[:, None], found[told] / norm)[0]
+        if not np.isfinite(seen).all():
+            return np.eye(len(size))[0]
+        shares = _solved(seen, found, told)
+        # a share that independent data have by chance, and that cannot be negative, would make all
+        # errors too large; the variance of a product of residuals is twice its trace
+        chance = _CHANCE * np.sqrt(2 / np.maximum(np.diag(seen), 1.0)) * shares.sum()
+        chance[0] = 0.0
+        shares = _solved(seen, found, told & (shares >= chance))
         # nothing is told: independent data
         return shares if shares.any() else np.eye(len(size))[0]
 
@@ -195,6 +201,14 @@ class Scatter:
         found = np.full(len(part.kernels[0]), np.nan)
         found[part.bin] = share * part.amplitude * self._level[part.rows]
         return found
+
+
+def _solved(seen, found, taken):
+    """Return the shares of the components that are taken, none negative."""
+    shares, norm = np.zeros(len(found)), np.sqrt(np.diag(seen)[taken])
+    if taken.any():
+        shares[taken] = nnls(seen[np.ix_(taken, taken)] / norm[:, None], found[taken] / norm)[0]
+    return shares
 
 
 def _patterns(dataset, group):

@@ -55,11 +55,11 @@ _UNPOLARIZED = 1e-3
 # Share by which the degree of polarized stars departs from the law: beyond 1.5 um it falls with a
 # power of the wavelength, slower than the law (Martin & Whittet 1990, ApJ 357, 113).
 _DEPARTURE = 0.2
-# Departures of a star's q and u hang together over a factor of two in the wavelength. The first
-# three terms of a process with a squared exponential correlation of length L in its logarithm have
-# normal coefficients of widths 1, 1 / L and 1 / (sqrt(2) L^2).
-_LENGTH = np.log(2)
-_WIDTHS = {"": 1.0, "_slope": 1 / _LENGTH, "_curvature": 1 / (np.sqrt(2) * _LENGTH**2)}
+# Departures of a star's q and u hang together over a factor of e in the wavelength, so that both a
+# grey star and one with a Serkowski law are likely. The first three terms of a process with a
+# squared exponential correlation of length L in its logarithm have normal coefficients of widths
+# 1, 1 / L and 1 / (sqrt(2) L^2); here L = 1.
+_WIDTHS = {"": 1.0, "_slope": 1.0, "_curvature": 0.71}
 
 
 def tertiary_mirror(model, wavelength, name="m3"):
