@@ -135,7 +135,7 @@ class StandardStar:
         Returns
         -------
         LinearStokes
-            Of a polarized star those of `interstellar`, with its errors; of an
+            Of a polarized star those of `interstellar`, with its covariance; of an
             unpolarized star q = u = 0, with the error of `unpolarized_error`.
 
         Raises
@@ -158,7 +158,7 @@ class StandardStar:
             variance = np.full(zero.shape, self.unpolarized_error().value ** 2)
             return LinearStokes(zero, zero.copy(), variance[..., None, None] * np.eye(2))
         known = self.interstellar()
-        return known.law.stokes(wavelength, known.errors)
+        return known.law.stokes(wavelength, known.covariance)
 
     def interstellar(self):
         """
@@ -167,7 +167,7 @@ class StandardStar:
         Returns
         -------
         Interstellar
-            The law, its errors, its source and what is assumed.
+            The law, its errors and their covariance, its source and what is assumed.
 
         Raises
         ------
@@ -177,7 +177,7 @@ class StandardStar:
         Notes
         -----
         What is published of the star counts first. What is not is that of the
-        interstellar medium on average: lambda_max = 0.545 +- 0.06 um, K = 0.01 + 1.66
+        interstellar medium on average: lambda_max = 0.545 +- 0.08 um, K = 0.01 + 1.66
         lambda_max / um +- 0.1, an angle that turns by 0 +- 3 deg/um. The law goes
         through the measurements by weighted least squares, and errors are never
         smaller than the scatter of bands and sources.
@@ -196,7 +196,7 @@ class StandardStar:
         >>> print(known.law(1.65 * u.um).to(u.percent).round(2), known.errors["p_max"].round(2))
         1.51 % 0.02 %
         >>> print(known.assumed[0])
-        lambda_max: 0.545 +- 0.06 um (Serkowski et al. 1975), where the bands do not say more
+        lambda_max: 0.545 +- 0.08 um (Serkowski et al. 1975), where the bands do not say more
         """
         return self._interstellar
 
@@ -391,9 +391,10 @@ def _law(row, measured):
     errors["K"] = float(row["width_err"])
     # a law published without its angle takes that of the measurements
     if not np.isfinite(row["law_theta"]):
-        angle, spread, _ = turning(*angles(measured), law.lambda_max.value)
-        law.theta, law.rotation = angle["theta"] * u.deg, angle["rotation"] * u.deg / u.um
-        errors |= {"theta": spread["theta"] * u.deg, "rotation": spread["rotation"] * u.deg / u.um}
+        (theta, rotation), covariance, _ = turning(*angles(measured), law.lambda_max.value)
+        law.theta, law.rotation = theta * u.deg, rotation * u.deg / u.um
+        error = np.sqrt(np.diag(covariance))
+        errors |= {"theta": error[0] * u.deg, "rotation": error[1] * u.deg / u.um}
     # errors of some parameters only would give a covariance that is too small
     complete = len(errors) == len(law.param_names) and all(map(np.isfinite, errors.values()))
     return law, errors if complete else {}

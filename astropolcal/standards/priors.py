@@ -13,14 +13,15 @@ from astropolcal.standards.law import SerkowskiLaw, whittet_width
 __all__ = ["Interstellar", "UnpolarizedError"]
 
 # fractions, micrometres and degrees throughout this module
-_DEG_UM = u.deg / u.um
 # what a source does not state
 _UNSTATED = 1e-3
 # less is not claimed of any star
 _LEAST = 1e-4
 # the interstellar medium: Serkowski, Mathewson & Ford (1975), Whittet et al. (1992)
-_MEDIUM, _MEDIUM_SCATTER = 0.545, 0.06
-_WIDTH_SCATTER = 0.1
+_MEDIUM = 0.545
+# with these, and not with 0.06 um, J, H and K of the stars behind ordinary dust are
+# within their errors as often as they should be if they are predicted from V, R or B to I
+_MEDIUM_SCATTER, _WIDTH_SCATTER = 0.08, 0.1
 # of the catalogue's 94 stars from U to K, 68 % lie within this
 _ROTATION_SCATTER = 3.0
 # the angles of ten stars with several sources scatter by 0.7 deg, errors of 0.5 deg included
@@ -31,7 +32,8 @@ _LAW_ERRORS = {"p_max": 1e-3, "lambda_max": 0.02, "theta": 1.0}
 _NO_BAND = 0.05
 # of the effective wavelength of a band: other filters, detectors and colours of stars
 _BAND_ERROR = 0.02
-_BOUNDS = ([-20, 0.3, 0.1], [0, 1.3, 3.0])
+_BOUNDS = ([1e-5, 0.3, 0.1], [1.0, 1.3, 3.0])
+_UNITS = {"lambda_max": u.um, "theta": u.deg, "rotation": u.deg / u.um}
 _PARAMETERS = ("p_max", "lambda_max", "K", "theta", "rotation")
 
 
@@ -67,9 +69,11 @@ class Interstellar(NamedTuple):
         The law.
     errors : dict
         Standard errors of ``p_max``, ``lambda_max``, ``K``, ``theta`` and
-        ``rotation``, as quantities where the parameter has a unit. They count as
-        independent. In truth K goes up with lambda_max, which cancels a part of their
-        errors in the near infrared: errors of the degree are safe rather than small.
+        ``rotation``, as quantities where the parameter has a unit.
+    covariance : `~numpy.ndarray`
+        Of the five in this order and in the units of the law. The errors alone give
+        two or three times too much in the near infrared, where those of lambda_max
+        and K cancel.
     source : str
         The publications that the numbers are from.
     assumed : tuple of str
@@ -85,6 +89,7 @@ class Interstellar(NamedTuple):
 
     law: SerkowskiLaw
     errors: dict
+    covariance: np.ndarray
     source: str
     assumed: tuple
 
@@ -133,34 +138,31 @@ def interstellar(star):
         raise ParameterError(f"{star.name} is {star.kind}; ask for unpolarized_error() instead")
     if star.law is None and not np.any(np.isfinite(star.polarization["theta"])):
         raise ParameterError(f"{star.name} has neither a law nor a measurement with an angle")
-    if set(_PARAMETERS) <= set(star.law_errors):
-        values = {name: getattr(star.law, name).value for name in _PARAMETERS}
-        errors = {name: _plain(star.law_errors[name], name) for name in _PARAMETERS}
-        words = [_zero_words()]
-    else:
-        values, errors, words = _fitted(star)
-        angle, angle_errors, angle_words = _turned(star, values["lambda_max"])
-        values, errors = values | angle, errors | angle_errors
-        words += [*angle_words, _zero_words()]
-    words += _vary(star, errors)
-    law = SerkowskiLaw(**{name: _quantity(v, name) for name, v in values.items()})
-    errors = {name: _quantity(float(v), name) for name, v in errors.items()}
-    return Interstellar(law, errors, _source(star), tuple(words))
+    complete = set(_PARAMETERS) <= set(star.law_errors)
+    shape, within, words = (_published if complete else _fitted)(star)
+    angle, turned, angle_words = _turned(star, shape[1], complete)
+    words = [*words, *angle_words, f"theta: +- {_ZERO_POINT:g} deg for its zero"]
+    covariance = np.zeros((5, 5))
+    covariance[:3, :3], covariance[3:, 3:] = within, turned
+    words += _vary(star, covariance)
+    law = SerkowskiLaw(
+        shape[0], shape[1] * u.um, shape[2], angle[0] * u.deg, angle[1] * u.deg / u.um
+    )
+    errors = dict(zip(_PARAMETERS, map(float, np.sqrt(np.diag(covariance))), strict=True))
+    errors = {name: _quantity(error, name) for name, error in errors.items()}
+    return Interstellar(law, errors, covariance, _source(star), tuple(words))
 
 
 def _plain(error, name):
     """Return an error as a number in the units of this module."""
-    units = {"lambda_max": u.um, "theta": u.deg, "rotation": _DEG_UM}
-    unit = units.get(name, u.dimensionless_unscaled)
-    return float(u.Quantity(error).to_value(unit))
+    return float(u.Quantity(error).to_value(_UNITS.get(name, u.dimensionless_unscaled)))
 
 
 def _quantity(value, name):
     """Return a number of this module as users see it."""
     if name == "p_max":
         return 100 * value * u.percent
-    units = {"lambda_max": u.um, "theta": u.deg, "rotation": _DEG_UM}
-    return value * units[name] if name in units else value
+    return value * _UNITS[name] if name in _UNITS else value
 
 
 def _source(star):
@@ -174,24 +176,46 @@ def _source(star):
     return "; ".join(parts)
 
 
-def _vary(star, errors):
-    """Add how much a star varies to the errors; return the sentence."""
+def _vary(star, covariance):
+    """Add how much a star varies to the covariance; return the sentence."""
     if not star.variability:
         return []
-    degree, angle = star.variability["p"], star.variability["theta"]
-    errors["p_max"] = np.hypot(errors["p_max"], degree.to_value(u.dimensionless_unscaled))
-    errors["theta"] = np.hypot(errors["theta"], angle.to_value(u.deg))
-    return [
-        f"the star varies, by about {degree.to_value(u.percent):.2g} % and "
-        f"{angle.to_value(u.deg):.2g} deg; the errors include it"
-    ]
+    degree, angle = (_plain(star.variability[key], key) for key in ("p", "theta"))
+    covariance[0, 0] += degree**2
+    covariance[3, 3] += angle**2
+    return [f"it varies, by about {100 * degree:.2g} % and {angle:.2g} deg; the errors include it"]
 
 
 # --- the degree --------------------------------------------------------------------------
 
 
+def _model(x, shape):
+    """Return degrees of a law, and their derivatives by p_max, lambda_max and K."""
+    p_max, lambda_max, width = shape
+    log = np.log(lambda_max / x)
+    degree = p_max * np.exp(-width * log**2)
+    slopes = [1 / p_max + 0 * log, -2 * width * log / lambda_max, -(log**2)]
+    return degree, degree[:, None] * np.stack(slopes, axis=-1)
+
+
+def _published(star):
+    """Return the published shape of a law, and its covariance."""
+    shape = np.array([getattr(star.law, name).value for name in _PARAMETERS[:3]], dtype=float)
+    errors = np.array([_plain(star.law_errors[name], name) for name in _PARAMETERS[:3]])
+    table = star.polarization[star.polarization["reference"] == star.law_reference]
+    error = table["p_err"].to_value(u.dimensionless_unscaled)
+    if np.unique(table["wavelength"]).size < 3 or not np.all(np.isfinite(error)):
+        return shape, np.diag(errors**2), []
+    # the errors are published, but not that those of lambda_max and K go together,
+    # as they do in every fit to these bands
+    slopes = _model(table["wavelength"].to_value(u.um), shape)[1] / error[:, None]
+    together = np.linalg.inv(slopes.T @ slopes)
+    scale = errors / np.sqrt(np.diag(together))
+    return shape, together * np.outer(scale, scale), []
+
+
 def _fitted(star):
-    """Return p_max, lambda_max and K that go through what is known, and their errors."""
+    """Return a shape that goes through what is known, its covariance, and what is assumed."""
     x, degree, error, words = _degrees(star)
     center, spread, prior_words = _prior(star)
     # a band elsewhere than said has another degree, dp = 2 K p ln(lambda_max / lambda) dln(lambda)
@@ -199,31 +223,22 @@ def _fitted(star):
     error = np.hypot(error, _BAND_ERROR * slope * degree)
     if star.law is not None:
         # a published maximum is one more measurement, made where the maximum is
-        x, degree = np.append(x, star.law.lambda_max.value), np.append(degree, _p_max(star))
+        x, degree = np.append(x, star.law.lambda_max.value), np.append(degree, star.law.p_max.value)
         error = np.append(error, spread["p_max"])
-    start = [np.log(max(degree.max(), _UNSTATED)), center["lambda_max"], center["K"]]
 
     def residuals(t):
-        model = np.exp(t[0] - t[2] * np.log(t[1] / x) ** 2)
         # K follows the relation, unless one is published with its error
-        width = whittet_width(t[1] * u.um) if "K" not in star.law_errors else center["K"]
+        width = center["K"] if "K" in star.law_errors else whittet_width(t[1] * u.um)
         prior = [(t[1] - center["lambda_max"]) / spread["lambda_max"], (t[2] - width) / spread["K"]]
-        return np.append((degree - model) / error, prior)
+        return np.append((degree - _model(x, t)[0]) / error, prior)
 
-    fit = least_squares(residuals, start, bounds=_BOUNDS)
-    variance = np.diag(np.linalg.inv(fit.jac.T @ fit.jac)).copy()
+    start = [max(degree.max(), _LEAST), center["lambda_max"], center["K"]]
+    fit = least_squares(residuals, start, bounds=_BOUNDS, x_scale=[0.01, 0.1, 0.1])
     # bands and sources may disagree by more than their errors
-    excess = np.sum(fit.fun[: x.size] ** 2) / max(x.size - 1, 1)
-    variance[0] *= max(excess, 1.0)
-    p_max, errors = np.exp(fit.x[0]), np.sqrt(variance)
-    values = {"p_max": p_max, "lambda_max": fit.x[1], "K": fit.x[2]}
-    # the first parameter of the fit is the logarithm
-    errors = {"p_max": p_max * errors[0], "lambda_max": errors[1], "K": errors[2]}
-    return {k: float(v) for k, v in values.items()}, errors, prior_words + words
-
-
-def _p_max(star):
-    return float(u.Quantity(star.law.p_max.value))
+    excess = max(np.sum(fit.fun[: x.size] ** 2) / max(x.size - 1, 1), 1.0)
+    weight = np.append(np.full(x.size, 1 / excess), [1, 1])
+    inverse = np.linalg.inv((fit.jac * weight[:, None]).T @ fit.jac)
+    return fit.x, inverse, prior_words + words
 
 
 def _degrees(star):
@@ -241,8 +256,9 @@ def _degrees(star):
     if np.any(vague):
         words.append(f"p: +- {100 * _NO_BAND:g} % of it where the source names no band")
         error = np.where(vague, np.hypot(error, _NO_BAND * degree), error)
-    scatter = star.variability["p"] if star.variability else 0 * u.percent
-    return x, degree, np.hypot(error, scatter.to_value(u.dimensionless_unscaled)), words
+    if star.variability:
+        error = np.hypot(error, _plain(star.variability["p"], "p"))
+    return x, degree, error, words
 
 
 def _prior(star):
@@ -280,21 +296,24 @@ def _prior(star):
 # --- the angle ---------------------------------------------------------------------------
 
 
-def _turned(star, lambda_max):
-    """Return theta and rotation of a star, their errors, and what is assumed."""
+def _turned(star, lambda_max, complete):
+    """Return theta and rotation of a star, their covariance, and what is assumed."""
     x, theta, error = angles(star.polarization)
     words = []
     if star.variability:
-        error = np.hypot(error, star.variability["theta"].to_value(u.deg))
-    if star.law is not None:
+        error = np.hypot(error, _plain(star.variability["theta"], "theta"))
+    if complete and x.size == 0:
+        errors = [_plain(star.law_errors[name], name) for name in _PARAMETERS[3:]]
+        return (star.law.theta.value, star.law.rotation.value), np.diag(errors) ** 2, words
+    if star.law is not None and not complete:
         stated = "theta" in star.law_errors
         spread = _plain(star.law_errors["theta"], "theta") if stated else _LAW_ERRORS["theta"]
         if not stated:
             words.append(f"theta: published without error; {spread:g} deg is assumed")
         x, theta = np.append(x, lambda_max), np.append(theta, star.law.theta.value)
         error = np.append(error, spread)
-    values, errors, assumed = turning(x, theta, error, lambda_max)
-    return values, errors, words + assumed
+    values, covariance, assumed = turning(x, theta, error, lambda_max)
+    return values, covariance, words + assumed
 
 
 def angles(table):
@@ -309,20 +328,21 @@ def angles(table):
 
 
 def turning(x, theta, error, lambda_max):
-    """Return theta at lambda_max and rotation, their errors, and what is assumed."""
+    """Return theta at lambda_max and rotation, their covariance, and what is assumed."""
     mean, offset = _centered(theta, error)
-    line = _line(x - lambda_max, offset, error)
-    if line is not None:
-        (theta, turn), errors, words = line[0], line[1], []
-    else:
+    line, words = _line(x - lambda_max, offset, error), []
+    if line is None:
         weight = error**-2.0
         scatter = np.sum(weight * offset**2) / np.sum(weight) / max(x.size - 1, 1)
-        away = _ROTATION_SCATTER * (np.average(x, weights=weight) - lambda_max)
-        spread = np.sqrt(max(scatter, 1 / np.sum(weight)) + away**2)
-        theta, turn, errors = 0.0, 0.0, (spread, _ROTATION_SCATTER)
+        # from where it was measured to lambda_max it may have turned, too
+        away = np.array([lambda_max - np.average(x, weights=weight), 1.0])
+        inverse = np.outer(away, away) * _ROTATION_SCATTER**2
+        inverse[0, 0] += max(scatter, 1 / np.sum(weight))
+        line = np.zeros(2), inverse
         words = [f"rotation: 0 +- {_ROTATION_SCATTER:g} deg/um, the scatter of other stars"]
-    values = {"theta": float(np.mod(mean + theta, 180)), "rotation": float(turn)}
-    return values, {"theta": np.hypot(errors[0], _ZERO_POINT), "rotation": errors[1]}, words
+    (theta, turn), inverse = line
+    inverse[0, 0] += _ZERO_POINT**2
+    return (float(np.mod(mean + theta, 180)), float(turn)), inverse, words
 
 
 def _centered(theta, error):
@@ -335,16 +355,12 @@ def _centered(theta, error):
 
 
 def _line(x, offset, error):
-    """Return a straight line's values and errors, None if its slope is not measured."""
+    """Return a straight line's values and covariance, None if its slope is not measured."""
     if np.unique(x).size < 3:
         return None
     design = np.stack([np.ones_like(x), x], axis=-1) / error[:, None]
     inverse = np.linalg.inv(design.T @ design)
     values = inverse @ design.T @ (offset / error)
-    excess = np.sum((offset / error - design @ values) ** 2) / (x.size - 2)
-    errors = np.sqrt(np.diag(inverse) * max(excess, 1.0))
-    return (values, errors) if errors[1] < _ROTATION_SCATTER else None
-
-
-def _zero_words():
-    return f"theta: +- {_ZERO_POINT:g} deg for its zero, by which sources disagree"
+    # bands and sources may disagree by more than their errors
+    inverse *= max(np.sum((offset / error - design @ values) ** 2) / (x.size - 2), 1.0)
+    return (values, inverse) if inverse[1, 1] < _ROTATION_SCATTER**2 else None

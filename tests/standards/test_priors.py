@@ -46,15 +46,15 @@ def _number(value):
 
 def _pulls(star, table):
     """How far degrees and angles are from the star's law, in their errors together."""
-    known = star.interstellar()
-    q, stokes_u, covariance = known.law.stokes(table["wavelength"], known.errors)
+    law = star.interstellar().law
+    q, stokes_u, covariance = star.stokes(table["wavelength"])
     degree = np.hypot(q, stokes_u)
     along = np.stack([q, stokes_u], -1) / degree[:, None]
     across = np.stack([-along[:, 1], along[:, 0]], -1)
     radial, turned = (np.sqrt(np.einsum("ni,nij,nj->n", a, covariance, a)) for a in (along, across))
     one = u.dimensionless_unscaled
     error = np.hypot(radial, table["p_err"].to_value(one))
-    off = table["theta"].to_value(u.deg) - known.law.angle(table["wavelength"]).to_value(u.deg)
+    off = table["theta"].to_value(u.deg) - law.angle(table["wavelength"]).to_value(u.deg)
     angle_error = np.hypot(np.rad2deg(turned / 2 / degree), table["theta_err"].to_value(u.deg))
     return (table["p"].to_value(one) - degree) / error, ((off + 90) % 180 - 90) / angle_error
 
@@ -68,6 +68,11 @@ def test_every_polarized_star_has_five_errors_and_says_what_is_assumed():
         assert set(known.errors) == PARAMETERS
         for name, error in known.errors.items():
             assert 0 < _number(error) < np.inf, (star.name, name)
+        # errors are the diagonal of the covariance, in the units of the law
+        scale = [0.01 if name == "p_max" else 1 for name in known.errors]
+        errors = np.array([_number(error) for error in known.errors.values()]) * scale
+        np.testing.assert_allclose(np.sqrt(np.diag(known.covariance)), errors, rtol=1e-9)
+        assert np.all(np.linalg.eigvalsh(known.covariance / np.outer(errors, errors)) > 0)
         # a number of the assumption, or no assumption
         assert all(any(c.isdigit() for c in words) for words in known.assumed), star.name
         assert star.law is None or known.source.startswith(star.law_reference)
@@ -112,17 +117,22 @@ def test_hd30675_in_j_h_and_k():
 
 
 def test_errors_are_those_of_the_measurements():
-    """In the sample, to which the laws were fitted, at least 68 % are within the errors."""
-    together = []
+    """To these the laws were fitted: at least 68 % are within the errors of law and band."""
+    together, infrared = [], []
     for star in POLARIZED:
         table = star.polarization[np.isfinite(star.polarization["theta_err"])]
         if len(table):
             together.append(_pulls(star, table))
+            infrared.append(together[-1][0][table["wavelength"] > 1 * u.um])
     degree, angle = map(np.concatenate, zip(*together, strict=True))
     assert degree.size > 700
     for pulls in (degree, angle):
         assert np.mean(np.abs(pulls) < 1) > 0.68
-        assert 0.5 < np.std(pulls) < 1.1
+        assert 0.8 < np.std(pulls) < 1.05
+    # J, H and K are known as well as they were measured, neither better nor worse
+    infrared = np.concatenate(infrared)
+    assert infrared.size > 250
+    assert 0.9 < np.std(infrared) < 1.15
 
 
 @pytest.mark.parametrize("bands", ["V", "R", "BVRI"])
@@ -130,8 +140,8 @@ def test_errors_are_right_where_nothing_was_measured(bands):
     """
     J, H and K held out: the law of the medium through what is optical.
 
-    The stars behind ordinary dust, of which a standard is one, have pulls of 0.6 to
-    0.9, all 94 with those in dark clouds 1.1 to 1.6.
+    Behind ordinary dust, where a standard usually is, the pulls have a width of 1; the
+    errors are too small for stars in dark clouds, whose lambda_max is up to 0.9 um.
     """
     every, ordinary, angles = [], [], []
     for star in WHITTET:
@@ -147,11 +157,10 @@ def test_errors_are_right_where_nothing_was_measured(bands):
         if 0.42 < star.law.lambda_max.value < 0.68:
             ordinary.append(degree)
     every, ordinary, angles = map(np.concatenate, (every, ordinary, angles))
-    assert 0.55 < np.std(ordinary) < 1.05
-    assert 0.9 < np.std(every) < 1.6
-    assert np.mean(np.abs(ordinary) < 1) > 0.68
-    assert np.mean(np.abs(every) < 1) > 0.64
-    assert np.mean(np.abs(angles) < 1) > 0.64
+    assert 0.9 < np.std(ordinary) < 1.15
+    assert 0.63 < np.mean(np.abs(ordinary) < 1) < 0.73
+    assert np.std(every) < 2.2
+    assert 0.63 < np.mean(np.abs(angles) < 1) < 0.85
 
 
 def test_variable_stars_are_less_certain():
@@ -210,9 +219,9 @@ def test_the_law_goes_through_the_measurements():
     rows = [(b, p, 0.01, 40, 0.1) for b, p in zip(BANDS, degree, strict=True)]
     for bands in ("UBVRIJHK", "BVRI"):
         known = _star([row for row in rows if row[0] in bands]).interstellar()
-        assert known.law.lambda_max.value == pytest.approx(0.6, abs=0.005)
-        assert known.law.K.value == pytest.approx(law.K.value, abs=0.01)
-        assert known.law.p_max.value == pytest.approx(0.05, abs=2e-4)
+        assert known.law.lambda_max.value == pytest.approx(0.6, abs=0.01)
+        assert known.law.K.value == pytest.approx(law.K.value, abs=0.02)
+        assert known.law.p_max.value == pytest.approx(0.05, abs=3e-4)
         assert known.law.theta.value == pytest.approx(40, abs=1e-6)
         assert known.errors["rotation"] < 1 * u.deg / u.um
         assert not any(words.startswith("rotation") for words in known.assumed)
@@ -223,13 +232,20 @@ def test_one_band_gets_the_law_of_the_medium():
     assert known.law.lambda_max.value == pytest.approx(0.545, abs=0.001)
     assert known.law.K.value == pytest.approx(whittet_width(0.545 * u.um), abs=0.01)
     assert known.law(0.65 * u.um).to_value(u.percent) == pytest.approx(4.0, abs=0.01)
-    assert known.errors["lambda_max"].to_value(u.um) == pytest.approx(0.06, abs=0.001)
-    # that of the relation, and what the relation takes over from lambda_max
-    assert known.errors["K"] == pytest.approx(np.hypot(0.1, 1.66 * 0.06), abs=0.003)
-    assert known.errors["rotation"].value == 3
+    assert known.errors["lambda_max"].to_value(u.um) == pytest.approx(0.08, abs=0.001)
+    # that of the relation, and what the relation takes over from lambda_max: the two
+    # go together, and the degree in H is known better than they are as independent errors
+    assert known.errors["K"] == pytest.approx(np.hypot(0.1, 1.66 * 0.08), abs=0.003)
+    assert known.covariance[1, 2] > 0.7 * np.sqrt(known.covariance[1, 1] * known.covariance[2, 2])
+    together, apart = (
+        np.trace(known.law.stokes(1.65 * u.um, errors).covariance)
+        for errors in (known.covariance, known.errors | {"theta": 0 * u.deg})
+    )
+    assert together < 0.5 * apart
+    assert known.errors["rotation"].value == pytest.approx(3)
     assert known.errors["theta"].to_value(u.deg) == pytest.approx(0.6, abs=0.1)
     text = " ".join(known.assumed)
-    for words in ("0.545 +- 0.06 um", "0.01 + 1.66 lambda_max", "0 +- 3 deg/um", "0.5 deg"):
+    for words in ("0.545 +- 0.08 um", "0.01 + 1.66 lambda_max", "0 +- 3 deg/um", "0.5 deg"):
         assert words in text
     assert known.source == "Nobody 1900 (R)"
 
@@ -287,32 +303,36 @@ def test_angles_turn_along_a_straight_line():
     x = np.array([0.44, 0.55, 0.65, 0.8, 1.25, 1.65])
     for start in (58.0, 179.0, 0.5):
         theta = np.mod(start + 8 * (x - 0.6), 180)
-        values, errors, words = turning(x, theta, np.full(6, 0.5), 0.6)
-        off = (values["theta"] - start + 90) % 180 - 90
-        assert abs(off) < 1e-6
-        assert values["rotation"] == pytest.approx(8)
+        (at, turn), covariance, words = turning(x, theta, np.full(6, 0.5), 0.6)
+        assert abs((at - start + 90) % 180 - 90) < 1e-6
+        assert turn == pytest.approx(8)
         assert words == []
-        assert 0.5 < errors["theta"] < 0.7
-        assert errors["rotation"] < 1
+        assert 0.5 < np.sqrt(covariance[0, 0]) < 0.7
+        assert covariance[1, 1] < 1
 
 
 def test_few_or_uncertain_bands_do_not_turn():
     x = np.array([0.44, 0.65, 0.8])
     for n, error in ((1, 0.1), (2, 0.1), (3, 3.0)):
         theta = np.array([20.0, 21.0, 22.0])[:n]
-        values, errors, words = turning(x[:n], theta, np.full(n, error), 0.55)
-        assert values["rotation"] == 0
-        assert errors["rotation"] == 3
-        assert values["theta"] == pytest.approx(theta.mean(), abs=1e-6)
+        (at, turn), covariance, words = turning(x[:n], theta, np.full(n, error), 0.55)
+        assert turn == 0
+        assert covariance[1, 1] == pytest.approx(9)
+        assert at == pytest.approx(theta.mean(), abs=1e-6)
         assert len(words) == 1
+        # where it was measured the angle is known without the rotation
+        away = np.array([1, x[:n].mean() - 0.55])
+        least = 0.5**2 + max(error**2 / n, np.var(theta) / max(n - 1, 1))
+        assert away @ covariance @ away == pytest.approx(least, rel=0.05)
     # on both sides of north the mean is north
-    values, _, _ = turning(x[:2], np.array([179.0, 1.0]), np.ones(2), 0.55)
-    assert min(values["theta"], 180 - values["theta"]) < 1e-9
+    (at, _), _, _ = turning(x[:2], np.array([179.0, 1.0]), np.ones(2), 0.55)
+    assert min(at, 180 - at) < 1e-9
 
 
 def test_errors_of_the_line_are_no_smaller_than_its_scatter():
     x, rng = np.linspace(0.4, 2, 40), np.random.default_rng(3)
     theta = 50 + rng.normal(0, 2, 40)
-    _, errors, _ = turning(x, theta, np.full(40, 0.1), 1.2)
-    assert errors["theta"] == pytest.approx(np.hypot(2 / np.sqrt(40), 0.5), rel=0.2)
-    assert errors["rotation"] == pytest.approx(2 / np.sqrt(40) / x.std(), rel=0.3)
+    _, covariance, _ = turning(x, theta, np.full(40, 0.1), 1.2)
+    error = np.sqrt(np.diag(covariance))
+    assert error[0] == pytest.approx(np.hypot(2 / np.sqrt(40), 0.5), rel=0.2)
+    assert error[1] == pytest.approx(2 / np.sqrt(40) / x.std(), rel=0.3)
