@@ -163,6 +163,25 @@ def test_errors_are_right_where_nothing_was_measured(bands):
     assert 0.63 < np.mean(np.abs(angles) < 1) < 0.85
 
 
+def test_the_table_of_the_page():
+    """Median error of the degree in J, H and K, by what is measured."""
+    found = {}
+    for star in POLARIZED:
+        many = len(set(star.polarization["band"])) > 2
+        group = "published" if star.law_errors else "three" if many else "one or two"
+        q, stokes_u, covariance = star.stokes([1.25, 1.65, 2.2] * u.um)
+        degree = np.hypot(q, stokes_u)
+        along = np.stack([q, stokes_u], -1) / degree[:, None]
+        variance = np.einsum("ni,nij,nj->n", along, covariance, along)
+        found.setdefault(group, []).append(100 * np.sqrt(variance) / degree)
+    assert {group: len(rows) for group, rows in found.items()} == {
+        "published": 94, "three": 11, "one or two": 41
+    }  # fmt: skip
+    expected = {"published": (3, 4, 8), "three": (5, 10, 15), "one or two": (15, 18, 23)}
+    for group, rows in found.items():
+        np.testing.assert_allclose(np.median(rows, axis=0), expected[group], atol=0.6)
+
+
 def test_variable_stars_are_less_certain():
     for name, degree, angle in (("HD 183143", 0.3, 1), ("HD 198478", 0.3, 1), ("HD 80558", 0, 0.8)):
         star = standards.get(name)
