@@ -5,24 +5,28 @@ Polarimetric standard stars, the Serkowski law, and which star to observe.
 `get` and `search` look into the catalogue that comes with the package,
 `observability` says when a star is up and at which angles, and
 `telescope_information` how well it then fixes the diattenuation of the
-telescope. `SerkowskiLaw` is the wavelength dependence of interstellar
-polarization as an astropy model.
+telescope. `StandardStar.interstellar` and `StandardStar.unpolarized_error` say how
+well the polarization of a star is known. `SerkowskiLaw` is the wavelength
+dependence of interstellar polarization as an astropy model.
 """
 
 from astropolcal.standards.catalogues import KINDS, MAGNITUDES, StandardStar, catalogue, get, names
 from astropolcal.standards.information import TelescopeInformation, telescope_information
 from astropolcal.standards.law import LinearStokes, SerkowskiLaw, whittet_width
+from astropolcal.standards.priors import Interstellar, UnpolarizedError
 from astropolcal.standards.searching import search
 from astropolcal.standards.visibility import Observability, observability
 
 __all__ = [
     "KINDS",
     "MAGNITUDES",
+    "Interstellar",
     "LinearStokes",
     "Observability",
     "SerkowskiLaw",
     "StandardStar",
     "TelescopeInformation",
+    "UnpolarizedError",
     "catalogue",
     "get",
     "names",

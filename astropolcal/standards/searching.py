@@ -193,7 +193,7 @@ def _from_law(star, band):
     # the error of the degree is that along the direction of polarization in the (q, u) plane
     along = np.array([q, stokes_u]) / np.hypot(q, stokes_u)
     # where the angle alone is uncertain rounding may leave less than zero
-    error = np.nan if covariance is None else np.sqrt(max(along @ covariance @ along, 0.0))
+    error = np.sqrt(max(along @ covariance @ along, 0.0))
     return 100 * float(np.hypot(q, stokes_u)), 100 * float(error)
 
 

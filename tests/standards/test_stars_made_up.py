@@ -7,13 +7,11 @@ import pytest
 from astropy.coordinates import EarthLocation, SkyCoord
 from astropy.table import QTable
 from astropy.time import Time
-from hypothesis import given
-from hypothesis import strategies as st
 
 from astropolcal import standards
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.standards import Observability, SerkowskiLaw, StandardStar, telescope_information
-from astropolcal.standards.catalogues import _law, _mean_angle, _normal
+from astropolcal.standards.catalogues import _law, _normal
 from astropolcal.standards.searching import _degree, _in_band
 from astropolcal.standards.visibility import _spread
 
@@ -33,6 +31,7 @@ def _measured(bands="UVH", p=(0.1, 0.2, 0.3), p_err=(0.01, 0.02, np.nan), theta=
             "p_err": list(p_err)[:n] * u.percent,
             "theta": theta * u.deg,
             "theta_err": error * u.deg,
+            "reference": ["Nobody 1900"] * n,
             "checked": np.ones(n, dtype=bool),
         }
     )
@@ -45,25 +44,7 @@ def _star(kind="unpolarized", table=None, **options):
     return StandardStar("made up", kind, place, 1 * u.arcsec, magnitudes, table, **options)
 
 
-# --- what an unpolarized star is expected to be ------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("wavelength", "expected"),
-    [
-        # p and its error in squares; in H no error is stated
-        (0.36, np.hypot(0.1, 0.01)),
-        (0.55, np.hypot(0.2, 0.02)),
-        (2.5, 0.3),
-        # the geometric, not the arithmetic mean of 0.55 and 1.65 um is half way: 0.95 um
-        (0.94, np.hypot(0.2, 0.02)),
-        (0.97, 0.3),
-    ],
-)
-def test_zero_is_as_uncertain_as_the_nearest_measurement(wavelength, expected):
-    q, stokes_u, covariance = _star().stokes(wavelength * u.um)
-    assert (q, stokes_u) == (0, 0)
-    np.testing.assert_allclose(covariance, np.eye(2) * (expected / 100) ** 2, rtol=1e-12)
+# --- what a star is expected to be -------------------------------------------------------------
 
 
 def test_shape_of_the_wavelengths_is_kept():
@@ -73,21 +54,6 @@ def test_shape_of_the_wavelengths_is_kept():
     # two arrays, or a change of one would be one of both
     found.q[:] = 1
     assert not found.u.any()
-
-
-def test_a_polarized_star_without_a_law_says_what_it_has():
-    with pytest.raises(ParameterError, match=r"made up has no published Serkowski.*bands U, V, H"):
-        _star("polarized").stokes(1 * u.um)
-
-
-def test_a_law_is_asked_with_its_errors_where_it_has_some():
-    law = SerkowskiLaw(p_max=0.04, theta=90 * u.deg)
-    assert _star("polarized", law=law).stokes(1 * u.um).covariance is None
-    errors = {"p_max": 0.1 * u.percent}
-    found = _star("polarized", law=law, law_errors=errors).stokes(law.lambda_max.quantity)
-    # at the maximum the degree is p_max, and here it lies along -q
-    np.testing.assert_allclose(found.covariance, [[1e-6, 0], [0, 0]], atol=1e-15)
-    assert found.q == pytest.approx(-0.04)
 
 
 def test_a_law_ends_at_2_5_um():
@@ -110,35 +76,7 @@ def test_a_star_without_magnitudes_has_none():
     assert band == "V"
 
 
-# --- the angle of a law without one ---------------------------------------------------------
-
-
-@given(st.floats(0, 179.99), st.lists(st.floats(0.2, 5), min_size=3, max_size=3))
-def test_equal_angles_have_that_mean_and_the_error_of_weights(angle, errors):
-    mean, error = _mean_angle(_measured(theta=[angle] * 3, error=errors))
-    off = (mean.to_value(u.deg) - angle + 90) % 180 - 90
-    assert abs(off) < 1e-6
-    expected = 1 / np.sqrt(np.sum(np.array(errors) ** -2.0))
-    assert error.to_value(u.deg) == pytest.approx(expected, rel=1e-6)
-
-
-def test_angles_on_both_sides_of_north_average_to_north():
-    mean, _ = _mean_angle(_measured(theta=[179.0, 1.0, 0.0]))
-    assert min(mean.to_value(u.deg), 180 - mean.to_value(u.deg)) < 1e-9
-
-
-def test_scatter_counts_where_it_exceeds_the_errors():
-    """Angles 10, 20, 30 deg with tiny errors: the error of the mean is their scatter's."""
-    mean, error = _mean_angle(_measured(theta=[10, 20, 30], error=[0.01] * 3))
-    assert mean.to_value(u.deg) == pytest.approx(20, abs=1e-9)
-    # sqrt(sum of squares / 3 / (3 - 1))
-    assert error.to_value(u.deg) == pytest.approx(np.sqrt(200 / 3 / 2), rel=1e-9)
-
-
-def test_the_more_certain_angle_weighs_more():
-    mean, _ = _mean_angle(_measured("UV", theta=[10, 13], error=[1.0, 2.0]))
-    # weights 1 and 1/4
-    assert mean.to_value(u.deg) == pytest.approx((10 + 13 / 4) / 1.25, abs=0.01)
+# --- a law of the catalogue's table ----------------------------------------------------------
 
 
 def _row(**changes):
@@ -151,11 +89,13 @@ def test_a_law_takes_its_own_angle_or_that_of_the_measurements():
     measured = _measured(theta=[50, 50, 50])
     own, errors = _law(_row(), measured)
     assert own.theta.value == pytest.approx(30)
+    assert own.rotation.value == 0
     # the published angle has no error: errors of the others alone would be too small
     assert errors == {}
     derived, errors = _law(_row(law_theta=np.nan * u.deg), measured)
     assert derived.theta.value == pytest.approx(50)
-    assert errors["theta"].to_value(u.deg) == pytest.approx(1 / np.sqrt(3))
+    assert derived.rotation.value == pytest.approx(0, abs=1e-9)
+    assert set(errors) == set(derived.param_names)
     assert errors["K"] == 0.05
 
 
@@ -210,15 +150,15 @@ def test_degree_without_a_band_is_that_nearest_to_v():
 
 
 def test_degree_of_a_law_has_the_error_along_the_polarization():
-    """For an error of the angle alone the degree is certain; for one of p_max it is its share."""
+    """An error of the angle leaves the degree certain; one of p_max is its share of it."""
     law = SerkowskiLaw(p_max=0.04, lambda_max=0.5 * u.um, K=1.0, theta=70 * u.deg)
     shape = np.exp(-(np.log(0.5 / 1.65) ** 2))
-    star = _star("polarized", _measured("U"), law=law, law_errors={"theta": 5 * u.deg})
-    assert _degree(star, "H") == pytest.approx((4 * shape, 0), abs=1e-9)
-    star = _star("polarized", _measured("U"), law=law, law_errors={"p_max": 0.2 * u.percent})
+    errors = {"p_max": 0.2 * u.percent, "lambda_max": 0 * u.um, "K": 0.0}
+    errors |= {"theta": 5 * u.deg, "rotation": 0 * u.deg / u.um}
+    star = _star("polarized", _measured("U"), law=law, law_errors=errors)
     assert _degree(star, "H") == pytest.approx((4 * shape, 0.2 * shape), rel=1e-9)
-    star = _star("polarized", _measured("U"), law=law)
-    assert np.isnan(_degree(star, "H")[1])
+    star = _star("polarized", _measured("U"), law=law, law_errors=errors | {"p_max": 0 * u.percent})
+    assert _degree(star, "H") == pytest.approx((4 * shape, 0), abs=1e-9)
 
 
 def test_without_measurements_the_law_speaks_in_v():

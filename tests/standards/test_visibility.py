@@ -213,7 +213,7 @@ def test_search_by_band_gives_magnitude_and_polarization_in_it():
     # a bright star without measurement in H has its law there
     law = found[found["name"] == "HD 7927"][0]
     assert law["p"].value == pytest.approx(
-        standards.get("HD 7927").law(1.65 * u.um).to_value(u.percent)
+        standards.get("HD 7927").interstellar().law(1.65 * u.um).to_value(u.percent)
     )
     # neither law nor measurement in H
     assert "HD 155197" not in found["name"]
