@@ -304,21 +304,19 @@ def _polarized_star(wavelength, name, target):
     """Return a star with the interstellar polarization of the catalogue."""
     known, middle = standards.get(target).interstellar(), _middle(wavelength)
     law, errors = known.law, known.errors
-    q, stokes_u, covariance = law.stokes(middle, known.covariance)
-    degree = np.hypot(q, stokes_u)
-    # of an error across the polarization, the angle has half the share of the degree
-    across = np.array([-stokes_u, q]) / degree
-    angle_error = 0.5 * np.sqrt(across @ covariance @ across) / degree * u.rad
+    longest = law.lambda_max.quantity
+    # the catalogue's change of the angle is one per wavelength, here it is one per logarithm
+    per_log = (middle - longest) / np.log(middle / longest)
+    departure = _DEPARTURE * law(middle).to_value(u.one)
     values = {
         "p_max": (law.p_max.value, errors["p_max"]),
-        "lambda_max": (law.lambda_max.quantity, errors["lambda_max"]),
+        "lambda_max": (longest, errors["lambda_max"]),
         "K": (law.K.value, errors["K"]),
-        "theta": (law.angle(middle), angle_error),
-        # the catalogue's change of the angle is one per wavelength, here one per logarithm
-        "rotation": (law.rotation.quantity * middle, errors["rotation"] * middle),
+        "theta": (law.theta.quantity, errors["theta"]),
+        "rotation": (law.rotation.quantity * per_log, errors["rotation"] * per_log),
     }
     # the degree may depart from the law; its angle is better known than that
-    values |= {f"q{suffix}": (0.0, _DEPARTURE * degree * w) for suffix, w in _smooth(wavelength)}
+    values |= {f"q{suffix}": (0.0, departure * w) for suffix, w in _smooth(wavelength)}
     return _with_priors(name, middle, values)
 
 

@@ -69,7 +69,7 @@ class StarSource(PolarizedSource):
     .. math::
 
         q + i u = p_\mathrm{max} \exp\left[-K \ln^2(\lambda_\mathrm{max} / \lambda)
-                  + 2 i \rho x\right] + a + b x + c x^2,
+                  + 2 i \rho \ln(\lambda / \lambda_\mathrm{max})\right] + a + b x + c x^2,
                   \qquad x = \ln(\lambda / \lambda_0)
 
     The first part is interstellar (Serkowski, Mathewson & Ford 1975, ApJ 196, 261,
@@ -93,9 +93,9 @@ class StarSource(PolarizedSource):
     q_slope, u_slope, q_curvature, u_curvature : float
         Changes of ``q`` and ``u`` with the logarithm of the wavelength and its square.
     reference : `~astropy.units.Quantity`
-        The wavelength :math:`\lambda_0` at which ``q``, ``u`` and ``theta`` hold; fixed.
+        The wavelength :math:`\lambda_0` at which ``q`` and ``u`` hold; fixed.
     theta : `~astropy.units.Quantity`
-        Angle of the interstellar polarization at the reference wavelength, and of the axis of q.
+        Angle of the interstellar polarization at ``lambda_max``, and of the axis of q.
 
     Examples
     --------
@@ -132,7 +132,7 @@ class StarSource(PolarizedSource):
         unit=units.nm,
         bounds=(100, 10000),
         fixed=True,
-        description="wavelength at which q, u and theta hold",
+        description="wavelength at which q and u hold",
     )
 
     def stokes(self, wavelength):
@@ -183,7 +183,7 @@ class StarSource(PolarizedSource):
 
     def _matrix(self, wavelength, q, u, *law):
         x, (q1, u1, q2, u2) = np.log(wavelength / law[8]), law[4:8]
-        degree, along, *_ = _interstellar(wavelength, x, *law[:4])
+        degree, along, *_ = _interstellar(wavelength, *law[:4])
         return super()._matrix(
             wavelength,
             q + q1 * x + q2 * x**2 + degree * along.real,
@@ -193,7 +193,7 @@ class StarSource(PolarizedSource):
     def _derivatives(self, wavelength, q, u, *law):
         (_, longest, width, rotation), slopes, reference = law[:4], law[4:8], law[8]
         x = np.log(wavelength / reference)
-        degree, along, log, shape = _interstellar(wavelength, x, *law[:4])
+        degree, along, log, shape = _interstellar(wavelength, *law[:4])
         light = degree * along
         slope, curvature = slopes[0] + 1j * slopes[1], slopes[2] + 1j * slopes[3]
         # changes of q + iu, in the order of the parameters
@@ -201,25 +201,26 @@ class StarSource(PolarizedSource):
             1.0,
             1j,
             shape * along,
-            -2 * width * log * light / longest,
+            # the logarithm grows by 1 / lambda_max, and the angle falls by rotation times that
+            -2 * (width * log + 1j * rotation) * light / longest,
             -(log**2) * light,
-            2j * x * light,
+            -2j * log * light,
             x,
             1j * x,
             x**2,
             1j * x**2,
             # x falls by 1 / reference
-            -(slope + 2 * curvature * x + 2j * rotation * light) / reference,
+            -(slope + 2 * curvature * x) / reference,
         )
         shape = np.broadcast(wavelength, q, u, *law).shape
         return tuple(_column(np.broadcast_to(change, shape)) for change in changes)
 
 
-def _interstellar(wavelength, x, p_max, lambda_max, width, rotation):
+def _interstellar(wavelength, p_max, lambda_max, width, rotation):
     """Return degree and direction, the logarithm of lambda_max over the wavelength, and shape."""
     log = np.log(lambda_max / wavelength)
     shape = np.exp(-width * log**2)
-    return p_max * shape, np.exp(2j * rotation * x), log, shape
+    return p_max * shape, np.exp(-2j * rotation * log), log, shape
 
 
 def _column(change):

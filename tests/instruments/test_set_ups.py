@@ -5,7 +5,6 @@ import warnings
 from datetime import date
 from types import SimpleNamespace
 
-import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
@@ -17,7 +16,7 @@ from astropolcal import instruments, optics
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, InstrumentError
 from astropolcal.instruments import SkyLaw
-from astropolcal.instruments.telescope import k_mirror, star_options, tertiary_mirror
+from astropolcal.instruments.telescope import k_mirror, star_options
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS, VAMPIRES, IRDIS = (instruments.get(name) for name in ("charis", "vampires", "irdis"))
@@ -78,26 +77,6 @@ def test_settings_of_a_k_mirror_go_before_the_usual_ones():
     assert not held.k_scale.fixed
     assert held.film_thickness.bounds == (100, 300)
     assert held.k_scale.bounds == (0.5, 2)
-
-
-@pytest.mark.parametrize(
-    ("model", "free"),
-    [
-        ("free", {"diattenuation"}),
-        ("power law", {"b1", "m1", "b2", "m2"}),
-        ("metal", {"film_thickness", "n_scale", "k_scale"}),
-    ],
-)
-def test_what_is_free_of_a_tertiary_mirror(model, free):
-    mirror = tertiary_mirror(model, [1.2, 1.6] * u.um, name="mirror")
-    assert {k for k in mirror.param_names if not getattr(mirror, k).fixed} == free
-    assert mirror.name == "mirror"
-    if model == "power law":
-        for key in free:
-            low, high = getattr(mirror, key).bounds
-            assert [low, high] == pytest.approx(
-                [0.5 * getattr(mirror, key).value, 2 * getattr(mirror, key).value]
-            )
 
 
 def test_retardances_of_the_published_derotator_are_between_its_bins():

@@ -91,7 +91,7 @@ def polarized_source(q, u):
 def star_source(p_max, lambda_max, K, rotation, reference, **departure):
     ratio = (lambda_max / WAVELENGTH).to_value(u.one)
     x = np.log((WAVELENGTH / reference).to_value(u.one))
-    chi = (rotation * x).to_value(u.rad)
+    chi = (-rotation * np.log(ratio)).to_value(u.rad)
     light = p_max * np.exp(-K * np.log(ratio) ** 2) * np.exp(2j * chi)
     for key, power in (("{}", 0), ("{}_slope", 1), ("{}_curvature", 2)):
         light = light + (departure[key.format("q")] + 1j * departure[key.format("u")]) * x**power
