@@ -124,7 +124,7 @@ def test_option_that_a_chain_does_not_have_is_an_error():
 # --- sources --------------------------------------------------------------------------------------
 
 
-def drawn(star, n=300):
+def drawn(star, n=800):
     """Return q + iu of a star for values drawn from its priors, (n, n_wavelengths)."""
     rng, sizes = np.random.default_rng(0), {}
     for key in star.param_names:
