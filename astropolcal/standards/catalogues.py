@@ -157,7 +157,7 @@ class StandardStar:
             zero = np.zeros_like(length_to_um(wavelength))
             variance = np.full(zero.shape, self.unpolarized_error().value ** 2)
             return LinearStokes(zero, zero.copy(), variance[..., None, None] * np.eye(2))
-        known = self.interstellar()
+        known = self._interstellar
         return known.law.stokes(wavelength, known.covariance)
 
     def interstellar(self):
@@ -198,7 +198,11 @@ class StandardStar:
         >>> print(known.assumed[0])
         lambda_max: 0.545 +- 0.08 um (Serkowski et al. 1975), where the bands do not say more
         """
-        return self._interstellar
+        known = self._interstellar
+        # the star is shared by all who ask for it, and what it says must not change
+        return known._replace(
+            law=known.law.copy(), errors=dict(known.errors), covariance=known.covariance.copy()
+        )
 
     @cached_property
     def _interstellar(self):

@@ -24,7 +24,8 @@ _MEDIUM = 0.545
 _MEDIUM_SCATTER, _WIDTH_SCATTER = 0.08, 0.1
 # of the catalogue's 94 stars from U to K, 68 % lie within this
 _ROTATION_SCATTER = 3.0
-# the angles of ten stars with several sources scatter by 0.7 deg, errors of 0.5 deg included
+# the angles of ten stars with several sources scatter by 0.7 deg, and would by about
+# 0.5 deg because of the errors that are stated
 _ZERO_POINT = 0.5
 # of a law that is published without errors; its numbers have as many digits
 _LAW_ERRORS = {"p_max": 1e-3, "lambda_max": 0.02, "theta": 1.0}

@@ -305,6 +305,17 @@ def test_an_angle_without_error_has_that_of_the_degree():
         )
 
 
+def test_what_a_star_says_cannot_be_changed_from_outside():
+    star = standards.get("HD 30675")
+    known = star.interstellar()
+    known.law.p_max, known.errors["K"] = 0.5, 7.0
+    known.covariance[:] = 0
+    again = star.interstellar()
+    assert again.law.p_max.value == pytest.approx(0.039)
+    assert again.errors["K"] == pytest.approx(0.05)
+    assert np.all(np.linalg.eigvalsh(star.stokes(1.6 * u.um).covariance) > 0)
+
+
 def test_kinds_are_not_mixed_up():
     with pytest.raises(ParameterError, match=r"HD 293396 is unpolarized; ask for unpolarized_err"):
         standards.get("HD 293396").interstellar()
