@@ -214,7 +214,7 @@ def test_source_and_modulator_of_a_table():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"derotator": "kmirror"}, {"bounds": "paper"}, {"source": "moon"}, {"optics_in": "x"}]
+    "wrong", [{"derotator": "fibre"}, {"bounds": "paper"}, {"source": "moon"}, {"optics_in": "x"}]
 )
 def test_unknown_choice(wrong):
     with pytest.raises(InstrumentError, match=f"vampires: {next(iter(wrong))} = '.*'; allowed are"):

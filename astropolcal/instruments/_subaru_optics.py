@@ -10,6 +10,9 @@ from astropolcal.instruments.telescope import mounted
 #: Longitude, latitude (deg) and height (m) of the Subaru Telescope.
 SITE = (-155.4761, 19.8255, 4139.0)
 
+# 't Hart et al. 2021, thicknesses of the half-wave plate in mm
+_THART_SIO2, _THART_MGF2 = 1.63398, 1.27711
+
 #: What has changed; both days are known to the month only (McIntosh et al. 2026, Sec. 2 and 7).
 CHANGES = (
     (None, "2025-08-01", "2025-10-01", "the Nasmyth beam switcher was installed"),
@@ -20,6 +23,17 @@ CHANGES = (
 def misaligned(about, most=5):
     """Return what frees an angle within some degrees of where the optic should stand."""
     return {"fixed": {"theta": False}, "bounds": {"theta": (about - most, about + most)}}
+
+
+def two_layer_plate(**settings):
+    """Return the half-wave plate of both instruments, its thicknesses near the published ones."""
+    settings["bounds"] |= {
+        "w_sio2": (0.6 * _THART_SIO2, 1.4 * _THART_SIO2),
+        "w_mgf2": (0.6 * _THART_MGF2, 1.4 * _THART_MGF2),
+    }
+    return optics.TwoLayerWaveplate(
+        w_sio2=_THART_SIO2 * u.mm, w_mgf2=_THART_MGF2 * u.mm, mount="hwp", name="hwp", **settings
+    )
 
 
 def polarizer():

@@ -5,8 +5,8 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.instruments._subaru_optics import misaligned
-from astropolcal.instruments.telescope import tertiary_mirror
+from astropolcal.instruments._subaru_optics import misaligned, two_layer_plate
+from astropolcal.instruments.telescope import k_mirror, tertiary_mirror
 
 # where fits start: wavelength in nm, and retardances in deg
 _START_AT = (610.0, 670.0, 725.0, 775.0)
@@ -37,8 +37,10 @@ def _starts(grid, values):
     return np.interp(grid.to_value(u.nm), _START_AT, values) * u.deg
 
 
-def half_wave_plate(grid):
+def half_wave_plate(grid, kind):
     settings = misaligned(0)
+    if kind == "two-layer":
+        return two_layer_plate(**settings)
     # the branch of our sign: without it (H, 45, R) and (-H, -45, R) fit alike
     settings["bounds"] |= {"retardance": (-180, -90)}
     start = _starts(grid, _HALF_WAVE_PLATE)
@@ -50,6 +52,8 @@ def derotator(grid, kind):
     main = "retardance" if kind == "linear" else "horizontal"
     settings["bounds"] |= {main: (0, 360)}
     settings |= {"mount": "derotator", "name": "derotator"}
+    if kind == "kmirror":
+        return k_mirror(**misaligned(0), mount="derotator", name="derotator")
     if kind == "linear":
         return optics.LinearRetarder(retardance=start, **settings)
     settings["bounds"] |= {"diagonal": (-90, 90), "circular": (-90, 90)}

@@ -18,7 +18,14 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments._subaru_optics import CHANGES, SITE, fold_mirror, misaligned, polarizer
+from astropolcal.instruments._subaru_optics import (
+    CHANGES,
+    SITE,
+    fold_mirror,
+    misaligned,
+    polarizer,
+    two_layer_plate,
+)
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.keywords import frame_time
 from astropolcal.instruments.layout import FileLayout
@@ -35,9 +42,6 @@ from astropolcal.instruments.telescope import (
 from astropolcal.observations.reading import stated_date
 
 __all__ = ["CHARIS"]
-
-# 't Hart et al. 2021, thicknesses of the half-wave plate in mm
-_THART_SIO2, _THART_MGF2 = 1.63398, 1.27711
 
 # McIntosh et al. 2026, Dataset 3, final fit for each of the 22 bins (in the signs they publish)
 _DEROTATOR_HORIZONTAL = [251.47, 235.97, 223.97, 209.45, 166.71, 153.47, 140.0, 124.37, 110.61,
@@ -217,7 +221,7 @@ class CHARIS(Instrument):
         if source in STARS:
             light = star_source(source, grid, star, target)
             train = [light, *telescope(tertiary_mirror(m3, grid))]
-        train += [_half_wave_plate(), _derotator(grid, derotator, _BOUNDS[bounds])]
+        train += [two_layer_plate(**misaligned(0)), _derotator(grid, derotator, _BOUNDS[bounds])]
         if "dichroic" in optics_in:
             # to be freed where several angles of the derotator tell the two apart
             train.append(optics.LinearRetarder(name="dichroic", fixed={"retardance": True}))
@@ -356,17 +360,6 @@ def _switcher_by(day):
         return False
     # between the two runs it was installed on a day that no table tells
     return True if day >= _NBS_PRESENT_FROM else None
-
-
-def _half_wave_plate():
-    settings = misaligned(0)
-    settings["bounds"] |= {
-        "w_sio2": (0.6 * _THART_SIO2, 1.4 * _THART_SIO2),
-        "w_mgf2": (0.6 * _THART_MGF2, 1.4 * _THART_MGF2),
-    }
-    return optics.TwoLayerWaveplate(
-        w_sio2=_THART_SIO2 * u.mm, w_mgf2=_THART_MGF2 * u.mm, mount="hwp", name="hwp", **settings
-    )
 
 
 def _derotator(grid, kind, bounds):

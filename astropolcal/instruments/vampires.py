@@ -77,6 +77,7 @@ class VAMPIRES(Instrument):
         derotator="elliptical",
         bounds="physical",
         m3="free",
+        plate="free",
         star="star",
         target=None,
     ):
@@ -103,13 +104,18 @@ class VAMPIRES(Instrument):
             ``"flc"`` where the liquid crystal is in the beam.
         wavelength : `~astropy.units.Quantity`, optional
             Grid, by default the fields of the multiband imager.
-        derotator : {"elliptical", "linear"}
-            Kind of retarder.
+        derotator : {"elliptical", "linear", "kmirror"}
+            Kind of retarder, with values of its own in each band; or three silver mirrors with
+            films of silica, one law for all bands, see
+            `~astropolcal.instruments.telescope.k_mirror`.
         bounds : {"physical"}
             Half-wave plate from -180 to -90 deg, derotator within the turn from 0 deg on.
         m3 : {"free", "power law", "metal"}
             Tertiary mirror of a star's chain: a diattenuation a wavelength with the retardance of
             silver, a law of the permittivity, or silver with a film.
+        plate : {"free", "two-layer"}
+            Half-wave plate with a retardance of its own in each band, or with the law of its two
+            layers, whose thicknesses are free.
         star : str
             Name of the source optic in a star's chain.
         target : str, optional
@@ -134,7 +140,8 @@ class VAMPIRES(Instrument):
         self.check_choices(
             source,
             optics_in,
-            derotator=(derotator, ("elliptical", "linear")),
+            derotator=(derotator, ("elliptical", "linear", "kmirror")),
+            plate=(plate, ("free", "two-layer")),
             bounds=(bounds, ("physical",)),
             m3=(m3, M3_MODELS),
         )
@@ -144,7 +151,7 @@ class VAMPIRES(Instrument):
             light = star_source(source, grid, star, target)
             train = [light, *telescope(_optics.mirror(m3, grid))]
         train += [
-            _optics.half_wave_plate(grid),
+            _optics.half_wave_plate(grid, plate),
             _optics.derotator(grid, derotator),
             _optics.relay(grid.size),
         ]
