@@ -13,9 +13,9 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, ObservationError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import cycle_numbers
-from astropolcal.optics import PolarizedSource
+from astropolcal.optics import PolarizedSource, StarSource
 
-__all__ = ["star_accuracy", "star_stokes"]
+__all__ = ["fitted_stars", "star_accuracy", "star_stokes"]
 
 
 def star_stokes(calibration, chain, observations, positions=None):
@@ -188,3 +188,95 @@ def star_accuracy(table, q=0.0, u_=0.0):
     for key, value in zip(("s_q", "s_u"), np.sqrt(np.nanmean(off**2, axis=2)), strict=True):
         result[key] = value * percent
     return result
+
+
+# ---- what a calibration has found of its standards -----------------------------------------
+
+
+def fitted_stars(calibration):
+    """
+    Return the polarization that a calibration has found of its standard stars.
+
+    The field turns a star against the telescope, so that a calibration can tell the two apart as
+    far as it has turned. What it cannot tell rests on the catalogue.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+
+    Returns
+    -------
+    list of `~astropy.table.QTable`
+        One a star whose polarization had a prior: ``wavelength``, ``q``, ``q_err``, ``q_prior``,
+        ``q_prior_err`` and the same of u, in percent and in the frame of the sky. Meta ``name`` of
+        the optic, ``from_data``, the share of the prior variance that the data have taken away, 0
+        to 1, and ``words``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration.stars import fitted_stars
+    >>> from astropolcal.observations import Observations
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> lam = [1.2, 1.6, 2.2] * u.um
+    >>> chain = charis.chain("unpolarized standard star", derotator="linear", wavelength=lam)
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> frames["parallactic"] = np.linspace(-40, 40, len(frames)) * u.deg
+    >>> frames["altitude"] = np.linspace(60, 70, len(frames)) * u.deg
+    >>> cal = calibrate(chain, simulate(chain, lam, frames, seed=2), cross_validate=False)
+    >>> fitted_stars(cal)[0].colnames[:4]
+    ['wavelength', 'q', 'q_err', 'q_prior']
+    """
+    found = {}
+    for chain in calibration.chains:
+        star = leaves(chain)[0]
+        free = [key for key in star.param_names if not getattr(star, key).fixed]
+        if isinstance(star, StarSource) and any(getattr(star, key).prior for key in free):
+            found.setdefault(star.name, _fitted_star(calibration, star, free))
+    return list(found.values())
+
+
+def _fitted_star(calibration, star, free):
+    """Return q and u of a fitted star with their errors, and those of its priors."""
+    wavelength, covariance = calibration.wavelength, calibration.covariance
+    slopes = star.mueller_derivatives(wavelength)
+    means = {key: getattr(star, key).prior for key in free}
+    units = {key: getattr(star, key).unit or u.one for key in free}
+    before = star.with_parameters(**{key: p.mean() * units[key] for key, p in means.items()})
+    table = QTable({"wavelength": wavelength})
+    share = []
+    for row, key in ((1, "q"), (2, "u")):
+        matrix = np.zeros((wavelength.size, len(covariance)))
+        prior = np.zeros(wavelength.size)
+        for name in free:
+            slope = (slopes[name] * units[name]).to_value(u.one)[..., row, 0]
+            matrix[:, covariance.names.index(f"{star.name}.{name}")] = slope
+            prior += (slope * means[name].std()) ** 2
+        error = np.sqrt(np.diag(covariance.propagate(matrix)))
+        values = star.mueller(wavelength)[..., row, 0], error
+        known = before.mueller(wavelength)[..., row, 0], np.sqrt(prior)
+        for stem, (value, std) in ((key, values), (f"{key}_prior", known)):
+            table[stem], table[f"{stem}_err"] = 100 * value * u.percent, 100 * std * u.percent
+        share.append(1 - np.clip(error**2 / prior, 0, 1))
+    table.meta |= {"name": star.name, "from_data": float(np.median(share))}
+    table.meta["words"] = _fitted_words(table)
+    return table
+
+
+def _fitted_words(table):
+    """Say q and u in the middle of the wavelengths, before and after the fit."""
+    i = len(table) // 2
+    parts = [
+        f"{key} = {table[key][i].value:+.2f} +- {table[f'{key}_err'][i].value:.2f} % "
+        f"({table[f'{key}_prior'][i].value:+.2f} +- {table[f'{key}_prior_err'][i].value:.2f} % "
+        "in the catalogue)"
+        for key in "qu"
+    ]
+    return (
+        f"{table.meta['name']} at {table['wavelength'][i].to_value(u.nm):.0f} nm: "
+        f"{', '.join(parts)}; {100 * table.meta['from_data']:.0f} % of it rests on the data"
+    )
