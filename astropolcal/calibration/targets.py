@@ -119,14 +119,10 @@ def _accuracies(calibration, targets, wanted, view):
 
 def _target(dolp, aolp):
     """Return a degree of polarization as a fraction, and the double angles, radian."""
-    angle = _ANY if aolp is None else aolp
-    propagate_accuracy(dolp, angle, 0.0, 0.0)
-    double = 2 * np.atleast_1d(angle_to_rad(angle, "aolp"))
     if np.ndim(dolp) or np.ndim(aolp):
-        raise ParameterError(
-            f"target {dolp}, {aolp}: one degree and one angle, or None, are needed"
-        )
-    return float(u.Quantity(dolp).to_value(u.one)), double
+        raise ParameterError(f"target {dolp}, {aolp}: one degree and one angle are needed")
+    double = 2 * np.atleast_1d(angle_to_rad(_ANY if aolp is None else aolp, "aolp"))
+    return float(_fraction("dolp", dolp, 1.0)), double
 
 
 def _made_of(calibration, view):
