@@ -36,6 +36,8 @@ __all__ = [
 
 #: Degrees and angles of polarization that are reported; an angle of None is any.
 TARGETS = ((30 * u.percent, None), (1 * u.percent, None), (0.1 * u.percent, None))
+#: Those of the paper.
+PAPER_TARGETS = ((1 * u.percent, None), (30 * u.percent, None))
 
 _COLUMNS = ("s_mean", "s_res", "s_cv")
 _CALIBRATIONS = {"polarized": "s_rel", "unpolarized": "s_unpol", "on_sky": "s_sky"}
@@ -379,7 +381,7 @@ def _words(column, missing):
     return f"by {column}; without the calibration {lacking}: the accuracies are lower limits"
 
 
-def paper_accuracies(calibration, targets=TARGETS, column="s_mean"):
+def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     """
     Return the paper's accuracy of a calibration for several targets, per wavelength.
 

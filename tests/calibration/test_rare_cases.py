@@ -22,9 +22,9 @@ from astropolcal.calibration import (
     full_covariance,
     noise_from_null_channel,
     noise_from_replicates,
+    paper_accuracies,
     settle,
     star_stokes,
-    target_accuracies,
 )
 from astropolcal.calibration._header import describe
 from astropolcal.calibration.accuracy import cross_validated_residuals
@@ -340,11 +340,11 @@ def test_a_source_of_no_known_kind_gives_no_accuracy_for_a_target(cal):
     records = [SimpleNamespace(source="sunlit dome", accuracy=cal.accuracy)]
     bare = optics.Diattenuator(name="mirror") | optics.WollastonPrism(name="wollaston")
     other = SimpleNamespace(datasets=records, chains=[bare], wavelength=cal.wavelength, fit={})
-    assert target_accuracies(other) == []
+    assert paper_accuracies(other) == []
     assert _target_lines(other, ((1 * u.percent, None),)) == []
     # an impossible target is refused all the same
     with pytest.raises(ParameterError, match="dolp"):
-        target_accuracies(other, [(2.0, None)])
+        paper_accuracies(other, [(2.0, None)])
 
 
 # --- headers --------------------------------------------------------------------------------------

@@ -255,12 +255,12 @@ def test_a_source_that_is_not_stated_is_told_by_its_polarizer(chain):
         assert paper_accuracies(_calibration([(source, accuracy(1, 2, 3))], [train])) == []
 
 
-def test_default_targets_count_at_any_angle(chain):
+def test_default_targets_are_the_paper_s_at_any_angle(chain):
     tables = [("polarized", accuracy(1, 2, 3)), ("unpolarized", accuracy(0.3, 0.04, 0.5)),
               ("unpolarized standard star", accuracy(0.4, 0.03, 1.2))]  # fmt: skip
     cal = _calibration(tables, [chain] * 3)
     found = paper_accuracies(cal)
-    assert [t.meta["dolp"] for t in found] == [30 * u.percent, 1 * u.percent, 0.1 * u.percent]
+    assert [table.meta["dolp"] for table in found] == [1 * u.percent, 30 * u.percent]
     for table in found:
         np.testing.assert_allclose(percent(table["s_abs"]), [0.5, 0.05, 1.3])
         each = [
