@@ -15,8 +15,8 @@ KEYS = ("s_Q", "s_U", "s_p", "s_chi")
 class SkyErrors:
     """Covariance of the nine changes of I, Q and U that a calibration's errors make on sky."""
 
-    def __init__(self, calibration, view):
-        self._good = view.good
+    def __init__(self, calibration, view, ignore=False):
+        self._good, self._ignore = view.good, ignore
         axes = full_covariance(calibration)._axes()
         # the nine in one axis, in degree, micrometre or percent
         slopes = view.changes.reshape(*view.good.shape, 9, -1) * axes.steps
@@ -46,7 +46,8 @@ class SkyErrors:
         lost = blind > limit
         if not self._partial:
             lost &= known <= limit
-        variance[lost | (is_open > limit)] = np.inf
+        if not self._ignore:
+            variance[lost | (is_open > limit)] = np.inf
         variance[~self._good] = np.nan
         with np.errstate(invalid="ignore", divide="ignore"):
             count = self._good.sum(axis=1)[:, None]

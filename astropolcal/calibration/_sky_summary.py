@@ -101,7 +101,7 @@ def _entry(table):
     return {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns
 
 
-# ---- what an accuracy for a target leaves out ---------------------------------------------
+# ---- what an accuracy for a target is made of -----------------------------------------------
 
 
 def open_on_sky(calibration):
@@ -124,11 +124,11 @@ def open_on_sky(calibration):
 
 
 def open_lines(calibration):
-    """Say what an accuracy for a target does not include, one line a kind."""
+    """Say what makes an accuracy for a target infinite or large, one line a kind."""
     found, lines = open_on_sky(calibration), []
     for kind, says in (
-        ("open", "without what the data leave open"),
-        ("badly determined", "without what is badly determined"),
+        ("open", "infinite by what the data leave open"),
+        ("badly determined", "large by what is badly determined"),
     ):
         words = [one["words"] for one in found if one["kind"] == kind]
         more = [f"and {len(words) - _N_OPEN} more, see below"] if len(words) > _N_OPEN else []

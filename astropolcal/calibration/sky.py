@@ -123,7 +123,8 @@ def sky_words(sky):
         for target in targets_of(sky)
     ]
     (dolp, turn, gain), *fainter = each
-    words = f"on sky the AoLP changes by up to {turn} deg and the DoLP by up to {gain} % of itself"
+    turned, gained = (f"up to {size}" if size[0].isdigit() else size for size in (turn, gain))
+    words = f"on sky the AoLP changes by {turned} deg and the DoLP by {gained} % of itself"
     if all(one[1:] == (turn, gain) for one in each):
         return f"{words}, whatever the DoLP"
     others = (f"{dolp}: {turn} deg, {gain} %" for dolp, turn, gain in fainter)

@@ -215,8 +215,11 @@ def _target_lines(calibration, targets):
         "Accuracy for a target in percent, s_chi in deg, median over the wavelengths",
         f"  {'DoLP':>6}{'AoLP':>10}" + "".join(f"{name:>10}" for name in heads),
         *(_target_row(table) for table in tables),
-        f"  {tables[0].meta['words']}",
     ]
+    if any(np.isinf(table["s_p"]).any() for table in tables):
+        known = target_accuracies(calibration, targets, open_directions="ignore")
+        lines += ["  as if what the data leave open were known:", *map(_target_row, known)]
+    lines.append(f"  {tables[0].meta['words']}")
     if any(table.meta["aolp"] is None for table in tables):
         lines.append("  AoLP any: at whichever angle the accuracy is worst")
     lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration)]

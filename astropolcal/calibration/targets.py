@@ -43,6 +43,7 @@ _COLUMNS = ("s_mean", "s_res", "s_cv")
 _CALIBRATIONS = {"polarized": "s_rel", "unpolarized": "s_unpol", "on_sky": "s_sky"}
 # where s_Q, s_U, s_p and s_chi are largest: between these angles each rises or falls steadily
 _EXTREMES = (0.0, 22.5, 45.0) * u.deg
+_OPEN = ("infinite", "ignore")
 # angles among which those of a calibration are sought
 _ANY = np.arange(0.0, 180.0, 7.5) * u.deg
 
@@ -50,7 +51,7 @@ _ANY = np.arange(0.0, 180.0, 7.5) * u.deg
 # ---- what a calibration claims --------------------------------------------------------------
 
 
-def target_accuracies(calibration, targets=TARGETS):
+def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite"):
     """
     Return the accuracy of a calibration for several targets, per wavelength.
 
@@ -66,6 +67,9 @@ def target_accuracies(calibration, targets=TARGETS):
     targets : sequence of (dolp, aolp)
         Degree and angle of linear polarization of each. An angle of None stands for any: each
         error is then that at its worst angle.
+    open_directions : {"infinite", "ignore"}
+        As for `~astropolcal.correction.correct`: errors along directions that the data leave open
+        are infinite, or zero as if the choice that the calibration made were true.
 
     Returns
     -------
@@ -78,7 +82,7 @@ def target_accuracies(calibration, targets=TARGETS):
     Raises
     ------
     ParameterError
-        If a target is impossible.
+        If a target is impossible, or the choice is unknown.
 
     Notes
     -----
@@ -98,14 +102,20 @@ def target_accuracies(calibration, targets=TARGETS):
     >>> bool((table["s_chi"] < 0.05 * u.deg).all())
     True
     """
+    if open_directions not in _OPEN:
+        raise ParameterError(
+            f"open_directions = {open_directions!r}; allowed are {', '.join(_OPEN)}"
+        )
     wanted = [_target(dolp, aolp) for dolp, aolp in targets]
-    return _accuracies(calibration, targets, wanted, view_of_calibration(calibration))
+    view, ignore = view_of_calibration(calibration), open_directions == "ignore"
+    return _accuracies(calibration, targets, wanted, view, ignore)
 
 
-def _accuracies(calibration, targets, wanted, view):
+def _accuracies(calibration, targets, wanted, view, ignore=False):
     if view is None:
         return []
-    errors, words, tables = SkyErrors(calibration, view), _made_of(calibration, view), []
+    errors, words, tables = SkyErrors(calibration, view, ignore), _made_of(calibration, view), []
+    words += "; as if what the data leave open were known" if ignore else ""
     for (dolp, aolp), (p, double) in zip(targets, wanted, strict=True):
         found = np.max(errors.of_target(p, double), axis=-1)
         if p == 0:

@@ -155,7 +155,7 @@ def test_what_is_said_grows_as_the_polarization_becomes_faint(alone):
     [
         ((0, 0), (0, 0), "on sky nothing changes"),
         ((-5.26, 0), (0, 3), "by up to 5.3 deg and the DoLP by up to 3 % of itself, whatever"),
-        ((0.004, -0.004), (-300, 1), "up to less than 0.01 deg and the DoLP by up to 300 % of"),
+        ((0.004, -0.004), (-300, 1), "less than 0.01 deg and the DoLP by up to 300 % of"),
     ],
 )
 def test_a_file_of_before_knows_one_degree_of_polarization(turn, gain, words):
