@@ -65,15 +65,15 @@ def sky_consequences(measurement, vector, directions, instrument=None):
     >>> turn = np.zeros((1, measurement.free.size))
     >>> turn[0, measurement.free.by_name["hwp.theta"].start] = np.deg2rad(1)
     >>> sky = sky_consequences(measurement, measurement.vector(), turn)[0]
-    >>> [round(change, 1) for change in sky["aolp_deg"]]
-    [2.0, 2.0]
+    >>> [round(max(map(abs, target["aolp_deg"])), 1) for target in sky["targets"]]
+    [2.1, 2.1, 2.1]
 
     The tertiary mirror polarizes, and with a plate at a wrong angle its polarization is
     subtracted at a wrong angle, too:
 
     >>> sky = sky_consequences(measurement, measurement.vector(), turn, "charis")[0]
-    >>> [round(max(target["aolp_deg"])) for target in sky["targets"]]
-    [2, 5, 26]
+    >>> [round(max(map(abs, target["aolp_deg"])), 1) for target in sky["targets"]]
+    [2.4, 5.7, 37.4]
     """
     view = view_of_measurement(measurement, vector, instrument)
     return consequences_along(view, directions)
