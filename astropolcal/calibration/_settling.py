@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Which star settles on sky what the data leave open."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from astropolcal import standards
@@ -16,6 +18,7 @@ def star_words(site):
     return f"a polarized standard star over a range of parallactic angle (such as {name}{reach})"
 
 
+@lru_cache
 def _best_star(latitude):
     """Return name and greatest altitude of the star whose angle frames tell best."""
     stars, _ = standards.catalogue()

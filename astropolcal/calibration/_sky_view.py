@@ -122,7 +122,9 @@ def _view(chains, free, lam, metas, name, settings):
     mode = stated[0] if stated else next(iter(law.modes), None)
     placed = _positions(stages(chain), settings, law.plate_law(mode))
     site = None if instrument is None else instrument.location
-    return SkyView(chain, telescope, free, lam, placed, site)
+    view = SkyView(chain, telescope, free, lam, placed, site)
+    # optics that never determine q and u say nothing of the sky
+    return view if view.good.any() else None
 
 
 def _positions(wanted, settings, law):

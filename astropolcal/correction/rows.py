@@ -13,6 +13,7 @@ import numpy as np
 
 from astropolcal.calibration._beam import inner_optics, telescope_optics
 from astropolcal.calibration._rows import Rows
+from astropolcal.calibration._sky_view import chain_from_sky, known_instrument
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import (
     AstropolcalWarning,
@@ -78,31 +79,9 @@ def sky_chain(
     elif hasattr(calibration, "datasets"):
         inner = inner_optics(calibration, optics_in, beam, label)
         chains = [join([*(telescope_optics(calibration) or ()), *inner])]
-    seen = [chain for chain in chains if "parallactic" in stages(chain)]
-    if seen:
-        return _from_stage(seen[0], ("parallactic",))
-    name = getattr(calibration, "instrument", None)
-    if name:
-        from astropolcal import instruments
-        from astropolcal.exceptions import InstrumentError
-
-        try:
-            instrument = instruments.get(name)
-        except InstrumentError:
-            instrument = None  # it need not be installed here
-        if instrument and instrument.has_telescope:
-            known = {"wavelength": getattr(calibration, "wavelength", None), "date": date}
-            options = {key: known[key] for key in instrument.sky_options}
-            return instrument.on_sky(chains[0], **options)
-    return _from_stage(chains[0], [s for s in stages(chains[0]) if s not in COORDINATES])
-
-
-def _from_stage(chain, wanted):
-    found = leaves(chain)
-    first = next((i for i, leaf in enumerate(found) if leaf.stage in wanted), None)
-    if first is None:
-        raise ChainError("the chain has no optic on a stage; give the chain from the sky")
-    return join(found[first:])
+    instrument = known_instrument(getattr(calibration, "instrument", None))
+    wavelength = getattr(calibration, "wavelength", None)
+    return chain_from_sky(chains, instrument, wavelength, date)[0]
 
 
 def check_optics(chain, optics_in):
