@@ -127,7 +127,8 @@ class Scatter:
     @property
     def is_known(self):
         """Whether the residuals of all datasets tell how they scatter."""
-        return all(np.isfinite(part.amplitude).all() for part in self.parts)
+        known = (np.isfinite(part.amplitude).all() for part in self.parts)
+        return bool(np.isfinite(self._level).all()) and all(known)
 
     def _part(self, i, groups, residuals, leverage):
         dataset, rows = self.measurement.datasets[i], self.measurement.segments[i]
@@ -244,13 +245,15 @@ def _amplitude(bins, residuals, spare):
 
 def model_error(measurement, scatter):
     """
-    Return the error of the model at a setting that it has not seen, for `Calibration.fit`.
+    Return the error of the model at a setting that it has not seen, for ``Calibration.fit``.
 
     ``relative_percent`` multiplies the polarization, from sources that are fully polarized;
     ``absolute_percent`` does not depend on it, from all others. Both are standard errors of Stokes
     q and u per wavelength; zero, and named in ``missing``, where no dataset tells.
     """
     squares = {"relative": [], "absolute": []}
+    if not scatter.is_known:
+        return None
     for i, dataset in enumerate(measurement.datasets):
         polarized = kind_of_source(dataset.observations.source) == "polarized"
         squares["relative" if polarized else "absolute"].append(scatter.at_settings(i) ** 2)

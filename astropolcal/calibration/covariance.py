@@ -355,7 +355,7 @@ def full_covariance(calibration):
     return covariance_around(calibration.measurement, whitened, weighting)
 
 
-def covariance_around(measurement, whitened, weighting):
+def covariance_around(measurement, whitened, weighting, scatter=None):
     """
     Return the covariance with its directions, of a problem that is decomposed once.
 
@@ -371,13 +371,15 @@ def covariance_around(measurement, whitened, weighting):
         The problem around its solution.
     weighting : Weighting
         The noise; without any there is no error.
+    scatter : Scatter, optional
+        Of the residuals, if it is at hand.
 
     Returns
     -------
     Covariance
     """
-    scatter = Scatter(measurement, weighting, whitened)
-    if not (scatter.is_known and weighting.is_known):
+    scatter = Scatter(measurement, weighting, whitened) if scatter is None else scatter
+    if not scatter.is_known:
         return white_covariance(measurement, whitened, weighting)
     prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T * weighting.level
     return sandwich(measurement, whitened, scatter.middle() + prior.T @ prior)

@@ -21,6 +21,7 @@ from astropy.modeling import Model
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
 
+from astropolcal.calibration._scatter import Scatter, model_error
 from astropolcal.calibration._sky_view import view_of_measurement
 from astropolcal.calibration.accuracy import accuracy_table
 from astropolcal.calibration.covariance import covariance_around
@@ -423,10 +424,11 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     view = view_of_measurement(measurement, vector, settings["instrument"])
     complete(finding, measurement, vector, whitened, level, view=view)
     names = measurement.free.names
+    scatter = Scatter(measurement, measurement.weighting, whitened)
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
-        covariance=covariance_around(measurement, whitened, measurement.weighting),
+        covariance=covariance_around(measurement, whitened, measurement.weighting, scatter),
         identifiability=finding,
         at_bound=[names[i] for i in np.flatnonzero(whitened.held)],
         datasets=[_record(measurement, i, residuals) for i in range(len(measurement.datasets))],
@@ -441,6 +443,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
     calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
     calibration.fit["outliers"] = _outliers(calibration)
+    calibration.fit["model_error"] = model_error(measurement, scatter)
     keep_sky_accuracy(calibration, view)
     return calibration.cross_validate() if cross_validate else calibration
 
