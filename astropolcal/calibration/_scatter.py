@@ -19,7 +19,6 @@ doi:10.1016/0047-259X(71)90001-7).
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
 
 from astropolcal.calibration.groups import leave_out_groups
 from astropolcal.calibration.steps import kind_of_source
@@ -206,6 +205,8 @@ class Scatter:
 
 def _solved(seen, found, taken):
     """Return the shares of the components that are taken, none negative."""
+    from scipy.optimize import nnls
+
     shares, norm = np.zeros(len(found)), np.sqrt(np.diag(seen)[taken])
     if taken.any():
         shares[taken] = nnls(seen[np.ix_(taken, taken)] / norm[:, None], found[taken] / norm)[0]

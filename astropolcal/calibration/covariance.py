@@ -352,7 +352,8 @@ def full_covariance(calibration):
         return Covariance(known.names, known.units, known.matrix, null=_open_of_file(calibration))
     weighting = weighting_of(calibration)
     whitened = around(calibration.measurement, weighting)
-    return covariance_around(calibration.measurement, whitened, weighting)
+    how = white_covariance if calibration.settings.get("errors") == "white" else covariance_around
+    return how(calibration.measurement, whitened, weighting)
 
 
 def covariance_around(measurement, whitened, weighting, scatter=None):

@@ -2,8 +2,7 @@
 """
 Standard errors of parameters: of the full covariance, robust, and as published ones are.
 
-The covariance takes residuals to be independent. Where they are not, the
-sandwich estimate reads from the residuals of whole groups of data how far each
+The sandwich estimate reads from the residuals of whole groups of data how far each
 group pulls the parameters (White 1980; Liang & Zeger 1986).
 """
 
@@ -11,7 +10,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration._whitened import decompose
-from astropolcal.calibration.covariance import sandwich
+from astropolcal.calibration.covariance import sandwich, white_covariance
 from astropolcal.calibration.identifiability import physical_scale
 from astropolcal.calibration.resampling import labels_of
 from astropolcal.calibration.weighting import around, weighting_of
@@ -19,7 +18,7 @@ from astropolcal.exceptions import FitError
 
 __all__ = ["robust_covariance", "standard_errors"]
 
-METHODS = ("covariance", "robust", "van-holstein")
+METHODS = ("covariance", "white", "robust", "van-holstein")
 CORRECTIONS = ("leverage", "number")
 _FEWEST_GROUPS = 3
 # a share of a residual below this is what the fit has taken away, and no scatter
@@ -30,9 +29,9 @@ def standard_errors(calibration, method=None, groups=None):
     r"""
     Return the standard errors of the free parameters.
 
-    ``"covariance"`` takes all correlations of the parameters into account, and
-    the residuals to be independent. ``"robust"`` does not, see
-    `robust_covariance`. ``"van-holstein"`` is the error that calibrations of
+    ``"covariance"`` is that of the calibration, by default from how its residuals scatter and hang
+    together. ``"white"`` takes them to be independent, with the noise of its weights.
+    ``"robust"`` lets groups of residuals hang together in any way, see `robust_covariance`. ``"van-holstein"`` is the error that calibrations of
     SPHERE/IRDIS and CHARIS quote (van Holstein et al. 2020, A&A 633, A64,
     Appendix E): each wavelength is a fit of its own in which the parameters
     common to all wavelengths are known, with covariance
@@ -48,7 +47,7 @@ def standard_errors(calibration, method=None, groups=None):
     ----------
     calibration : Calibration
         The calibration; with its data for all but ``"covariance"``.
-    method : {"covariance", "robust", "van-holstein"}, optional
+    method : {"covariance", "white", "robust", "van-holstein"}, optional
         Which error; by default ``"covariance"``, or ``"robust"`` with groups.
     groups : str or array_like, optional
         For ``"robust"``, see `robust_covariance`; by default ``"derotator"``.
@@ -95,6 +94,9 @@ def standard_errors(calibration, method=None, groups=None):
         raise FitError(f"method = {method!r} knows no groups; 'robust' does")
     covariance = calibration.covariance
     stds, held, meta = covariance.stds, [], {}
+    if method == "white":
+        weighting, live = weighting_of(calibration), calibration.live_measurement()
+        stds = white_covariance(live, around(live, weighting), weighting).stds
     if method == "robust":
         groups = "derotator" if groups is None else groups
         stds = robust_covariance(calibration, groups).stds

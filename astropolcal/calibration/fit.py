@@ -24,7 +24,7 @@ from astropy.utils.exceptions import AstropyWarning
 from astropolcal.calibration._scatter import Scatter, model_error
 from astropolcal.calibration._sky_view import view_of_measurement
 from astropolcal.calibration.accuracy import accuracy_table
-from astropolcal.calibration.covariance import covariance_around
+from astropolcal.calibration.covariance import covariance_around, white_covariance
 from astropolcal.calibration.gauge import describe_gauge, hold_silent, open_parameters, settled
 from astropolcal.calibration.goodness import lack_of_fit
 from astropolcal.calibration.identifiability import complete, finding_of
@@ -52,6 +52,7 @@ from astropolcal.version import version
 __all__ = ["calibrate"]
 
 STRATEGIES = ("joint", "two-step", "sequential")
+ERRORS = ("scatter", "white")
 _MAX_EVALUATIONS = 500
 _MAX_ROUNDS = 4
 _ROBUST_ROUNDS = 50
@@ -75,6 +76,7 @@ def calibrate(
     loss="linear",
     fix=None,
     instrument=None,
+    errors="scatter",
     cross_validate=True,
 ):
     """
@@ -127,6 +129,10 @@ def calibrate(
         that of the chain: another way to choose a gauge.
     instrument : str, optional
         Name to record.
+    errors : {"scatter", "white"}
+        Errors of the parameters: from how the residuals scatter and hang together at wavelengths,
+        pairs of frames and settings of each dataset; or those of independent data whose noise is
+        that of ``weights``.
     cross_validate : bool
         Whether to work out ``s_cv``, which costs one fit a derotator angle.
 
@@ -162,6 +168,8 @@ def calibrate(
         raise FitError(f"strategy = {strategy!r}; allowed are {', '.join(STRATEGIES)}")
     if loss not in LOSSES:
         raise FitError(f"loss = {loss!r}; allowed are {', '.join(LOSSES)}")
+    if errors not in ERRORS:
+        raise FitError(f"errors = {errors!r}; allowed are {', '.join(ERRORS)}")
     search = strategy != "two-step" if search is None else search
     started = time.perf_counter()
     fitter = TRFLSQFitter() if fitter is None else fitter
@@ -192,6 +200,7 @@ def calibrate(
             "strategy": strategy,
             "weights": weighting.choice,
             "loss": loss,
+            "errors": errors,
             "noise": describe(measurement, weighting),
             "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
         },
@@ -424,11 +433,11 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     view = view_of_measurement(measurement, vector, settings["instrument"])
     complete(finding, measurement, vector, whitened, level, view=view)
     names = measurement.free.names
-    scatter = Scatter(measurement, measurement.weighting, whitened)
+    covariance, lacking = _errors(measurement, whitened, settings["errors"])
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
-        covariance=covariance_around(measurement, whitened, measurement.weighting, scatter),
+        covariance=covariance,
         identifiability=finding,
         at_bound=[names[i] for i in np.flatnonzero(whitened.held)],
         datasets=[_record(measurement, i, residuals) for i in range(len(measurement.datasets))],
@@ -443,9 +452,18 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
     calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
     calibration.fit["outliers"] = _outliers(calibration)
-    calibration.fit["model_error"] = model_error(measurement, scatter)
+    calibration.fit["model_error"] = lacking
     keep_sky_accuracy(calibration, view)
     return calibration.cross_validate() if cross_validate else calibration
+
+
+def _errors(measurement, whitened, how):
+    """Return the covariance of the parameters, and the error of the model at a new setting."""
+    if how == "white":
+        return white_covariance(measurement, whitened, measurement.weighting), None
+    scatter = Scatter(measurement, measurement.weighting, whitened)
+    covariance = covariance_around(measurement, whitened, measurement.weighting, scatter)
+    return covariance, model_error(measurement, scatter)
 
 
 def _lack_of_fit(calibration):

@@ -74,7 +74,7 @@ def test_noisy_data_give_the_truth_within_errors(few, strategy):
 def test_unknown_errors_are_scaled_to_the_residuals(few):
     """Without weights the covariance is (J J^T)^-1 times sum r^2 / (n - rank)."""
     chain, _, data = few
-    cal = calibrate(chain, data, cross_validate=False)
+    cal = calibrate(chain, data, errors="white", cross_validate=False)
     slopes = cal.measurement.jacobian(cal.measurement.vector())
     variance = np.sum(cal.residuals**2) / (cal.measurement.n_data - 11)
     stds = np.sqrt(np.diag(np.linalg.inv(slopes @ slopes.T)) * variance)
@@ -91,7 +91,8 @@ def test_known_errors_are_taken_as_they_are(few):
     for beam in ("right", "left"):
         table[f"flux_{beam}_err"] *= 2
     pair = (data, Observations.from_table(table))
-    one, two = (calibrate(chain, d, weights="errors", cross_validate=False) for d in pair)
+    options = {"weights": "errors", "errors": "white", "cross_validate": False}
+    one, two = (calibrate(chain, d, **options) for d in pair)
     np.testing.assert_allclose(two.covariance.stds, 2 * one.covariance.stds, rtol=1e-3)
 
 
@@ -194,8 +195,8 @@ def test_two_datasets_share_optics_and_halve_the_variance(make):
     pair = [make.chain(wavelength=FEW, optics_in=o) for o in ([], ["nbs"])]
     truths = [make.truth(c) for c in pair]
     data = [make.observe(t, wavelength=FEW, seed=i, name=f"set {i}") for i, t in enumerate(truths)]
-    both = calibrate(pair, data, weights="errors", cross_validate=False)
-    alone = calibrate(pair[0], data[0], weights="errors", cross_validate=False)
+    options = {"weights": "errors", "errors": "white", "cross_validate": False}
+    both, alone = calibrate(pair, data, **options), calibrate(pair[0], data[0], **options)
     assert [record.name for record in both.datasets] == ["set 0", "set 1"]
     assert both.covariance.names == alone.covariance.names
     for name in ("hwp.w_sio2", "calibration_polarizer.theta", "wollaston.efficiency[2]"):

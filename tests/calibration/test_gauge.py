@@ -116,13 +116,13 @@ def test_a_prior_is_a_gauge_and_gives_errors(observations):
 
 def test_a_prior_competes_with_the_data_by_their_errors(observations):
     chain, name = _chain(), "wollaston.efficiency"
-    free = _fit(_chain(), observations, weights="errors")
+    free = _fit(_chain(), observations, weights="errors", errors="white")
     value = free.parameter_values()[name]["value"]
     rows = [free.covariance.names.index(f"{name}[{i}]") for i in range(4)]
     data = free.covariance.matrix[np.ix_(rows, rows)]
     mean, std = float(value.mean()), float(np.sqrt(data[0, 0]))
     chain["wollaston"].efficiency.prior = Normal(mean, std)
-    pulled = _fit(chain, observations, weights="errors")
+    pulled = _fit(chain, observations, weights="errors", errors="white")
     # a prior on these four alone combines with their covariance as two measurements do
     posterior = np.linalg.inv(np.linalg.inv(data) + np.eye(4) / std**2)
     expected = posterior @ (np.linalg.inv(data) @ value + mean / std**2)

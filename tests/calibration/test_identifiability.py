@@ -279,7 +279,8 @@ def faint(make, flux, fixed=True, **options):
     data = make.observe(chain, frames, lam, seed=1, flux=flux)
     for name, prior in options.items():
         getattr(chain["derotator"], name).prior = prior
-    return calibrate(chain, data, weights="errors", search=False, cross_validate=False)
+    options = {"weights": "errors", "errors": "white", "search": False}
+    return calibrate(chain, data, cross_validate=False, **options)
 
 
 def test_what_is_uncertain_by_many_degrees_is_named(make):

@@ -15,7 +15,7 @@ LAM = [1.2, 1.6, 2.2] * u.um
 def calibrated(make, kind="linear", fixed=True, **options):
     truth = make.truth(make.chain(kind, fixed=fixed, wavelength=LAM))
     data = make.observe(truth, wavelength=LAM, seed=1)
-    return calibrate(truth, data, search=False, cross_validate=False, **options)
+    return calibrate(truth, data, search=False, cross_validate=False, errors="white", **options)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,9 @@ def test_prior_bounds_what_the_data_leave_open(make):
     chain = make.truth(make.chain("elliptical", fixed=False, wavelength=LAM))
     chain["hwp"].theta.prior = Normal(0 * u.deg, 0.1 * u.deg)
     data = make.observe(chain, wavelength=LAM, seed=1)
-    cal = calibrate(chain, data, weights="errors", search=False, cross_validate=False)
+    cal = calibrate(
+        chain, data, weights="errors", errors="white", search=False, cross_validate=False
+    )
     low, high = profile(cal, "hwp.theta", n=5).interval()
     assert u.isclose((high - low) / 2, 0.1 * u.deg, rtol=0.02)
 
@@ -128,7 +130,7 @@ def test_bound_ends_the_profile(make):
     data = make.observe(chain, wavelength=LAM, seed=1)
     chain["wollaston"].efficiency.bounds = (0, 0.965)
     chain["wollaston"].efficiency = [0.96, 0.965, 0.965]
-    cal = calibrate(chain, data, search=False, cross_validate=False)
+    cal = calibrate(chain, data, errors="white", search=False, cross_validate=False)
     assert "wollaston.efficiency[2]" in cal.at_bound
     made = profile(cal, "wollaston.efficiency[2]", n=5)
     assert made.values.max() <= 0.965

@@ -23,7 +23,8 @@ def problem(make):
 
 
 def _fit(problem, **options):
-    return calibrate(problem[0], problem[1], search=False, cross_validate=False, **options)
+    options = {"search": False, "errors": "white", "cross_validate": False} | options
+    return calibrate(problem[0], problem[1], **options)
 
 
 def _moved(cal, vector):

@@ -161,7 +161,6 @@ def test_joint_fit_is_fast(joint, prepared):
         cal = calibrate(chains, data, cross_validate=False)
         seconds.append(time.process_time() - start)
     assert cal.converged
-    assert len(cal.covariance) == 137
     # 1 s on a quiet machine
     assert min(seconds) < 4
 
