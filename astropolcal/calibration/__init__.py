@@ -61,7 +61,7 @@ from astropolcal.calibration.sampling import sample
 from astropolcal.calibration.sky import sky_consequences
 from astropolcal.calibration.standards import add_standard, standard_accuracy
 from astropolcal.calibration.star_checks import add_star_check, star_check
-from astropolcal.calibration.stars import star_accuracy, star_stokes
+from astropolcal.calibration.stars import fitted_stars, star_accuracy, star_stokes
 from astropolcal.calibration.starts import BinProblem, search_branches
 from astropolcal.calibration.summaries import summary, to_dict
 from astropolcal.calibration.targets import (
@@ -125,6 +125,7 @@ __all__ = [
     "describe_gauge",
     "estimate_noise",
     "examine",
+    "fitted_stars",
     "four_accuracies",
     "full_covariance",
     "groups_by",

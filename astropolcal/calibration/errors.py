@@ -31,8 +31,9 @@ def standard_errors(calibration, method=None, groups=None):
 
     ``"covariance"`` is that of the calibration, by default from how its residuals scatter and hang
     together. ``"white"`` takes them to be independent, with the noise of its weights.
-    ``"robust"`` lets groups of residuals hang together in any way, see `robust_covariance`. ``"van-holstein"`` is the error that calibrations of
-    SPHERE/IRDIS and CHARIS quote (van Holstein et al. 2020, A&A 633, A64,
+    ``"robust"`` lets groups of residuals hang together in any way, see `robust_covariance`.
+    ``"van-holstein"`` is the error that calibrations of SPHERE/IRDIS and CHARIS quote (van Holstein
+    et al. 2020, A&A 633, A64,
     Appendix E): each wavelength is a fit of its own in which the parameters
     common to all wavelengths are known, with covariance
 

@@ -116,7 +116,7 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     True
     """
     refuse_fitted(calibration, observations)
-    rows = _rows_on_grid(calibration, observations)
+    rows = rows_on_grid(calibration, observations)
     predicted = _calibrated_chain(calibration, chain, rows, observations.name)
     known = parameter_table([predicted])
     measurement = Measurement(
@@ -144,11 +144,11 @@ def standard_accuracy(calibration, chain, observations, positions=None):
 
 def predicted_chain(calibration, chain, observations):
     """Return the chain with the calibration's values at the wavelengths of the observations."""
-    rows = _rows_on_grid(calibration, observations)
+    rows = rows_on_grid(calibration, observations)
     return _calibrated_chain(calibration, chain, rows, observations.name, sources=True)
 
 
-def _rows_on_grid(calibration, observations):
+def rows_on_grid(calibration, observations):
     """Return the calibration's wavelength (index) of each of the observations'."""
     grid, own = (w.to_value(u.nm) for w in (calibration.wavelength, observations.wavelength))
     nearest = np.abs(own[:, None] - grid).argmin(axis=1)

@@ -7,8 +7,9 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import standards
-from astropolcal.calibration.standards import refuse_fitted
+from astropolcal.calibration.standards import refuse_fitted, rows_on_grid
 from astropolcal.calibration.stars import star_accuracy, star_stokes
+from astropolcal.calibration.targets import target_accuracies
 from astropolcal.exceptions import (
     AstropolcalError,
     ObservationError,
@@ -22,10 +23,12 @@ __all__ = ["add_star_check", "star_check"]
 _KEPT = {
     "dolp": u.percent,
     "dolp_err": u.percent,
+    "dolp_sys_err": u.percent,
     "dolp_known": u.percent,
     "dolp_known_err": u.percent,
     "aolp": u.deg,
     "aolp_err": u.deg,
+    "aolp_sys_err": u.deg,
     "aolp_known": u.deg,
     "aolp_known_err": u.deg,
     "dolp_error": u.percent,
@@ -61,7 +64,9 @@ def star_check(calibration, chain, observations, positions=None, star=None):
     -------
     `~astropy.table.QTable`
         The columns of `~astropolcal.calibration.star_stokes` and
-        `~astropolcal.calibration.star_accuracy`; and ``q_known``, ``u_known``, ``dolp_known``,
+        `~astropolcal.calibration.star_accuracy`; ``dolp_sys_err`` and ``aolp_sys_err``, what the
+        calibration claims of such light, see `~astropolcal.calibration.target_accuracies`; and
+        ``q_known``, ``u_known``, ``dolp_known``,
         ``aolp_known`` of the catalogue with ``dolp_known_err`` and ``aolp_known_err``, NaN
         where no errors are published. Meta ``star``, ``name`` and ``words``.
 
@@ -102,6 +107,7 @@ def star_check(calibration, chain, observations, positions=None, star=None):
     for key in accuracy.colnames[1:]:
         table[key] = accuracy[key]
     _add_known(table, np.asarray(q), np.asarray(stokes_u), covariance)
+    _add_claims(table, calibration, rows_on_grid(calibration, observations))
     table.meta["words"] = _words(table)
     return table
 
@@ -144,6 +150,22 @@ def _add_known(table, q, stokes_u, covariance):
         table["aolp_known_err"] = np.rad2deg(0.5 * across / length) * u.deg
 
 
+def _add_claims(table, calibration, rows):
+    """Add the errors that the calibration claims for light of the catalogue's polarization."""
+    degrees = np.clip(table["dolp_known"], 0 * u.percent, 100 * u.percent)
+    angles = np.nan_to_num(table["aolp_known"])
+    claimed = target_accuracies(calibration, list(zip(degrees, angles, strict=True)))
+    for key, name, unit in (("dolp", "s_p", u.percent), ("aolp", "s_chi", u.deg)):
+        values = [one[name][row].value for one, row in zip(claimed, rows, strict=bool(claimed))]
+        table[f"{key}_sys_err"] = (values or np.full(len(table), np.nan)) * unit
+
+
+def _stated(table, key):
+    """Return the errors of the star, the calibration and the catalogue together."""
+    parts = (table[f"{key}{suffix}"].value for suffix in ("_err", "_sys_err", "_known_err"))
+    return np.sqrt(sum(np.nan_to_num(part, posinf=np.inf) ** 2 for part in parts))
+
+
 def _error_along(direction, matrix):
     """Return the standard error along unit vectors, shape (n_wavelengths, 2)."""
     variance = np.einsum("wi,wij,wj->w", direction, matrix, direction)
@@ -160,7 +182,11 @@ def _words(table):
     )
     turned = table["aolp_error"].to_value(u.deg)
     if np.isfinite(turned).any():
-        words += f"; AoLP by {np.nanmedian(turned):+.2g} deg (median)"
+        pull = np.nanmedian(np.abs(turned) / _stated(table, "aolp"))
+        words += (
+            f"; AoLP by {np.nanmedian(turned):+.2g} deg (median), {pull:.1f} times the errors of "
+            "calibration, star and catalogue together"
+        )
     return words
 
 

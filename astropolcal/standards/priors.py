@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import astropy.units as u
 import numpy as np
-from scipy.optimize import least_squares
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.standards.law import SerkowskiLaw, whittet_width
@@ -217,6 +216,8 @@ def _published(star):
 
 def _fitted(star):
     """Return a shape that goes through what is known, its covariance, and what is assumed."""
+    from scipy.optimize import least_squares
+
     x, degree, error, words = _degrees(star)
     center, spread, prior_words = _prior(star)
     # a band elsewhere than said has another degree, dp = 2 K p ln(lambda_max / lambda) dln(lambda)

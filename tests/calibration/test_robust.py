@@ -247,6 +247,8 @@ def test_errors_of_dataset_3_are_those_of_the_bootstrap(charis_data, make):
     fix = {"hwp.theta": None, "derotator.theta": None}
     cal = calibrate(make.charis.chains_for([data]), data, fix=fix, cross_validate=False)
     robust = robust_covariance(cal).stds
-    assert np.nanmedian(robust / standard_errors(cal, "white")["std"]) == pytest.approx(1.7, abs=0.2)
+    assert np.nanmedian(robust / standard_errors(cal, "white")["std"]) == pytest.approx(
+        1.7, abs=0.2
+    )
     ratio = robust / bootstrap(cal, n=60, seed=1).stds
     assert np.nanmedian(ratio) == pytest.approx(0.9, abs=0.2)

@@ -12,6 +12,7 @@ from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import calibrate, standards
 from astropolcal.calibration import (
+    fitted_stars,
     paper_accuracies,
     standard_accuracy,
     star_accuracy,
@@ -165,12 +166,25 @@ def test_joint_fit_is_fast(joint, prepared):
     assert min(seconds) < 4
 
 
-def test_diattenuation_of_m3_falls_from_1_6_to_1_2_percent(joint):
-    found = 100 * joint.parameter_values()["m3.diattenuation"]["value"]
+def test_diattenuation_of_m3_falls_from_1_6_to_1_2_percent(joint, prepared):
+    """If the star were exactly unpolarized; as nobody knows that, it is up to 0.2 % less."""
+    data = prepared("dataset3", "dataset4", "hd293396")
+    chains = CHARIS.chains_for(data)
+    exact = {
+        f"star_HD293396.{key}{suffix}": None
+        for key in "qu"
+        for suffix in ("", "_slope", "_curvature")
+    }
+    held = calibrate(chains, data, fix=exact, instrument="charis", cross_validate=False)
+    found = 100 * held.parameter_values()["m3.diattenuation"]["value"]
     slope, middle = np.polyfit(np.linspace(-1, 1, 22), found, 1)
     assert middle - slope == pytest.approx(1.62, abs=0.06)
     assert middle + slope == pytest.approx(1.19, abs=0.06)
     assert np.std(found - np.polyval([slope, middle], np.linspace(-1, 1, 22))) < 0.08
+    free = joint.parameter_values()["m3.diattenuation"]
+    pulls = (100 * free["value"] - found) / (100 * free["std"])
+    assert np.abs(pulls).max() < 2.5
+    assert np.median(free["std"]) > 5e-4
 
 
 def test_residuals_are_below_those_of_the_published_law(joint, prepared):
@@ -209,11 +223,17 @@ def test_frames_left_out_are_stated_beside(joint):
     assert 0.8 * s_res < s_cv < 1.3 * s_res
 
 
-def test_unpolarized_star_is_unpolarized(joint, prepared):
+def test_unpolarized_star_is_what_the_fit_has_found_of_it(joint, prepared):
     (star,) = prepared("hd293396")
     (chain,) = CHARIS.chains_for([star])
     table = star_stokes(joint, chain, star)
-    assert np.median(np.abs(table["q"].to_value(u.percent))) < 0.03
+    (found,) = fitted_stars(joint)
+    for key in "qu":
+        assert np.median(np.abs(table[key] - found[key])) < 0.04 * u.percent
+        # two catalogue errors
+        assert np.abs(found[key]).max() < 0.5 * u.percent
+        assert (found[f"{key}_err"] < 0.75 * found[f"{key}_prior_err"]).all()
+    assert 0.4 < found.meta["from_data"] <= 1
     assert table["n_cycles"].max() == 23
 
 

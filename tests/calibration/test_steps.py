@@ -181,7 +181,8 @@ def test_two_stars_share_the_mirror_and_not_their_polarization():
     np.testing.assert_allclose(values["m3.diattenuation"]["value"], M3, atol=5e-4)
     np.testing.assert_allclose(values["star_b.q"]["value"], known, atol=1e-3)
     np.testing.assert_allclose(values["star_b.u"]["value"], -known, atol=1e-3)
-    assert "star_a.q" not in cal.covariance.names
+    # the other one is unpolarized, as far as one knows
+    assert np.abs(float(values["star_a.q"]["value"])) < 3 * float(values["star_a.q"]["std"])
 
 
 # --- cross-validation on sky ----------------------------------------------------------------------

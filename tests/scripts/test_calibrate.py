@@ -372,7 +372,7 @@ def test_nothing_is_masked_where_all_is_to_be_kept(tables, star_table, tmp_path)
 def test_model_of_the_tertiary_mirror(tables, star_table, tmp_path):
     content = run(tmp_path, star_table, tables["first"], *HELD, "--m3", "metal")
     free = {k for k, v in content["parameters"].items() if k.startswith("m3.") and not v["fixed"]}
-    assert free == {"m3.film_thickness", "m3.n_scale", "m3.k_scale"}
+    assert free == {"m3.theta", "m3.film_thickness", "m3.n_scale", "m3.k_scale"}
 
 
 @pytest.mark.parametrize(
