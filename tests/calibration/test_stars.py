@@ -10,12 +10,13 @@ import pytest
 from astropy.table import QTable
 from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
 
-from astropolcal import calibrate, standards
+from astropolcal import calibrate
 from astropolcal.calibration import (
     fitted_stars,
     paper_accuracies,
     standard_accuracy,
     star_accuracy,
+    star_check,
     star_stokes,
 )
 from astropolcal.chain import leaves, replace_optic
@@ -264,17 +265,30 @@ def february(prepared):
     return calibrate(CHARIS.chains_for(data), data, instrument="charis", cross_validate=False)
 
 
-def test_polarized_standard_comes_out(february, prepared):
-    """The paper's appendix: DoLP residual below 0.3 % in J and H."""
+def test_polarized_standard_comes_out(february, joint, prepared):
+    """
+    The paper's appendix: DoLP residual below 0.3 % in J and H. No fit has seen it.
+
+    Its angle is that of the catalogue within 1.5 times the errors stated, with calibrations of
+    July and of October.
+    """
     (star,) = prepared("hd30675")
     (chain,) = CHARIS.chains_for([star])
-    table = star_stokes(february, chain, star)
-    law = standards.get("HD 30675").stokes(star.wavelength)
-    found = star_accuracy(table, np.asarray(law.q), np.asarray(law.u))
-    in_j_and_h = star.wavelength < 1.81 * u.um
-    assert np.median(found["s_dolp"][in_j_and_h]) < 0.25 * u.percent
-    assert np.abs(found["dolp_error"][in_j_and_h]).max() < 0.2 * u.percent
-    assert np.median(np.abs(found["aolp_error"][in_j_and_h])) < 1.5 * u.deg
+    for calibration in (february, joint):
+        found = star_check(calibration, chain, star)
+        in_j_and_h = star.wavelength < 1.81 * u.um
+        assert np.abs(found["dolp_error"][in_j_and_h]).max() < 0.3 * u.percent
+        stated = {
+            key: np.sqrt(
+                sum(found[f"{key}{part}"] ** 2 for part in ("_err", "_sys_err", "_known_err"))
+            )
+            for key in ("dolp", "aolp")
+        }
+        assert np.abs(np.median(found["aolp_error"] / stated["aolp"])) < 1.5
+        assert np.abs(found["aolp_error"] / stated["aolp"]).max() < 2.5
+        # beyond 1.8 um the star has more than its law
+        assert np.abs(found["dolp_error"] / stated["dolp"])[in_j_and_h].max() < 2.5
+        assert (found["aolp_sys_err"] < 10 * u.deg).all()
 
 
 def test_polarized_standard_is_predicted(february, prepared):
