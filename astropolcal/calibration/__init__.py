@@ -73,6 +73,7 @@ from astropolcal.calibration.targets import (
     target_accuracy,
 )
 from astropolcal.calibration.validity import Validity, content_hash, validity_of, with_validity
+from astropolcal.calibration.verdicts import Verdict, verdict
 from astropolcal.calibration.weighting import Weighting, noise_of, residual_noise, weighting_of
 
 __all__ = [
@@ -98,6 +99,7 @@ __all__ = [
     "Resampled",
     "SystemMueller",
     "Validity",
+    "Verdict",
     "Weighting",
     "absolute_accuracy",
     "accuracy_table",
@@ -166,6 +168,7 @@ __all__ = [
     "target_accuracy",
     "to_dict",
     "validity_of",
+    "verdict",
     "weighting_of",
     "with_validity",
     "write_mueller",

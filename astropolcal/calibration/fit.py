@@ -22,6 +22,7 @@ from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
 
 from astropolcal.calibration.accuracy import accuracy_table
+from astropolcal.calibration.bounds import errors_at_bounds
 from astropolcal.calibration.covariance import covariance_around
 from astropolcal.calibration.gauge import describe_gauge, hold_silent, open_parameters, settled
 from astropolcal.calibration.goodness import lack_of_fit
@@ -436,6 +437,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     )
     observations = (dataset.observations for dataset in measurement.datasets)
     calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
+    calibration.fit["bounds"] = errors_at_bounds(measurement, whitened)
     calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
     calibration.fit["outliers"] = _outliers(calibration)
     return calibration.cross_validate() if cross_validate else calibration
