@@ -111,18 +111,21 @@ def verdict(calibration, targets=SKY_TARGETS):
     known = calibration.parameter_values()
     free = {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
     tables = target_accuracies(calibration, targets)
+    # whether it is usable does not hang on what was asked for
+    bright = target_accuracies(calibration, SKY_TARGETS[:1])
     sky = _open_on_sky(calibration, free)
     # what must be wrong with the set-up or its description comes before what is not known
     wrong = [
         _nothing(calibration),
-        _stuck(free),
         _angles(calibration, free),
         *_mirrors(calibration, known),
         _misfit(calibration),
     ]
-    unknown = [*_absurd(free), *_open_words(sky), *_too_far(tables, sky)]
-    arrived = "" if calibration.converged else "the fit did not converge"
-    wrong, reasons = any(wrong), [words for words in (*wrong, *unknown, arrived) if words]
+    unknown = [*_absurd(free), *_open_words(sky), *_too_far(bright, sky)]
+    stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
+    reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
+    # what is not known runs to its bounds, too
+    wrong = any(wrong) or bool(stuck and not unknown)
     cautions = [] if reasons else _cautions(calibration, free)
     words = [
         _first(reasons, cautions),
@@ -288,10 +291,10 @@ def _open_words(sky):
 
 
 def _too_far(tables, sky):
-    """Say what of the brightest target is known too badly to be called known."""
+    """Say what of a bright target is known too badly to be called known."""
     if not tables:
         return []
-    table = max(tables, key=lambda each: each.meta["dolp"])
+    (table,) = tables
     dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
     s_p, s_chi = _median(table["s_p"].value), _median(table["s_chi"].value)
     return [

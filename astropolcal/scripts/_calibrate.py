@@ -73,7 +73,7 @@ def add_parser(commands):
     add_full(parser)
     add_json(parser)
     add_online(parser)
-    add_quiet(parser, "print nothing but warnings, such as that it is not usable, and errors")
+    add_quiet(parser)
     parser.set_defaults(run=run)
 
 
@@ -269,7 +269,7 @@ def _written(arguments, written):
     named = [path for path in written if path in (arguments.output, arguments.json)]
     named += [f"{counted(figures, 'figure')} in {arguments.plots}"] if figures else []
     kept = [] if arguments.output else ["Not kept: -o cal.asdf writes the calibration to a file"]
-    return [f"Written     {one_line(name, None)}" for name in named] + kept
+    return [f"Written:    {one_line(name, None)}" for name in named] + kept
 
 
 def _is_known(observations):
