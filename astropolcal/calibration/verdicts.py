@@ -121,11 +121,12 @@ def verdict(calibration, targets=SKY_TARGETS):
         *_mirrors(calibration, known),
         _misfit(calibration),
     ]
-    unknown = [*_absurd(free), *_open_words(sky), *_too_far(bright, sky)]
+    hanging = _hanging(free)
+    unknown = [*_absurd(free), *_open_words(sky), *_too_far(bright, sky), hanging]
     stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
     reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
     # what is not known runs to its bounds, too
-    wrong = any(wrong) or bool(stuck and not unknown)
+    wrong = any(wrong) or bool(stuck and not any(unknown))
     cautions = [] if reasons else _cautions(calibration, free)
     words = [
         _first(reasons, cautions),
@@ -245,6 +246,14 @@ def _absurd(free):
             told.append(f"{name} is known to {std.to_value(u.deg):.3g} deg only")
     wide = [n for n, e in free.items() if np.mean(e["std"] > _width(e)) > _MOST]
     return [*told, f"errors larger than the bounds: {', '.join(wide)}"] if wide else told
+
+
+def _hanging(free):
+    """Name the orientations at a bound on which others hang: these are where the bound is."""
+    angles = _orientations(free)
+    told = [str(e["conditional_on"]) for e in angles.values() if e["status"] == "conditional"]
+    names = dict.fromkeys(name for by in told for name in by.split(", ") if name in angles)
+    return f"orientations hang on the bound of {', '.join(names)}" if names else ""
 
 
 def _width(entry):
@@ -394,6 +403,7 @@ def _next(calibration, free, wrong, sky, tables):
             unknown and "polarized" not in kinds,
             "the internal source with its polarizer, at several derotator angles",
         ),
+        (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
         (unknown or not calibration.converged, "more angles of derotator and half-wave plate"),
         ("on_sky" in missing, "an unpolarized standard star: the telescope is not in the errors"),
