@@ -8,7 +8,6 @@ that matters, the error with the bound released is worked out beside it.
 """
 
 import numpy as np
-from scipy.optimize import brentq, nnls
 
 from astropolcal.calibration._directions import LARGE, declared_step, step_of
 
@@ -57,9 +56,11 @@ def errors_at_bounds(measurement, whitened):
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
-    >>> chain["calibration_polarizer"].theta.bounds = (90.2, 95)
     >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> data = simulate(chain, charis.wavelength, frames, seed=2)
+    >>> polarizer = chain["calibration_polarizer"]
+    >>> polarizer.theta, polarizer.theta.bounds = 91 * u.deg, (90.2, 95)
+    >>> cal = calibrate(chain, data, fix={"hwp.theta": None, "derotator.theta": None})
     >>> problem = around(cal.measurement, cal.measurement.weighting)
     >>> list(errors_at_bounds(cal.measurement, problem)["inward"])
     ['calibration_polarizer.theta']
@@ -117,6 +118,9 @@ def _one_sided(columns, residual, level, widths):
 
 
 def _rises(columns, residual, level, i, width):
+    # a calibration is read where there is no scipy
+    from scipy.optimize import brentq, nnls
+
     own, others = columns[:, i], np.delete(columns, i, axis=1)
     if not np.isfinite(level) or not own.any():
         return np.nan if own.any() else np.inf
