@@ -75,6 +75,7 @@ from astropolcal.calibration.targets import (
     target_accuracy,
 )
 from astropolcal.calibration.validity import Validity, content_hash, validity_of, with_validity
+from astropolcal.calibration.verdicts import Verdict, verdict
 from astropolcal.calibration.weighting import Weighting, noise_of, residual_noise, weighting_of
 
 __all__ = [
@@ -100,6 +101,7 @@ __all__ = [
     "Resampled",
     "SystemMueller",
     "Validity",
+    "Verdict",
     "Weighting",
     "absolute_accuracy",
     "accuracy_table",
@@ -171,6 +173,7 @@ __all__ = [
     "target_accuracy",
     "to_dict",
     "validity_of",
+    "verdict",
     "weighting_of",
     "with_validity",
     "write_mueller",

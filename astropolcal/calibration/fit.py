@@ -24,6 +24,7 @@ from astropy.utils.exceptions import AstropyWarning
 from astropolcal.calibration._scatter import Scatter, model_error
 from astropolcal.calibration._sky_view import view_of_measurement
 from astropolcal.calibration.accuracy import accuracy_table
+from astropolcal.calibration.bounds import errors_at_bounds
 from astropolcal.calibration.covariance import covariance_around, white_covariance
 from astropolcal.calibration.gauge import describe_gauge, hold_silent, open_parameters, settled
 from astropolcal.calibration.goodness import lack_of_fit
@@ -450,6 +451,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     )
     observations = (dataset.observations for dataset in measurement.datasets)
     calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
+    calibration.fit["bounds"] = errors_at_bounds(measurement, whitened)
     calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
     calibration.fit["outliers"] = _outliers(calibration)
     calibration.fit["model_error"] = lacking

@@ -144,8 +144,9 @@ def profile(calibration, name, values=None, n=21):
         One of ``calibration.covariance.names``, such as ``"hwp.w_sio2"`` or
         ``"derotator.horizontal[3]"``.
     values : `~astropy.units.Quantity` or array_like, optional
-        Where to hold it; by default three standard errors to either side, or
-        1 degree (micrometre, percent) where it has none, within its bounds.
+        Where to hold it; by default three standard errors to either side, of what
+        is at a bound one-sided ones, or 1 degree (micrometre, percent) where it has
+        none, within its bounds.
     n : int
         Number of values if none are given.
 
@@ -189,7 +190,9 @@ def profile(calibration, name, values=None, n=21):
     best = refit.solution[index] / factor
     low, high = (bounds[index] / factor for bounds in refit.measurement.free.bounds())
     if values is None:
-        grid = _grid(best, covariance.stds[index], declared_step(unit), n)
+        inward = (calibration.fit.get("bounds") or {"inward": {}})["inward"]
+        std = inward.get(name, covariance.stds[index])
+        grid = _grid(best, std, declared_step(unit), n)
         grid = np.unique(np.clip(grid, low, high))
     else:
         grid = np.unique(np.append(to_unit(values, unit, name), best))

@@ -9,11 +9,23 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.accuracy import accuracy_table, cross_validated_residuals
+from astropolcal.calibration.bounds import status_of
 from astropolcal.calibration.groups import groups_by
 from astropolcal.chain import leaves
 from astropolcal.exceptions import CalibrationFileError
 
 __all__ = ["Calibration", "DatasetRecord"]
+
+# what is known of each element of a parameter, and what is said of those without an error
+_OF_ELEMENTS = (
+    "std",
+    "identifiable",
+    "at_bound",
+    "std_inward",
+    "conditional_on",
+    "std_released",
+)
+_UNKNOWN = (np.nan, False, False, np.nan, "", np.nan)
 
 
 @dataclass
@@ -303,8 +315,13 @@ class Calibration:
         -------
         dict of str to dict
             ``"optic.parameter"`` to ``value``, ``std`` (NaN where not
-            determined), ``unit``, ``fixed``, ``tied``, ``at_bound`` and
-            ``identifiable``; arrays for parameters given per wavelength.
+            determined), ``unit``, ``bounds``, ``fixed``, ``tied``, ``at_bound``,
+            ``identifiable``; ``status``, see
+            `~astropolcal.calibration.bounds.status_of`; ``std_inward``, how far
+            what is at a bound may go inward at one sigma; and for errors that
+            hang on such a bound ``conditional_on``, the names of what is at
+            it, and ``std_released``, the error without it. Arrays for
+            parameters given per wavelength.
         """
         result = {}
         for chain in self.chains:
@@ -323,46 +340,49 @@ class Calibration:
         elements = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
         shape = np.shape(parameter.value)
         known = self._known() if free else {}
-        rows = [known.get(element, (np.nan, False, False)) for element in elements]
-        std, identifiable, at_bound = (
-            np.array(column).reshape(shape) for column in zip(*rows, strict=True)
-        )
-        return {
+        rows = [known.get(element, _UNKNOWN) for element in elements]
+        columns = (np.array(column).reshape(shape) for column in zip(*rows, strict=True))
+        entry = {
             "value": np.array(parameter.value),
-            "std": std,
             "unit": parameter.unit,
+            "bounds": tuple(parameter.bounds),
             "fixed": bool(parameter.fixed),
             "tied": self.ties[name].source if name in self.ties else None,
-            "at_bound": at_bound,
-            "identifiable": identifiable,
+            **dict(zip(_OF_ELEMENTS, columns, strict=True)),
         }
+        return entry | {"status": status_of(entry)}
 
     def _known(self):
-        stds = self.covariance.stds
-        flags = self.identifiability.identifiable
-        bound = set(self.at_bound)
-        return {
-            name: (stds[i], bool(flags[i]), name in bound)
-            for i, name in enumerate(self.covariance.names)
-        }
+        stds, flags = self.covariance.stds, self.identifiability.identifiable
+        bound, found = set(self.at_bound), self.fit.get("bounds") or {}
+        inward, released = found.get("inward", {}), found.get("released", {})
+        known = {}
+        for i, name in enumerate(self.covariance.names):
+            more = released.get(name, {"times": np.nan, "by": []})
+            beside = (inward.get(name, np.nan), ", ".join(more["by"]), stds[i] * more["times"])
+            known[name] = (stds[i], bool(flags[i]), name in bound, *beside)
+        return known
 
     @property
     def parameters(self):
-        """One row a free parameter: name, value, std, unit, flags; a `~astropy.table.QTable`."""
-        rows = []
+        """
+        One row a free parameter: name, value, unit, errors, status; a `~astropy.table.QTable`.
+
+        The columns are those of `parameter_values`.
+        """
+        keys, rows = ("value", *_OF_ELEMENTS, "status"), []
         for name, known in self.parameter_values().items():
             if known["fixed"] or known["tied"]:
                 continue
-            flat = [np.ravel(known[key]) for key in ("value", "std", "at_bound", "identifiable")]
-            labels = [name] if flat[0].size == 1 else [f"{name}[{i}]" for i in range(flat[0].size)]
-            unit = str(known["unit"] or "")
-            rows += [
-                (label, value, std, unit, bound, ok)
-                for label, value, std, bound, ok in zip(labels, *flat, strict=True)
-            ]
-        names = ("name", "value", "std", "unit", "at_bound", "identifiable")
-        types = (str, float, float, str, bool, bool)
-        return QTable(rows=rows or None, names=names, dtype=None if rows else types)
+            size, unit = np.size(known["value"]), str(known["unit"] or "")
+            labels = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
+            flat = (np.ravel(known[key]) for key in keys)
+            rows += [(label, *row, unit) for label, *row in zip(labels, *flat, strict=True)]
+        types = (str, float, float, bool, bool, float, str, float, str, str)
+        table = QTable(
+            rows=rows or None, names=("name", *keys, "unit"), dtype=None if rows else types
+        )
+        return table["name", "value", "std", "unit", "status", *_OF_ELEMENTS[1:]]
 
     # ---- for pipelines ---------------------------------------------------------
 
@@ -394,9 +414,27 @@ class Calibration:
 
     # ---- in words and files ----------------------------------------------------
 
-    def summary(self):
+    def verdict(self):
         """
-        Return a table for the terminal: how good, what came out, what is undetermined.
+        Return whether it can be used, and why not.
+
+        Returns
+        -------
+        `~astropolcal.calibration.Verdict`
+        """
+        from astropolcal.calibration.verdicts import verdict
+
+        return verdict(self)
+
+    def summary(self, full=False):
+        """
+        Return a text for the terminal: whether it is usable, how good, what came out.
+
+        Parameters
+        ----------
+        full : bool
+            Whether to add the tables per wavelength, what is not determined in
+            detail, and the gauge.
 
         Returns
         -------
@@ -404,7 +442,7 @@ class Calibration:
         """
         from astropolcal.calibration.summaries import summary
 
-        return summary(self)
+        return summary(self, full=full)
 
     def to_dict(self):
         """

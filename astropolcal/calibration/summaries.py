@@ -7,6 +7,13 @@ import textwrap
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration._compact import (
+    HEIGHT,
+    HINT,
+    compact_lines,
+    inward_words,
+    parameter_lines,
+)
 from astropolcal.calibration._sky_summary import (
     mirror_lines,
     mirrors,
@@ -14,24 +21,28 @@ from astropolcal.calibration._sky_summary import (
     open_on_sky,
     star_lines,
 )
-from astropolcal.calibration._unusable import unusable_words
 from astropolcal.calibration.groups import what_is_left_out
-from astropolcal.calibration.targets import TARGETS, target_accuracies
+from astropolcal.calibration.targets import target_accuracies
+from astropolcal.calibration.verdicts import SKY_TARGETS, verdict
 from astropolcal.words import counted
 
 __all__ = ["summary", "to_dict"]
 
 _WIDTH = 80
-_N_COLUMNS = 5
+# value and error of so many parameters fill the 80 columns
+_N_COLUMNS = 3
+# errors from which on digits behind the point are too long
+_MANY = 1000
+# what stands beside an error, and in place of one
+_MARKS = {"badly determined": "?", "conditional": "c"}
+_SAID = {"open": "open", "at bound": "bound", "badly determined": "no error"}
 _ACCURACIES = ("s_res", "s_mean", "s_cv", "s_standard")
 # pairs of frames at odds with the fit that a summary names
 _MOST_OUTLIERS = 5
-# values at a bound that are listed by their wavelength
-_MOST_BOUNDS = 6
 _ELEMENT = re.compile(r"(\w+\.\w+)\[(\d+)\]")
 
 
-def summary(calibration, targets=TARGETS):
+def summary(calibration, targets=SKY_TARGETS, full=False):
     """
     Return a calibration as text of at most 80 columns.
 
@@ -42,12 +53,15 @@ def summary(calibration, targets=TARGETS):
     targets : sequence of (dolp, aolp)
         Targets whose accuracy is given, see
         `~astropolcal.calibration.target_accuracies`.
+    full : bool
+        Whether to say everything; by default the text has less than 24 lines.
 
     Returns
     -------
     str
-        Accuracy per wavelength with the parameters given per wavelength, the
-        global parameters, and what the data do not determine.
+        The five lines of `~astropolcal.calibration.verdict`, the parameters and how
+        good the fit is. In full also the accuracy of each dataset, the parameters
+        given per wavelength, what the data do not determine, and the gauge.
 
     Examples
     --------
@@ -60,11 +74,15 @@ def summary(calibration, targets=TARGETS):
     >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
     >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
     >>> print(summary(cal).splitlines()[0])
-    Calibration of an instrument from simulated
+    Usable
     """
+    found = verdict(calibration, targets)
+    if not full:
+        return "\n".join([*compact_lines(calibration, found, HEIGHT - 1), HINT])
     known = calibration.parameter_values()
     parts = [
-        [*_heading(calibration), *_unusable_lines(calibration, known)],
+        [*found.words, *_more_reasons(found)],
+        _heading(calibration),
         _global_lines(known),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
@@ -74,15 +92,22 @@ def summary(calibration, targets=TARGETS):
             for entry in calibration.fit.get("stars", [])
         ),
         _target_lines(calibration, targets),
-        _wavelength_lines(calibration, known),
+        *_wavelength_blocks(calibration, known),
         mirror_lines(calibration),
         _goodness_lines(calibration),
         list(_wrap([_with_wavelengths(str(calibration.identifiability), calibration)])),
         _gauge_lines(calibration),
-        _bound_lines(calibration),
+        _bound_lines(calibration, known),
         _posterior_lines(calibration),
     ]
     return "\n\n".join("\n".join(part) for part in parts if part)
+
+
+def _more_reasons(found):
+    """Return in full what the first line has no room for."""
+    told = [*found.reasons, *found.cautions]
+    hidden = told and "; ".join(told) not in found.words[0]
+    return list(_wrap(f"  - {words}" for words in told)) if hidden else []
 
 
 def _wrap(lines):
@@ -100,41 +125,21 @@ def _with_wavelengths(text, calibration):
     )
 
 
-def _unusable_lines(calibration, known):
-    words = unusable_words(calibration, known)
-    return list(_wrap(words)) if words else []
-
-
 def _heading(calibration):
     fit, settings = calibration.fit, calibration.settings
     names = ", ".join(record.name for record in calibration.datasets)
     state = "converged" if calibration.converged else "NOT CONVERGED"
+    title = f"Calibration of {calibration.instrument or 'an instrument'} from {names}"
     return [
-        f"Calibration of {calibration.instrument or 'an instrument'} from {names}",
+        *_wrap([title]),
         f"{settings['strategy']} fit of {counted(len(calibration.covariance), 'parameter')} to "
         f"{fit['n_data']} {settings['observable'].replace('_', ' ')}s,",
         f"{settings['fitter']}, {fit['seconds']:.2f} s, {state}",
     ]
 
 
-def _number(entry):
-    """Return value, error and unit of a parameter common to all wavelengths."""
-    value, std, unit = float(entry["value"]), float(entry["std"]), str(entry["unit"] or "")
-    if entry["tied"]:
-        note = f"follows {entry['tied']}"
-    elif entry["at_bound"]:
-        note = "at a bound"
-    elif not np.isfinite(std):
-        note = "not determined alone, see below"
-    else:
-        # z: what rounds to zero has no sign
-        return f"{value:z12.5f} +- {std:.5f} {unit}"
-    return f"{value:z12.5f} {unit} ({note})"
-
-
 def _global_lines(known):
-    shown = {n: e for n, e in known.items() if not e["fixed"] and not e["value"].ndim}
-    lines = [f"  {name:<28}{_number(entry)}".rstrip() for name, entry in shown.items()]
+    lines = parameter_lines(known, several=False)
     return ["Parameters for all wavelengths", *lines] if lines else []
 
 
@@ -245,47 +250,41 @@ def _short(values, function):
     return f"{function(known):.2g}" if known.size else "-"
 
 
-def _wavelength_lines(calibration, known):
-    """Return a table with one row a wavelength, as many columns as fit."""
-    several = {n: e for n, e in known.items() if e["value"].ndim and not e["fixed"]}
-    if not several:
-        return []
-    # five of 12 characters behind wavelength and accuracy fill the 80 columns
-    shown = dict(list(several.items())[:_N_COLUMNS])
-    left_out = (
-        f"; not shown: {', '.join(list(several)[_N_COLUMNS:])}" if len(several) > len(shown) else ""
-    )
-    title = f"Parameters for each wavelength (* at a bound; ~ not determined alone{left_out})"
-    rows = [*_wrap([title]), *_table_head(shown)]
-    s_mean = _by_wavelength(calibration.datasets)
+def _wavelength_blocks(calibration, known):
+    """Return tables with one row a wavelength, and in each as many parameters as fit."""
+    several = [(n, e) for n, e in known.items() if e["value"].ndim and not e["fixed"]]
+    marks = "? badly determined, c conditional on a bound"
+    for i in range(0, len(several), _N_COLUMNS):
+        title = [] if i else [f"Parameters for each wavelength ({marks})"]
+        yield title + _block(calibration, dict(several[i : i + _N_COLUMNS]))
+
+
+def _block(calibration, shown):
+    rows, s_mean = _table_head(shown), _by_wavelength(calibration.datasets)
     for i, wavelength in enumerate(calibration.wavelength.to_value(u.nm)):
         mean = s_mean.get(round(wavelength, 2), np.nan)
-        row = f"{wavelength:9.1f}" + (f"{mean:9.3f}" if np.isfinite(mean) else f"{'-':>9}")
-        for entry in shown.values():
-            # degrees to 0.01, shares of one to 0.0001
-            digits = 2 if entry["unit"] else 4
-            row += f"{entry['value'][i]:z11.{digits}f}" + _mark(entry, i)
-        rows.append(row.rstrip())
+        row = f"{wavelength:8.1f}" + (f"{mean:8.3f}" if np.isfinite(mean) else f"{'-':>8}")
+        rows.append((row + "".join(_cell(entry, i) for entry in shown.values())).rstrip())
     return rows
 
 
-def _mark(entry, i):
-    if entry["at_bound"][i]:
-        return "*"
+def _cell(entry, i):
+    """Return value and error of one wavelength; 21 characters."""
+    # degrees to 0.01, shares of one to 0.0001
+    digits, std, status = 2 if entry["unit"] else 4, entry["std"][i], entry["status"][i]
+    value = f"{entry['value'][i]:z10.{digits}f}"
+    if np.isfinite(std):
+        error = f"{std:.{digits}f}" if std < _MANY else f"{std:.0e}"
+        return f"{value} +- {error}".ljust(20) + _MARKS.get(status, " ")
     # what follows another parameter has no error of its own
-    return " " if np.isfinite(entry["std"][i]) or entry["tied"] else "~"
-
-
-def _shortened(text):
-    """Return a name that leaves a blank between columns of eleven."""
-    return text if len(text) < 11 else f"{text[:9]}."
+    return f"{value} {_SAID.get(status, '')}".ljust(21)
 
 
 def _table_head(shown):
     optics, keys = zip(*(name.split(".") for name in shown), strict=True)
     units = [str(entry["unit"] or "") for entry in shown.values()]
     return [
-        f"{first:>9}{second:>9}" + "".join(f"{_shortened(text):>11} " for text in texts).rstrip()
+        f"{first:>8}{second:>8}" + "".join(f"{text[:20]:>17}    " for text in texts).rstrip()
         for first, second, texts in (("", "", optics), ("", "s_mean", keys), ("nm", "%", units))
     ]
 
@@ -325,24 +324,43 @@ def _gauge_lines(calibration):
     return list(_wrap([_with_wavelengths(f"Gauge: {gauge}", calibration)])) if gauge else []
 
 
-def _bound_lines(calibration):
-    if not calibration.at_bound:
-        return []
-    elements = {}
-    for name in calibration.at_bound:
-        stem, _, index = name.rstrip("]").partition("[")
-        elements.setdefault(stem, []).extend([int(index)] if index else [])
+def _bound_lines(calibration, known):
+    """Name what is at a bound, how far it may go inward, and whose errors hang on that."""
+    lines = []
+    for name, entry in known.items():
+        where = np.flatnonzero(np.ravel(entry["at_bound"]))
+        inward, values = (np.ravel(entry[key])[where] for key in ("std_inward", "value"))
+        ends = [inward_words(entry, *pair) for pair in zip(values, inward, strict=True)]
+        places = _places(calibration, entry, where)
+        told = zip(places, ends, strict=True)
+        lines += [f"  - {name}{place}{end and ': '}{end}" for place, end in told]
+    hanging = {}
+    for name, entry in known.items():
+        for i in np.flatnonzero(np.ravel(entry["status"]) == "conditional"):
+            by = str(np.ravel(entry["conditional_on"])[i])
+            times = (np.ravel(entry["std_released"]) / np.ravel(entry["std"]))[i]
+            hanging.setdefault((by, name), []).append(times)
+    lines += [
+        f"  - the error of {name}{_of_several(times)} is conditional on {by} at its bound; without "
+        f"it {_times(times)} times as large"
+        for (by, name), times in hanging.items()
+    ]
+    lines = [_with_wavelengths(line, calibration) for line in lines]
+    return list(_wrap(["At a bound", *lines])) if lines else []
+
+
+def _places(calibration, entry, where):
     nm = calibration.wavelength.to_value(u.nm)
-    words = [stem + _at(nm, own) for stem, own in elements.items()]
-    return list(_wrap([f"At a bound, so without an error: {', '.join(words)}"]))
+    return [f" ({nm[i]:.1f} nm)" if entry["value"].ndim else "" for i in where]
 
 
-def _at(nm, indices):
-    if not indices:
-        return ""
-    if len(indices) > _MOST_BOUNDS:
-        return f" ({len(indices)} of {len(nm)} wavelengths)"
-    return f" ({', '.join(f'{nm[i]:.1f}' for i in indices)} nm)"
+def _of_several(times):
+    return f" at {len(times)} wavelengths" if len(times) > 1 else ""
+
+
+def _times(times):
+    low, high = min(times), max(times)
+    return f"{low:.2g}" if low == high else f"{low:.2g} to {high:.2g}"
 
 
 def _posterior_lines(calibration):
@@ -356,7 +374,7 @@ def _posterior_lines(calibration):
 # ---- for machines ------------------------------------------------------------------
 
 
-def to_dict(calibration, targets=TARGETS):
+def to_dict(calibration, targets=SKY_TARGETS):
     """
     Return a calibration as plain numbers, lists and strings, ready for JSON.
 
@@ -371,7 +389,7 @@ def to_dict(calibration, targets=TARGETS):
     Returns
     -------
     dict
-        Keys ``instrument, observable, fitter, strategy, seconds, n_data,
+        Keys ``verdict, instrument, observable, fitter, strategy, seconds, n_data,
         n_free, rank, converged, datasets, standards, targets, parameters,
         null_directions`` and others; what is not a number is None.
 
@@ -390,6 +408,7 @@ def to_dict(calibration, targets=TARGETS):
     """
     settings, fit = calibration.settings, calibration.fit
     content = {
+        "verdict": verdict(calibration, targets).to_dict(),
         "instrument": calibration.instrument,
         "observable": settings["observable"],
         "fitter": settings["fitter"],

@@ -148,7 +148,10 @@ def _finite(value):
 
 
 def _check_fit(fit):
-    """Check what a schema does not: the pairs of frames at odds with the fit."""
+    """Check what a schema does not: what is masked, at odds with the fit, or at a bound."""
+    bounds = fit.get("bounds") or {}
+    if not _are_bounds(bounds):
+        raise CalibrationFileError("fit.bounds lacks what an error at a bound is told by")
     masked = fit.get("masked") or []
     if not isinstance(masked, list) or not all(isinstance(one, dict) for one in masked):
         raise CalibrationFileError("fit.masked is no list of reasons, one entry a dataset")
@@ -160,6 +163,22 @@ def _check_fit(fit):
         good = isinstance(one, dict) and {"frames", "dataset", *numbers} <= set(one)
         if not good or not all(isinstance(one[key], int | float) for key in numbers):
             raise CalibrationFileError("fit.outliers lacks what a pair of frames is told by")
+
+
+def _are_bounds(bounds):
+    """Return whether errors at bounds, and what hangs on these, are all there."""
+    if not isinstance(bounds, dict):
+        return False
+    inward, released = (bounds.get(key, {}) for key in ("inward", "released"))
+    if not (isinstance(inward, dict) and isinstance(released, dict)):
+        return False
+    return all(isinstance(value, float) for value in inward.values()) and all(
+        isinstance(one, dict)
+        and isinstance(one.get("times"), float)
+        and isinstance(one.get("by"), list)
+        and all(isinstance(name, str) for name in one["by"])
+        for one in released.values()
+    )
 
 
 def _check_words(calibration, names):

@@ -1,29 +1,34 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal calibrate``: fit an instrument's chain to observation tables."""
 
+import sys
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.files import one_line
 from astropolcal.scripts._common import (
     Folder,
     Input,
     Output,
     add_edits,
+    add_full,
     add_json,
     add_online,
     add_quiet,
     check_suffix,
     edit_chains,
     instrument_of,
+    is_quiet,
     printer,
     read_datasets,
-    say_written,
+    show,
     write_calibration,
 )
 from astropolcal.units import plain_number
+from astropolcal.words import counted
 
 _EPILOG = """\
 examples:
@@ -65,6 +70,7 @@ def add_parser(commands):
     parser.add_argument(
         "--plots", metavar="DIR", type=Folder, help="save the figures in this folder"
     )
+    add_full(parser)
     add_json(parser)
     add_online(parser)
     add_quiet(parser)
@@ -179,16 +185,17 @@ def _add_accuracy_options(parser):
         action="append",
         default=[],
         metavar="DOLP[,AOLP]",
-        help="target whose accuracy is given, in percent and degree (default: 1 and 30, any angle)",
+        help="target whose accuracy is given, in percent and degree (default: 30, 1 and 0.1, at "
+        "any angle)",
     )
 
 
 def run(arguments):
     """Calibrate, print the summary and write what was asked for."""
-    from astropolcal.calibration import summary, to_dict
+    from astropolcal.calibration import to_dict
     from astropolcal.calibration.standards import add_standard
     from astropolcal.calibration.star_checks import add_star_check
-    from astropolcal.calibration.targets import TARGETS
+    from astropolcal.calibration.verdicts import SKY_TARGETS
     from astropolcal.observations import get_observable
 
     say = printer(arguments)
@@ -196,7 +203,7 @@ def run(arguments):
     _check_start(arguments)
     # raises before any table is read
     get_observable(arguments.observable)
-    targets = [_target(text) for text in arguments.target] or TARGETS
+    targets = [_target(text) for text in arguments.target] or SKY_TARGETS
     # so that a first call without any data shows what comes out
     files = arguments.files or [_example(say)]
     datasets, standards = read_datasets(files), read_datasets(arguments.standard)
@@ -232,10 +239,37 @@ def run(arguments):
             add_star_check(calibration, *item)
     # written first: whoever reads the summary may go away
     written = write_calibration(calibration, arguments, lambda: to_dict(calibration, targets))
-    say(summary(calibration, targets))
-    say_written(say, written)
-    if not arguments.output:
-        say("\nThe calibration was not kept; -o cal.asdf writes it to a file.")
+    _tell(arguments, calibration, targets, written)
+
+
+def _tell(arguments, calibration, targets, written):
+    """Print the summary and what was written; of an unusable result something even if quiet."""
+    from astropolcal.calibration import summary, verdict
+    from astropolcal.calibration._compact import HEIGHT, HINT, compact_lines
+
+    found = verdict(calibration, targets)
+    if is_quiet(arguments):
+        if not found.usable:
+            words = f"NOT USABLE AS IT IS: {'; '.join(found.reasons)}"
+            show(f"astropolcal: warning: {words}", file=sys.stderr)
+        return
+    last = _written(arguments, written) + ([] if arguments.full else [HINT])
+    if arguments.full:
+        # its end is what stays on the screen
+        lines = [summary(calibration, targets, full=True), "", *found.words]
+    else:
+        before = 0 if arguments.files else 2
+        lines = compact_lines(calibration, found, HEIGHT - before - len(last))
+    show("\n".join([*lines, *last]))
+
+
+def _written(arguments, written):
+    """Say in a few lines which files were written; figures are counted."""
+    figures = len(written) - sum(path in (arguments.output, arguments.json) for path in written)
+    named = [path for path in written if path in (arguments.output, arguments.json)]
+    named += [f"{counted(figures, 'figure')} in {arguments.plots}"] if figures else []
+    kept = [] if arguments.output else ["Not kept: -o cal.asdf writes the calibration to a file"]
+    return [f"Written:    {one_line(name, None)}" for name in named] + kept
 
 
 def _is_known(observations):
@@ -346,8 +380,5 @@ def _example(say):
     import astropolcal
 
     path = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
-    say(
-        "No files given: calibrating the packaged example, a simulated CHARIS run\n"
-        "(22 wavelengths, 8 derotator angles x 8 half-wave-plate angles).\n"
-    )
+    say("No files given: this is the packaged example, a simulated run of CHARIS\n")
     return path

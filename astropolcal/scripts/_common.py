@@ -240,6 +240,12 @@ def add_quiet(parser, meaning="print nothing but warnings and errors"):
     parser.add_argument("-q", "--quiet", action="store_true", help=meaning)
 
 
+def add_full(parser):
+    """Add ``--full``."""
+    meaning = "print everything; by default what fits a terminal of 80 columns and 24 lines"
+    parser.add_argument("--full", action="store_true", help=meaning)
+
+
 def add_online(parser):
     """Add ``--online``, which `astropolcal.scripts.main` obeys."""
     parser.add_argument(

@@ -6,6 +6,7 @@ from pathlib import Path
 from astropolcal.exceptions import ObservationError
 from astropolcal.scripts._common import (
     Input,
+    add_full,
     add_json,
     add_quiet,
     printer,
@@ -33,6 +34,7 @@ def add_parser(commands):
         help="ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product",
     )
     parser.add_argument("--instruments", action="store_true", help="list the instruments only")
+    add_full(parser)
     add_json(parser, "write it")
     add_quiet(parser)
     parser.set_defaults(run=run)
@@ -50,7 +52,7 @@ def run(arguments):
     elif Path(arguments.file).is_dir():
         text, content = _library(arguments.file)
     elif Path(arguments.file).suffix.lower() == ".asdf":
-        text, content = _calibration(arguments.file)
+        text, content = _calibration(arguments.file, arguments.full)
     elif _is_fits(arguments.file):
         text, content = _lines(*describe_fits(arguments.file))
     else:
@@ -78,8 +80,9 @@ def _installation():
     return "\n".join(lines), content
 
 
-def _calibration(path):
+def _calibration(path, full):
     from astropolcal.calibration import Calibration
+    from astropolcal.calibration._compact import HEIGHT, HINT, compact_lines
     from astropolcal.calibration.validity import content_hash, validity_of
 
     calibration = Calibration.read(path)
@@ -92,12 +95,17 @@ def _calibration(path):
         f"  valid for {held}",
         f"  sha256 {digest}",
     ]
+    content = calibration.to_dict() | {"validity": held.to_dict(), "content_hash": digest}
+    if not full:
+        lines = [wrapped(line, indent=4) for line in lines]
+        height = HEIGHT - len("\n".join(lines).split("\n")) - 1
+        told = compact_lines(calibration, calibration.verdict(), height)
+        return "\n".join([*told, *lines, HINT]), content
     for record in calibration.datasets:
         optics = ", ".join(f"{k}: {v}" for k, v in record.meta.items() if k not in _DULL)
         lines.append(f"  {record.name}: {optics}, sha256 {record.content_hash[:12]}")
-    content = calibration.to_dict() | {"validity": held.to_dict(), "content_hash": digest}
     lines = [wrapped(line, indent=4) for line in lines]
-    return "\n".join([*lines, "", calibration.summary()]), content
+    return "\n".join([*lines, "", calibration.summary(full=True)]), content
 
 
 def _library(folder):

@@ -85,7 +85,7 @@ def test_the_gauge_is_recorded_and_read_back(observations, tmp_path):
     assert minimal.settings["gauge"].startswith("minimal")
     for name in ANGLES:
         assert name in minimal.settings["gauge"]
-    assert "Gauge: minimal" in minimal.summary()
+    assert "Gauge: minimal" in minimal.summary(full=True)
     minimal.write(tmp_path / "cal.asdf")
     assert Calibration.read(tmp_path / "cal.asdf").settings == minimal.settings
     assert "accident" in _fit(_chain(), observations, gauge=None).settings["gauge"]

@@ -232,7 +232,7 @@ def test_parameter_that_ends_at_a_bound_is_flagged(make):
     assert known["at_bound"]
     assert not known["identifiable"]
     assert np.isnan(known["std"])
-    assert "At a bound" in cal.summary()
+    assert "At a bound" in cal.summary(full=True)
     assert known["value"] == pytest.approx(90.2)
 
 

@@ -118,7 +118,7 @@ def test_unknown_mirror_is_refused(free):
 
 
 def test_summary_and_json_have_the_mirrors(free):
-    text = summary(free[0])
+    text = summary(free[0], full=True)
     assert "Diattenuation in percent; the metals bare, at 45 deg" in text
     (entry,) = to_dict(free[0])["mirrors"]
     assert entry["name"] == "m3"
@@ -175,7 +175,7 @@ def test_check_is_kept_in_file_summary_and_json(free, tmp_path):
     cal.write(tmp_path / "cal.asdf")
     back = Calibration.read(tmp_path / "cal.asdf")
     assert back.fit["stars"] == cal.fit["stars"]
-    assert "HD 30675 against the catalogue" in summary(back)
+    assert "HD 30675 against the catalogue" in summary(back, full=True)
     assert to_dict(back)["stars"][0]["dolp_percent"] == cal.fit["stars"][0]["dolp_percent"]
     assert len(plot_star_check(back).axes) == 4
 

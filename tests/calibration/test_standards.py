@@ -266,9 +266,9 @@ def test_file_and_json_hold_the_standards(tmp_path, fresh, chain, standard):
 
 
 def test_summary_shows_four_accuracies_and_the_prediction(fresh, chain, standard):
-    assert "(none given)" in summary(fresh)
+    assert "(none given)" in summary(fresh, full=True)
     add_standard(fresh, chain, standard)
-    text = summary(fresh)
+    text = summary(fresh, full=True)
     head = next(line for line in text.splitlines() if "s_res" in line)
     assert head.split() == ["s_res", "s_mean", "s_cv", "s_standard"]
     assert "Prediction of other night (not fitted), in percent" in text

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from astropolcal.calibration import _unusable
+from astropolcal.calibration._compact import parameter_lines
 from astropolcal.calibration._sky_summary import (
     mirror_lines,
     open_lines,
     open_on_sky,
     star_lines,
 )
+from astropolcal.calibration.bounds import status_of
 from astropolcal.calibration.summaries import (
     _accuracy_lines,
     _bound_lines,
@@ -26,8 +27,7 @@ from astropolcal.calibration.summaries import (
     _rows,
     _standard_lines,
     _target_row,
-    _unusable_lines,
-    _wavelength_lines,
+    _wavelength_blocks,
     _with_wavelengths,
     _wrap,
 )
@@ -36,8 +36,10 @@ from astropolcal.calibration.summaries import (
 def _entry(value, std=np.nan, unit=None, **flags):
     shape = np.shape(value)
     known = {"value": np.asarray(value, float), "std": np.broadcast_to(std, shape), "unit": unit}
-    known |= {"fixed": False, "tied": None, "at_bound": np.zeros(shape, bool)}
-    return known | {"identifiable": np.ones(shape, bool)} | flags
+    known |= {"fixed": False, "tied": None, "at_bound": np.zeros(shape, bool), "bounds": (0, 2)}
+    known |= {key: np.full(shape, np.nan) for key in ("std_inward", "std_released")}
+    known |= {"identifiable": np.isfinite(known["std"]), "conditional_on": np.full(shape, "")}
+    return known | flags | {"status": status_of(known | flags)}
 
 
 def _accuracy(n=3, **columns):
@@ -63,6 +65,9 @@ def _calibration(**changes):
         "at_bound": [],
     }
     return SimpleNamespace(**made | changes)
+
+
+AT = np.array(True)
 
 
 # --- lines ------------------------------------------------------------------------------------
@@ -95,9 +100,22 @@ def test_heading(converged, instrument, words):
     ("entry", "words"),
     [
         (_entry(1.5, 0.25, u.deg), "     1.50000 +- 0.25000 deg"),
-        (_entry(1.5, 0.25), "     1.50000 +- 0.25000"),
-        (_entry(1.5, 0.25, u.deg, at_bound=np.array(True)), "     1.50000 deg (at a bound)"),
-        (_entry(1.5, np.nan, u.deg), "     1.50000 deg (not determined alone, see below)"),
+        (_entry(0.5, 0.025), "     0.50000 +- 0.02500"),
+        (_entry(1.5, 12.0, u.deg), "     1.50000 +- 12 deg (badly determined)"),
+        (_entry(2.0, unit=u.deg, at_bound=AT), "     2.00000 deg (at its bound)"),
+        (
+            _entry(2.0, unit=u.deg, at_bound=AT, std_inward=0.5),
+            "     2.00000 deg (at its bound; above 1.50)",
+        ),
+        (
+            _entry(0.0, unit=u.deg, at_bound=AT, std_inward=0.0123),
+            "     0.00000 deg (at its bound; below 0.012)",
+        ),
+        (
+            _entry(0.0, unit=u.deg, at_bound=AT, std_inward=np.inf),
+            "     0.00000 deg (at its bound; not limited)",
+        ),
+        (_entry(1.5, np.nan, u.deg), "     1.50000 deg (open: not determined alone)"),
         (_entry(1.5, 0.25, u.deg, tied="b.c"), "     1.50000 deg (follows b.c)"),
     ],
 )
@@ -108,8 +126,20 @@ def test_a_parameter_for_all_wavelengths(entry, words):
 
 
 def test_fixed_ones_and_those_of_a_wavelength_are_not_among_them():
-    known = {"a.b": _entry(1.0, fixed=True), "c.d": _entry([1.0, 2.0])}
+    known = {"a.b": _entry(1.0, fixed=True), "c.d": _entry([1.0, 2.0], [0.01, np.nan])}
     assert _global_lines(known) == []
+    (line,) = parameter_lines(known)
+    assert line.split() == ["c.d", *"1.0000 to 2.0000 +- 0.01 (1 open)".split()]
+
+
+def test_what_is_conditional_says_on_what_and_what_it_is_else():
+    hanging = {"conditional_on": "calibration_polarizer.theta", "std_released": np.array(0.25)}
+    lines = parameter_lines({"derotator.theta": _entry(1.5, 0.125, u.deg, **hanging)})
+    assert " ".join(" ".join(lines).split()) == (
+        "derotator.theta 1.50000 +- 0.12500 deg (conditional on calibration_polarizer.theta at its "
+        "bound; without it 0.25)"
+    )
+    assert all(len(line) <= 80 for line in lines)
 
 
 # --- accuracies ---------------------------------------------------------------------------------
@@ -154,67 +184,53 @@ def test_a_standard_shows_its_prediction():
 # --- parameters per wavelength -----------------------------------------------------------------
 
 
-def test_a_row_a_wavelength_with_stars_at_bounds():
+def test_a_row_a_wavelength_with_errors_and_what_stands_for_them():
     known = {
         "hwp.retardance": _entry(
             [10.0, 20.0, 30.0], [0.1, np.nan, np.nan], u.deg, at_bound=np.array([0, 1, 0], bool)
         ),
-        "w.efficiency": _entry([0.9, 0.95, 1.0], 0.01),
+        "w.efficiency": _entry([0.9, 0.95, 1.0], [0.01, 0.1, 5e3]),
+        "m.theta": _entry([1.0, 2.0, 3.0], 0.1, u.deg, std_released=np.array([np.nan, 1, np.inf])),
         "hwp.theta": _entry(1.0),
         "held.retardance": _entry([1.0, 2.0, 3.0], fixed=True),
+        "a.b": _entry([1.0, 2.0, 3.0], tied="c.d"),
     }
     cal = _calibration(datasets=[_record(s_mean=np.array([0.1, np.nan, 0.3]))])
-    title, optics, keys, units, *rows = _wavelength_lines(cal, known)
-    assert title == "Parameters for each wavelength (* at a bound; ~ not determined alone)"
-    assert optics.split() == ["hwp", "w"]
-    assert keys.split() == ["s_mean", "retardance", "efficiency"]
-    assert units.split() == ["nm", "%", "deg"]
-    assert [row.split() for row in rows] == [
-        ["1200.0", "0.100", "10.00", "0.9000"],
-        ["1700.0", "-", "20.00*", "0.9500"],
-        ["2200.0", "0.300", "30.00~", "1.0000"],
+    first, second = _wavelength_blocks(cal, known)
+    title, optics, keys, units, *rows = first
+    assert "? badly determined, c conditional on a bound" in title
+    assert optics.split() == ["hwp", "w", "m"]
+    assert keys.split() == ["s_mean", "retardance", "efficiency", "theta"]
+    assert units.split() == ["nm", "%", "deg", "deg"]
+    assert [" ".join(row.split()) for row in rows] == [
+        "1200.0 0.100 10.00 +- 0.10 0.9000 +- 0.0100 1.00 +- 0.10",
+        "1700.0 - 20.00 bound 0.9500 +- 0.1000? 2.00 +- 0.10 c",
+        "2200.0 0.300 30.00 open 1.0000 +- 5e+03 ? 3.00 +- 0.10 c",
     ]
+    # what follows another parameter has no error of its own
+    assert [row.split()[2:] for row in second[-3:]] == [["1.0000"], ["2.0000"], ["3.0000"]]
+    assert all(len(line) <= 80 for line in (*first, *second))
 
 
-def test_more_than_five_columns_are_named():
-    known = {f"o{i}.p": _entry([1.0, 2.0, 3.0]) for i in range(7)}
-    lines = _wavelength_lines(_calibration(), known)
-    title = " ".join(" ".join(lines[:2]).split())
-    assert title.startswith(
-        "Parameters for each wavelength (* at a bound; ~ not determined alone; "
-        "not shown: o5.p, o6.p)"
-    )
-    assert all(len(line) <= 80 for line in lines)
-
-
-def test_a_wavelength_that_the_first_table_lacks_has_no_accuracy():
-    cal = _calibration(wavelength=[1000, 1200] * u.nm)
-    cal.datasets[0].accuracy["s_mean"] = [0.1, 0.2, 0.3] * u.percent
-    rows = _wavelength_lines(cal, {"a.b": _entry([1.0, 2.0])})[-2:]
-    assert [row.split()[:2] for row in rows] == [["1000.0", "-"], ["1200.0", "0.100"]]
+def test_all_parameters_are_shown_in_as_many_blocks_as_it_takes():
+    known = {f"o{i}.p": _entry([1.0, 2.0, 3.0], 0.01) for i in range(7)}
+    blocks = list(_wavelength_blocks(_calibration(), known))
+    heads = [block[-6].split() for block in blocks]
+    assert heads == [["o0", "o1", "o2"], ["o3", "o4", "o5"], ["o6"]]
+    assert all(len(line) <= 80 for block in blocks for line in block)
+    assert list(_wavelength_blocks(_calibration(), {"a.b": _entry(1.0)})) == []
 
 
 def test_each_wavelength_has_the_accuracy_of_the_first_dataset_that_has_it():
     values = np.array([[0.1, np.nan, np.nan], [0.7, 0.2, np.nan]])
     cal = _calibration(datasets=[_record(s_mean=row) for row in values])
-    rows = _wavelength_lines(cal, {"a.b": _entry([1.0, 2.0, 3.0])})[-3:]
-    assert [row.split()[1] for row in rows] == ["0.100", "0.200", "-"]
-
-
-def test_long_names_do_not_run_together():
-    names = ("calibration_polarizer.diattenuation", "m3.diattenuation", "derotator.horizontal")
-    lines = _wavelength_lines(_calibration(), {name: _entry([1.0, 2, 3]) for name in names})
-    assert lines[1].split() == ["calibrati.", "m3", "derotator"]
-    assert lines[2].split() == ["s_mean", "diattenua.", "diattenua.", "horizontal"]
-
-
-def test_what_follows_another_parameter_has_no_mark():
-    known = {"a.b": _entry([1.0, 2.0, 3.0], tied="c.d")}
-    assert "~" not in "".join(_wavelength_lines(_calibration(), known)[1:])
-
-
-def test_nothing_per_wavelength_no_table():
-    assert _wavelength_lines(_calibration(), {"a.b": _entry(1.0)}) == []
+    (block,) = _wavelength_blocks(cal, {"a.b": _entry([1.0, 2.0, 3.0], 0.01)})
+    assert [row.split()[1] for row in block[-3:]] == ["0.100", "0.200", "-"]
+    # and none where the first table lacks it
+    cal = _calibration(wavelength=[1000, 1200] * u.nm)
+    cal.datasets[0].accuracy["s_mean"] = [0.1, 0.2, 0.3] * u.percent
+    (block,) = _wavelength_blocks(cal, {"a.b": _entry([1.0, 2.0])})
+    assert [row.split()[:2] for row in block[-2:]] == [["1000.0", "-"], ["1200.0", "0.100"]]
 
 
 # --- goodness, bounds, stars ---------------------------------------------------------------------
@@ -243,82 +259,30 @@ def test_some_outliers_are_named_and_the_others_counted(count, more):
 
 def test_nothing_tested_nothing_said():
     assert _goodness_lines(_calibration()) == []
-    assert _bound_lines(_calibration()) == []
+    assert _bound_lines(_calibration(), {"a.b": _entry(1.0, 0.1)}) == []
 
 
-def test_values_at_bounds_are_named_by_their_wavelength():
-    lines = _bound_lines(_calibration(at_bound=["a.b", "c.d[2]", "e.f[0]", "e.f[1]"]))
-    assert " ".join(lines) == (
-        "At a bound, so without an error: a.b, c.d (2200.0 nm), e.f (1200.0, 1700.0 nm)"
+def test_what_is_at_a_bound_and_what_hangs_on_it():
+    at = np.array([True, False, False])
+    hanging = {"conditional_on": np.array(["", "w.eff[0]", "w.eff[0]"])}
+    hanging["std_released"] = np.array([np.nan, 0.02, 0.05])
+    known = {
+        "a.theta": _entry(2.0, unit=u.deg, at_bound=AT, std_inward=np.array(0.5)),
+        "w.eff": _entry([2.0, 1.0, 1.0], 0.01, at_bound=at, std_inward=np.full(3, np.inf)),
+        "b.q": _entry([1.0, 1.0, 1.0], 0.01, **hanging),
+    }
+    lines = _bound_lines(_calibration(), known)
+    assert all(len(line) <= 80 for line in lines)
+    assert " ".join(" ".join(lines).split()) == (
+        "At a bound - a.theta: above 1.50 - w.eff (1200.0 nm): not limited - the "
+        "error of b.q at 2 wavelengths is conditional on w.eff (1200.0 nm) at its bound; without "
+        "it 2 to 5 times as large"
     )
-    many = _calibration(
-        at_bound=[f"c.d[{i}]" for i in range(7)], wavelength=np.arange(600, 609) * u.nm
-    )
-    assert _bound_lines(many) == ["At a bound, so without an error: c.d (7 of 9 wavelengths)"]
 
 
 def test_elements_in_words_are_named_by_their_wavelength():
     words = _with_wavelengths("hwp.retardance[1] by +1 deg, a.b[9]", _calibration())
     assert words == "hwp.retardance (1700.0 nm) by +1 deg, a.b[9]"
-
-
-@pytest.mark.parametrize(("stuck", "says"), [(1, False), (2, True), (3, True)])
-def test_a_parameter_at_a_bound_nearly_everywhere_is_not_usable(stuck, says):
-    known = {
-        "w.efficiency": _entry([1.0, 1.0, 1.0], at_bound=np.arange(3) < stuck),
-        "hwp.theta": _entry(1.0, at_bound=np.array(True)),
-    }
-    line = f"NOT USABLE AS IT IS: at a bound at most wavelengths: w.efficiency ({stuck} of 3)"
-    assert _unusable_lines(_calibration(), known) == ([line] if says else [])
-
-
-def _angles(stuck):
-    return {
-        name: _entry(1.0, unit="deg", at_bound=np.array(i < stuck))
-        for i, name in enumerate(("polarizer.theta", "hwp.theta", "derotator.theta"))
-    } | {"hwp.w_sio2": _entry(1.6, unit="mm"), "m3.theta": _entry(0.0, unit="deg", fixed=True)}
-
-
-@pytest.mark.parametrize(
-    ("stuck", "p_value", "says"),
-    [(1, 0.0, False), (2, 0.0, True), (3, 0.0, True), (3, 0.3, False), (3, np.nan, False)],
-)
-def test_most_angles_at_bounds_and_large_residuals_are_not_usable(stuck, p_value, says):
-    tests = [{"times_noise": 41.2, "p_value": p_value}, {"times_noise": 80.0, "p_value": p_value}]
-    cal = _calibration(fit={"lack_of_fit": tests})
-    lines = _unusable_lines(cal, _angles(stuck))
-    assert bool(lines) is says
-    assert all(len(line) <= 80 for line in lines)
-    if says:
-        words = " ".join(lines)
-        assert words.startswith("NOT USABLE AS IT IS: at a bound: polarizer.theta, hwp.theta")
-        assert "41.2 times the noise" in words
-        assert "astropolcal diagnose" in words
-
-
-@pytest.mark.parametrize(
-    ("source", "percent", "std", "fixed", "says"),
-    [
-        ("unpolarized", [-99.0, -98.0, -100.0], np.nan, False, True),
-        ("unpolarized standard star", [60.0, 70.0, 1.0], 2.0, False, True),
-        # one wavelength that went astray, a small one, one within its error, and one held
-        ("unpolarized", [60.0, 2.0, 1.0], np.nan, False, False),
-        ("unpolarized", [8.0, 9.0, 9.0], 0.1, False, False),
-        ("unpolarized", [60.0, 70.0, 80.0], 20.0, False, False),
-        ("unpolarized", [60.0, 70.0, 80.0], np.nan, True, False),
-        ("polarized", [-99.0, -98.0, -100.0], np.nan, False, False),
-        (None, [-99.0, -98.0, -100.0], np.nan, False, False),
-    ],
-)
-def test_a_mirror_that_polarizes_as_none_does(monkeypatch, source, percent, std, fixed, says):
-    table = QTable({"diattenuation": percent * u.percent})
-    table["diattenuation_err"] = np.full(3, std) * u.percent
-    monkeypatch.setattr(_unusable, "mirror_names", lambda calibration: ["m3"])
-    monkeypatch.setattr(_unusable, "mirror_values", lambda calibration, name: table)
-    known = {"m3.diattenuation": _entry(np.array(percent) / 100, fixed=fixed)}
-    words = " ".join(_unusable_lines(_calibration(datasets=[_record(source=source)]), known))
-    assert ("NOT USABLE AS IT IS: m3 polarizes by more than 30 %" in words) is says
-    assert (f"is the source of night really {source!r}" in words) is says
 
 
 def test_row_of_a_target_has_a_dash_for_what_is_not_known():

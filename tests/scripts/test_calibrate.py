@@ -115,13 +115,15 @@ def test_several_standards_and_optics_of_their_own(tables, tmp_path, capsys):
 def test_summary_file_and_info_know_the_standard(tables, tmp_path, capsys):
     cal = tmp_path / "cal.asdf"
     arguments = [tables["first"], "--standard", tables["second"], "-o", cal, "--plots", tmp_path]
-    assert main(["calibrate", *map(str, arguments)]) == 0
+    assert main(["calibrate", "--full", *map(str, arguments)]) == 0
     text = capsys.readouterr().out
     assert "Prediction of second (not fitted), in percent" in text
     assert max(len(line) for line in text.splitlines() if str(tmp_path) not in line) <= 80
     assert (tmp_path / "accuracy.png").is_file()
-    assert main(["info", str(cal)]) == 0
+    assert main(["info", "--full", str(cal)]) == 0
     assert "Prediction of second (not fitted), in percent" in capsys.readouterr().out
+    assert main(["info", str(cal)]) == 0
+    assert "Predicted   second: errors" in capsys.readouterr().out
     assert Calibration.read(cal).fit["standards"][0]["name"] == "second"
 
 
@@ -156,7 +158,7 @@ def test_cross_validation_leaves_out_what_is_asked_for(tables, tmp_path, capsys)
     assert s_cv["derotator"] == usual["datasets"][0]["s_cv_percent"]
     # the two cycles at 50 deg predict each other
     assert not np.allclose(s_cv["cycle"], s_cv["derotator"], rtol=1e-3)
-    assert main(["calibrate", str(tables["first"]), "--groups", "cycle"]) == 0
+    assert main(["calibrate", "--full", str(tables["first"]), "--groups", "cycle"]) == 0
     assert "s_cv: rms error on half-wave-plate cycles left out" in capsys.readouterr().out
 
 
@@ -193,7 +195,7 @@ def test_choices_are_those_of_the_function(capsys):
 @pytest.mark.slow
 def test_targets_by_default_and_by_choice(tables, tmp_path, capsys):
     usual = run(tmp_path, tables["first"], tables["dark"])["targets"]
-    assert [(t["dolp_percent"], t["aolp_deg"]) for t in usual] == [(1.0, None), (30.0, None)]
+    assert [(t["dolp_percent"], t["aolp_deg"]) for t in usual] == [(d, None) for d in (30, 1, 0.1)]
     assert usual[0]["missing"] == ["on_sky"]
     files = [tables["first"], tables["dark"], "-o", tmp_path / "cal.asdf"]
     chosen = run(tmp_path, *files, "--target", "5%,20", "--target", "2")["targets"]
@@ -204,8 +206,9 @@ def test_targets_by_default_and_by_choice(tables, tmp_path, capsys):
         np.testing.assert_allclose(chosen[0][f"{key}_percent"], table[key].value)
     np.testing.assert_allclose(chosen[0]["s_chi_deg"], table["s_chi"].value)
     assert chosen[0]["s_sky_percent"] == [None] * 3
-    assert main(["calibrate", str(tables["first"]), "--target", "5%,20"]) == 0
+    assert main(["calibrate", "--full", str(tables["first"]), "--target", "5%,20"]) == 0
     text = capsys.readouterr().out
+    assert "On sky      at best 5 % to" in text
     row = next(line for line in text.splitlines() if line.split()[:3] == ["5", "%", "20"])
     assert len(row.split()) == 9
     assert "lower limits" in " ".join(text.split())
@@ -293,20 +296,23 @@ def _edited(path, to, edit):
     return to
 
 
-def _top(capsys, *arguments):
-    """Return what the summary says before its first blank line."""
+def _shown(capsys, *arguments):
+    """Return what the command prints, which fits a terminal."""
     assert main(["calibrate", *map(str, arguments)]) == 0
-    return " ".join(capsys.readouterr().out.split("\n\n")[0].split())
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 24
+    # names of files are not broken
+    assert all(len(line) <= 80 or line.startswith("Written") for line in lines)
+    return lines
 
 
 def test_a_lamp_with_the_wrong_source_is_not_usable(tables, tmp_path, capsys):
     wrong = _edited(
         tables["first"], tmp_path / "lamp.ecsv", lambda t: t.meta.update(source="unpolarized")
     )
-    top = _top(capsys, wrong)
-    assert "NOT USABLE AS IT IS: fold_mirror polarizes by more than 30 % at 3 of 3" in top
-    assert "is the source of lamp really 'unpolarized'" in top
-    assert "NOT USABLE" not in _top(capsys, tables["first"], tables["dark"])
+    first = _shown(capsys, wrong)[0]
+    assert first.startswith("NOT USABLE AS IT IS: fold_mirror polarizes by more than 30 %")
+    assert _shown(capsys, tables["first"], tables["dark"], *HELD)[0] == "Usable"
 
 
 def test_exchanged_beams_are_not_usable(tmp_path, capsys):
@@ -315,10 +321,45 @@ def test_exchanged_beams_are_not_usable(tmp_path, capsys):
         table["flux_left"], table["flux_right"] = right, left
 
     right = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
-    top = _top(capsys, _edited(right, tmp_path / "beams.ecsv", exchange))
-    assert "NOT USABLE AS IT IS: at a bound: calibration_polarizer.theta, hwp.theta" in top
-    assert "check which beam is left" in top
-    assert "NOT USABLE" not in _top(capsys, right)
+    lines = _shown(capsys, _edited(right, tmp_path / "beams.ecsv", exchange), *HELD[2:])
+    assert lines[0].startswith("NOT USABLE AS IT IS: most angles at their bounds: are beams or")
+    assert "astropolcal diagnose" in lines[4]
+
+
+def test_what_is_printed_fits_a_terminal_and_tells_what_is_hidden(tables, tmp_path, capsys):
+    cal, figures, out = tmp_path / "cal.asdf", tmp_path / "figures", tmp_path / "cal.json"
+    files = [tables["first"]]
+    lines = _shown(capsys, *files, "-o", cal, "--plots", figures, "--json", out)
+    assert lines[0].startswith("NOT USABLE AS IT IS: the AoLP on sky is open")
+    assert lines[-1].startswith("--full (full=True) adds tables per wavelength")
+    n = len(list(figures.iterdir()))
+    assert [line.partition("  ")[2].strip() for line in lines[-4:-1]] == [
+        str(cal), str(out), f"{n} figures in {figures}",
+    ]  # fmt: skip
+    verdict = json.loads(out.read_text())["verdict"]
+    assert (verdict["usable"], verdict["words"]) == (False, lines[:5])
+    # a file says the same, and in full it stands at both ends
+    assert main(["info", str(cal)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[:5] == lines[:5]
+    assert len(told) < 24
+    assert main(["calibrate", "--full", *map(str, files)]) == 0
+    full = capsys.readouterr().out.splitlines()
+    assert full[:5] == full[-6:-1] == lines[:5]
+    assert full[-1].startswith("Not kept: -o cal.asdf")
+    assert len(full) > 50
+
+
+def test_quiet_warns_of_what_is_not_usable(tables, capsys):
+    for options in (["-q"], ["--json", "-"]):
+        assert main(["calibrate", str(tables["first"]), *options]) == 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line == (
+            "astropolcal: warning: NOT USABLE AS IT IS: the AoLP on sky is open "
+            "(calibration_polarizer.theta)"
+        )
+    assert main(["calibrate", str(tables["first"]), "-q", *HELD]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_two_steps_need_a_polarized_source(tables, capsys):

@@ -360,7 +360,7 @@ def test_one_frame_is_no_frames(desk, capsys):
 def test_summary_has_no_negative_zero(desk, capsys):
     """Misalignments that are held at zero, and those that the data pull just below it."""
     held = "--fix hwp.theta=-1e-9 --fix derotator.theta=0"
-    assert call(desk, f"calibrate run.ecsv --derotator linear {held}") == 0
+    assert call(desk, f"calibrate run.ecsv --full --derotator linear {held}") == 0
     out = capsys.readouterr().out
     assert "24 frames x 22 wavelengths" in out
     assert "-0.00000" not in out
@@ -368,8 +368,8 @@ def test_summary_has_no_negative_zero(desk, capsys):
 
 
 def test_parameter_just_below_zero_is_printed_without_a_sign():
-    from astropolcal.calibration.summaries import _number
+    from astropolcal.calibration._compact import number
 
-    entry = {"value": -1e-7, "std": 1e-3, "unit": "deg", "tied": None, "at_bound": False}
-    assert _number(entry).strip() == "0.00000 +- 0.00100 deg"
-    assert _number(entry | {"value": -0.1}).strip() == "-0.10000 +- 0.00100 deg"
+    entry = {"value": -1e-7, "std": 1e-3, "unit": "deg", "tied": None, "status": "determined"}
+    assert number(entry).strip() == "0.00000 +- 0.00100 deg"
+    assert number(entry | {"value": -0.1}).strip() == "-0.10000 +- 0.00100 deg"

@@ -1,0 +1,426 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Whether a calibration can be used, and if not why, in five lines for the top of a summary."""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.calibration.bounds import STATUSES
+from astropolcal.calibration.reflections import mirror_names, mirror_values
+from astropolcal.calibration.steps import kind_of_source
+from astropolcal.calibration.targets import target_accuracies
+
+__all__ = ["Verdict", "verdict"]
+
+#: What is said to be known of light from the sky: a disk, a planet, an interstellar polarization.
+SKY_TARGETS = tuple((dolp * u.percent, None) for dolp in (30, 1, 0.1))
+
+_WIDTH = 80
+# what holds at more than this share of the wavelengths holds of the calibration
+_MOST = 0.5
+# bare metals polarize by a few percent at most, coated ones by little more
+_NO_MIRROR = 30 * u.percent
+# so many angles common to all wavelengths at their bounds are no chance
+_ANGLES = 2
+# residuals at least as large happen by chance less often
+_UNLIKELY = 0.01
+# the mounts are known better than this before any fit, and it turns 6 % of Q into U
+_ABSURD_ANGLE = 10 * u.deg
+# real data of three instruments leave 0.1 to 1.5 %, exchanged beams and wrong signs leave tens
+_MISFIT = 5 * u.percent
+# a turn or a change of the DoLP by less, in degree or percent of itself, does not show
+_SHOWS = 0.005
+# accuracies below this, in percent or degree, are not told apart
+_LEAST = 0.001
+# residuals of so many times the noise are worth a word: the noise is not known better
+_CLEARLY = 2
+
+
+@dataclass
+class Verdict:
+    """
+    Whether a calibration can be used.
+
+    Parameters
+    ----------
+    usable : bool
+        Whether nothing was found that makes the result unusable as it is.
+    reasons : list of str
+        Why it is not usable; the most telling first.
+    cautions : list of str
+        What to mind in one that is.
+    words : list of str
+        Five lines of at most 80 columns: the verdict, the accuracy on sky, what is
+        determined, what is not, and which observation would help most.
+
+    Examples
+    --------
+    >>> from astropolcal.calibration import Verdict
+    >>> Verdict(False, ["the fit did not converge"], [], ["NOT USABLE AS IT IS: ..."]).usable
+    False
+    """
+
+    usable: bool
+    reasons: list
+    cautions: list
+    words: list
+
+    def to_dict(self):
+        """
+        Return it for machines.
+
+        Returns
+        -------
+        dict
+            Keys ``usable``, ``reasons``, ``cautions``, ``words``.
+        """
+        return dict(vars(self))
+
+
+def verdict(calibration, targets=SKY_TARGETS):
+    """
+    Return whether a calibration can be used, and why not.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    targets : sequence of (dolp, aolp)
+        Targets whose accuracy the words give, see
+        `~astropolcal.calibration.target_accuracies`.
+
+    Returns
+    -------
+    Verdict
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import verdict
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> found = verdict(cal)
+    >>> found.usable, len(found.words)
+    (True, 5)
+    """
+    known = calibration.parameter_values()
+    free = {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
+    tables = target_accuracies(calibration, targets)
+    # whether it is usable does not hang on what was asked for
+    bright = target_accuracies(calibration, SKY_TARGETS[:1])
+    sky = _open_on_sky(calibration, free)
+    # what must be wrong with the set-up or its description comes before what is not known
+    wrong = [
+        _nothing(calibration),
+        _angles(calibration, free),
+        *_mirrors(calibration, known),
+        _misfit(calibration),
+    ]
+    hanging = _hanging(free)
+    unknown = [*_absurd(free), *_open_words(sky), *_too_far(bright, sky), hanging]
+    stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
+    reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
+    # what is not known runs to its bounds, too
+    wrong = any(wrong) or bool(stuck and not any(unknown))
+    cautions = [] if reasons else _cautions(calibration, free)
+    words = [
+        _first(reasons, cautions),
+        "On sky      unknown, as something is wrong" if wrong else _accuracy(tables, sky),
+        *_determined(calibration, free),
+        f"Next        {_next(calibration, free, wrong, sky, tables)}",
+    ]
+    return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words])
+
+
+def shortened(line, width=_WIDTH):
+    """Cut a line off at a word; blanks at its begin and inside stay."""
+    if len(line) <= width:
+        return line
+    return line[: width - 3].rpartition(" ")[0].rstrip(",;: ") + " ..."
+
+
+def _first(reasons, cautions):
+    told = reasons or cautions
+    head = "NOT USABLE AS IT IS" if reasons else "Usable"
+    line = f"{head}: {'; '.join(told)}" if told else head
+    if len(line) <= _WIDTH or len(told) == 1:
+        return line
+    more = f" (and {len(told) - 1} more)"
+    return shortened(f"{head}: {told[0]}", _WIDTH - len(more)) + more
+
+
+# ---- reasons ------------------------------------------------------------------------------
+
+
+def _nothing(calibration):
+    finding = calibration.identifiability
+    if finding.rank == 0:
+        return "no free parameter changes any datum"
+    n_data = calibration.fit.get("n_data", np.inf)
+    return "no datum is left over to tell the noise" if n_data <= finding.rank else ""
+
+
+def _stuck(free):
+    """Name the parameters that are at a bound nearly everywhere."""
+    stuck = [
+        f"{name} ({np.sum(entry['at_bound'])} of {entry['value'].size})"
+        for name, entry in free.items()
+        if entry["value"].ndim and np.mean(entry["at_bound"]) > _MOST
+    ]
+    return f"at a bound at most wavelengths: {', '.join(stuck)}" if stuck else ""
+
+
+def _orientations(free):
+    """Return the free angles common to all wavelengths."""
+    return {
+        name: entry
+        for name, entry in free.items()
+        if not entry["value"].ndim
+        and entry["unit"] is not None
+        and u.Unit(entry["unit"]).is_equivalent(u.rad)
+    }
+
+
+def _angles(calibration, free):
+    """Say that most of the angles are at a bound, and the residuals larger than the noise."""
+    angles = _orientations(free)
+    stuck = [name for name, entry in angles.items() if entry["at_bound"]]
+    if len(stuck) < _ANGLES or len(stuck) <= _MOST * len(angles) or not _excess(calibration):
+        return ""
+    return (
+        f"most angles at their bounds: are beams or signs exchanged? ({', '.join(stuck)}; "
+        f"residuals {_excess(calibration):.3g} times the noise)"
+    )
+
+
+def _excess(calibration):
+    """Return by how many times the residuals exceed the noise for certain; 0 where they do not."""
+    tests = calibration.fit.get("lack_of_fit") or []
+    times = [test["times_noise"] for test in tests if test["p_value"] < _UNLIKELY]
+    # with several estimates of the noise that which excuses most
+    return min(times) if times and len(times) == len(tests) else 0.0
+
+
+def _mirrors(calibration, known):
+    """Say of each mirror that polarizes as no mirror does, where the source is not to."""
+    sources = [r for r in calibration.datasets if kind_of_source(r.source) != "polarized"]
+    told = " or ".join(f"{r.name} really {str(r.source)!r}" for r in sources)
+    return [
+        f"{name} polarizes by more than {_NO_MIRROR.value:g} %, as no mirror does: is {told}?"
+        for name in (mirror_names(calibration) if sources else ())
+        if _too_much(calibration, known, name)
+    ]
+
+
+def _too_much(calibration, known, name):
+    """Return whether a fitted mirror polarizes too much with certainty, at most wavelengths."""
+    if known.get(f"{name}.diattenuation", {"fixed": False})["fixed"]:
+        return False
+    table = mirror_values(calibration, name)
+    # without an error where it is at a bound, and where only a product with another is known
+    error = np.nan_to_num(table["diattenuation_err"].value, posinf=np.inf)
+    least = np.abs(table["diattenuation"].value) - 3 * error
+    return np.mean(least * table["diattenuation"].unit > _NO_MIRROR) > _MOST
+
+
+def _misfit(calibration):
+    """Say that the model does not describe the data at all."""
+    left = [_median(r.accuracy["s_res"].to_value(u.percent)) for r in calibration.datasets]
+    worst = np.nanmax([0.0, *left])
+    if not worst > _MISFIT.value or not _excess(calibration):
+        return ""
+    return f"the model misses the data by {worst:.2g} %, {_excess(calibration):.2g} times the noise"
+
+
+def _absurd(free):
+    """Name orientations and other parameters whose errors say that nothing is known."""
+    told = []
+    for name, entry in _orientations(free).items():
+        std = float(entry["std"]) * u.Unit(entry["unit"])
+        if std > _ABSURD_ANGLE:
+            told.append(f"{name} is known to {std.to_value(u.deg):.3g} deg only")
+    wide = [n for n, e in free.items() if np.mean(e["std"] > _width(e)) > _MOST]
+    return [*told, f"errors larger than the bounds: {', '.join(wide)}"] if wide else told
+
+
+def _hanging(free):
+    """Name the orientations at a bound on which others hang: these are where the bound is."""
+    angles = _orientations(free)
+    told = [str(e["conditional_on"]) for e in angles.values() if e["status"] == "conditional"]
+    names = dict.fromkeys(name for by in told for name in by.split(", ") if name in angles)
+    return f"orientations hang on the bound of {', '.join(names)}" if names else ""
+
+
+def _width(entry):
+    low, high = entry["bounds"]
+    return np.inf if low is None or high is None else high - low
+
+
+def _open_leads(calibration, free, shown=False):
+    """Return what leads the open directions, and their change on sky if known, or if it shows."""
+    found = {}
+    for direction in calibration.identifiability.directions:
+        sky, lead = direction.get("sky"), direction["words"].partition(" ")[0]
+        stem, _, index = lead.rstrip("]").partition("[")
+        # a prior or a bound may have closed what the data leave open
+        is_open = stem in free and np.ravel(free[stem]["status"])[int(index or 0)] == "open"
+        if is_open and not (shown and sky and not _seen(sky)):
+            found[lead] = sky or {}
+    return found
+
+
+def _seen(sky):
+    """Return what of AoLP and DoLP changes by what shows."""
+    kinds = (("aolp_deg", "AoLP"), ("dolp_percent", "DoLP"))
+    return [what for key, what in kinds if max(map(abs, sky[key])) >= _SHOWS]
+
+
+def _open_on_sky(calibration, free):
+    """Return what of AoLP and DoLP is open on sky, at most wavelengths, and along which leads."""
+    found = {}
+    for lead, sky in _open_leads(calibration, free).items():
+        for what in _seen(sky) if sky else ():
+            found.setdefault(what, []).append(lead)
+    # what leads at a single wavelength opens that one only
+    many = _MOST * len(calibration.wavelength)
+    return {
+        what: leads
+        for what, leads in found.items()
+        if any("[" not in lead for lead in leads) or len(leads) > many
+    }
+
+
+def _open_words(sky):
+    return [f"the {what} on sky is open ({leads[0]})" for what, leads in sky.items()]
+
+
+def _too_far(tables, sky):
+    """Say what of a bright target is known too badly to be called known."""
+    if not tables:
+        return []
+    (table,) = tables
+    dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
+    s_p, s_chi = _median(table["s_p"].value), _median(table["s_chi"].value)
+    return [
+        words
+        for words in (
+            f"of {dolp:g} % on sky the DoLP is known to {_number(s_p)} % only"
+            if s_p > dolp and "DoLP" not in sky
+            else "",
+            f"of {dolp:g} % on sky the AoLP is known to {_number(s_chi)} deg only"
+            if s_chi > _ABSURD_ANGLE.value and "AoLP" not in sky
+            else "",
+        )
+        if words
+    ]
+
+
+def _median(values):
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def _cautions(calibration, free):
+    """Say what to mind in a calibration that is usable."""
+    tests, excess = calibration.fit.get("lack_of_fit") or [], _excess(calibration)
+    stuck = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
+    told = [f"residuals {excess:.2g} times the noise"] if excess > _CLEARLY else []
+    told += [f"at its bound: {', '.join(stuck)}"] if stuck else []
+    if any("disagree with the priors" in test["words"] for test in tests):
+        told.append("data and priors disagree")
+    return told
+
+
+# ---- accuracy, what is determined, what to do -----------------------------------------------
+
+
+def _accuracy(tables, sky):
+    """Return what is known of light from the sky, medians over the wavelengths."""
+    if not tables:
+        return "On sky      unknown: no dataset tells how accurate it is"
+    dolps = ", ".join(f"{u.Quantity(t.meta['dolp']).to_value(u.percent):.3g}" for t in tables)
+    s_p, s_chi = (
+        "open" if what in sky else _listed([_number(_median(t[key].value)) for t in tables], unit)
+        for key, what, unit in (("s_p", "DoLP", "%"), ("s_chi", "AoLP", "deg"))
+    )
+    # a calibration that is missing can only add to them
+    best = "at best " if tables[0].meta.get("missing") else ""
+    return f"On sky      {best}{dolps} % to {s_p}, AoLP {'' if s_chi == 'open' else 'to '}{s_chi}"
+
+
+def _number(value):
+    """Return two digits; what is infinite is open."""
+    if np.isinf(value) or np.isnan(value):
+        return "open" if np.isinf(value) else "-"
+    return f"{value:.2g}" if value >= _LEAST else f"<{_LEAST:g}"
+
+
+def _listed(numbers, unit):
+    alike = len(set(numbers)) == 1
+    unit = "" if alike and numbers[0] in ("open", "-") else f" {unit}"
+    return (numbers[0] if alike else ", ".join(numbers)) + unit
+
+
+def _determined(calibration, free):
+    """Say how many parameters are determined, and how many are not and why, by name."""
+    total = sum(entry["value"].size for entry in free.values())
+    good, names = _with_status(free, "determined")
+    yield f"Determined  {good} of {total}{': ' if good else ''}{names}"
+    # what is open comes first
+    bad = {s: _with_status(free, s) for s in (*STATUSES[3:6], STATUSES[2])}
+    counts = [f"{n} {status}" for status, (n, _) in bad.items() if n]
+    if bad["open"][0] and not _open_leads(calibration, free, shown=True):
+        counts[0] += " (not seen on sky)"
+    names = ", ".join(names for n, names in bad.values() if n)
+    yield f"Not         {', '.join(counts)}: {names}" if counts else "Not         none"
+
+
+def _with_status(free, status):
+    """Return how many elements have a status, and the parameters they belong to."""
+    counts = {name: int(np.sum(entry["status"] == status)) for name, entry in free.items()}
+    shown = [
+        name if n == free[name]["value"].size else f"{name} ({n})"
+        for name, n in counts.items()
+        if n
+    ]
+    return sum(counts.values()), ", ".join(shown)
+
+
+def _next(calibration, free, wrong, sky, tables):
+    """Return the one thing that would help most."""
+    kinds = {kind_of_source(r.source) for r in calibration.datasets}
+    missing = tables[0].meta.get("missing", []) if tables else []
+    unknown = any(_absurd(free)) or bool(sky)
+    advice = (
+        (calibration.identifiability.rank == 0, "check that every optic that turns has its mount="),
+        (wrong, "check mounts, beams, angles, source; or run astropolcal diagnose"),
+        (
+            unknown and "polarized" not in kinds,
+            "the internal source with its polarizer, at several derotator angles",
+        ),
+        (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
+        ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
+        (unknown or not calibration.converged, "more angles of derotator and half-wave plate"),
+        ("on_sky" in missing, "an unpolarized standard star: the telescope is not in the errors"),
+        ("unpolarized" in missing, "the internal source without its polarizer"),
+        (_excess(calibration) > _CLEARLY, "astropolcal diagnose: what does the model lack?"),
+        (True, "a dataset that no fit saw, as a test (--standard FILE)"),
+    )
+    return next(words for applies, words in advice if applies)
+
+
+def _mount(calibration, free, sky):
+    """Return the angle to hold where the zero of the AoLP is open: the last that takes part."""
+    moved = [
+        direction["parameters"]
+        for direction in calibration.identifiability.directions
+        for lead in sky.get("AoLP", [])[:1]
+        if direction["words"].startswith(f"{lead} ")
+    ]
+    angles = [name for names in moved for name in names if name in _orientations(free)]
+    return f", or --fix {angles[-1]} if its mount is known" if angles else ""

@@ -1,0 +1,140 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Errors at a bound and next to one, against profiles and fits without the bound."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from astropolcal import Calibration
+from astropolcal.calibration import calibrate, profile
+from astropolcal.calibration.bounds import STATUSES, status_of
+from astropolcal.exceptions import CalibrationFileError
+
+LAM = [1.2, 1.6, 2.2] * u.um
+POLARIZER = "calibration_polarizer.theta"
+
+
+def fitted(make, bounds, kind="elliptical", efficiency=None, **options):
+    """A fit of a polarizer at 90.4 deg within other bounds."""
+    chain = make.chain(kind, wavelength=LAM)
+    truth = make.truth(chain)
+    data = make.observe(truth, wavelength=LAM, seed=1)
+    chain["calibration_polarizer"].theta.bounds = bounds
+    chain["calibration_polarizer"].theta = np.clip(90, *bounds) * u.deg
+    if efficiency is not None:
+        chain["wollaston"].efficiency.bounds = (0, efficiency)
+        chain["wollaston"].efficiency = np.full(3, efficiency - 0.01)
+    return calibrate(chain, data, cross_validate=False, **options)
+
+
+@pytest.fixture(scope="module")
+def cal(make):
+    return fitted(make, (85, 90.39))
+
+
+# --- errors of what is at a bound ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weights", [None, "errors"])
+def test_one_sided_error_is_where_the_profile_has_risen_by_one(make, weights):
+    # far from the bound, near it, at the lower one, and several at bounds that correlate
+    cases = [((85, 90.2), None), ((85, 90.39), None), ((90.5, 95), None), ((85, 90.2), 0.965)]
+    for bounds, efficiency in cases:
+        cal = fitted(make, bounds, efficiency=efficiency, weights=weights)
+        assert POLARIZER in cal.at_bound
+        assert len(cal.at_bound) > 1 or efficiency is None
+        for name in cal.at_bound:
+            row = cal.parameters[cal.parameters["name"] == name][0]
+            assert (row["status"], np.isnan(row["std"])) == ("at bound", True)
+            made = profile(cal, name, n=13)
+            best = getattr(made.best, "value", made.best)
+            ends = [abs(getattr(end, "value", end) - best) for end in made.interval()]
+            assert min(ends) == pytest.approx(row["std_inward"], rel=0.02)
+            assert max(ends) == np.inf
+
+
+# --- errors next to a bound ---------------------------------------------------------------------
+
+
+def test_errors_without_the_bound_are_those_of_a_fit_without_it(make, cal):
+    free = fitted(make, (85, 95))
+    released, other = cal.parameters, free.parameters
+    hanging = released["status"] == "conditional"
+    assert 3 < hanging.sum() < len(released) - 1
+    # the noise comes from the residuals, which a bound enlarges a little
+    np.testing.assert_allclose(released["std_released"][hanging], other["std"][hanging], rtol=0.03)
+    np.testing.assert_array_less(1.1 * released["std"][hanging], released["std_released"][hanging])
+    assert set(released["conditional_on"][hanging]) == {POLARIZER}
+    plain = released["status"] == "determined"
+    np.testing.assert_allclose(released["std"][plain], other["std"][plain], rtol=0.1)
+    assert np.isnan(released["std_released"][plain]).all()
+    assert not np.isin(other["status"], ["conditional", "at bound"]).any()
+    assert f"conditional on {POLARIZER} at its bound; without it" in " ".join(
+        cal.summary(full=True).split()
+    )
+
+
+def test_what_only_a_bound_determines_is_open_without_it(make):
+    """Turning polarizer and half-wave plate together changes no datum."""
+    chain = make.chain("elliptical", fixed=False, wavelength=LAM)
+    chain["derotator"].theta.fixed = True
+    data = make.observe(make.truth(chain), wavelength=LAM, seed=1)
+    chain = calibrate(chain, data, cross_validate=False).chain
+    # a bound right where the fit ends, so that nothing pushes against it
+    angle = chain["calibration_polarizer"].theta
+    angle.bounds = (float(angle.value), 95)
+    cal = calibrate(chain, data, search=False, cross_validate=False)
+    known = cal.parameter_values()
+    assert known[POLARIZER]["status"] == "at bound"
+    assert known[POLARIZER]["std_inward"] == np.inf
+    assert "not limited" in cal.summary()
+    for name in ("hwp.theta", "derotator.circular"):
+        assert (known[name]["status"] == "conditional").all()
+        assert np.isfinite(known[name]["std"]).all()
+        assert np.isinf(known[name]["std_released"]).all()
+    assert "without it open" in " ".join(cal.summary().split())
+
+
+# --- status, files ----------------------------------------------------------------------------
+
+
+def test_status_of_every_kind():
+    plain = {"std": 0.01, "std_released": np.nan, "unit": u.deg, "bounds": (-5, 5)}
+    plain |= {"fixed": False, "tied": None, "at_bound": False, "identifiable": True}
+    open_bounds = {"bounds": (None, 5)}
+    nothing = {"std": np.nan, "identifiable": False}
+    for changes, status in (
+        ({}, "determined"),
+        ({"identifiable": False}, "determined"),  # by a prior
+        ({"fixed": True}, "fixed"),
+        ({"tied": "a.b"}, "tied"),
+        (nothing, "open"),
+        (nothing | {"at_bound": True}, "at bound"),
+        ({"std": np.nan}, "badly determined"),  # no noise is known
+        ({"std": 2.8}, "determined"),
+        ({"std": 3.0}, "badly determined"),  # anywhere between the bounds
+        ({"std": 3.0} | open_bounds, "determined"),
+        ({"std": 5.1} | open_bounds, "badly determined"),
+        ({"std": 0.06, "unit": u.mm, "bounds": (0, 2)}, "badly determined"),
+        ({"std": 0.04, "unit": u.mm, "bounds": (0, 2)}, "determined"),
+        ({"std": 0.06, "unit": None, "bounds": (0, 1)}, "badly determined"),
+        ({"std_released": np.inf}, "conditional"),
+        ({"std": 6.0, "std_released": np.inf} | open_bounds, "badly determined"),
+    ):
+        assert status_of(plain | changes) == status, changes
+        assert status in STATUSES
+
+
+def test_file_keeps_them_and_refuses_what_is_none(cal, tmp_path):
+    cal.write(tmp_path / "cal.asdf")
+    again = Calibration.read(tmp_path / "cal.asdf")
+    assert again.fit["bounds"] == cal.fit["bounds"]
+    assert (again.parameters["status"] == cal.parameters["status"]).all()
+    for bad in ([1], {"inward": 1}, {"inward": {"a": "b"}}, {"released": {"a": {"times": 1.0}}}):
+        again.fit["bounds"] = bad
+        with pytest.raises(CalibrationFileError, match=r"fit\.bounds lacks"):
+            again.write(tmp_path / "bad.asdf")
+    # files from before did not say it
+    del again.fit["bounds"]
+    assert np.isnan(again.parameters["std_inward"]).all()
+    assert "conditional" not in again.parameters["status"]

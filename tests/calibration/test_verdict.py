@@ -1,0 +1,281 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Whether a calibration is usable, why not, and that it is said in 24 lines of 80 columns."""
+
+import json
+import sys
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+sys.path.append(str(Path(__file__).parents[1]))
+
+from star_data import WAVELENGTH, observe_star, star_chain
+
+import astropolcal
+from astropolcal import Calibration, Observations, calibrate, instruments, optics, standards
+from astropolcal.calibration import verdict, verdicts
+from astropolcal.calibration.bounds import status_of
+
+CHARIS = instruments.get("charis")
+
+
+def _entry(value, std=np.nan, unit=None, **flags):
+    shape = np.shape(value)
+    known = {"value": np.asarray(value, float), "std": np.broadcast_to(std, shape), "unit": unit}
+    known |= {"fixed": False, "tied": None, "at_bound": np.zeros(shape, bool), "bounds": (0, 2)}
+    known |= {"identifiable": np.isfinite(known["std"]), "std_released": np.full(shape, np.nan)}
+    return known | flags | {"status": status_of(known | flags)}
+
+
+def _calibration(source=None, s_res=0.1, **fit):
+    accuracy = QTable({"s_res": np.full(3, s_res) * u.percent})
+    record = SimpleNamespace(name="night", source=source, accuracy=accuracy)
+    return SimpleNamespace(fit=fit, datasets=[record])
+
+
+def _test(times, p_value):
+    return {"times_noise": times, "p_value": p_value, "words": ""}
+
+
+def fits_a_terminal(calibration):
+    """Return the summary's lines after a look at their size, in full as well."""
+    lines = calibration.summary().splitlines()
+    assert len(lines) < 24
+    assert lines[:5] == calibration.verdict().words
+    assert lines[-1].startswith("--full")
+    full = calibration.summary(full=True)
+    assert max(map(len, [*lines, *full.splitlines()])) <= 80
+    assert full.splitlines()[:5] == lines[:5]
+    return lines
+
+
+# ---- whole calibrations -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def example():
+    path = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
+    return Observations.read(path)
+
+
+def test_the_example_leaves_the_zero_of_the_angle_open(example, tmp_path):
+    (chain,) = CHARIS.chains_for([example])
+    cal = calibrate(chain, example, instrument="charis", cross_validate=False)
+    found = cal.verdict()
+    assert not found.usable
+    assert found.reasons == ["the AoLP on sky is open (calibration_polarizer.theta)"]
+    first, accuracy, determined, missing, advice = fits_a_terminal(cal)[:5]
+    assert first == f"NOT USABLE AS IT IS: {found.reasons[0]}"
+    assert accuracy.endswith("AoLP open")
+    assert "open" not in accuracy.partition("AoLP")[0]
+    assert determined.startswith("Determined  23 of 93: hwp.w_sio2, hwp.w_mgf2")
+    assert missing.startswith("Not         69 open, 1 at bound: calibration_polarizer.theta")
+    assert advice.endswith("or --fix hwp.theta if its mount is known")
+    # the same from a file, and for machines
+    cal.write(tmp_path / "cal.asdf")
+    again = Calibration.read(tmp_path / "cal.asdf")
+    assert again.verdict() == found
+    assert json.loads(json.dumps(again.to_dict(), allow_nan=False))["verdict"] == vars(found)
+    # and with the advice followed
+    held = calibrate(chain, example, fix={"hwp.theta": None}, cross_validate=False)
+    assert held.verdict().usable
+    assert "open (not seen on sky)" in fits_a_terminal(held)[3]
+    assert "AoLP to " in held.verdict().words[1]
+
+
+def test_a_polarized_star_alone_determines_nothing():
+    options = {"target": "HD 30675", "star": "star_HD30675"}
+    truth = star_chain("polarized standard star", **options)
+    known = standards.get("HD 30675").stokes(WAVELENGTH)
+    truth["star_HD30675"].q, truth["star_HD30675"].u = known.q, known.u
+    data = observe_star(truth, 8, source="polarized standard star", target="HD 30675", seed=1)
+    cal = calibrate(CHARIS.chains_for([data]), [data], instrument="charis", cross_validate=False)
+    found = cal.verdict()
+    assert not found.usable
+    assert any("is known to" in reason or "larger than" in reason for reason in found.reasons)
+    assert "the internal source with its polarizer" in fits_a_terminal(cal)[4]
+
+
+def test_a_forgotten_mount_leaves_nothing_to_fit(example):
+    n = len(example.wavelength)
+    own = (
+        optics.LinearPolarizer(theta=90 * u.deg, name="polarizer")
+        | optics.LinearRetarder(retardance=np.full(n, -172) * u.deg, name="plate")
+        | optics.WollastonPrism(efficiency=np.full(n, 0.98), name="prism")
+    )
+    cal = calibrate(own, example, cross_validate=False)
+    assert cal.converged
+    assert cal.identifiability.rank == 0
+    found = cal.verdict()
+    assert found.reasons[0] == "no free parameter changes any datum"
+    lines = fits_a_terminal(cal)
+    assert "mount=" in lines[4]
+    # a number there would be none of this instrument
+    assert "unknown" in lines[1]
+
+
+@pytest.mark.slow
+def test_real_data_fit_a_terminal(shared_data):
+    for name, patterns, first in (
+        ("charis", ["charis/dataset3*", "charis/dataset4*", "charis/hd293396*"], "Usable: "),
+        ("vampires", ["vampires/*.ecsv"], "Usable: "),
+        (
+            "vampires",
+            ["vampires/*internal_[67o]*"],
+            "NOT USABLE AS IT IS: orientations hang on the bound of hwp.theta",
+        ),
+    ):
+        found = [sorted(shared_data.glob(f"data/{pattern}")) for pattern in patterns]
+        if not all(found):
+            pytest.skip(f"no real tables of {name}")
+        instrument = instruments.get(name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", astropolcal.exceptions.AstropolcalWarning)
+            data = [instrument.prepare(Observations.read(p)) for paths in found for p in paths]
+        cal = calibrate(instrument.chains_for(data), data, instrument=name, cross_validate=False)
+        assert fits_a_terminal(cal)[0].startswith(first)
+
+
+# ---- reasons one by one -----------------------------------------------------------------------
+
+
+def test_a_fit_that_did_not_arrive_is_not_usable(make):
+    lam = [1.2, 1.6, 2.2] * u.um
+    chain = make.chain(wavelength=lam)
+    cal = calibrate(chain, make.observe(make.truth(chain), wavelength=lam, seed=1))
+    assert cal.verdict().usable
+    assert fits_a_terminal(cal)[0] == "Usable"
+    cal.fit["converged"] = False
+    assert cal.verdict().reasons == ["the fit did not converge"]
+    assert verdict(cal).words[0] == "NOT USABLE AS IT IS: the fit did not converge"
+
+
+def test_a_parameter_at_a_bound_nearly_everywhere():
+    for stuck, words in ((1, ""), (2, "at a bound at most wavelengths: w.efficiency (2 of 3)")):
+        free = {
+            "w.efficiency": _entry([1.0, 1.0, 1.0], at_bound=np.arange(3) < stuck),
+            "hwp.theta": _entry(1.0, at_bound=np.array(True)),
+        }
+        assert verdicts._stuck(free) == words
+
+
+def test_most_angles_at_bounds_and_large_residuals():
+    for stuck, p_values, says in (
+        (1, (0.0, 0.0), False),
+        (2, (0.0, 0.0), True),
+        (3, (0.0, 0.0), True),
+        (3, (0.3, 0.3), False),
+        # one estimate of the noise excuses them
+        (3, (0.3, 0.0), False),
+        (3, (np.nan, np.nan), False),
+    ):
+        free = {
+            name: _entry(1.0, unit="deg", at_bound=np.array(i < stuck))
+            for i, name in enumerate(("polarizer.theta", "hwp.theta", "derotator.theta"))
+        } | {"hwp.w_sio2": _entry(1.6, unit="mm")}
+        tests = [_test(times, p) for times, p in zip((41.2, 80.0), p_values, strict=True)]
+        words = verdicts._angles(_calibration(lack_of_fit=tests), free)
+        assert bool(words) is says
+        if says:
+            assert "are beams or signs exchanged? (polarizer.theta, hwp.theta" in words
+            assert "41.2 times the noise" in words
+
+
+@pytest.mark.parametrize(
+    ("source", "percent", "std", "fixed", "says"),
+    [
+        ("unpolarized", [-99.0, -98.0, -100.0], np.nan, False, True),
+        ("unpolarized standard star", [60.0, 70.0, 1.0], 2.0, False, True),
+        # one wavelength that went astray, a small one, one within its error, and one held
+        ("unpolarized", [60.0, 2.0, 1.0], np.nan, False, False),
+        ("unpolarized", [8.0, 9.0, 9.0], 0.1, False, False),
+        ("unpolarized", [60.0, 70.0, 80.0], 20.0, False, False),
+        ("unpolarized", [60.0, 70.0, 80.0], np.nan, True, False),
+        ("polarized", [-99.0, -98.0, -100.0], np.nan, False, False),
+        (None, [-99.0, -98.0, -100.0], np.nan, False, False),
+    ],
+)
+def test_a_mirror_that_polarizes_as_none_does(monkeypatch, source, percent, std, fixed, says):
+    table = QTable({"diattenuation": percent * u.percent})
+    table["diattenuation_err"] = np.full(3, std) * u.percent
+    monkeypatch.setattr(verdicts, "mirror_names", lambda calibration: ["m3"])
+    monkeypatch.setattr(verdicts, "mirror_values", lambda calibration, name: table)
+    known = {"m3.diattenuation": _entry(np.array(percent) / 100, fixed=fixed)}
+    words = verdicts._mirrors(_calibration(source), known)
+    told = f"m3 polarizes by more than 30 %, as no mirror does: is night really {source!r}?"
+    assert words == ([told] if says else [])
+
+
+def test_residuals_of_a_model_that_is_none():
+    bad, good = [_test(60.0, 0.0)], [_test(1.0, 0.4)]
+    assert verdicts._misfit(_calibration(s_res=1.5, lack_of_fit=bad)) == ""
+    # noise may be large
+    assert verdicts._misfit(_calibration(s_res=20.0, lack_of_fit=good)) == ""
+    assert verdicts._misfit(_calibration(s_res=np.nan, lack_of_fit=bad)) == ""
+    words = verdicts._misfit(_calibration(s_res=20.0, lack_of_fit=bad))
+    assert words == "the model misses the data by 20 %, 60 times the noise"
+
+
+def test_errors_that_say_that_nothing_is_known():
+    wide = {"bounds": (-360, 360)}
+    for entry, words in (
+        (_entry(1.0, 9.0, u.deg, **wide), []),
+        (_entry(1.0, 1328.0, u.deg, bounds=(None, None)), ["a.b is known to 1.33e+03 deg only"]),
+        (_entry(1.0, 1.9, u.mm), []),
+        (_entry(1.0, 2.1, u.mm), ["errors larger than the bounds: a.b"]),
+        (_entry([1.0, 1.0, 1.0], [3, 3, 0.1]), ["errors larger than the bounds: a.b"]),
+        (_entry([1.0, 1.0, 1.0], [3, 0.1, 0.1]), []),
+        (_entry([1.0, 1.0, 1.0], 100.0, u.deg, **wide), []),
+    ):
+        assert verdicts._absurd({"a.b": entry}) == words
+
+
+def test_orientations_that_hang_on_a_bound():
+    entry = {"unit": u.deg, "bounds": (-5, 5), "std_released": np.array(2.4)}
+    for by, words in (("hwp.theta", "orientations hang on the bound of hwp.theta"), ("a.q", "")):
+        free = {
+            "hwp.theta": _entry(5.0, unit=u.deg, at_bound=np.array(True)),
+            "polarizer.theta": _entry(1.0, 0.2, conditional_on=np.array(f"b.q, {by}"), **entry),
+        }
+        assert verdicts._hanging(free) == words
+
+
+def test_a_target_that_is_not_known():
+    def table(s_p, s_chi):
+        found = QTable({"s_p": np.full(3, s_p) * u.percent, "s_chi": np.full(3, s_chi) * u.deg})
+        found.meta |= {"dolp": 30 * u.percent, "aolp": None}
+        return found
+
+    for s_p, s_chi, sky, words in (
+        (0.1, 0.1, {}, []),
+        (40.0, 0.1, {}, ["of 30 % on sky the DoLP is known to 40 % only"]),
+        (0.1, 20.0, {}, ["of 30 % on sky the AoLP is known to 20 deg only"]),
+        # what is open is said with its name
+        (np.inf, np.inf, {"AoLP": ["a.b"], "DoLP": ["a.b"]}, []),
+    ):
+        assert verdicts._too_far([table(s_p, s_chi)], sky) == words
+    assert verdicts._too_far([], {}) == []
+    assert verdicts._accuracy([], {}) == "On sky      unknown: no dataset tells how accurate it is"
+    words = verdicts._accuracy([table(0.0001, np.inf), table(0.02, np.inf)], {})
+    assert words == "On sky      30, 30 % to <0.001, 0.02 %, AoLP open"
+    assert "% to open" in verdicts._accuracy([table(0.02, 1.0)], {"DoLP": ["a.b"]})
+
+
+def test_a_long_first_line_counts_what_it_leaves_out():
+    one, two = "a reason " * 3, "another reason " * 5
+    for told, words in (
+        ([], "Usable"),
+        ([one], f"Usable: {one}"),
+        ([two], verdicts.shortened(f"Usable: {two}")),
+        ([one, one], f"Usable: {one}; {one}"),
+    ):
+        assert verdicts.shortened(verdicts._first([], told)) == words
+    line = verdicts._first([two, one], [])
+    assert line.startswith("NOT USABLE AS IT IS: another reason another")
+    assert line.endswith(" ... (and 1 more)")
+    assert len(line) <= 80
