@@ -34,11 +34,9 @@ class SkyErrors:
         Shape (4, n_wavelengths, n_angles) for angles of which the double is given in radian;
         infinite where an open direction changes a quantity.
         """
-        weights = _weights(dolp, double)
-        size = len(weights), -1
-        flat = weights.reshape(-1, 9)
+        weights = _weights(dolp, double).reshape(-1, 9)
         variance, known, is_open, blind = (
-            _quadratic(matrix, flat)
+            _quadratic(matrix, weights)
             for matrix in (self._covariance, self._known, self._open, self._blind)
         )
         # as for any quantity derived from the parameters, see `Covariance.propagate`
@@ -52,7 +50,7 @@ class SkyErrors:
         with np.errstate(invalid="ignore", divide="ignore"):
             count = self._good.sum(axis=1)[:, None]
             rms = np.sqrt(np.nansum(variance, axis=1) / np.where(count, count, np.nan))
-        return np.moveaxis(rms.reshape(len(rms), *size), 0, 1)
+        return np.moveaxis(rms.reshape(len(rms), len(KEYS), -1), 0, 1)
 
 
 def _products(rows):

@@ -7,6 +7,7 @@ data unchanged moves it. An error is given for identifiable parameters only:
 a pseudo-inverse would return a small and wrong number for the others.
 """
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -314,12 +315,11 @@ def _settled_by_a_star(finding, view):
     """Say which open directions a star of known polarization would close, and which star."""
     if view is None or view.telescope == LEFT_OUT:
         return []
-    turns = {
-        direction["words"].partition(" by ")[0]: max(map(abs, direction["sky"]["aolp_deg"]))
+    leads = [
+        re.split(" by | changes ", direction["words"])[0]
         for direction in finding.directions
-        if "sky" in direction
-    }
-    leads = [lead for lead, turn in turns.items() if turn > _TURNS]
+        if "sky" in direction and max(map(abs, direction["sky"]["aolp_deg"])) > _TURNS
+    ]
     if not leads:
         return []
     return [f"{', '.join(leads)}: {star_words(view.site)} settles what that does on sky"]

@@ -129,12 +129,7 @@ def _within_bounds(measurement, vector):
     ]
     if retarders:
         flip = dict.fromkeys(retarders, _other_hand)
-        candidates.append(
-            (
-                f"{', '.join(retarders)}: {_SAME_DATA}",
-                flip,
-            )
-        )
+        candidates.append((f"{', '.join(retarders)}: {_SAME_DATA}", flip))
     others = [(words, _mirrored(measurement, vector, edits)) for words, edits in candidates]
     return [{"words": words, "vector": other} for words, other in others if other is not None]
 
