@@ -3,15 +3,15 @@
 Errors at a bound, and next to one.
 
 A parameter at its bound has no standard error: chi-square still falls beyond. How far it may go
-inward is known, and is its one-sided error. The errors of all others count it as known; where
-that matters, the error with the bound released is worked out beside it.
+inward is known, and is its one-sided error. The errors of all others include that it may; where
+that matters, they say so, and the error without any bound stands beside theirs.
 """
 
 import numpy as np
 
 from astropolcal.calibration._directions import LARGE, declared_step, step_of
 
-__all__ = ["STATUSES", "errors_at_bounds", "status_of"]
+__all__ = ["STATUSES", "errors_at_bounds", "slack_of_bounds", "status_of"]
 
 #: What may be said of a parameter, in the order in which it is decided.
 STATUSES = ("fixed", "tied", "at bound", "open", "badly determined", "conditional", "determined")
@@ -20,6 +20,8 @@ STATUSES = ("fixed", "tied", "at bound", "open", "badly determined", "conditiona
 _MATTERS = 1.1
 # derivatives that others take up to this share of the largest singular value are open
 _OPEN = 1e-9
+# as far from one bound as 68 % of what is anywhere between two
+_ANYWHERE = 0.6827
 # the spread of what is anywhere between two bounds, as a share of their distance
 _UNIFORM = 1 / np.sqrt(12)
 
@@ -45,7 +47,9 @@ def errors_at_bounds(measurement, whitened):
         ``inward``: name to the one-sided error in the parameter's unit, infinite where the data do
         not limit it before the opposite bound. ``released``: name of every other parameter whose
         error grows by more than a tenth without the bounds, to the ratio of the two errors,
-        ``times``, and the names of those at a bound that matter, ``by``.
+        ``times``, with the bound as exact in the smaller one; the names of those at a bound that
+        matter, ``by``; and what they add to its error in its unit, as far as they may go inward,
+        ``slack``, and if there were no bounds, ``without``.
 
     Examples
     --------
@@ -65,24 +69,54 @@ def errors_at_bounds(measurement, whitened):
     >>> list(errors_at_bounds(cal.measurement, problem)["inward"])
     ['calibration_polarizer.theta']
     """
-    held = np.flatnonzero(whitened.held)
-    if not held.size:
+    if not whitened.held.any():
         return {"inward": {}, "released": {}}
-    names, free = measurement.free.names, measurement.free
+    held, columns, response, steps, widths = _inward(measurement, whitened)
+    names, per_unit = measurement.free.names, whitened.scale / measurement.free.factors()
+    released = _released(names, whitened, held, columns, response)
+    slack = np.linalg.norm(_moved(whitened, held, response, steps, widths), axis=0) * per_unit
+    root = np.linalg.pinv(np.linalg.qr(columns, mode="r")) * measurement.weighting.level
+    without = np.linalg.norm(response @ root, axis=1) * per_unit[whitened.live]
+    for name, told in released.items():
+        i = names.index(name)
+        told["slack"] = float(slack[i])
+        beyond = np.flatnonzero(whitened.live == i)[0]
+        told["without"] = float(without[beyond]) if np.isfinite(told["times"]) else np.inf
+    inward = {names[k]: float(t * per_unit[k]) for k, t in zip(held, steps, strict=True)}
+    return {"inward": inward, "released": released}
+
+
+def slack_of_bounds(measurement, whitened):
+    """
+    Return how the parameters move while one at its bound goes inward by its one-sided error.
+
+    Shape (n_held, n_free), in steps of a degree, micrometre or percent.
+    """
+    if not whitened.held.any():
+        return np.zeros((0, whitened.scale.size))
+    held, _, response, steps, widths = _inward(measurement, whitened)
+    return _moved(whitened, held, response, steps, widths)
+
+
+def _inward(measurement, whitened):
+    """Return what is held, its derivatives, how others follow, one-sided errors and widths."""
+    held = np.flatnonzero(whitened.held)
     columns, residual, response = _without_others(measurement, whitened, held)
-    low, high = free.bounds()
+    low, high = measurement.free.bounds()
     inward = np.where(_at_low(measurement, held), 1.0, -1.0)
-    per_unit = whitened.scale / free.factors()
-    steps = _one_sided(
-        columns * inward,
-        residual,
-        measurement.weighting.level,
-        (high - low)[held] / whitened.scale[held],
-    )
-    return {
-        "inward": {names[k]: float(t * per_unit[k]) for k, t in zip(held, steps, strict=True)},
-        "released": _released(names, whitened, held, columns, response),
-    }
+    widths = (high - low)[held] / whitened.scale[held]
+    steps = _one_sided(columns * inward, residual, measurement.weighting.level, widths)
+    return held, columns, response, steps, widths
+
+
+def _moved(whitened, held, response, steps, widths):
+    # what the data do not limit is anywhere up to the opposite bound
+    steps = np.where(np.isfinite(steps), steps, _ANYWHERE * widths)
+    rows = np.zeros((held.size, whitened.scale.size))
+    rows[:, whitened.live] = response.T
+    rows[np.arange(held.size), held] = 1.0
+    # without an opposite bound either, it stays where it is
+    return rows * np.where(np.isfinite(steps), steps, 0.0)[:, None]
 
 
 def _at_low(measurement, held):

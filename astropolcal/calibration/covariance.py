@@ -15,6 +15,7 @@ import numpy as np
 
 from astropolcal.calibration._directions import declared_step
 from astropolcal.calibration._scatter import Scatter
+from astropolcal.calibration.bounds import slack_of_bounds
 from astropolcal.calibration.weighting import Weighting, around, weighting_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor
@@ -46,7 +47,7 @@ class Covariance:
     factor : array_like, optional
         Directions that the data determine, each as long as its standard
         error, shape (rank, n); ``factor.T @ factor`` is the covariance as far
-        as it is known. Zero for parameters held at a bound.
+        as it is known. Of those at a bound it has how far they may go inward.
     null : array_like, optional
         Directions that stay open, shape (n_open, n).
 
@@ -362,7 +363,7 @@ def covariance_around(measurement, whitened, weighting, scatter=None):
 
     It is the sandwich (White 1980, Econometrica 48, 817) of how the residuals scatter and hang
     together at the wavelengths, pairs and settings of each dataset; where residuals do not tell
-    it, that of independent data.
+    it, that of independent data. What is at a bound may go inward by its one-sided error.
 
     Parameters
     ----------
@@ -383,7 +384,8 @@ def covariance_around(measurement, whitened, weighting, scatter=None):
     if not scatter.is_known:
         return white_covariance(measurement, whitened, weighting)
     prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T * weighting.level
-    return sandwich(measurement, whitened, scatter.middle() + prior.T @ prior)
+    slack = slack_of_bounds(measurement, whitened)
+    return sandwich(measurement, whitened, scatter.middle() + prior.T @ prior, slack)
 
 
 def white_covariance(measurement, whitened, weighting):
@@ -397,13 +399,18 @@ def white_covariance(measurement, whitened, weighting):
     )
 
 
-def sandwich(measurement, whitened, middle):
-    """Return the covariance from that of the pulls on the determined directions."""
+def sandwich(measurement, whitened, middle, slack=None):
+    """
+    Return the covariance from that of the pulls on the determined directions.
+
+    ``slack`` has further directions, each one standard error long, in the steps of the problem.
+    """
     variances, vectors = np.linalg.eigh(middle)
     stds = np.sqrt(variances.clip(0))
     # with fewer groups than directions a sum of outer products is singular
     stds = np.maximum(stds, _LEAST * stds.max(initial=0.0))
     rows = (stds[:, None] * vectors.T) @ whitened.factor()
+    rows = rows if slack is None else np.concatenate([rows, slack])
     # back to orthogonal directions, as `Covariance` keeps them
     _, sizes, principal = np.linalg.svd(rows, full_matrices=False)
     free = measurement.free

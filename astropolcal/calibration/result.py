@@ -358,8 +358,11 @@ class Calibration:
         inward, released = found.get("inward", {}), found.get("released", {})
         known = {}
         for i, name in enumerate(self.covariance.names):
-            more = released.get(name, {"times": np.nan, "by": []})
-            beside = (inward.get(name, np.nan), ", ".join(more["by"]), stds[i] * more["times"])
+            more = released.get(name, {"without": np.nan, "slack": 0.0, "by": []})
+            # the error with all bounds as exact, and then as if there were none
+            exact = np.sqrt(max(stds[i] ** 2 - more["slack"] ** 2, 0.0))
+            beyond = np.hypot(exact, more["without"])
+            beside = (inward.get(name, np.nan), ", ".join(more["by"]), beyond)
             known[name] = (stds[i], bool(flags[i]), name in bound, *beside)
         return known
 

@@ -174,7 +174,7 @@ def _are_bounds(bounds):
         return False
     return all(isinstance(value, float) for value in inward.values()) and all(
         isinstance(one, dict)
-        and isinstance(one.get("times"), float)
+        and all(isinstance(one.get(key), float) for key in ("times", "slack", "without"))
         and isinstance(one.get("by"), list)
         and all(isinstance(name, str) for name in one["by"])
         for one in released.values()
