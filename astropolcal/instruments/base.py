@@ -12,7 +12,7 @@ from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments._choices import check_choice
 from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
-from astropolcal.instruments.telescope import behind_telescope, star_options
+from astropolcal.instruments.telescope import as_exact, behind_telescope, star_options
 from astropolcal.observations import (
     common_wavelengths,
     is_star,
@@ -311,7 +311,7 @@ class Instrument(ABC):
         """Return published mirrors to compare with: name of the optic to label to optic."""
         return {}
 
-    def chains_for(self, datasets, *, nuisance=(), **options):
+    def chains_for(self, datasets, *, nuisance=(), exact=False, **options):
         """
         Return one chain a dataset, all on the common wavelength grid.
 
@@ -322,6 +322,10 @@ class Instrument(ABC):
         nuisance : sequence of str
             What to add to the chain of each dataset, see `~astropolcal.instruments.add_nuisance`:
             ``"background"``, ``"beam_gain"``, ``"lamp"``.
+        exact : bool
+            Whether the polarization of standard stars and the orientation of fixed optics are
+            held at what is known of them, as in the published calibrations; by default they have
+            the errors of the catalogue and of the mounting as priors.
         **options
             Passed to `chain`.
 
@@ -346,7 +350,7 @@ class Instrument(ABC):
             self.chain(source, optics_in, wavelength=grid, **own, **options)
             for (source, optics_in), own in zip(setups, particulars, strict=True)
         ]
-        return add_nuisance(chains, datasets, nuisance)
+        return add_nuisance(map(as_exact, chains) if exact else chains, datasets, nuisance)
 
     def telescope_optics(self, behind, **options):
         """

@@ -19,6 +19,7 @@ from astropolcal.observations import is_star
 from astropolcal.units import to_unit
 
 __all__ = [
+    "as_exact",
     "INTERNAL",
     "M3_MODELS",
     "STARS",
@@ -234,6 +235,36 @@ def mounted(optic, tolerance=_MOUNTING):
     spread = tolerance.to_value(optic.theta.unit)
     optic.theta.fixed, optic.theta.prior = False, _normal(float(optic.theta.value), spread)
     return optic
+
+
+def as_exact(chain):
+    """
+    Return a chain in which standard stars and mountings are held at what is known of them.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        The chain; its optics are changed.
+
+    Returns
+    -------
+    `~astropy.modeling.CompoundModel`
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments.telescope import as_exact
+    >>> chain = as_exact(instruments.get("charis").chain("unpolarized standard star"))
+    >>> chain["star"].q.fixed, chain["m3"].theta.fixed, chain["m3"].diattenuation.fixed
+    (True, True, False)
+    """
+    for leaf in leaves(chain):
+        keys = leaf.param_names if isinstance(leaf, optics.StarSource) else ["theta"]
+        # the orientation of what stands on a stage is for the data to find
+        for parameter in (getattr(leaf, key) for key in keys if leaf.mount is None):
+            if parameter.prior is not None:
+                parameter.fixed, parameter.prior = True, None
+    return chain
 
 
 def star_source(source, wavelength, name="star", target=None):

@@ -96,6 +96,19 @@ def _add_model_options(parser):
         "'power law' (the paper's permittivity) or metal (silver with a film)",
     )
     parser.add_argument(
+        "--plate",
+        metavar="MODEL",
+        help="half-wave plate of VAMPIRES: free (default, a retardance per band) or two-layer (one "
+        "law for all bands)",
+    )
+    parser.add_argument(
+        "--exact",
+        action="store_true",
+        help="take the polarization of standard stars and the orientation of fixed optics as "
+        "exact, as published calibrations do; by default they have the errors of the catalogue "
+        "and of the mounting",
+    )
+    parser.add_argument(
         "--nuisance",
         action="append",
         default=[],
@@ -140,6 +153,13 @@ def _add_fit_options(parser):
         default="none",
         help="equal weights (default), one over the residuals' scatter at each wavelength, or one "
         "over the tables' errors",
+    )
+    parser.add_argument(
+        "--errors",
+        choices=("scatter", "white"),
+        default="scatter",
+        help="errors from how the residuals scatter and hang together (default), or those of "
+        "independent data with the noise of --weights",
     )
 
 
@@ -217,9 +237,10 @@ def run(arguments):
         standards = [instrument.prepare(table) for table in standards]
     tables = [*datasets, *standards]
     # only what was typed: an instrument need not know all options
-    stated = {key: getattr(arguments, key) for key in ("derotator", "bounds", "m3")}
+    stated = {key: getattr(arguments, key) for key in ("derotator", "bounds", "m3", "plate")}
     options = {key: value for key, value in stated.items() if value is not None}
-    chains = instrument.chains_for(datasets, nuisance=arguments.nuisance, **options)
+    exact = {"nuisance": arguments.nuisance, "exact": arguments.exact}
+    chains = instrument.chains_for(datasets, **exact, **options)
     # each on its own wavelengths
     chains += [instrument.chains_for([table], **options)[0] for table in standards]
     edits = {key: getattr(arguments, key) for key in ("without", "free", "fix", "prior")}
@@ -285,7 +306,8 @@ def _is_known(observations):
         return False
     return True
 
-
+        "loss": arguments.loss,
+        "errors": arguments.errors,
 def _fitted(arguments, chains, datasets, positions, instrument):
     """Return the fit of all that is free, or of what changed since another calibration."""
     from astropolcal.calibration import Calibration, calibrate, restart
