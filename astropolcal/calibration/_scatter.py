@@ -11,8 +11,9 @@ data as independent are too small then. Here the residuals of each dataset have 
 S is the scatter at each wavelength. C is the correlation of pairs of frames: of a pair with itself,
 or of the pairs at one setting, where an error of Stokes q and u goes with :math:`\cos 4\theta` and
 :math:`\sin 4\theta` of the half-wave plate. L is that of wavelengths: none, over a tenth of their
-logarithm, or all. The shares :math:`\tau` are those for which products of residuals have the values
-that are found, after what the fit took away (MINQUE: Rao 1971, J. Multivariate Anal. 1, 257,
+logarithm, all, or that of the principal components of the errors at the settings. The shares
+:math:`\tau` are those for which products of residuals have the values that are found, after what the
+fit took away (MINQUE: Rao 1971, J. Multivariate Anal. 1, 257,
 doi:10.1016/0047-259X(71)90001-7).
 """
 
@@ -34,6 +35,10 @@ _LEAST_FREEDOM = 1.0
 _FEWEST_SETTINGS = 3
 # shares below so many times their error under independence count as chance
 _CHANCE = 2.0
+# share of the scatter that is independent from datum to datum at the least
+_INDEPENDENT = 0.05
+# and principal components of the errors at settings below so many times what they have by chance
+_MORE = 1.5
 # a part of which the fit leaves less than this share is not seen in the residuals
 _LEFT = 0.05
 
@@ -80,17 +85,19 @@ class _Part:
     def overlaps(self):
         """Return the traces of the products of two components, shape (n, n)."""
         present = self.dense(np.ones((len(self.pair), 1)))[..., 0]
-        alone = present.T @ present
+        alone, diagonal = present.T @ present, np.sum(self.patterns**2, axis=1)
+        mixed = present.T @ (diagonal[:, None] * present)
         # the square of the correlation of the pairs at a setting
         setting = [self.patterns[:, i::2] for i in (0, 1)] if self.patterns.shape[1] else []
-        together = np.zeros_like(alone)
+        both = np.zeros_like(alone)
         for i, first in enumerate(setting):
             for second in setting[i:]:
                 crossed = (first * second).T @ present
-                together += (1 if second is first else 2) * crossed.T @ crossed
+                both += (1 if second is first else 2) * crossed.T @ crossed
         parts = list(self.components())
+        pairs = {(True, True): both, (False, False): alone}
         return np.array(
-            [[np.sum(k * m * (together if a and b else alone)) for b, m in parts] for a, k in parts]
+            [[np.sum(k * m * pairs.get((a, b), mixed)) for b, m in parts] for a, k in parts]
         )
 
 
@@ -134,7 +141,7 @@ class Scatter:
         bins, group = self.measurement.bins[rows], groups[rows]
         log = np.log(self.measurement.wavelength)
         distance = np.abs(log[:, None] - log)
-        return _Part(
+        part = _Part(
             rows,
             dataset.group_of_datum,
             bins,
@@ -142,6 +149,11 @@ class Scatter:
             (np.eye(log.size), np.exp(-distance / _LENGTH), np.ones_like(distance)),
             _amplitude(bins, residuals[rows], 1 - leverage[rows]),
         )
+        errors = _errors_at_settings(part, residuals[rows] / part.amplitude)
+        if errors is not None:
+            part.kernels += _found(errors)
+            part.patterns = part.patterns * _uneven(errors)
+        return part
 
     def _shares(self, part, residuals):
         """Solve for the shares with which products of residuals are as large as they are."""
@@ -167,8 +179,9 @@ class Scatter:
         chance = _CHANCE * np.sqrt(2 / np.maximum(np.diag(seen), 1.0)) * shares.sum()
         chance[0] = 0.0
         shares = _solved(seen, found, told & (shares >= chance))
-        # nothing is told: independent data
-        return shares if shares.any() else np.eye(len(size))[0]
+        # some of it always is independent, and all of it where nothing is told
+        shares[0] = max(shares[0], _INDEPENDENT if shares.any() else 1.0)
+        return shares
 
     def middle(self):
         """Return the covariance of the pulls of the residuals on the determined directions."""
@@ -196,11 +209,44 @@ class Scatter:
             Standard deviation, shape (n_wavelengths,); NaN where the dataset has no data.
         """
         part = self.parts[i]
-        together = [flag for flag, _ in part.components()]
-        share = np.sqrt(part.shares[together].sum())
-        found = np.full(len(part.kernels[0]), np.nan)
-        found[part.bin] = share * part.amplitude * self._level[part.rows]
+        variance = sum(
+            share * np.diag(kernel)
+            for share, (together, kernel) in zip(part.shares, part.components(), strict=True)
+            if together
+        ) + np.zeros(len(part.kernels[0]))
+        found = np.full(variance.size, np.nan)
+        found[part.bin] = np.sqrt(variance)[part.bin] * part.amplitude * self._level[part.rows]
         return found
+
+
+def _errors_at_settings(part, scaled):
+    """Return q and u of the residuals at each setting, (2 n_settings, n_wavelengths)."""
+    if not part.patterns.shape[1] or not np.isfinite(scaled).all():
+        return None
+    errors = part.patterns.T @ part.dense(scaled[:, None])[..., 0]
+    return errors / np.sqrt(np.sum(part.patterns**2, axis=0))[:, None]
+
+
+def _uneven(errors):
+    """Return by how much the error of each setting is above the mean one, half believed."""
+    size = np.repeat(np.sum(errors**2, axis=1).reshape(-1, 2).sum(axis=1), 2)
+    return np.sqrt(0.5 + 0.5 * size / max(size.mean(), 1e-300))
+
+
+def _found(errors):
+    """
+    Return the correlation of wavelengths that the errors at the settings have, if there is one.
+
+    Their principal components that have more of the variance than those of independent wavelengths
+    would by chance (Marchenko & Pastur 1967).
+    """
+    count, size = errors.shape
+    _, singular, shapes = np.linalg.svd(errors, full_matrices=False)
+    share = singular**2 / max(np.sum(singular**2), 1e-300)
+    chance = (np.sqrt(count) + np.sqrt(size)) ** 2 / (count * size)
+    shapes = shapes[share > _MORE * chance] * singular[share > _MORE * chance, None]
+    kernel = shapes.T @ shapes
+    return (kernel * size / np.trace(kernel),) if len(shapes) else ()
 
 
 def _solved(seen, found, taken):

@@ -19,10 +19,10 @@ from astropolcal.observations import is_star
 from astropolcal.units import to_unit
 
 __all__ = [
-    "as_exact",
     "INTERNAL",
     "M3_MODELS",
     "STARS",
+    "as_exact",
     "behind_telescope",
     "k_mirror",
     "mounted",

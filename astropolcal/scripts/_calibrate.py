@@ -306,8 +306,7 @@ def _is_known(observations):
         return False
     return True
 
-        "loss": arguments.loss,
-        "errors": arguments.errors,
+
 def _fitted(arguments, chains, datasets, positions, instrument):
     """Return the fit of all that is free, or of what changed since another calibration."""
     from astropolcal.calibration import Calibration, calibrate, restart
@@ -315,6 +314,7 @@ def _fitted(arguments, chains, datasets, positions, instrument):
     options = {
         "weights": None if arguments.weights == "none" else arguments.weights,
         "loss": arguments.loss,
+        "errors": arguments.errors,
         "positions": positions,
         "gauge": None if arguments.gauge == "none" else arguments.gauge,
         "cross_validate": arguments.groups is None,
