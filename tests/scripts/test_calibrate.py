@@ -330,7 +330,7 @@ def test_what_is_printed_fits_a_terminal_and_tells_what_is_hidden(tables, tmp_pa
     cal, figures, out = tmp_path / "cal.asdf", tmp_path / "figures", tmp_path / "cal.json"
     files = [tables["first"]]
     lines = _shown(capsys, *files, "-o", cal, "--plots", figures, "--json", out)
-    assert lines[0].startswith("NOT USABLE AS IT IS: the AoLP on sky is open")
+    assert lines[0].startswith("NOT USABLE AS IT IS: AoLP on sky is open")
     assert lines[-1].startswith("--full (full=True) adds tables per wavelength")
     n = len(list(figures.iterdir()))
     assert [line.partition("  ")[2].strip() for line in lines[-4:-1]] == [
@@ -355,7 +355,7 @@ def test_quiet_warns_of_what_is_not_usable(tables, capsys):
         assert main(["calibrate", str(tables["first"]), *options]) == 0
         (line,) = capsys.readouterr().err.splitlines()
         assert line == (
-            "astropolcal: warning: NOT USABLE AS IT IS: the AoLP on sky is open "
+            "astropolcal: warning: NOT USABLE AS IT IS: AoLP on sky is open "
             "(calibration_polarizer.theta)"
         )
     assert main(["calibrate", str(tables["first"]), "-q", *HELD]) == 0
