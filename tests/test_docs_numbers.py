@@ -12,7 +12,7 @@ from astropy.table import Table
 
 from astropolcal import Observations, calibrate, instruments
 from astropolcal.calibration import polarimetric_efficiency, star_check, star_stokes
-from astropolcal.calibration.targets import target_accuracies
+from astropolcal.calibration.targets import paper_accuracies
 from astropolcal.exceptions import AstropolcalWarning
 
 CHARIS = instruments.get("charis")
@@ -180,7 +180,7 @@ def test_numbers_of_the_star(joint, joint_data):
 
 @pytest.mark.slow
 def test_numbers_of_a_target(joint):
-    (table,) = target_accuracies(joint, [(1 * u.percent, 50 * u.deg)])
+    (table,) = paper_accuracies(joint, [(1 * u.percent, 50 * u.deg)])
     s_p, s_chi = _percent(table["s_p"]), table["s_chi"].to_value(u.deg)
     _states(":math:`s_p`", s_p.min(), s_p.max())
     _states(":math:`s_\\chi`", s_chi.min(), s_chi.max())

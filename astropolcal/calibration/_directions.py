@@ -4,6 +4,7 @@
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration.sky import sky_words
 from astropolcal.units import canonical_factor
 
 # what is worth a word in a direction, as a share of its largest component
@@ -12,8 +13,6 @@ _WORTH_A_WORD = 0.02
 LARGE = {" deg": 5.0, " um": 50.0, "": 0.05}
 # and where the data hold one direction so much better than another
 _CONDITION = 1e4
-# changes on sky that are not worth a number, degree and percent
-_NOTHING_ON_SKY = 0.005
 # what of a near-null direction is worth a word, as a share of what moves most
 _PART = 0.1
 # the sky is worked out for so many near-null directions, the worst
@@ -167,29 +166,6 @@ def plain(moved):
     }
 
 
-def sky_words(sky):
-    """Say what a direction does on sky."""
-    turn, gain = sky["aolp_deg"], sky["dolp_percent"]
-    return (
-        f"; on sky this turns the AoLP by {_range(turn)} deg and changes the DoLP by "
-        f"{_range(gain)} % of itself"
-    )
-
-
-def _range(span):
-    low, high = span
-    if max(abs(low), abs(high)) < _NOTHING_ON_SKY:
-        return "less than 0.01"
-    if high - low < _NOTHING_ON_SKY:
-        return _signed(low, 2)
-    return f"{_signed(low, 2)} to {_signed(high, 2)}"
-
-
-def shows_on_sky(sky):
-    """Return whether a direction changes the AoLP or the DoLP on sky by what is worth a word."""
-    return max(map(abs, (*sky["aolp_deg"], *sky["dolp_percent"]))) >= _NOTHING_ON_SKY
-
-
 # ---- near-null directions -----------------------------------------------------------------
 
 
@@ -247,8 +223,7 @@ def _near_null(free, error, times_large, condition, sky):
         words += f" (condition {condition:.1g})"
     found = {"words": words, "parameters": plain(_moved(free, error))}
     if sky is not None:
-        turn, gain = (max(map(abs, sky[key])) for key in ("aolp_deg", "dolp_percent"))
-        found["words"] += f"; on sky that is {turn:.2g} deg of AoLP and {gain:.2g} % of the DoLP"
+        found["words"] += f"; {sky_words(sky)}"
         found["sky"] = sky
     return found
 

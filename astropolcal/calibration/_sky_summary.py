@@ -6,8 +6,8 @@ import textwrap
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration._directions import shows_on_sky, sky_words
 from astropolcal.calibration.reflections import METALS, mirror_names, mirror_values
+from astropolcal.calibration.sky import shows_on_sky, sky_words
 
 _WIDTH = 80
 _N_MIRROR_ROWS = 5
@@ -101,7 +101,7 @@ def _entry(table):
     return {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns
 
 
-# ---- what an accuracy for a target leaves out ---------------------------------------------
+# ---- what an accuracy for a target is made of -----------------------------------------------
 
 
 def open_on_sky(calibration):
@@ -124,11 +124,11 @@ def open_on_sky(calibration):
 
 
 def open_lines(calibration):
-    """Say what an accuracy for a target does not include, one line a kind."""
+    """Say what makes an accuracy for a target infinite or large, one line a kind."""
     found, lines = open_on_sky(calibration), []
     for kind, says in (
-        ("open", "without what the data leave open"),
-        ("badly determined", "without what is badly determined"),
+        ("open", "infinite by what the data leave open"),
+        ("badly determined", "large by what is badly determined"),
     ):
         words = [one["words"] for one in found if one["kind"] == kind]
         more = [f"and {len(words) - _N_OPEN} more, see below"] if len(words) > _N_OPEN else []
@@ -143,10 +143,9 @@ def _turn(direction):
 
 def _open_words(direction):
     lead = direction["words"].partition(" cannot be told")[0].partition(" changes no datum")[0]
-    return f"{lead}, which on sky {sky_words(direction['sky']).removeprefix('; on sky this ')}"
+    return f"{lead}: {sky_words(direction['sky'])}"
 
 
 def _near_words(direction):
     lead = direction["words"].partition(" at the noise of this fit")[0]
-    turn, gain = (max(map(abs, direction["sky"][key])) for key in ("aolp_deg", "dolp_percent"))
-    return f"{lead}, which on sky is {turn:.2g} deg of AoLP and {gain:.2g} % of the DoLP"
+    return f"{lead}: {sky_words(direction['sky'])}"

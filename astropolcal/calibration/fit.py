@@ -21,6 +21,7 @@ from astropy.modeling import Model
 from astropy.modeling.fitting import TRFLSQFitter
 from astropy.utils.exceptions import AstropyWarning
 
+from astropolcal.calibration._sky_view import view_of_measurement
 from astropolcal.calibration.accuracy import accuracy_table
 from astropolcal.calibration.bounds import errors_at_bounds
 from astropolcal.calibration.covariance import covariance_around
@@ -33,6 +34,7 @@ from astropolcal.calibration.result import Calibration, DatasetRecord
 from astropolcal.calibration.robust import LOSSES, outlying_data, robust_sigma
 from astropolcal.calibration.starts import BinProblem, search_branches
 from astropolcal.calibration.steps import copy_fitted, sequential, telescope_alone, two_step
+from astropolcal.calibration.targets import keep_sky_accuracy
 from astropolcal.calibration.weighting import (
     ROUNDS,
     Weighting,
@@ -419,7 +421,8 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     vector = measurement.vector()
     residuals, level = measurement.residuals(vector), measurement.weighting.level
     finding = finding_of(measurement.free, whitened)
-    complete(finding, measurement, vector, whitened, level)
+    view = view_of_measurement(measurement, vector, settings["instrument"])
+    complete(finding, measurement, vector, whitened, level, view=view)
     names = measurement.free.names
     calibration = Calibration(
         chains=measurement.put_back(vector),
@@ -440,6 +443,7 @@ def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
     calibration.fit["bounds"] = errors_at_bounds(measurement, whitened)
     calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
     calibration.fit["outliers"] = _outliers(calibration)
+    keep_sky_accuracy(calibration, view)
     return calibration.cross_validate() if cross_validate else calibration
 
 

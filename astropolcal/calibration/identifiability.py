@@ -7,6 +7,7 @@ data unchanged moves it. An error is given for identifiable parameters only:
 a pseudo-inverse would return a small and wrong number for the others.
 """
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,14 +17,15 @@ from astropolcal.calibration._directions import (
     led,
     near_null_directions,
     open_directions,
-    sky_words,
     step_of,
 )
+from astropolcal.calibration._settling import star_words
+from astropolcal.calibration._sky_view import LEFT_OUT, view_of_measurement
 from astropolcal.calibration._telescope import telescope_words
 from astropolcal.calibration._whitened import Whitened, decompose
 from astropolcal.calibration.harmonics import harmonic_words
-from astropolcal.calibration.mirrors import mirror_solutions
-from astropolcal.calibration.sky import sky_consequences
+from astropolcal.calibration.mirrors import mirror_branches
+from astropolcal.calibration.sky import consequences_along, sky_words
 
 __all__ = [
     "Identifiability",
@@ -36,6 +38,8 @@ __all__ = [
 
 # a direction that is a parameter of its own is that parameter by all but this
 _OWN = 1e-9
+# a direction whose step turns the AoLP by more, in degree, is one for a polarized star
+_TURNS = 0.1
 
 
 @dataclass
@@ -62,13 +66,16 @@ class Identifiability:
         Harmonics that the half-wave-plate angles cannot separate, and what stars leave open
         of the telescope.
     mirrors : list of str
-        Discrete mirror solutions within the bounds.
+        Discrete mirror solutions within the bounds; and the other hand of the whole instrument,
+        which bounds may exclude but no datum does, where it matters on sky.
     near_null : list of dict
         Directions that are determined so badly that it hardly counts: at the
         noise of the fit some parameter is uncertain by more than 5 deg, 0.05 mm
         or 5 %, or the singular value is more than 1e4 times below the largest.
         ``words``, the ``parameters`` with their change at one standard error,
         and what that is on ``sky`` for the worst six. Priors count as data here.
+    branches : list of dict
+        Of each of ``mirrors`` the ``words``, and what it does on ``sky``, or None.
 
     Examples
     --------
@@ -87,6 +94,7 @@ class Identifiability:
     sampling: list = field(default_factory=list)
     mirrors: list = field(default_factory=list)
     near_null: list = field(default_factory=list)
+    branches: list = field(default_factory=list)
 
     @property
     def n_free(self):
@@ -230,10 +238,13 @@ def examine(measurement, weights=None):
     data = measurement.jacobian(vector) * (1.0 if weights is None else weights)
     whitened = Whitened(data, physical_scale(free), free.prior_jacobian(vector))
     level = np.nan if weights is None else 1.0
-    return complete(finding_of(free, whitened), measurement, vector, whitened, level)
+    finding = finding_of(free, whitened)
+    name = measurement.datasets[0].observations.instrument
+    view = view_of_measurement(measurement, vector, name)
+    return complete(finding, measurement, vector, whitened, level, view=view)
 
 
-def complete(finding, measurement, vector, whitened=None, level=1.0):
+def complete(finding, measurement, vector, whitened=None, level=1.0, *, view=None):
     """
     Add to a finding what it means on sky, the sampling and the mirror solutions.
 
@@ -250,6 +261,8 @@ def complete(finding, measurement, vector, whitened=None, level=1.0):
         are determined badly.
     level : float
         Noise of a datum of weight one.
+    view : SkyView, optional
+        What the solution sees of the sky; by default without a published telescope.
 
     Returns
     -------
@@ -276,14 +289,14 @@ def complete(finding, measurement, vector, whitened=None, level=1.0):
     scaled = [direction for direction, _ in led(free, finding.null_vectors)]
     # one degree, micrometre or percent of the leading parameter
     canonical = np.array(scaled).reshape(-1, free.size) * physical_scale(free)
-    consequences = sky_consequences(measurement, vector, canonical)
-    for direction, sky in zip(finding.directions, consequences, strict=True):
+    view = view_of_measurement(measurement, vector) if view is None else view
+    for direction, sky in zip(finding.directions, consequences_along(view, canonical), strict=True):
         if sky is not None:
             direction["sky"] = sky
-            direction["words"] += sky_words(sky)
+            direction["words"] += f"; {sky_words(sky)}"
     if whitened is not None and np.isfinite(level):
         finding.near_null = near_null_directions(
-            free, whitened, level, lambda changes: sky_consequences(measurement, vector, changes)
+            free, whitened, level, lambda changes: consequences_along(view, changes)
         )
     angles = {
         # commanded angles repeat in many frames; a microradian is none
@@ -292,9 +305,24 @@ def complete(finding, measurement, vector, whitened=None, level=1.0):
         for angle in dataset.observations.position("hwp")
     }
     finding.sampling = harmonic_words(np.array(sorted(angles)))
-    finding.sampling += telescope_words(finding, measurement)
-    finding.mirrors = mirror_solutions(measurement, vector)
+    finding.sampling += telescope_words(finding, measurement) + _settled_by_a_star(finding, view)
+    finding.branches = mirror_branches(measurement, vector, view)
+    finding.mirrors = [branch["words"] for branch in finding.branches]
     return finding
+
+
+def _settled_by_a_star(finding, view):
+    """Say which open directions a star of known polarization would close, and which star."""
+    if view is None or view.telescope == LEFT_OUT:
+        return []
+    leads = [
+        re.split(" by | changes ", direction["words"])[0]
+        for direction in finding.directions
+        if "sky" in direction and max(map(abs, direction["sky"]["aolp_deg"])) > _TURNS
+    ]
+    if not leads:
+        return []
+    return [f"{', '.join(leads)}: {star_words(view.site)} settles what that does on sky"]
 
 
 def physical_scale(free):

@@ -22,8 +22,8 @@ from astropolcal.calibration._sky_summary import (
     star_lines,
 )
 from astropolcal.calibration.groups import what_is_left_out
-from astropolcal.calibration.targets import target_accuracies
-from astropolcal.calibration.verdicts import SKY_TARGETS, verdict
+from astropolcal.calibration.targets import TARGETS, target_accuracies
+from astropolcal.calibration.verdicts import verdict
 from astropolcal.words import counted
 
 __all__ = ["summary", "to_dict"]
@@ -42,7 +42,7 @@ _MOST_OUTLIERS = 5
 _ELEMENT = re.compile(r"(\w+\.\w+)\[(\d+)\]")
 
 
-def summary(calibration, targets=SKY_TARGETS, full=False):
+def summary(calibration, targets=TARGETS, full=False):
     """
     Return a calibration as text of at most 80 columns.
 
@@ -215,15 +215,16 @@ def _target_lines(calibration, targets):
     tables = target_accuracies(calibration, targets)
     if not tables:
         return []
-    meta = tables[0].meta
-    known = [_known_of(key, tables[0][key].value) for key in ("s_rel", "s_abs")]
     heads = ("s_Q", "s_U", "s_p", "(worst)", "s_chi", "(worst)")
     lines = [
         "Accuracy for a target in percent, s_chi in deg, median over the wavelengths",
         f"  {'DoLP':>6}{'AoLP':>10}" + "".join(f"{name:>10}" for name in heads),
         *(_target_row(table) for table in tables),
-        f"  from {', '.join(known)}; {meta['words']}",
     ]
+    if any(np.isinf(table["s_p"]).any() for table in tables):
+        known = target_accuracies(calibration, targets, open_directions="ignore")
+        lines += ["  as if what the data leave open were known:", *map(_target_row, known)]
+    lines.append(f"  {tables[0].meta['words']}")
     if any(table.meta["aolp"] is None for table in tables):
         lines.append("  AoLP any: at whichever angle the accuracy is worst")
     lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration)]
@@ -236,26 +237,17 @@ def _target_row(table):
     row = f"  {dolp:4.3g} %" + (
         f"{'any':>10}" if angle is None else f"{angle.to_value(u.deg):10.4g}"
     )
-    # a calibration that is missing can only add to them
-    mark = ">" if table.meta["missing"] else ""
     for key in ("s_Q", "s_U", "s_p", "s_chi"):
         # s_Q and s_U only lead to s_p: their worst values would crowd the table
         worst = (np.max,) if key in ("s_p", "s_chi") else ()
         for function in (np.median, *worst):
-            text = _short(table[key].value, function)
-            row += f"{mark + text if text != '-' else text:>10}"
+            row += f"{_short(table[key].value, function):>10}"
     return row
 
 
 def _short(values, function):
     known = values[~np.isnan(values)]
     return f"{function(known):.2g}" if known.size else "-"
-
-
-def _known_of(key, values):
-    if np.isnan(values).all():
-        return f"{key} unknown"
-    return f"{key} {_short(values, np.median)} % (worst {_short(values, np.max)} %)"
 
 
 def _wavelength_blocks(calibration, known):
@@ -382,7 +374,7 @@ def _posterior_lines(calibration):
 # ---- for machines ------------------------------------------------------------------
 
 
-def to_dict(calibration, targets=SKY_TARGETS):
+def to_dict(calibration, targets=TARGETS):
     """
     Return a calibration as plain numbers, lists and strings, ready for JSON.
 
@@ -447,6 +439,7 @@ def to_dict(calibration, targets=SKY_TARGETS):
         "near_null_directions": calibration.identifiability.near_null,
         "sampling": list(calibration.identifiability.sampling),
         "mirror_solutions": list(calibration.identifiability.mirrors),
+        "mirror_branches": calibration.identifiability.branches,
         "at_bound": list(calibration.at_bound),
         "posterior": calibration.posterior and calibration.posterior.report(),
         "stages": calibration.stages,
@@ -484,7 +477,7 @@ def _target(table):
         "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
         **{f"{key}_percent": _plain(table[key].value) for key in shares},
         "s_chi_deg": _plain(table["s_chi"].value),
-        **{key: table.meta[key] for key in ("column", "missing", "words")},
+        "words": table.meta["words"],
     }
 
 

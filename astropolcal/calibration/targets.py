@@ -2,14 +2,17 @@
 """
 What an accuracy means for a target, and four accuracies side by side.
 
-The equations are those of McIntosh et al. (2026, Sec. 2.3), after van Holstein
-et al. 2020, A&A 633, A64 (doi:10.1051/0004-6361/201834996).
+`target_accuracies` is what a calibration claims. The equations of McIntosh et al. (2026, Sec. 2.3),
+after van Holstein et al. 2020, A&A 633, A64 (doi:10.1051/0004-6361/201834996), stand beside it as
+`paper_accuracies`.
 """
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from astropolcal.calibration._sky_accuracy import KEYS, SkyErrors
+from astropolcal.calibration._sky_view import settings_of, view_of_calibration
 from astropolcal.calibration.accuracy import accuracy_table, cross_validated_residuals
 from astropolcal.calibration.groups import GROUPS, groups_by
 from astropolcal.calibration.standards import refuse_fitted
@@ -24,21 +27,179 @@ __all__ = [
     "absolute_accuracy",
     "four_accuracies",
     "groups_by",
+    "keep_sky_accuracy",
+    "paper_accuracies",
     "propagate_accuracy",
     "target_accuracies",
     "target_accuracy",
 ]
 
 #: Degrees and angles of polarization that are reported; an angle of None is any.
-TARGETS = ((1 * u.percent, None), (30 * u.percent, None))
+TARGETS = ((30 * u.percent, None), (1 * u.percent, None), (0.1 * u.percent, None))
+#: Those of the paper.
+PAPER_TARGETS = ((1 * u.percent, None), (30 * u.percent, None))
 
 _COLUMNS = ("s_mean", "s_res", "s_cv")
 _CALIBRATIONS = {"polarized": "s_rel", "unpolarized": "s_unpol", "on_sky": "s_sky"}
 # where s_Q, s_U, s_p and s_chi are largest: between these angles each rises or falls steadily
 _EXTREMES = (0.0, 22.5, 45.0) * u.deg
+_OPEN = ("infinite", "ignore")
+# angles among which those of a calibration are sought
+_ANY = np.arange(0.0, 180.0, 7.5) * u.deg
 
 
-# ---- a target of any polarization ---------------------------------------------------------
+# ---- what a calibration claims --------------------------------------------------------------
+
+
+def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite"):
+    """
+    Return the accuracy of a calibration for several targets, per wavelength.
+
+    What the errors of all calibrated parameters, with their correlations, and the error of the
+    model do to the polarization of a target on sky: the systematic error that
+    `~astropolcal.correction.correct` states, for one cycle of the half-wave plate, rms over a few
+    settings of telescope and derotator.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    targets : sequence of (dolp, aolp)
+        Degree and angle of linear polarization of each. An angle of None stands for any: each
+        error is then that at its worst angle.
+    open_directions : {"infinite", "ignore"}
+        As for `~astropolcal.correction.correct`: errors along directions that the data leave open
+        are infinite, or zero as if the choice that the calibration made were true.
+
+    Returns
+    -------
+    list of `~astropy.table.QTable`
+        One a target, with columns ``wavelength``, ``s_Q``, ``s_U``, ``s_p`` (percent) and
+        ``s_chi`` (degree), infinite where the data leave a direction open that changes it; in
+        the meta ``dolp``, ``aolp`` and, in ``words``, what the numbers are made of. None where
+        the chain has no half-wave plate.
+
+    Raises
+    ------
+    ParameterError
+        If a target is impossible, or the choice is unknown.
+
+    Notes
+    -----
+    It is linear error propagation: above some 30 deg the angle is simply unknown.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import target_accuracies
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> (table,) = target_accuracies(cal, [(30 * u.percent, 50 * u.deg)])
+    >>> bool((table["s_chi"] < 0.05 * u.deg).all())
+    True
+    """
+    if open_directions not in _OPEN:
+        raise ParameterError(
+            f"open_directions = {open_directions!r}; allowed are {', '.join(_OPEN)}"
+        )
+    wanted = [_target(dolp, aolp) for dolp, aolp in targets]
+    view, ignore = view_of_calibration(calibration), open_directions == "ignore"
+    return _accuracies(calibration, targets, wanted, view, ignore)
+
+
+def _accuracies(calibration, targets, wanted, view, ignore=False):
+    if view is None:
+        return []
+    errors, words, tables = SkyErrors(calibration, view, ignore), _made_of(calibration, view), []
+    words += "; as if what the data leave open were known" if ignore else ""
+    for (dolp, aolp), (p, double) in zip(targets, wanted, strict=True):
+        found = np.max(errors.of_target(p, double), axis=-1)
+        if p == 0:
+            # no angle at all
+            found[-1] = np.inf
+        table = QTable({"wavelength": calibration.wavelength})
+        for key, values in zip(KEYS, found, strict=True):
+            table[key] = np.rad2deg(values) * u.deg if key == "s_chi" else 100 * values * u.percent
+        table.meta |= {"dolp": dolp, "aolp": aolp, "words": words}
+        tables.append(table)
+    return tables
+
+
+def _target(dolp, aolp):
+    """Return a degree of polarization as a fraction, and the double angles, radian."""
+    if np.ndim(dolp) or np.ndim(aolp):
+        raise ParameterError(f"target {dolp}, {aolp}: one degree and one angle are needed")
+    double = 2 * np.atleast_1d(angle_to_rad(_ANY if aolp is None else aolp, "aolp"))
+    return float(_fraction("dolp", dolp, 1.0)), double
+
+
+def _made_of(calibration, view):
+    model = calibration.fit.get("model_error")
+    count = view.good.shape[1]
+    return (
+        f"from the covariance of the fit {'and' if model else 'without'} an error of the model; "
+        f"{view.telescope}; one cycle of the half-wave plate"
+        + (f", rms over {count} settings" if count > 1 else "")
+    )
+
+
+def keep_sky_accuracy(calibration, view=None):
+    """
+    Keep what a calibration claims on sky in its ``fit``, and with it in its file.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; its ``fit`` gets ``sky_accuracy``, a list with ``dolp_percent``,
+        ``aolp_deg`` (None for any), ``wavelength_nm``, ``s_q_percent``, ``s_u_percent``,
+        ``s_p_percent``, ``s_chi_deg`` and ``words`` of each of the usual targets, and
+        ``sky_settings``, the angles of the stages for which it holds, in radian.
+    view : SkyView, optional
+        What it sees of the sky, if that is known already.
+
+    Returns
+    -------
+    Calibration
+        Itself.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> [entry["dolp_percent"] for entry in cal.fit["sky_accuracy"]]
+    [30.0, 1.0, 0.1]
+    """
+    if calibration.measurement is not None:
+        calibration.fit["sky_settings"] = settings_of(calibration.measurement)
+    view = view_of_calibration(calibration) if view is None else view
+    tables = _accuracies(calibration, TARGETS, [_target(*one) for one in TARGETS], view)
+    calibration.fit["sky_accuracy"] = [_kept(table) for table in tables]
+    return calibration
+
+
+def _kept(table):
+    aolp = table.meta["aolp"]
+    columns = {f"{key.lower()}_percent": table[key].to_value(u.percent) for key in KEYS[:3]}
+    return {
+        "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
+        "aolp_deg": None if aolp is None else float(aolp.to_value(u.deg)),
+        "wavelength_nm": table["wavelength"].to_value(u.nm).tolist(),
+        **{key: values.tolist() for key, values in columns.items()},
+        "s_chi_deg": table["s_chi"].to_value(u.deg).tolist(),
+        "words": table.meta["words"],
+    }
+
+
+# ---- the equations of the paper ------------------------------------------------------------
 
 
 def absolute_accuracy(s_unpol, s_sky):
@@ -230,14 +391,15 @@ def _words(column, missing):
     return f"by {column}; without the calibration {lacking}: the accuracies are lower limits"
 
 
-def target_accuracies(calibration, targets=TARGETS, column="s_mean"):
+def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     """
-    Return the accuracy of a calibration for several targets, per wavelength.
+    Return the paper's accuracy of a calibration for several targets, per wavelength.
 
-    Which datasets give s_rel, s_unpol and s_sky follows from their sources: s_sky is that of
-    unpolarized standard stars. Several of one kind count by the rms of their accuracies. Where no
-    dataset of a kind was fitted, a standard of that kind counts that was predicted, see
-    `~astropolcal.calibration.add_standard`.
+    It follows from residuals alone, and knows neither telescope nor correlations: what a
+    calibration claims is `target_accuracies`. Which datasets give s_rel, s_unpol and s_sky
+    follows from their sources: s_sky is that of unpolarized standard stars. Several of one kind
+    count by the rms of their accuracies. Where no dataset of a kind was fitted, a standard of
+    that kind counts that was predicted, see `~astropolcal.calibration.add_standard`.
 
     Parameters
     ----------
@@ -265,13 +427,13 @@ def target_accuracies(calibration, targets=TARGETS, column="s_mean"):
     --------
     >>> import astropy.units as u
     >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.calibration.targets import target_accuracies
+    >>> from astropolcal.calibration import paper_accuracies
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
     >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
     >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> (table,) = target_accuracies(cal, [(30 * u.percent, 50 * u.deg)])
+    >>> (table,) = paper_accuracies(cal, [(30 * u.percent, 50 * u.deg)])
     >>> table.meta["missing"]
     ['unpolarized', 'on_sky']
     """

@@ -9,12 +9,9 @@ import numpy as np
 from astropolcal.calibration.bounds import STATUSES
 from astropolcal.calibration.reflections import mirror_names, mirror_values
 from astropolcal.calibration.steps import kind_of_source
-from astropolcal.calibration.targets import target_accuracies
+from astropolcal.calibration.targets import TARGETS, target_accuracies
 
 __all__ = ["Verdict", "verdict"]
-
-#: What is said to be known of light from the sky: a disk, a planet, an interstellar polarization.
-SKY_TARGETS = tuple((dolp * u.percent, None) for dolp in (30, 1, 0.1))
 
 _WIDTH = 80
 # what holds at more than this share of the wavelengths holds of the calibration
@@ -76,7 +73,7 @@ class Verdict:
         return dict(vars(self))
 
 
-def verdict(calibration, targets=SKY_TARGETS):
+def verdict(calibration, targets=TARGETS):
     """
     Return whether a calibration can be used, and why not.
 
@@ -110,7 +107,7 @@ def verdict(calibration, targets=SKY_TARGETS):
     free = {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
     tables = target_accuracies(calibration, targets)
     # whether it is usable does not hang on what was asked for
-    bright = target_accuracies(calibration, SKY_TARGETS[:1])
+    bright = target_accuracies(calibration, TARGETS[:1])
     sky = _open_on_sky(calibration, free)
     # what must be wrong with the set-up or its description comes before what is not known
     wrong = [
@@ -341,15 +338,14 @@ def _cautions(calibration, free):
 def _accuracy(tables, sky):
     """Return what is known of light from the sky, medians over the wavelengths."""
     if not tables:
-        return "On sky      unknown: no dataset tells how accurate it is"
+        return "On sky      unknown: the chain has no half-wave plate"
     dolps = ", ".join(f"{u.Quantity(t.meta['dolp']).to_value(u.percent):.3g}" for t in tables)
     s_p, s_chi = (
         [_number(_median(t[key].value), what in sky, *limits) for t in tables]
         for key, what, limits in (("s_p", "DoLP", (3, 100)), ("s_chi", "AoLP", (2, 45)))
     )
-    # a calibration that is missing can only add to them
-    best = "at best " if tables[0].meta.get("missing") else ""
-    return f"On sky      {best}{dolps} % to {_listed(s_p, '%')}, AoLP {_listed(s_chi, 'deg')}"
+    degree, angle = _listed(s_p, "%"), _listed(s_chi, "deg")
+    return f"On sky      {dolps} % {'' if degree == 'open' else 'to '}{degree}, AoLP {angle}"
 
 
 def _number(value, is_open, decimals, most):

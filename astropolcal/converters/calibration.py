@@ -206,6 +206,7 @@ def _covariance_node(covariance):
 
 
 def _identifiability_node(finding):
+    from astropolcal.converters.nodes import plain
 
     return {
         "names": list(finding.names),
@@ -218,6 +219,7 @@ def _identifiability_node(finding):
         "near_null": [_direction_node(direction) for direction in finding.near_null],
         "sampling": list(finding.sampling),
         "mirrors": list(finding.mirrors),
+        "branches": plain(finding.branches, "branches"),
     }
 
 
@@ -391,6 +393,7 @@ def _identifiability(node):
     import numpy as np
 
     from astropolcal.calibration import Identifiability
+    from astropolcal.converters.nodes import plain
 
     names, vectors = list(node["names"]), node["null_vectors"]
     return Identifiability(
@@ -403,6 +406,7 @@ def _identifiability(node):
         near_null=[_direction(entry) for entry in node.get("near_null", [])],
         sampling=list(node["sampling"]),
         mirrors=list(node["mirrors"]),
+        branches=plain(node.get("branches", [])),
     )
 
 

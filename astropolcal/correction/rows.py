@@ -12,18 +12,18 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration._beam import inner_optics, telescope_optics
+from astropolcal.calibration._rows import Rows
+from astropolcal.calibration._sky_view import chain_from_sky, known_instrument
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import (
     AstropolcalWarning,
     ChainError,
-    ParameterError,
     WavelengthRangeError,
 )
 from astropolcal.measurement import FreeParameters
 from astropolcal.observations import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.positions import finite_position
-from astropolcal.propagation import Propagator
 from astropolcal.units import length_to_um
 
 __all__ = ["RowModel", "check_optics", "measurement_rows", "sky_chain"]
@@ -79,31 +79,9 @@ def sky_chain(
     elif hasattr(calibration, "datasets"):
         inner = inner_optics(calibration, optics_in, beam, label)
         chains = [join([*(telescope_optics(calibration) or ()), *inner])]
-    seen = [chain for chain in chains if "parallactic" in stages(chain)]
-    if seen:
-        return _from_stage(seen[0], ("parallactic",))
-    name = getattr(calibration, "instrument", None)
-    if name:
-        from astropolcal import instruments
-        from astropolcal.exceptions import InstrumentError
-
-        try:
-            instrument = instruments.get(name)
-        except InstrumentError:
-            instrument = None  # it need not be installed here
-        if instrument and instrument.has_telescope:
-            known = {"wavelength": getattr(calibration, "wavelength", None), "date": date}
-            options = {key: known[key] for key in instrument.sky_options}
-            return instrument.on_sky(chains[0], **options)
-    return _from_stage(chains[0], [s for s in stages(chains[0]) if s not in COORDINATES])
-
-
-def _from_stage(chain, wanted):
-    found = leaves(chain)
-    first = next((i for i, leaf in enumerate(found) if leaf.stage in wanted), None)
-    if first is None:
-        raise ChainError("the chain has no optic on a stage; give the chain from the sky")
-    return join(found[first:])
+    instrument = known_instrument(getattr(calibration, "instrument", None))
+    wavelength = getattr(calibration, "wavelength", None)
+    return chain_from_sky(chains, instrument, wavelength, date)[0]
 
 
 def check_optics(chain, optics_in):
@@ -137,7 +115,7 @@ def check_optics(chain, optics_in):
         )
 
 
-class RowModel:
+class RowModel(Rows):
     """
     Measurement rows of a calibration at given positions and wavelengths, and how they move.
 
@@ -182,35 +160,28 @@ class RowModel:
     """
 
     def __init__(self, calibration, positions, wavelength, *, chain=None, interpolate=False):
-        self.chain = sky_chain(calibration) if chain is None else chain
+        chain = sky_chain(calibration) if chain is None else chain
         self.wavelength = np.atleast_1d(u.Quantity(wavelength))
         self.calibration = calibration if hasattr(calibration, "covariance") else None
-        lam = length_to_um(self.wavelength)
-        self._leaves = leaves(self.chain)
-        self._own = [leaf.canonical_values() for leaf in self._leaves]
-        self._mix = self._mixing(lam, interpolate)
-        self._free = None
+        lam, free = length_to_um(self.wavelength), None
         if self.calibration is not None:
             grid = len(calibration.wavelength)
-            self._free = FreeParameters(calibration.chains, grid, calibration.ties)
-        placed, self._nodes = _placed(positions, stages(self.chain))
-        # fluxes of I, Q, U and V alone: a flux is linear in the light, these are its coefficients
-        self._light = [Propagator(self.chain, lam, placed, source) for source in np.eye(4)]
-        columns = self._light[0].shape[1]
-        self.n_frames = columns // len(self._nodes)
+            free = FreeParameters(calibration.chains, grid, calibration.ties)
+        mix = self._mixing(chain, lam, interpolate)
+        placed, nodes = _placed(positions, stages(chain))
+        super().__init__(chain, lam, placed, free, mix, nodes)
+        self.n_frames = self._shape[1]
 
-    def _mixing(self, lam, interpolate):
+    def _mixing(self, chain, lam, interpolate):
         """Return weights of the calibrated wavelengths, (n_wavelengths, n_grid), or None."""
         names = [
             f"{leaf.name}.{key}"
-            for leaf, own in zip(self._leaves, self._own, strict=True)
-            for key, value in zip(leaf.param_names, own, strict=True)
+            for leaf in leaves(chain)
+            for key, value in zip(leaf.param_names, leaf.canonical_values(), strict=True)
             if value.size > 1
         ]
-        if not names:
+        if not names or self.calibration is None:
             return None
-        if self.calibration is None:
-            return np.eye(len(lam))
         grid = np.atleast_1d(self.calibration.wavelength.to_value(u.um))
         nearest = np.abs(lam[:, None] - grid).argmin(axis=1)
         off = np.abs(lam / grid[nearest] - 1) > SAME_WAVELENGTH
@@ -220,133 +191,15 @@ class RowModel:
             raise WavelengthRangeError(_not_calibrated(self.wavelength, off, grid, names))
         return _between(lam, self.wavelength, grid, names)
 
-    def rows(self, vector=None):
-        """
-        Return the rows of both beams.
-
-        Parameters
-        ----------
-        vector : `~numpy.ndarray`, optional
-            Free parameters of the calibration in canonical units; by default its own values.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Shape (2, n_wavelengths, n_frames, 4), the right beam first; the last axis is
-            I, Q, U, V.
-        """
-        values = self._values(vector)
-        fluxes = [np.stack(light.fluxes(values)) for light in self._light]
-        return np.stack([self._over_nodes(flux) for flux in fluxes], axis=-1)
-
-    def derivatives(self):
-        """
-        Return how the rows change with each free parameter of the chain.
-
-        Returns
-        -------
-        dict of str to `~numpy.ndarray`
-            ``"optic.parameter"`` to derivative per canonical unit (radian, micrometre or 1), of
-            the shape of `rows`; for a parameter given per wavelength, to the value at that
-            wavelength.
-        """
-        wanted = self._wanted()
-        if not wanted:
-            return {}
-        values, shape = self._values(None), self._light[0].shape
-        result = {name: np.empty((2, *self._shape(), 4)) for name in wanted.values()}
-        ones, zeros = np.ones(shape), np.zeros(shape)
-        for k, light in enumerate(self._light):
-            # one forward sweep serves the derivatives of both beams
-            sweep = light.forward(values)
-            for beam, weights in enumerate([(ones, zeros), (zeros, ones)]):
-                found = sweep.derivatives(list(wanted), weights)
-                for place, name in wanted.items():
-                    # what lies behind the splitter of the other beam leaves no trace
-                    slope = found.get(place, np.zeros(shape))
-                    result[name][beam, ..., k] = self._over_nodes(slope)
-        return result
-
-    def spread(self, slopes):
-        """
-        Lay derivatives by name out over the calibration's free parameters.
-
-        Parameters
-        ----------
-        slopes : dict of str to `~numpy.ndarray`
-            Derivatives per canonical unit, the first axis that of the wavelengths.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Derivatives per declared unit, with a last axis for the free parameters.
-        """
-        shape = next(iter(slopes.values())).shape if slopes else self._shape()
-        result = np.zeros((*shape, self._free.size))
-        for name, slope in slopes.items():
-            slot, factor, _ = self._free.lookup(name)
-            # tie (own value by the source) and unit (canonical by declared)
-            part = slope * factor * slot.factor
-            if slot.per_wavelength:
-                # w: wavelengths of the data, weighted means of those of the calibration, i
-                result[..., slot.slice] += np.einsum("w...,wi->w...i", part, self._mix)
-            else:
-                result[..., slot.start] += part
-        return result
-
     @property
     def start(self):
         """Values of the calibration's free parameters, canonical; shape (n_free,)."""
-        return self._free.start()
+        return self.free.start()
 
     @property
     def held(self):
         """Names of parameters of optics in the chain that have no error: they were not free."""
         return [name for name in self._names() if self._slot(name) is None]
-
-    def _shape(self):
-        return len(self.wavelength), self.n_frames
-
-    def _names(self):
-        return [f"{leaf.name}.{key}" for leaf in self._leaves for key in leaf.param_names]
-
-    def _slot(self, name):
-        return None if self._free is None else self._free.lookup(name)[0]
-
-    def _wanted(self):
-        places = (
-            (i, j) for i, leaf in enumerate(self._leaves) for j in range(len(leaf.param_names))
-        )
-        named = zip(places, self._names(), strict=True)
-        return {place: name for place, name in named if self._slot(name) is not None}
-
-    def _values(self, vector):
-        """Return the values of every optic at the wavelengths of the data."""
-        names = iter(self._names())
-        values = []
-        for own in self._own:
-            values.append([self._at(next(names), value, vector) for value in own])
-        return values
-
-    def _at(self, name, value, vector):
-        slot = None if vector is None else self._slot(name)
-        if slot is not None:
-            _, factor, offset = self._free.lookup(name)
-            # a tied parameter follows its source: value = factor * source + offset
-            value = np.reshape(factor * vector[slot.slice] + offset, value.shape)
-        if value.size == 1:
-            return value.reshape(())
-        if value.size != self._mix.shape[1]:
-            raise ParameterError(
-                f"{name} has {value.size} values; allowed are 1 or {self._mix.shape[1]}, "
-                "one a wavelength"
-            )
-        return self._mix @ value
-
-    def _over_nodes(self, array):
-        """Average over the nodes of the exposures, the last axis but one of columns."""
-        array = array.reshape(*array.shape[:-1], len(self._nodes), self.n_frames)
-        return np.einsum("...nf,n->...f", array, self._nodes)
 
 
 def measurement_rows(calibration, positions, wavelength, *, chain=None, interpolate=False):

@@ -4,15 +4,18 @@ What the errors of a calibration do to corrected Stokes parameters.
 
 A change of the parameters changes the solution by :math:`\delta\hat{\mathbf S} = -G\,\delta A\,
 \mathbf S`, a 4 x 4 matrix times the Stokes vector, the same for all pixels. So the errors
-of all pixels and wavelengths, and their correlations, are a few small matrices.
+of all pixels and wavelengths, and their correlations, are a few small matrices. What the model
+of the instrument lacks (``model_error`` in the ``fit`` of a calibration) is a few more of them.
 """
 
 from dataclasses import dataclass, field
 
+import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration import full_covariance
 from astropolcal.calibration._directions import led
+from astropolcal.calibration._rows import model_error
 from astropolcal.correction.solve import estimator
 from astropolcal.exceptions import ParameterError
 from astropolcal.simulation import check_seed
@@ -153,15 +156,10 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
     _choice(open_directions)
     n = len(solution.components)
     gain = np.nan_to_num(solution.gain)
-    slopes = {}
-    for name, change in model.derivatives().items():
-        if mode == "ip":
-            change = change * np.array([1.0, 0.0, 0.0, 0.0])
-        scaled = change * _brightness(solution)
-        # dS = -G dA S; b: beams, f: frames, s: components of the light
-        slopes[name] = -np.einsum("wkbf,bwfs->wks", gain, scaled[..., :n])
     shape = (len(gain), n, n)
-    flat = model.spread(slopes).reshape(-1, model._free.size)
+    light = _light(mode, n)
+    changes = model.changes(gain, n, _brightness(solution)) * light[:, None]
+    flat = changes.reshape(-1, model.free.size)
     covariance = full_covariance(model.calibration)
     spread = covariance._spread(flat)
     # open: along a direction that no datum fixes; blind: of a parameter without any error
@@ -172,11 +170,11 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
         if open_directions != "ignore":
             axes = covariance._axes()
             # rows in which the leading parameter moves by one step: degree, micrometre, percent
-            steps = np.array([row for row, _ in led(model._free, axes.open)])
+            steps = np.array([row for row, _ in led(model.free, axes.open)])
             steps = steps.reshape(-1, flat.shape[1])
             along = float(open_directions) * (flat * axes.steps) @ steps.T
             moved = np.concatenate([moved, along], axis=1)
-    factor = moved.T.reshape(-1, *shape)
+    factor = np.concatenate([moved.T.reshape(-1, *shape), _model_error(model, n) * light])
     return Systematic(factor, is_open, "linear", model.held)
 
 
@@ -245,7 +243,17 @@ def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stoke
         found[i] = np.einsum("wkbf,bwfs->wks", np.nan_to_num(gain), solution.rows[..., :n])
     # so that the sum over samples of the products is the unbiased covariance
     factor = (found - found.mean(axis=0)) / np.sqrt(n_samples - 1)
+    factor = np.concatenate([factor, _model_error(model, n) * _light(mode, n)])
     return Systematic(factor, np.zeros(found.shape[1:], dtype=bool), "sampled", model.held)
+
+
+def _light(mode, n):
+    """Return which of the true Stokes parameters count, (n,): of offsets only the intensity."""
+    return (np.arange(n) < (1 if mode == "ip" else n)).astype(float)
+
+
+def _model_error(model, n):
+    return model_error(model.calibration.fit, model.wavelength.to_value(u.um), n)
 
 
 def _brightness(solution):
@@ -255,9 +263,9 @@ def _brightness(solution):
 
 def _draws(model, count, rng):
     """Yield values of all free parameters in canonical units."""
-    start, factors = model.start, model._free.factors()
+    start, factors = model.start, model.free.factors()
     posterior = model.calibration.posterior
-    if posterior is not None and set(model._free.names) <= set(posterior.names):
+    if posterior is not None and set(model.free.names) <= set(posterior.names):
         yield from _of_posterior(model, posterior, count, rng)
         return
     covariance = full_covariance(model.calibration)
@@ -270,9 +278,9 @@ def _draws(model, count, rng):
 
 def _of_posterior(model, posterior, count, rng):
     samples = posterior.samples()
-    columns = [posterior.index(name) for name in model._free.names]
+    columns = [posterior.index(name) for name in model.free.names]
     for row in samples[rng.integers(len(samples), size=count)]:
-        yield row[columns] * model._free.factors()
+        yield row[columns] * model.free.factors()
 
 
 def _choice(open_directions):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration import accuracy_table, target_accuracies
+from astropolcal.calibration import accuracy_table, paper_accuracies
 from astropolcal.calibration._directions import ranked
 from astropolcal.gap.problem import OPEN, TOUCHES
 from astropolcal.gap.shrinkage import frame_groups, left_out_fits
@@ -236,5 +236,5 @@ def _targets(model, tables, column):
             "s_chi_deg": _median(t["s_chi"].value),
             "missing": t.meta["missing"],
         }
-        for t in target_accuracies(like, column=column)
+        for t in paper_accuracies(like, column=column)
     ]

@@ -4,7 +4,7 @@
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration import target_accuracies
+from astropolcal.calibration import paper_accuracies, target_accuracies
 from astropolcal.calibration.targets import TARGETS
 from astropolcal.exceptions import ObservationError
 from astropolcal.plotting._style import (
@@ -45,19 +45,19 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
     Returns
     -------
     `~matplotlib.figure.Figure`
-        Panels of s_rel, s_unpol, s_sky and s_abs; of s_p, and of s_chi.
+        Panels of the residuals' s_rel, s_unpol, s_sky and s_abs, for comparison; of s_p, and of
+        s_chi.
 
     Raises
     ------
     ParameterError
         If a target is impossible.
     ObservationError
-        If no dataset is of a known kind of source.
+        If the chain has no half-wave plate.
 
     Notes
     -----
-    The figures of the accuracies of McIntosh et al. (2026, Sec. 2.3). All are
-    accuracies of means (s_mean); a prediction of one datum is worse, see the held-out error.
+    Where an open direction makes an error infinite there is no line.
 
     Examples
     --------
@@ -74,11 +74,12 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
     """
     tables = target_accuracies(calibration, targets)
     if not tables:
-        raise ObservationError("no dataset is of a known kind of source: no accuracy for targets")
+        raise ObservationError("the chain has no half-wave plate: no accuracy for targets")
+    parts = paper_accuracies(calibration, targets[:1])
     with style():
         figure = canvas(figure, 8.5, 11)
         panels = figure.subplots(3, 1, sharex=True)
-        handles = _draw_parts(panels[0], tables[0])
+        handles = _draw_parts(panels[0], parts[0]) if parts else []
         lines = _draw_targets(panels[1], tables, "s_p")
         # the lines of the angle look as those of the degree, and need no entries of their own
         _draw_targets(panels[2], tables, "s_chi")
@@ -94,7 +95,7 @@ def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
 
 def _draw_parts(axes, table):
     # the parts are those of the instrument and the same for every target: the first will do
-    axes.set_title("Parts of the accuracy, the same for every target")
+    axes.set_title("Residuals of the calibrations, which know neither telescope nor correlations")
     lam = nanometres(table["wavelength"])
     handles, values = [], []
     for (key, label), (color, marker) in zip(_PARTS.items(), looks(len(_PARTS)), strict=True):

@@ -124,7 +124,8 @@ plot_double_differences(calibration, dataset=2, figure=figure)
 # What an observer gets
 # ---------------------
 #
-# The accuracies of the three datasets, put together as in the paper, for targets of 1 and 30 %:
+# What the calibration claims for targets of 30, 1 and 0.1 %, below the residuals of the three
+# datasets:
 
 figure = plt.figure(figsize=(8.5, 11))
 plot_target_accuracy(calibration, figure=figure)

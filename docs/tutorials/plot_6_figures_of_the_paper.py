@@ -184,7 +184,7 @@ figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center
 # Accuracy for targets
 # --------------------
 #
-# :math:`s_p` and :math:`s_\chi` for targets of 1 and 30 %, and what they are made of.
+# The parts of the paper's accuracy, and what the calibration claims for targets of 30, 1 and 0.1 %.
 
 figure = plt.figure(figsize=(8.5, 11))
 plot_target_accuracy(calibration, figure=figure)

@@ -294,7 +294,7 @@ def test_what_is_uncertain_by_many_degrees_is_named(make):
     assert re.match(
         r"derotator\.\w+\[0\] is uncertain by \d+ deg at the noise of this fit", worst["words"]
     )
-    assert " deg of AoLP and " in worst["words"]
+    assert "; on sky the AoLP changes by up to " in worst["words"]
     said = float(worst["words"].split("uncertain by ")[1].split(" deg")[0])
     lead = worst["words"].split(" is uncertain")[0]
     # one direction is a part of the whole error

@@ -22,6 +22,7 @@ from astropolcal.calibration import (
     full_covariance,
     noise_from_null_channel,
     noise_from_replicates,
+    paper_accuracies,
     settle,
     star_stokes,
     target_accuracies,
@@ -336,15 +337,16 @@ def test_a_star_of_no_polarization_has_no_angle():
 
 
 def test_a_source_of_no_known_kind_gives_no_accuracy_for_a_target(cal):
-    """Nor a table in the summary: neither lamp nor star, and no polarizer in front."""
-    records = [SimpleNamespace(source="sunlit dome", accuracy=cal.accuracy)]
+    """Nor a table in the summary: neither lamp nor star, and no half-wave plate."""
+    records = [replace(cal.datasets[0], source="sunlit dome")]
     bare = optics.Diattenuator(name="mirror") | optics.WollastonPrism(name="wollaston")
-    other = SimpleNamespace(datasets=records, chains=[bare], wavelength=cal.wavelength, fit={})
-    assert target_accuracies(other) == []
+    other = replace(cal, datasets=records, chains=[bare], settings={}, fit={})
+    assert paper_accuracies(other) == target_accuracies(other) == []
     assert _target_lines(other, ((1 * u.percent, None),)) == []
     # an impossible target is refused all the same
-    with pytest.raises(ParameterError, match="dolp"):
-        target_accuracies(other, [(2.0, None)])
+    for accuracies in (paper_accuracies, target_accuracies):
+        with pytest.raises(ParameterError, match="dolp"):
+            accuracies(other, [(2.0, None)])
 
 
 # --- headers --------------------------------------------------------------------------------------

@@ -12,10 +12,10 @@ from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import calibrate, standards
 from astropolcal.calibration import (
+    paper_accuracies,
     standard_accuracy,
     star_accuracy,
     star_stokes,
-    target_accuracies,
 )
 from astropolcal.chain import leaves, replace_optic
 from astropolcal.exceptions import AstropolcalWarning, ChainError, FitError
@@ -125,9 +125,9 @@ def test_predicted_star_gives_s_sky_where_none_was_fitted():
     lamp = simulate(source, WAVELENGTH, frames, seed=1, meta={"source": "polarized"})
     cal = calibrate(source, lamp, cross_validate=False)
     star["m3"].diattenuation.fixed = True
-    (before,) = target_accuracies(cal, [(1 * u.percent, None)])
+    (before,) = paper_accuracies(cal, [(1 * u.percent, None)])
     table = add_standard(cal, star, observe_star(star, 6, seed=2))
-    (after,) = target_accuracies(cal, [(1 * u.percent, None)])
+    (after,) = paper_accuracies(cal, [(1 * u.percent, None)])
     assert before.meta["missing"] == ["unpolarized", "on_sky"]
     assert after.meta["missing"] == ["unpolarized"]
     assert u.allclose(after["s_sky"], table["s_standard"] / np.sqrt(12))
@@ -197,7 +197,7 @@ def test_fold_mirror_is_within_the_published_range(joint, shared_data):
 
 def test_accuracy_for_a_target_is_the_papers(joint):
     """Paper, Fig. of s_p: 0.02 to 0.12 % for a target of 1 %."""
-    (table,) = target_accuracies(joint, [(1 * u.percent, 50 * u.deg)])
+    (table,) = paper_accuracies(joint, [(1 * u.percent, 50 * u.deg)])
     s_p = table["s_p"].to_value(u.percent)
     assert table.meta["missing"] == []
     assert np.median(s_p) < 0.03

@@ -285,13 +285,12 @@ def test_elements_in_words_are_named_by_their_wavelength():
     assert words == "hwp.retardance (1700.0 nm) by +1 deg, a.b[9]"
 
 
-@pytest.mark.parametrize(("missing", "shown"), [([], "0.2"), (["on_sky"], ">0.2")])
-def test_lower_limits_for_a_target_are_marked(missing, shown):
-    columns = {key: np.full(3, 0.2) for key in ("s_Q", "s_U", "s_p")}
+def test_row_of_a_target_has_a_dash_for_what_is_not_known():
+    columns = {key: [0.2, 0.2, np.inf] for key in ("s_Q", "s_U", "s_p")}
     table = QTable({key: value * u.percent for key, value in columns.items()})
     table["s_chi"] = np.full(3, np.nan) * u.deg
-    table.meta |= {"aolp": None, "dolp": 1 * u.percent, "missing": missing}
-    assert _target_row(table).split() == ["1", "%", "any", *[shown] * 4, "-", "-"]
+    table.meta |= {"aolp": None, "dolp": 0.1 * u.percent}
+    assert _target_row(table).split() == ["0.1", "%", "any", "0.2", "0.2", "0.2", "inf", "-", "-"]
 
 
 # --- what is left open on sky, mirrors -----------------------------------------------------------
@@ -324,11 +323,12 @@ def test_what_is_open_on_sky_is_said_of_the_worst_first():
         ("badly determined", 0.3),
     ]
     assert open_lines(cal) == [
-        "  without what the data leave open: e.f by +1 deg, which on sky turns the AoLP by -2 deg "
-        "and changes the DoLP by less than 0.01 % of itself; a.b by +1 deg, which on sky turns "
-        "the AoLP by +0.5 deg and changes the DoLP by less than 0.01 % of itself",
-        "  without what is badly determined: m.n is uncertain by 7 deg, which on sky is 0.3 deg "
-        "of AoLP and 0.02 % of the DoLP",
+        "  infinite by what the data leave open: e.f by +1 deg: on sky the AoLP changes by up to 2 "
+        "deg and the DoLP by less than 0.01 % of itself, whatever the DoLP; a.b by +1 deg: "
+        "on sky the AoLP changes by up to 0.5 deg and the DoLP by less than 0.01 % of "
+        "itself, whatever the DoLP",
+        "  large by what is badly determined: m.n is uncertain by 7 deg: on sky the AoLP changes "
+        "by up to 0.3 deg and the DoLP by up to 0.02 % of itself, whatever the DoLP",
     ]
 
 

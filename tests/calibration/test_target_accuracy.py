@@ -18,12 +18,12 @@ from astropolcal.calibration import (
     four_accuracies,
     groups_by,
     leave_out_groups,
+    paper_accuracies,
     propagate_accuracy,
     target_accuracy,
 )
 from astropolcal.calibration.groups import GROUPS
 from astropolcal.calibration.standards import add_standard
-from astropolcal.calibration.targets import target_accuracies
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import get_observable
@@ -236,7 +236,7 @@ SOURCES = {
 @pytest.mark.parametrize("source", SOURCES)
 def test_kind_of_calibration_follows_from_the_source(chain, source):
     cal = _calibration([(source, accuracy(1, 2, 3))], [chain])
-    (table,) = target_accuracies(cal, [(0.1, 15 * u.deg)])
+    (table,) = paper_accuracies(cal, [(0.1, 15 * u.deg)])
     kind = SOURCES[source]
     assert table.meta["missing"] == [k for k in ("polarized", "unpolarized", "on_sky") if k != kind]
     expected = target_accuracy(0.1, 15 * u.deg, **{kind: accuracy(1, 2, 3)})
@@ -246,20 +246,20 @@ def test_kind_of_calibration_follows_from_the_source(chain, source):
 
 def test_a_source_that_is_not_stated_is_told_by_its_polarizer(chain):
     known = _calibration([(None, accuracy(1, 2, 3))], [chain])
-    assert "polarized" not in target_accuracies(known)[0].meta["missing"]
+    assert "polarized" not in paper_accuracies(known)[0].meta["missing"]
     for source, train in (
         (None, chain["hwp"]),
         ("polarized standard star", chain),
         ("moon on sky", chain),
     ):
-        assert target_accuracies(_calibration([(source, accuracy(1, 2, 3))], [train])) == []
+        assert paper_accuracies(_calibration([(source, accuracy(1, 2, 3))], [train])) == []
 
 
 def test_default_targets_are_the_paper_s_at_any_angle(chain):
     tables = [("polarized", accuracy(1, 2, 3)), ("unpolarized", accuracy(0.3, 0.04, 0.5)),
               ("unpolarized standard star", accuracy(0.4, 0.03, 1.2))]  # fmt: skip
     cal = _calibration(tables, [chain] * 3)
-    found = target_accuracies(cal)
+    found = paper_accuracies(cal)
     assert [table.meta["dolp"] for table in found] == [1 * u.percent, 30 * u.percent]
     for table in found:
         np.testing.assert_allclose(percent(table["s_abs"]), [0.5, 0.05, 1.3])
@@ -275,7 +275,7 @@ def test_default_targets_are_the_paper_s_at_any_angle(chain):
 def test_several_calibrations_of_a_kind_count_by_their_rms(chain):
     first, second = accuracy(3, 2, np.nan), accuracy(4, wavelength=LAM[:1])
     cal = _calibration([("polarized", first), ("polarized", second)], [chain] * 2)
-    (table,) = target_accuracies(cal, [(1.0, 0 * u.deg)])
+    (table,) = paper_accuracies(cal, [(1.0, 0 * u.deg)])
     np.testing.assert_allclose(percent(table["s_rel"]), [np.sqrt(12.5), 2, np.nan])
     assert np.isnan(table["s_p"][2])
 
@@ -284,9 +284,9 @@ def test_impossible_targets_of_a_calibration_are_refused(chain):
     cal = _calibration([("polarized", accuracy(1, 2, 3))], [chain])
     for target in ((2.0, None), (np.nan, None), (0.5, 1 * u.um)):
         with pytest.raises(ParameterError):
-            target_accuracies(cal, [target])
+            paper_accuracies(cal, [target])
     with pytest.raises(ParameterError, match="no column 's_rms'"):
-        target_accuracies(cal, column="s_rms")
+        paper_accuracies(cal, column="s_rms")
 
 
 def _scatter_of_star(observations):

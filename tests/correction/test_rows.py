@@ -45,8 +45,8 @@ def test_derivatives_are_central_differences(calibration, track):
     wavelength = calibration.wavelength[[4, 11]]
     model = RowModel(calibration, positions, wavelength)
     found = model.spread({k: np.moveaxis(v, 1, 0) for k, v in model.derivatives().items()})
-    start, factors = model.start, model._free.factors()
-    names = model._free.names
+    start, factors = model.start, model.free.factors()
+    names = model.free.names
     for name in ("hwp.w_sio2", "hwp.theta", "derotator.theta", "derotator.retardance[11]"):
         i = names.index(name)
         step = np.zeros(start.size)
