@@ -22,8 +22,8 @@ from astropolcal.calibration._sky_summary import (
     star_lines,
 )
 from astropolcal.calibration.groups import what_is_left_out
-from astropolcal.calibration.targets import target_accuracies
-from astropolcal.calibration.verdicts import SKY_TARGETS, verdict
+from astropolcal.calibration.targets import TARGETS, target_accuracies
+from astropolcal.calibration.verdicts import verdict
 from astropolcal.words import counted
 
 __all__ = ["summary", "to_dict"]
@@ -42,7 +42,7 @@ _MOST_OUTLIERS = 5
 _ELEMENT = re.compile(r"(\w+\.\w+)\[(\d+)\]")
 
 
-def summary(calibration, targets=SKY_TARGETS, full=False):
+def summary(calibration, targets=TARGETS, full=False):
     """
     Return a calibration as text of at most 80 columns.
 
@@ -374,7 +374,7 @@ def _posterior_lines(calibration):
 # ---- for machines ------------------------------------------------------------------
 
 
-def to_dict(calibration, targets=SKY_TARGETS):
+def to_dict(calibration, targets=TARGETS):
     """
     Return a calibration as plain numbers, lists and strings, ready for JSON.
 

@@ -9,12 +9,9 @@ import numpy as np
 from astropolcal.calibration.bounds import STATUSES
 from astropolcal.calibration.reflections import mirror_names, mirror_values
 from astropolcal.calibration.steps import kind_of_source
-from astropolcal.calibration.targets import target_accuracies
+from astropolcal.calibration.targets import TARGETS, target_accuracies
 
 __all__ = ["Verdict", "verdict"]
-
-#: What is said to be known of light from the sky: a disk, a planet, an interstellar polarization.
-SKY_TARGETS = tuple((dolp * u.percent, None) for dolp in (30, 1, 0.1))
 
 _WIDTH = 80
 # what holds at more than this share of the wavelengths holds of the calibration
@@ -31,8 +28,6 @@ _ABSURD_ANGLE = 10 * u.deg
 _MISFIT = 5 * u.percent
 # a turn or a change of the DoLP by less, in degree or percent of itself, does not show
 _SHOWS = 0.005
-# accuracies below this, in percent or degree, are not told apart
-_LEAST = 0.001
 # residuals of so many times the noise are worth a word: the noise is not known better
 _CLEARLY = 2
 
@@ -78,7 +73,7 @@ class Verdict:
         return dict(vars(self))
 
 
-def verdict(calibration, targets=SKY_TARGETS):
+def verdict(calibration, targets=TARGETS):
     """
     Return whether a calibration can be used, and why not.
 
@@ -112,7 +107,7 @@ def verdict(calibration, targets=SKY_TARGETS):
     free = {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
     tables = target_accuracies(calibration, targets)
     # whether it is usable does not hang on what was asked for
-    bright = target_accuracies(calibration, SKY_TARGETS[:1])
+    bright = target_accuracies(calibration, TARGETS[:1])
     sky = _open_on_sky(calibration, free)
     # what must be wrong with the set-up or its description comes before what is not known
     wrong = [
@@ -122,7 +117,7 @@ def verdict(calibration, targets=SKY_TARGETS):
         _misfit(calibration),
     ]
     hanging = _hanging(free)
-    unknown = [*_absurd(free), *_open_words(sky), *_too_far(bright, sky), hanging]
+    unknown = [*_absurd(free), _open_words(sky), *_too_far(bright, sky), hanging]
     stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
     reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
     # what is not known runs to its bounds, too
@@ -132,7 +127,7 @@ def verdict(calibration, targets=SKY_TARGETS):
         _first(reasons, cautions),
         "On sky      unknown, as something is wrong" if wrong else _accuracy(tables, sky),
         *_determined(calibration, free),
-        f"Next        {_next(calibration, free, wrong, sky, tables)}",
+        f"Next        {_next(calibration, free, wrong, sky)}",
     ]
     return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words])
 
@@ -296,7 +291,10 @@ def _open_on_sky(calibration, free):
 
 
 def _open_words(sky):
-    return [f"the {what} on sky is open ({leads[0]})" for what, leads in sky.items()]
+    if not sky:
+        return ""
+    what, lead = " and ".join(sky), next(iter(sky.values()))[0]
+    return f"{what} on sky {'are' if len(sky) > 1 else 'is'} open ({lead})"
 
 
 def _too_far(tables, sky):
@@ -305,19 +303,17 @@ def _too_far(tables, sky):
         return []
     (table,) = tables
     dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
-    s_p, s_chi = _median(table["s_p"].value), _median(table["s_chi"].value)
-    return [
-        words
-        for words in (
-            f"of {dolp:g} % on sky the DoLP is known to {_number(s_p)} % only"
-            if s_p > dolp and "DoLP" not in sky
-            else "",
-            f"of {dolp:g} % on sky the AoLP is known to {_number(s_chi)} deg only"
-            if s_chi > _ABSURD_ANGLE.value and "AoLP" not in sky
-            else "",
-        )
-        if words
-    ]
+    told = []
+    for key, what, unit, most in (
+        ("s_p", "DoLP", "%", dolp),
+        ("s_chi", "AoLP", "deg", _ABSURD_ANGLE.value),
+    ):
+        value = _median(table[key].value)
+        # what is open has been said, with its name
+        if value > most and what not in sky:
+            known = f"known to {value:.2g} {unit} only" if np.isfinite(value) else "open"
+            told.append(f"the {what} of {dolp:g} % on sky is {known}")
+    return told
 
 
 def _median(values):
@@ -342,22 +338,24 @@ def _cautions(calibration, free):
 def _accuracy(tables, sky):
     """Return what is known of light from the sky, medians over the wavelengths."""
     if not tables:
-        return "On sky      unknown: no dataset tells how accurate it is"
+        return "On sky      unknown: the chain has no half-wave plate"
     dolps = ", ".join(f"{u.Quantity(t.meta['dolp']).to_value(u.percent):.3g}" for t in tables)
     s_p, s_chi = (
-        "open" if what in sky else _listed([_number(_median(t[key].value)) for t in tables], unit)
-        for key, what, unit in (("s_p", "DoLP", "%"), ("s_chi", "AoLP", "deg"))
+        [_number(_median(t[key].value), what in sky, *limits) for t in tables]
+        for key, what, limits in (("s_p", "DoLP", (3, 100)), ("s_chi", "AoLP", (2, 45)))
     )
-    # a calibration that is missing can only add to them
-    best = "at best " if tables[0].meta.get("missing") else ""
-    return f"On sky      {best}{dolps} % to {s_p}, AoLP {'' if s_chi == 'open' else 'to '}{s_chi}"
+    degree, angle = _listed(s_p, "%"), _listed(s_chi, "deg")
+    return f"On sky      {dolps} % {'' if degree == 'open' else 'to '}{degree}, AoLP {angle}"
 
 
-def _number(value):
-    """Return two digits; what is infinite is open."""
-    if np.isinf(value) or np.isnan(value):
-        return "open" if np.isinf(value) else "-"
-    return f"{value:.2g}" if value >= _LEAST else f"<{_LEAST:g}"
+def _number(value, is_open, decimals, most):
+    """Return two digits with at most some decimals; what is infinite is open."""
+    if is_open or np.isinf(value):
+        return "open"
+    least = 10.0**-decimals
+    if not least <= value <= most:
+        return "-" if np.isnan(value) else f"<{least:g}" if value < least else f">{most}"
+    return f"{round(float(f'{value:.2g}'), decimals):g}"
 
 
 def _listed(numbers, unit):
@@ -391,10 +389,9 @@ def _with_status(free, status):
     return sum(counts.values()), ", ".join(shown)
 
 
-def _next(calibration, free, wrong, sky, tables):
+def _next(calibration, free, wrong, sky):
     """Return the one thing that would help most."""
     kinds = {kind_of_source(r.source) for r in calibration.datasets}
-    missing = tables[0].meta.get("missing", []) if tables else []
     unknown = any(_absurd(free)) or bool(sky)
     advice = (
         (calibration.identifiability.rank == 0, "check that every optic that turns has its mount="),
@@ -406,8 +403,8 @@ def _next(calibration, free, wrong, sky, tables):
         (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
         (unknown or not calibration.converged, "more angles of derotator and half-wave plate"),
-        ("on_sky" in missing, "an unpolarized standard star: the telescope is not in the errors"),
-        ("unpolarized" in missing, "the internal source without its polarizer"),
+        ("star" not in kinds, "an unpolarized standard star, which tells the telescope"),
+        ("unpolarized" not in kinds, "the internal source without its polarizer"),
         (_excess(calibration) > _CLEARLY, "astropolcal diagnose: what does the model lack?"),
         (True, "a dataset that no fit saw, as a test (--standard FILE)"),
     )

@@ -215,7 +215,7 @@ def run(arguments):
     from astropolcal.calibration import to_dict
     from astropolcal.calibration.standards import add_standard
     from astropolcal.calibration.star_checks import add_star_check
-    from astropolcal.calibration.verdicts import SKY_TARGETS
+    from astropolcal.calibration.targets import TARGETS
     from astropolcal.observations import get_observable
 
     say = printer(arguments)
@@ -223,7 +223,7 @@ def run(arguments):
     _check_start(arguments)
     # raises before any table is read
     get_observable(arguments.observable)
-    targets = [_target(text) for text in arguments.target] or SKY_TARGETS
+    targets = [_target(text) for text in arguments.target] or TARGETS
     # so that a first call without any data shows what comes out
     files = arguments.files or [_example(say)]
     datasets, standards = read_datasets(files), read_datasets(arguments.standard)

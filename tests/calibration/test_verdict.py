@@ -68,11 +68,10 @@ def test_the_example_leaves_the_zero_of_the_angle_open(example, tmp_path):
     cal = calibrate(chain, example, instrument="charis", cross_validate=False)
     found = cal.verdict()
     assert not found.usable
-    assert found.reasons == ["the AoLP on sky is open (calibration_polarizer.theta)"]
+    assert found.reasons == ["AoLP and DoLP on sky are open (calibration_polarizer.theta)"]
     first, accuracy, determined, missing, advice = fits_a_terminal(cal)[:5]
     assert first == f"NOT USABLE AS IT IS: {found.reasons[0]}"
-    assert accuracy.endswith("AoLP open")
-    assert "open" not in accuracy.partition("AoLP")[0]
+    assert accuracy == "On sky      30, 1, 0.1 % open, AoLP open"
     assert determined.startswith("Determined  23 of 93: hwp.w_sio2, hwp.w_mgf2")
     assert missing.startswith("Not         69 open, 1 at bound: calibration_polarizer.theta")
     assert advice.endswith("or --fix hwp.theta if its mount is known")
@@ -85,7 +84,7 @@ def test_the_example_leaves_the_zero_of_the_angle_open(example, tmp_path):
     held = calibrate(chain, example, fix={"hwp.theta": None}, cross_validate=False)
     assert held.verdict().usable
     assert "open (not seen on sky)" in fits_a_terminal(held)[3]
-    assert "AoLP to " in held.verdict().words[1]
+    assert held.verdict().words[1].endswith("deg")
 
 
 def test_a_polarized_star_alone_determines_nothing():
@@ -253,17 +252,24 @@ def test_a_target_that_is_not_known():
 
     for s_p, s_chi, sky, words in (
         (0.1, 0.1, {}, []),
-        (40.0, 0.1, {}, ["of 30 % on sky the DoLP is known to 40 % only"]),
-        (0.1, 20.0, {}, ["of 30 % on sky the AoLP is known to 20 deg only"]),
+        (40.0, 0.1, {}, ["the DoLP of 30 % on sky is known to 40 % only"]),
+        (0.1, 20.0, {}, ["the AoLP of 30 % on sky is known to 20 deg only"]),
+        (0.1, np.inf, {}, ["the AoLP of 30 % on sky is open"]),
         # what is open is said with its name
         (np.inf, np.inf, {"AoLP": ["a.b"], "DoLP": ["a.b"]}, []),
     ):
         assert verdicts._too_far([table(s_p, s_chi)], sky) == words
     assert verdicts._too_far([], {}) == []
-    assert verdicts._accuracy([], {}) == "On sky      unknown: no dataset tells how accurate it is"
+    assert verdicts._accuracy([], {}) == "On sky      unknown: the chain has no half-wave plate"
     words = verdicts._accuracy([table(0.0001, np.inf), table(0.02, np.inf)], {})
     assert words == "On sky      30, 30 % to <0.001, 0.02 %, AoLP open"
-    assert "% to open" in verdicts._accuracy([table(0.02, 1.0)], {"DoLP": ["a.b"]})
+    words = verdicts._accuracy([table(0.0253, 1.26), table(1.234, 60.0)], {})
+    assert words == "On sky      30, 30 % to 0.025, 1.2 %, AoLP 1.3, >45 deg"
+    words = verdicts._accuracy([table(0.02, 0.001)] * 2, {"DoLP": ["a.b"]})
+    assert words == "On sky      30, 30 % open, AoLP <0.01 deg"
+    assert verdicts._open_words({}) == ""
+    words = verdicts._open_words({"AoLP": ["calibration_polarizer.theta"], "DoLP": ["a.b"]})
+    assert words == "AoLP and DoLP on sky are open (calibration_polarizer.theta)"
 
 
 def test_a_long_first_line_counts_what_it_leaves_out():
