@@ -5,6 +5,7 @@ import textwrap
 
 import numpy as np
 
+from astropolcal.calibration.stars import fitted_stars
 from astropolcal.calibration.verdicts import shortened
 from astropolcal.words import counted
 
@@ -19,7 +20,10 @@ _NOISES = {"errors": "stated errors"}
 
 def compact_lines(calibration, found, height=HEIGHT):
     """Return the verdict, the parameters, the fit and its goodness in so many lines."""
-    rows = parameter_lines(calibration.parameter_values())
+    known = without_stars(calibration.parameter_values(), calibration)
+    single = parameter_lines(known, several=False)
+    stars = (shortened(f"  {words}") for words in stars_words(calibration))
+    rows = [*single, *stars, *parameter_lines(known)[len(single) :]]
     rest = [_heading(calibration), _fit(calibration), *_goodness(calibration)]
     room = height - len(found.words) - len(rest) - 2
     if len(rows) > room:
@@ -75,6 +79,17 @@ def _worst(calibration, key):
 
 
 # ---- parameters -----------------------------------------------------------------------------
+
+
+def stars_words(calibration):
+    """Return what was found of each standard star, whose parameters say it in many numbers."""
+    return [table.meta["words"] for table in fitted_stars(calibration)]
+
+
+def without_stars(known, calibration):
+    """Return the parameters that are not those of a standard star."""
+    names = tuple(f"{table.meta['name']}." for table in fitted_stars(calibration))
+    return {name: entry for name, entry in known.items() if not name.startswith(names or ("?",))}
 
 
 def parameter_lines(known, several=True):

@@ -12,8 +12,8 @@ S is the scatter at each wavelength. C is the correlation of pairs of frames: of
 or of the pairs at one setting, where an error of Stokes q and u goes with :math:`\cos 4\theta` and
 :math:`\sin 4\theta` of the half-wave plate. L is that of wavelengths: none, over a tenth of their
 logarithm, all, or that of the principal components of the errors at the settings. The shares
-:math:`\tau` are those for which products of residuals have the values that are found, after what the
-fit took away (MINQUE: Rao 1971, J. Multivariate Anal. 1, 257,
+:math:`\tau` are those for which products of residuals have the values that are found, after what
+the fit took away (MINQUE: Rao 1971, J. Multivariate Anal. 1, 257,
 doi:10.1016/0047-259X(71)90001-7).
 """
 
@@ -224,7 +224,9 @@ def _errors_at_settings(part, scaled):
     if not part.patterns.shape[1] or not np.isfinite(scaled).all():
         return None
     errors = part.patterns.T @ part.dense(scaled[:, None])[..., 0]
-    return errors / np.sqrt(np.sum(part.patterns**2, axis=0))[:, None]
+    size = np.sqrt(np.sum(part.patterns**2, axis=0))[:, None]
+    # of one plate angle q or u may not show at all
+    return np.divide(errors, size, out=np.zeros_like(errors), where=size > 0)
 
 
 def _uneven(errors):

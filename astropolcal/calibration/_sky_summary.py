@@ -123,11 +123,16 @@ def open_on_sky(calibration):
     ]
 
 
-def open_lines(calibration):
+def open_lines(calibration, infinite=True):
     """Say what makes an accuracy for a target infinite or large, one line a kind."""
     found, lines = open_on_sky(calibration), []
     for kind, says in (
-        ("open", "infinite by what the data leave open"),
+        (
+            "open",
+            "infinite by what the data leave open"
+            if infinite
+            else "resting on priors, as the data leave it open",
+        ),
         ("badly determined", "large by what is badly determined"),
     ):
         words = [one["words"] for one in found if one["kind"] == kind]

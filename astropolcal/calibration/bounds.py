@@ -14,7 +14,16 @@ from astropolcal.calibration._directions import LARGE, declared_step, step_of
 __all__ = ["STATUSES", "errors_at_bounds", "slack_of_bounds", "status_of"]
 
 #: What may be said of a parameter, in the order in which it is decided.
-STATUSES = ("fixed", "tied", "at bound", "open", "badly determined", "conditional", "determined")
+STATUSES = (
+    "fixed",
+    "tied",
+    "at bound",
+    "open",
+    "badly determined",
+    "conditional",
+    "by priors",
+    "determined",
+)
 
 # an error that grows by less than this when the bounds are released hardly hangs on them
 _MATTERS = 1.1
@@ -237,7 +246,9 @@ def status_of(entry):
             ~np.isfinite(std) & ~np.asarray(entry["identifiable"]),
             ~(std <= large),
             ~np.isnan(entry["std_released"]),
+            # the data alone leave it open
+            ~np.asarray(entry["identifiable"]),
         ],
-        STATUSES[2:6],
-        STATUSES[6],
+        STATUSES[2:7],
+        STATUSES[7],
     )

@@ -271,12 +271,11 @@ def _fitted_words(table):
     """Say q and u in the middle of the wavelengths, before and after the fit."""
     i = len(table) // 2
     parts = [
-        f"{key} = {table[key][i].value:+.2f} +- {table[f'{key}_err'][i].value:.2f} % "
-        f"({table[f'{key}_prior'][i].value:+.2f} +- {table[f'{key}_prior_err'][i].value:.2f} % "
-        "in the catalogue)"
-        for key in "qu"
+        f"{key} {table[key][i].value:+.2f} +- {table[f'{key}_err'][i].value:.2f}" for key in "qu"
     ]
+    prior = max(table[f"{key}_prior_err"][i].value for key in "qu")
+    nm = table["wavelength"][i].to_value(u.nm)
     return (
-        f"{table.meta['name']} at {table['wavelength'][i].to_value(u.nm):.0f} nm: "
-        f"{', '.join(parts)}; {100 * table.meta['from_data']:.0f} % of it rests on the data"
+        f"{table.meta['name']:<27} {', '.join(parts)} % ({nm:.0f} nm; +- {prior:.2f} before; "
+        f"{100 * table.meta['from_data']:.0f} % by the data)"
     )

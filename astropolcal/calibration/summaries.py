@@ -13,6 +13,8 @@ from astropolcal.calibration._compact import (
     compact_lines,
     inward_words,
     parameter_lines,
+    stars_words,
+    without_stars,
 )
 from astropolcal.calibration._sky_summary import (
     mirror_lines,
@@ -22,6 +24,7 @@ from astropolcal.calibration._sky_summary import (
     star_lines,
 )
 from astropolcal.calibration.groups import what_is_left_out
+from astropolcal.calibration.stars import fitted_stars
 from astropolcal.calibration.targets import TARGETS, target_accuracies
 from astropolcal.calibration.verdicts import verdict
 from astropolcal.words import counted
@@ -83,7 +86,8 @@ def summary(calibration, targets=TARGETS, full=False):
     parts = [
         [*found.words, *_more_reasons(found)],
         _heading(calibration),
-        _global_lines(known),
+        _global_lines(without_stars(known, calibration)),
+        _stars(calibration),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
         *(_standard_lines(entry) for entry in calibration.fit.get("standards", [])),
@@ -101,6 +105,14 @@ def summary(calibration, targets=TARGETS, full=False):
         _posterior_lines(calibration),
     ]
     return "\n\n".join("\n".join(part) for part in parts if part)
+
+
+def _stars(calibration):
+    """Say what was found of the standard stars, and how far it rests on the catalogue."""
+    words = stars_words(calibration)
+    return (
+        ["Standard stars", *_wrap(f"  {' '.join(one.split())}" for one in words)] if words else []
+    )
 
 
 def _more_reasons(found):
@@ -221,13 +233,14 @@ def _target_lines(calibration, targets):
         f"  {'DoLP':>6}{'AoLP':>10}" + "".join(f"{name:>10}" for name in heads),
         *(_target_row(table) for table in tables),
     ]
-    if any(np.isinf(table["s_p"]).any() for table in tables):
+    infinite = any(np.isinf(table[key]).any() for table in tables for key in ("s_p", "s_chi"))
+    if infinite:
         known = target_accuracies(calibration, targets, open_directions="ignore")
         lines += ["  as if what the data leave open were known:", *map(_target_row, known)]
     lines.append(f"  {tables[0].meta['words']}")
     if any(table.meta["aolp"] is None for table in tables):
         lines.append("  AoLP any: at whichever angle the accuracy is worst")
-    lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration)]
+    lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration, infinite)]
     return list(_wrap(lines))
 
 
@@ -371,6 +384,13 @@ def _posterior_lines(calibration):
     )
 
 
+def _fitted_star(table):
+    columns = {f"{key}_percent": table[key].value for key in table.colnames[1:]}
+    nm = table["wavelength"].to_value(u.nm)
+    return {"name": table.meta["name"], "from_data": table.meta["from_data"],
+            "wavelength_nm": nm} | columns  # fmt: skip
+
+
 # ---- for machines ------------------------------------------------------------------
 
 
@@ -429,6 +449,7 @@ def to_dict(calibration, targets=TARGETS):
         "left_out": what_is_left_out(calibration),
         "stars": fit.get("stars", []),
         "mirrors": mirrors(calibration),
+        "fitted_stars": [_fitted_star(table) for table in fitted_stars(calibration)],
         "standards": [_standard(entry) for entry in fit.get("standards", [])],
         "targets": [_target(table) for table in target_accuracies(calibration, targets)],
         "parameters": {

@@ -368,7 +368,9 @@ def _determined(calibration, free):
     """Say how many parameters are determined, and how many are not and why, by name."""
     total = sum(entry["value"].size for entry in free.values())
     good, names = _with_status(free, "determined")
-    yield f"Determined  {good} of {total}{': ' if good else ''}{names}"
+    held, _ = _with_status(free, "by priors")
+    more = f", {held} with priors" if held else ""
+    yield f"Determined  {good} of {total}{more}{': ' if good else ''}{names}"
     # what is open comes first
     bad = {s: _with_status(free, s) for s in (*STATUSES[3:6], STATUSES[2])}
     counts = [f"{n} {status}" for status, (n, _) in bad.items() if n]
@@ -405,6 +407,10 @@ def _next(calibration, free, wrong, sky):
         (unknown or not calibration.converged, "more angles of derotator and half-wave plate"),
         ("star" not in kinds, "an unpolarized standard star, which tells the telescope"),
         ("unpolarized" not in kinds, "the internal source without its polarizer"),
+        (
+            any(entry["status"] == "by priors" for entry in _orientations(free).values()),
+            "a polarized standard star: the AoLP rests on how optics are mounted",
+        ),
         (_excess(calibration) > _CLEARLY, "astropolcal diagnose: what does the model lack?"),
         (True, "a dataset that no fit saw, as a test (--standard FILE)"),
     )

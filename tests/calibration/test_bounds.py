@@ -106,7 +106,7 @@ def test_status_of_every_kind():
     nothing = {"std": np.nan, "identifiable": False}
     for changes, status in (
         ({}, "determined"),
-        ({"identifiable": False}, "determined"),  # by a prior
+        ({"identifiable": False}, "by priors"),
         ({"fixed": True}, "fixed"),
         ({"tied": "a.b"}, "tied"),
         (nothing, "open"),
