@@ -208,7 +208,7 @@ def _covariance_node(covariance):
 def _identifiability_node(finding):
     from astropolcal.converters.nodes import plain
 
-    return {
+    node = {
         "names": list(finding.names),
         "rank": int(finding.rank),
         "singular_values": finding.singular_values.copy(),
@@ -219,8 +219,9 @@ def _identifiability_node(finding):
         "near_null": [_direction_node(direction) for direction in finding.near_null],
         "sampling": list(finding.sampling),
         "mirrors": list(finding.mirrors),
-        "branches": plain(finding.branches, "branches"),
     }
+    # absent where there are none, as in files of before
+    return node | ({"branches": plain(finding.branches, "branches")} if finding.branches else {})
 
 
 def _direction_node(direction):

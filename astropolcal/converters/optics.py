@@ -13,6 +13,7 @@ import re
 import numpy as np
 from asdf.extension import Converter
 
+from astropolcal.converters.priors import prior_from_node, prior_node
 from astropolcal.exceptions import CalibrationFileError, ParameterError
 
 __all__ = ["OPTIC_MODULES", "OpticConverter", "node_from_optic", "optic_from_node", "optic_tag"]
@@ -133,7 +134,8 @@ def node_from_optic(optic):
     ------
     CalibrationFileError
         If a file cannot hold the optic: its class is not registered, or a
-        parameter has a callable tie, a prior, or a value that is not finite.
+        parameter has a callable tie, a prior that is no distribution, or a value that is not
+        finite.
 
     Examples
     --------
@@ -165,12 +167,11 @@ def _check_class(optic):
 def _parameter_node(optic, key):
     parameter = getattr(optic, key)
     label = f"{optic.name or type(optic).__name__}.{key}"
-    for kind in ("tied", "prior"):
-        if getattr(parameter, kind):
-            raise CalibrationFileError(
-                f"{label} has a callable {kind!r}, which files cannot hold"
-                + ("; use ties={...: Tie(...)} of calibrate" if kind == "tied" else "")
-            )
+    if parameter.tied:
+        raise CalibrationFileError(
+            f"{label} has a callable 'tied', which files cannot hold; use ties={{...: Tie(...)}} "
+            "of calibrate"
+        )
     declared = optic._declared(key).unit
     if parameter.unit != declared:
         raise CalibrationFileError(f"{label} is in {parameter.unit}, allowed is {declared}")
@@ -178,7 +179,9 @@ def _parameter_node(optic, key):
     node = {"value": _stored(np.reshape(parameter.value, parameter.shape), label)}
     if declared is not None:
         node["unit"] = declared.to_string()
-    return node | {"fixed": bool(parameter.fixed), "bounds": _bounds(parameter)}
+    node |= {"fixed": bool(parameter.fixed), "bounds": _bounds(parameter)}
+    known = {} if parameter.prior is None else {"prior": prior_node(parameter.prior, label)}
+    return node | known
 
 
 def _stored(value, label):
@@ -239,6 +242,8 @@ def optic_from_node(name, node):
         parameter = getattr(optic, key)
         parameter.fixed = entry["fixed"]
         parameter.bounds = tuple(entry["bounds"])
+        if "prior" in entry:
+            parameter.prior = prior_from_node(entry["prior"], f"{node.get('name')}.{key}")
     return optic
 
 

@@ -50,13 +50,14 @@ def node_from_priors(chains):
     # one entry a parameter: chains share the optics that stand in several of them
     table = parameter_table(chains).items()
     return [
-        {"parameter": name} | _node(parameters[0].prior, name)
+        {"parameter": name} | prior_node(parameters[0].prior, name)
         for name, parameters in table
         if parameters[0].prior is not None
     ]
 
 
-def _node(prior, name):
+def prior_node(prior, name):
+    """Return the node of a prior."""
     from astropolcal.converters.nodes import node_from_value
 
     kind = type(prior).__name__.lower()
@@ -167,10 +168,18 @@ def restore_priors(chains, nodes):
         if node["parameter"] not in table:
             raise CalibrationFileError(f"prior of {node['parameter']!r}, which no chain has")
         for parameter in table[node["parameter"]]:
-            parameter.prior = _prior(node)
+            parameter.prior = prior_from_node(node, node["parameter"])
 
 
-def _prior(node):
+def prior_from_node(node, name):
+    """Return the prior of a node."""
+    try:
+        return _prior(node, name)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CalibrationFileError(f"prior of {name}: {type(error).__name__}, {error}") from None
+
+
+def _prior(node, name):
     from astropolcal import measurement
     from astropolcal.converters.nodes import plain, value_from_node
 
@@ -178,7 +187,7 @@ def _prior(node):
         try:
             return _frozen(plain(node))
         except (TypeError, ValueError) as error:
-            raise CalibrationFileError(f"prior of {node['parameter']}: {error}") from None
+            raise CalibrationFileError(f"prior of {name}: {error}") from None
     values = [value_from_node(node[key]) for key in _OURS[node["kind"]]]
     # a number of its own type, as it was given
     values = [v if hasattr(v, "unit") else v.item() for v in values]

@@ -10,6 +10,7 @@ import pytest
 from asdf.exceptions import ValidationError
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 from astropolcal import optics
 from astropolcal.chain import at_positions, leaves
@@ -21,6 +22,7 @@ from astropolcal.converters.optics import (
     optic_tag,
 )
 from astropolcal.exceptions import CalibrationFileError
+from astropolcal.measurement import Normal
 from astropolcal.optics import OPTICS
 
 NAMES = sorted(OPTICS)
@@ -254,11 +256,21 @@ def test_callable_tie_is_refused():
         written(optic)
 
 
-def test_prior_is_refused():
+def test_prior_is_kept_if_it_is_a_distribution():
     optic = optics.LinearRetarder(name="r")
+    optic.retardance.prior = norm(170, 2)
+    optic.theta.prior = Normal(0 * u.deg, 6 * u.arcmin)
+    again = optic_from_node("LinearRetarder", node_from_optic(optic))
+    assert again.retardance.prior.mean() == 170
+    assert again.theta.prior == optic.theta.prior
     optic.retardance.prior = lambda value: 0.0
-    with pytest.raises(CalibrationFileError, match=r"r\.retardance has a callable 'prior'"):
+    with pytest.raises(CalibrationFileError, match=r"prior of r\.retardance is a function"):
         written(optic)
+    for bad in ({"kind": "normal"}, {"kind": "scipy", "distribution": "os"}, {"kind": 1}):
+        node = node_from_optic(optics.Rotator(name="t"))
+        node["parameters"]["theta"]["prior"] = bad
+        with pytest.raises(CalibrationFileError, match=r"prior of t\.theta"):
+            optic_from_node("Rotator", node)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
