@@ -9,6 +9,7 @@ from astropolcal import standards
 
 # a star that culminates lower has little range of parallactic angle, and much air in front
 _LOW = 45.0
+_EQUATOR = 60.0
 
 
 def star_words(site):
@@ -27,6 +28,7 @@ def _best_star(latitude):
     # photon noise of the angle; a law without errors does not tell what is known of the star
     score = numbers["p_max"] * 10 ** (-0.2 * numbers["V"])
     known = np.isfinite(score) & np.isfinite(numbers["p_max_err"])
-    seen = known & (high >= _LOW) if latitude is not None else known
+    # without a site one that most of them see, as it stands high over the equator
+    seen = known & (high >= (_LOW if latitude is not None else _EQUATOR))
     best = int(np.argmax(np.where(seen if seen.any() else known, score, -np.inf)))
     return str(stars["name"][best]), None if latitude is None else float(high[best])

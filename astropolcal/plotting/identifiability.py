@@ -215,6 +215,8 @@ def _draw_values(axes, finding, known, n_weak):
     n_open = len(values) - rank
     largest = values.max(initial=0.0) or 1.0
     threshold = _threshold(values, rank, largest)
+    # singular values and errors go together where the data count as independent
+    known = known if known is not None and _are_inverse(values[:rank], known[2]) else None
     is_weak = _is_weak(values[:rank], known, n_weak)
     low = threshold / 30 if n_open else values[rank - 1] / 3
     axes.set_yscale("log")
@@ -240,6 +242,14 @@ def _draw_values(axes, finding, known, n_weak):
     axes.legend(loc="center left" if n_open else "lower left")
     if known is not None and len(known[2]):
         _add_error_axis(axes, known[2].min() * largest, threshold if n_open else low)
+
+
+def _are_inverse(values, sigmas):
+    """Return whether errors are one over singular values, by the best and the worst of them."""
+    if not (len(values) and len(sigmas)):
+        return False
+    ratio = (sigmas.max() / sigmas.min()) / (values.max() / values.min())
+    return abs(np.log(ratio)) < _SAME
 
 
 def _is_weak(values, known, count):

@@ -104,7 +104,7 @@ def test_singular_wavelength_has_no_error(make):
 
 def test_bad_input_is_refused(cal, tmp_path):
     with pytest.raises(
-        FitError, match="method = 'jackknife'; allowed are covariance, robust, van-"
+        FitError, match="method = 'jackknife'; allowed are covariance, white, robust, van-"
     ):
         standard_errors(cal, "jackknife")
     cal.write(tmp_path / "cal.asdf")

@@ -194,7 +194,7 @@ def test_both_strategies_know_it(truth, data, strategy, fitted):
 def test_noise_given_as_it_is_in_the_table_gives_the_same_fit(truth, data, fitted):
     sigma = fitted["errors"].measurement.sigma
     for noise in (sigma, sigma * u.one, noise_from_errors(fitted["errors"].measurement)):
-        cal = fit(truth, data, noise)
+        cal = fit(truth, data, noise, errors="white")
         assert cal.settings["weights"] == "given"
         np.testing.assert_array_equal(
             cal.measurement.vector(), fitted["errors"].measurement.vector()

@@ -45,7 +45,7 @@ def make_observations(chain, angles=ANGLES, mask=None, **options):
 def elliptical():
     """A calibration in which every parameter is determined."""
     chain = make_chain()
-    return calibrate(chain, make_observations(chain), instrument="bench")
+    return calibrate(chain, make_observations(chain), instrument="bench", errors="white")
 
 
 @pytest.fixture(scope="session")
@@ -74,7 +74,7 @@ def undetermined():
         theta = chain[name].theta
         theta.fixed = False
         theta.bounds = (float(theta.value) - 5, float(theta.value) + 5)
-    return calibrate(chain, observations)
+    return calibrate(chain, observations, errors="white")
 
 
 @pytest.fixture(scope="session")
