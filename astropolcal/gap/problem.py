@@ -12,11 +12,14 @@ import numpy as np
 from scipy.linalg import null_space, qr, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
+from astropolcal.chain import leaves
 from astropolcal.gap._bases import law_basis, orthonormal
 from astropolcal.gap._noise import expected_fluxes, noise, settings
 from astropolcal.gap.channels import Channels
+from astropolcal.instruments.telescope import as_exact
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
+from astropolcal.optics import StarSource
 
 __all__ = ["Fit", "GapProblem", "law_basis", "orthonormal"]
 
@@ -37,6 +40,13 @@ _AT_BOUND = 1e-9
 _AT_WALL = 1e-7
 # so often it is guessed which bounds hold; a slope below this share of its terms is none
 _GUESSES, _ROUNDING = 10, 1e-13
+
+
+def _exact(chain):
+    """Return the chain, or a copy in which what is known beforehand is held."""
+    found = leaves(chain)
+    known = any(leaf.theta.prior is not None or isinstance(leaf, StarSource) for leaf in found)
+    return as_exact(chain.copy()) if known else chain
 
 
 class GapProblem:
@@ -98,7 +108,8 @@ class GapProblem:
     ):
         self.ties, self.laws, self.priors = dict(ties or {}), dict(laws or {}), dict(priors or {})
         self.neutral, self.limits = dict(neutral or {}), dict(limits or {})
-        chains, observations = list(chains), list(observations)
+        # what the model holds is held; an effect is what frees it
+        chains, observations = [_exact(chain) for chain in chains], list(observations)
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
         self.measurement = Measurement(
             chains,

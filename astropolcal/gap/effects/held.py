@@ -6,6 +6,7 @@ import numpy as np
 
 from astropolcal.chain import replace_optic
 from astropolcal.gap.effects.base import Edit, Effect, EffectParameter
+from astropolcal.gap.effects.roles import is_held
 
 __all__ = [
     "DerotatorAngleBound",
@@ -34,7 +35,7 @@ class _Freed(Effect):
 
     def is_open(self, parameter, limit):
         """Return whether the effect may act on a parameter: one that is fixed."""
-        return parameter.fixed
+        return is_held(parameter)
 
     def applies_to(self, roles):
         """Return whether one of the parameters is held."""
@@ -68,7 +69,7 @@ class _Freed(Effect):
                 continue
             # where it was held is where the effect is absent
             value = u.Quantity(parameter.value, parameter.unit or u.one)
-            parameter.fixed = False
+            parameter.fixed, parameter.prior = False, None
             parameter.bounds = _around(parameter, limit, getattr(type(optic), key).bounds)
             name = f"{optic.name}.{key}"
             found[name] = EffectParameter(name, scale, limit, neutral=value)

@@ -11,6 +11,11 @@ __all__ = ["SEVERAL", "Roles", "adapted"]
 SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
 
 
+def is_held(parameter):
+    """Return whether a parameter is fixed, or as good as that: known beforehand."""
+    return bool(parameter.fixed or parameter.prior is not None)
+
+
 class Roles:
     """
     The optics of a chain by what they are for.
@@ -99,7 +104,7 @@ class Roles:
         if "parallactic" not in on or "altitude" in on:
             return False
         # the sky turns, and the instrument with the telescope
-        return all(getattr(o, key).fixed for o in self._in_front() for key in o.param_names)
+        return all(is_held(getattr(o, key)) for o in self._in_front() for key in o.param_names)
 
 
 # positions that are not those of a stage which carries a retarder

@@ -8,6 +8,7 @@ from astropolcal import optics
 from astropolcal.chain import leaves, replace_optic
 from astropolcal.gap.effects._shared import Depolarization
 from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, Insertion
+from astropolcal.gap.effects.roles import is_held
 
 __all__ = [
     "PolarizerLeak",
@@ -195,7 +196,7 @@ class StandardPolarization(Effect):
 def _held_star(optics_of_chain):
     """Return the first star whose polarization is fixed."""
     stars = (o for o in optics_of_chain if isinstance(o, optics.PolarizedSource))
-    return next((star for star in stars if star.q.fixed and star.u.fixed), None)
+    return next((star for star in stars if is_held(star.q) and is_held(star.u)), None)
 
 
 def _able_to_hold(values, basis):

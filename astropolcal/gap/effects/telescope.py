@@ -13,6 +13,7 @@ from astropolcal import optics
 from astropolcal.chain import insert_optic
 from astropolcal.gap.effects._shared import LAG, Discrete, lagging
 from astropolcal.gap.effects.base import Edit, EffectParameter, Insertion, label_of
+from astropolcal.gap.effects.roles import is_held
 from astropolcal.observations.pointings import TRACKING
 
 __all__ = [
@@ -63,14 +64,17 @@ class _Telescope:
             return True
         others = (getattr(self.mirror, k) for k in self.mirror.param_names if k not in keys)
         # a free diattenuation or retardance of the mirror takes the effect up
-        return all(parameter.fixed for parameter in others)
+        return all(is_held(parameter) for parameter in others)
 
     @property
     def unpolarized(self):
         """Whether the star is held at zero polarization."""
         if self.star is None:
             return False
-        return all(p.fixed and not np.any(p.value) for p in (self.star.q, self.star.u))
+        if isinstance(self.star, optics.StarSource):
+            # nothing interstellar: unpolarized as far as the catalogue knows
+            return self.star.p_max.fixed and not np.any(self.star.p_max.value)
+        return all(is_held(p) and not np.any(p.value) for p in (self.star.q, self.star.u))
 
 
 def _turns(optic, stage):
