@@ -439,7 +439,6 @@ ALLOWED = {
     ("gap/effects/relay.py", "dichroic"): "place of an effect, in a chain with or without one",
     ("reduction/pypolcal.py", "SCExAO/CHARIS"): "the software whose tables are read has only it",
     ("scripts/_calibrate.py", "charis_example.ecsv"): "packaged data",
-    ("scripts/_calibrate.py", "No files given: calibrating the packaged example"): "packaged data",
     ("scripts/_calibrate.py", "--m3"): "option of the command line, and of two chains",
     ("scripts/_calibrate.py", "m3"): "option of the command line, and of two chains",
     ("scripts/_choosing.py", "charis"): DEFAULT,

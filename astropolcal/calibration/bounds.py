@@ -99,7 +99,26 @@ def slack_of_bounds(measurement, whitened):
     """
     Return how the parameters move while one at its bound goes inward by its one-sided error.
 
-    Shape (n_held, n_free), in steps of a degree, micrometre or percent.
+    Parameters
+    ----------
+    measurement : Measurement
+        The fitted measurement, with its ``weighting``.
+    whitened : Whitened
+        The linear problem around its solution.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (n_held, n_free), in steps of a degree, micrometre or percent.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> import numpy as np
+    >>> from astropolcal.calibration.bounds import slack_of_bounds
+    >>> nothing = SimpleNamespace(held=np.zeros(3, dtype=bool), scale=np.ones(3))
+    >>> slack_of_bounds(None, nothing).shape
+    (0, 3)
     """
     if not whitened.held.any():
         return np.zeros((0, whitened.scale.size))

@@ -221,7 +221,7 @@ def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stoke
     >>> positions = {"hwp": [0, 22.5, 45, 67.5] * u.deg, "derotator": [60] * 4 * u.deg}
     >>> model = RowModel(cal, positions, cal.wavelength)
     >>> sampled_systematic(model, estimator(model.rows()), n_samples=10, seed=1).factor.shape
-    (10, 22, 3, 3)
+    (16, 22, 3, 3)
     """
     if n_samples < 2:
         raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")

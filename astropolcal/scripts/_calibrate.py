@@ -402,5 +402,5 @@ def _example(say):
     import astropolcal
 
     path = Path(astropolcal.__file__).parent / "data" / "charis_example.ecsv"
-    say("No files given: this is the packaged example, a simulated run of CHARIS\n")
+    say("No files given: this is the packaged example, a simulated run\n")
     return path

@@ -562,7 +562,12 @@ def _polarization_agrees(chain, observations, instrument, q, u_):
             getattr(leaf, name).fixed = (leaf.name, name) not in {("star", "q"), ("star", "u")}
     model["star"].q = model["star"].u = np.zeros(22)
     found = calibrate(
-        model, observations, instrument=instrument.name, weights="errors", cross_validate=False
+        model,
+        observations,
+        instrument=instrument.name,
+        weights="errors",
+        errors="white",
+        cross_validate=False,
     )
     pulls = []
     for name, true in (("q", q), ("u", u_)):
