@@ -233,7 +233,8 @@ def telescope_alone(measurement, options):
     # what a lamp sees as well is found better with it
     lamps = {name for i, star in enumerate(seen) if not star for name in parameter_table(chains[i])}
     own = {s.name for s in measurement.free.slots if not s.per_wavelength} - lamps
-    if not own:
+    # what has a prior is not degenerate
+    if own <= {slot.name for slot, _ in measurement.free.priors}:
         return None
     held = {slot.name for slot in measurement.free.slots} - own
     positions = options["positions"]
