@@ -160,6 +160,11 @@ def _add_claims(table, calibration, rows):
         table[f"{key}_sys_err"] = (values or np.full(len(table), np.nan)) * unit
 
 
+def _pull(table, key):
+    """Return by how many of all errors together the star is off, median over the wavelengths."""
+    return np.nanmedian(np.abs(table[f"{key}_error"].value) / _stated(table, key))
+
+
 def _stated(table, key):
     """Return the errors of the star, the calibration and the catalogue together."""
     parts = (table[f"{key}{suffix}"].value for suffix in ("_err", "_sys_err", "_known_err"))
@@ -177,15 +182,14 @@ def _words(table):
     off = np.abs(table["dolp_error"].to_value(u.percent))
     words = (
         f"DoLP off by {np.nanmedian(off):.2g} % (median over the wavelengths; worst "
-        f"{np.nanmax(off):.2g} %), single cycles by "
+        f"{np.nanmax(off):.2g} %; {_pull(table, 'dolp'):.1f} times all errors), single cycles by "
         f"{np.nanmedian(table['s_dolp'].to_value(u.percent)):.2g} %"
     )
     turned = table["aolp_error"].to_value(u.deg)
     if np.isfinite(turned).any():
-        pull = np.nanmedian(np.abs(turned) / _stated(table, "aolp"))
         words += (
-            f"; AoLP by {np.nanmedian(turned):+.2g} deg (median), {pull:.1f} times the errors of "
-            "calibration, star and catalogue together"
+            f"; AoLP by {np.nanmedian(turned):+.2g} deg (median), {_pull(table, 'aolp'):.1f} times "
+            "the errors of calibration, star and catalogue together"
         )
     return words
 

@@ -405,7 +405,10 @@ def _next(calibration, free, wrong, sky):
         (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
         (unknown or not calibration.converged, "more angles of derotator and half-wave plate"),
-        ("star" not in kinds, "an unpolarized standard star, which tells the telescope"),
+        (
+            "star" not in kinds,
+            "an unpolarized standard star; the telescope counts as published, without error",
+        ),
         ("unpolarized" not in kinds, "the internal source without its polarizer"),
         (
             any(entry["status"] == "by priors" for entry in _orientations(free).values()),
