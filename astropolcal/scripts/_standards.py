@@ -16,6 +16,8 @@ from astropolcal.scripts._common import (
 from astropolcal.units import plain_number
 from astropolcal.words import counted, did_you_mean
 
+# R, J, H and K, for what a calibration assumes of a star
+_BANDS = (0.65, 1.25, 1.65, 2.2)
 # more stars than this make a figure unreadable
 _DRAWN = 5
 # of a night, whose list is ordered by how good a star is, so that its end is of no use
@@ -142,7 +144,7 @@ def _describe(star):
         lines.append(f"  type        {star.spectral_type}")
     if star.note:
         lines.append(wrapped(f"  note        {star.note}", indent=14))
-    lines += _law_lines(star)
+    lines += [*_law_lines(star), *_known_lines(star)]
     if len(star.polarization):
         lines += ["", "  band      um     p (%)         theta (deg)   source"]
     lines += [_measurement(row) for row in star.polarization]
@@ -166,6 +168,55 @@ def _law_lines(star):
         spread = "" if error is None else f" +- {getattr(error, 'value', error):.3g}"
         lines.append(f"    {name:<10}  {value:.4g}{spread}{unit}")
     return lines
+
+
+def _known_lines(star):
+    """Say what a calibration assumes of the star: the prior of its polarization."""
+    known = _known(star)
+    if known is None:
+        return []
+    lines = ["", "  In a calibration"]
+    for row in known["stokes"]:
+        turned, what = "", "q, u"
+        if row["theta_deg"] is not None:
+            what, turned = (
+                "p",
+                f", theta {_pair(row['theta_deg'], row['theta_err_deg'], '.1f')} deg",
+            )
+        degree = _pair(row["p_percent"], row["p_err_percent"], ".2f")
+        lines.append(f"    {row['wavelength_um']:.2f} um   {what} {degree} %{turned}")
+    return lines + [wrapped(f"    - {words}", indent=6) for words in known["words"]]
+
+
+def _known(star):
+    """Return degree and angle in a few bands with the errors that a calibration takes, or None."""
+    import astropy.units as u
+    import numpy as np
+
+    try:
+        law = star.stokes(np.array(_BANDS) * u.um)
+        if star.kind == "unpolarized":
+            words = [star.unpolarized_error().words]
+        else:
+            words = list(star.interstellar().assumed)
+    except ParameterError:
+        return None
+    rows = []
+    for i, band in enumerate(_BANDS):
+        light = np.array([law.q[i], law.u[i]])
+        degree, angle = np.hypot(*light), np.arctan2(law.u[i], law.q[i])
+        along = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-along[1], along[0]])
+        error, turn = (np.sqrt(d @ law.covariance[i] @ d) for d in (along, across))
+        polarized = degree > 0
+        rows.append({
+            "wavelength_um": float(band),
+            "p_percent": 100 * float(degree),
+            "p_err_percent": 100 * float(error),
+            "theta_deg": float(np.rad2deg(angle / 2) % 180) if polarized else None,
+            "theta_err_deg": float(np.rad2deg(turn / 2 / degree)) if polarized else None,
+        })  # fmt: skip
+    return {"stokes": rows, "words": words}
 
 
 def _measurement(row):
@@ -338,6 +389,7 @@ def _facts(star):
         "dec_deg": float(star.coord.dec.deg),
         "magnitudes": {band: float(m.value) for band, m in star.magnitudes.items()},
         "law": law,
+        "known": _known(star),
         "measurements": [_row(row) for row in star.polarization],
         "checked": star.checked,
     }
