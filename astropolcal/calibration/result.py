@@ -316,8 +316,9 @@ class Calibration:
         dict of str to dict
             ``"optic.parameter"`` to ``value``, ``std`` (NaN where not
             determined), ``unit``, ``bounds``, ``fixed``, ``tied``, ``at_bound``,
-            ``identifiable``; ``status``, see
-            `~astropolcal.calibration.bounds.status_of`; ``std_inward``, how far
+            ``identifiable``; ``status`` (``"determined"``, ``"by priors"``,
+            ``"conditional"``, ``"badly determined"``, ``"open"``,
+            ``"at bound"``, ``"tied"`` or ``"fixed"``); ``std_inward``, how far
             what is at a bound may go inward at one sigma; and for errors that
             hang on such a bound ``conditional_on``, the names of what is at
             it, and ``std_released``, the error without it. Arrays for
