@@ -60,12 +60,24 @@ def check_calibration(calibration):
         free = FreeParameters(calibration.chains, len(wavelength), calibration.ties)
     except AstropolcalError as error:
         raise CalibrationFileError(str(error)) from None
+    # another unit is the schema's to refuse
+    if wavelength.unit.is_equivalent("um"):
+        _check_laws(calibration.chains, wavelength.to_value("um"))
     _check_values(calibration.chains, free)
     _check_shared(calibration.chains, free)
     _check_covariance(calibration.covariance, free)
     _check_identifiability(calibration.identifiability, free.names)
     _check_fit(calibration.fit)
     _check_words(calibration, free.names)
+
+
+def _check_laws(chains, wavelength):
+    """Refuse wavelengths at which an optic has no matrix."""
+    for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+        try:
+            leaf._dispersion(wavelength)
+        except AstropolcalError as error:
+            raise CalibrationFileError(f"{leaf.name}: {error}") from None
 
 
 def _check_values(chains, free):
@@ -152,6 +164,7 @@ def _check_fit(fit):
     bounds = fit.get("bounds") or {}
     if not _are_bounds(bounds):
         raise CalibrationFileError("fit.bounds lacks what an error at a bound is told by")
+    _check_sky(fit)
     masked = fit.get("masked") or []
     if not isinstance(masked, list) or not all(isinstance(one, dict) for one in masked):
         raise CalibrationFileError("fit.masked is no list of reasons, one entry a dataset")
@@ -163,6 +176,36 @@ def _check_fit(fit):
         good = isinstance(one, dict) and {"frames", "dataset", *numbers} <= set(one)
         if not good or not all(isinstance(one[key], int | float) for key in numbers):
             raise CalibrationFileError("fit.outliers lacks what a pair of frames is told by")
+
+
+def _check_sky(fit):
+    """Check what the accuracy on sky is worked out from, and the accuracy that is kept."""
+    settings = {} if (found := fit.get("sky_settings")) is None else found
+    if not isinstance(settings, dict) or not all(
+        _is_numbers(angles) and np.isfinite(angles).all() for angles in settings.values()
+    ):
+        raise CalibrationFileError("fit.sky_settings must be finite angles, some for each stage")
+    keys = ("wavelength_nm", "relative_percent", "absolute_percent")
+    model = fit.get("model_error")
+    if model is not None:
+        lists = [model.get(key) for key in keys] if isinstance(model, dict) else [None]
+        good = all(_is_numbers(one) and len(one) == len(lists[0]) for one in lists)
+        if not good or not np.isfinite(lists).all() or np.min(lists) < 0:
+            raise CalibrationFileError(
+                f"fit.model_error must have {', '.join(keys)}, finite and of equal length"
+            )
+    kept = fit.get("sky_accuracy") or []
+    columns = ("wavelength_nm", "s_q_percent", "s_u_percent", "s_p_percent", "s_chi_deg")
+    if not isinstance(kept, list) or not all(
+        isinstance(one, dict) and all(_is_numbers(one.get(key)) for key in columns) for one in kept
+    ):
+        raise CalibrationFileError(f"fit.sky_accuracy must have {', '.join(columns)}")
+
+
+def _is_numbers(value):
+    """Return whether a value is a list of numbers that is not empty."""
+    plain = isinstance(value, list) and bool(value)
+    return plain and all(isinstance(x, int | float) and not isinstance(x, bool) for x in value)
 
 
 def _are_bounds(bounds):
