@@ -165,12 +165,10 @@ def calibrate(
     >>> cal.converged
     True
     """
-    if strategy not in STRATEGIES:
-        raise FitError(f"strategy = {strategy!r}; allowed are {', '.join(STRATEGIES)}")
-    if loss not in LOSSES:
-        raise FitError(f"loss = {loss!r}; allowed are {', '.join(LOSSES)}")
-    if errors not in ERRORS:
-        raise FitError(f"errors = {errors!r}; allowed are {', '.join(ERRORS)}")
+    choices = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS}
+    for (name, allowed), value in zip(choices.items(), (strategy, loss, errors), strict=True):
+        if value not in allowed:
+            raise FitError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
     search = strategy != "two-step" if search is None else search
     started = time.perf_counter()
     fitter = TRFLSQFitter() if fitter is None else fitter

@@ -360,8 +360,9 @@ class Calibration:
         known = {}
         for i, name in enumerate(self.covariance.names):
             more = released.get(name, {"without": np.nan, "slack": 0.0, "by": []})
-            # the error with all bounds as exact, and then as if there were none
-            exact = np.sqrt(max(stds[i] ** 2 - more["slack"] ** 2, 0.0))
+            # the error with all bounds as exact, as independent data have it, and with none
+            slack = 0.0 if self.settings.get("errors") == "white" else more["slack"]
+            exact = np.sqrt(max(stds[i] ** 2 - slack**2, 0.0))
             beyond = np.hypot(exact, more["without"])
             beside = (inward.get(name, np.nan), ", ".join(more["by"]), beyond)
             known[name] = (stds[i], bool(flags[i]), name in bound, *beside)

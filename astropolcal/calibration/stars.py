@@ -208,7 +208,7 @@ def fitted_stars(calibration):
     Returns
     -------
     list of `~astropy.table.QTable`
-        One a star whose polarization had a prior: ``wavelength``, ``q``, ``q_err``, ``q_prior``,
+        One per star whose polarization had a prior: ``wavelength``, ``q``, ``q_err``, ``q_prior``,
         ``q_prior_err`` and the same of u, in percent and in the frame of the sky. Meta ``name`` of
         the optic, ``from_data``, the share of the prior variance that the data have taken away, 0
         to 1, and ``words``.
