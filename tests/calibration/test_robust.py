@@ -13,7 +13,10 @@ from astropolcal.calibration import (
     leave_out_groups,
     standard_errors,
 )
+from astropolcal.calibration._scatter import Scatter
+from astropolcal.calibration.accuracy import cross_validated_residuals
 from astropolcal.calibration.errors import robust_covariance
+from astropolcal.calibration.weighting import around, weighting_of
 from astropolcal.exceptions import CalibrationFileError, FitError
 from astropolcal.measurement import Normal
 
@@ -252,3 +255,27 @@ def test_errors_of_dataset_3_are_those_of_the_bootstrap(charis_data, make):
     )
     ratio = robust / bootstrap(cal, n=60, seed=1).stds
     assert np.nanmedian(ratio) == pytest.approx(0.9, abs=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dataset1_", "dataset3_"])
+def test_derotator_angles_left_out_are_predicted_within_the_errors(charis_data, make, name):
+    """Errors of the parameters without an angle, and the scatter of its own data, together."""
+    data = charis_data(name)
+    cal = calibrate(make.charis.chains_for([data]), data, cross_validate=False)
+    model, weighting = cal.measurement, weighting_of(cal)
+    whitened = around(model, weighting)
+    (part,) = Scatter(model, weighting, whitened).parts
+    applied = part.applied(np.eye(model.n_data))
+    middle = sum(s * matrix for s, matrix in zip(part.shares, applied, strict=True))
+    scatter = part.amplitude[:, None] * middle * part.amplitude
+    held_out = cross_validated_residuals(model, model.vector())
+    slopes, groups, pulls = whitened.rows[:, whitened.live], leave_out_groups(model), []
+    for group in np.unique(groups):
+        out = groups == group
+        inverse = np.linalg.pinv(slopes[~out], rcond=1e-9)
+        moved = slopes[out] @ inverse
+        variance = np.diag(scatter)[out] + np.diag(moved @ scatter[np.ix_(~out, ~out)] @ moved.T)
+        pulls.append(held_out[out] / np.sqrt(variance))
+    width = np.sqrt(np.nanmean(np.concatenate(pulls) ** 2))
+    assert 0.8 < width < 1.3
