@@ -20,10 +20,11 @@ _NOISES = {"errors": "stated errors"}
 
 def compact_lines(calibration, found, height=HEIGHT):
     """Return the verdict, the parameters, the fit and its goodness in so many lines."""
-    known = without_stars(calibration.parameter_values(), calibration)
+    stars = fitted_stars(calibration)
+    known = without_stars(calibration.parameter_values(), stars)
     single = parameter_lines(known, several=False)
-    stars = (shortened(f"  {words}") for words in stars_words(calibration))
-    rows = [*single, *stars, *parameter_lines(known)[len(single) :]]
+    found_of = (shortened(f"  {star.meta['words']}") for star in stars)
+    rows = [*single, *found_of, *parameter_lines(known)[len(single) :]]
     rest = [_heading(calibration), _fit(calibration), *_goodness(calibration)]
     room = height - len(found.words) - len(rest) - 2
     if len(rows) > room:
@@ -81,15 +82,10 @@ def _worst(calibration, key):
 # ---- parameters -----------------------------------------------------------------------------
 
 
-def stars_words(calibration):
-    """Return what was found of each standard star, whose parameters say it in many numbers."""
-    return [table.meta["words"] for table in fitted_stars(calibration)]
-
-
-def without_stars(known, calibration):
-    """Return the parameters that are not those of a standard star."""
-    names = tuple(f"{table.meta['name']}." for table in fitted_stars(calibration))
-    return {name: entry for name, entry in known.items() if not name.startswith(names or ("?",))}
+def without_stars(known, stars):
+    """Return the parameters that are not those of a standard star, which say it in many numbers."""
+    names = tuple(f"{star.meta['name']}." for star in stars)
+    return {name: entry for name, entry in known.items() if not name.startswith(names)}
 
 
 def parameter_lines(known, several=True):

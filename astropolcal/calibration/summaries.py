@@ -13,7 +13,6 @@ from astropolcal.calibration._compact import (
     compact_lines,
     inward_words,
     parameter_lines,
-    stars_words,
     without_stars,
 )
 from astropolcal.calibration._sky_summary import (
@@ -82,12 +81,12 @@ def summary(calibration, targets=TARGETS, full=False):
     found = verdict(calibration, targets)
     if not full:
         return "\n".join([*compact_lines(calibration, found, HEIGHT - 1), HINT])
-    known = calibration.parameter_values()
+    known, stars = calibration.parameter_values(), fitted_stars(calibration)
     parts = [
         [*found.words, *_more_reasons(found)],
         _heading(calibration),
-        _global_lines(without_stars(known, calibration)),
-        _stars(calibration),
+        _global_lines(without_stars(known, stars)),
+        _stars(stars),
         *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
         _accuracy_words(calibration),
         *(_standard_lines(entry) for entry in calibration.fit.get("standards", [])),
@@ -107,12 +106,10 @@ def summary(calibration, targets=TARGETS, full=False):
     return "\n\n".join("\n".join(part) for part in parts if part)
 
 
-def _stars(calibration):
+def _stars(stars):
     """Say what was found of the standard stars, and how far it rests on the catalogue."""
-    words = stars_words(calibration)
-    return (
-        ["Standard stars", *_wrap(f"  {' '.join(one.split())}" for one in words)] if words else []
-    )
+    words = [f"  {' '.join(star.meta['words'].split())}" for star in stars]
+    return ["Standard stars", *_wrap(words)] if words else []
 
 
 def _more_reasons(found):
