@@ -39,6 +39,7 @@ OPTIC_MODULES = {
     "MetalMirror": "mirrors",
     "MuellerElement": "general",
     "ParityFlip": "mirrors",
+    "Perturbation": "perturbations",
     "PolarizedBackground": "fluxes",
     "PolarizedSource": "sources",
     "PowerLawMirror": "mirrors",

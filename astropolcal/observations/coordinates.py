@@ -6,6 +6,7 @@ from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.optics import COORDINATES
+from astropolcal.optics.positions import MOVES
 
 __all__ = ["angle_change", "clock", "frame_coordinate"]
 
@@ -30,6 +31,12 @@ def frame_coordinate(observations, name):
 
         ``"flc_state"`` is the state of a modulator, from the column of that name: 0 where it
         holds A (or 0), 1 where it holds B (or 1).
+
+        ``"frame"`` is the number of the frame, from 0.
+
+        ``"hwp_direction"`` and ``"derotator_direction"`` are 1 where the last move of that stage
+        was towards smaller angles, else 0; ``"hwp_move"`` and ``"derotator_move"`` are the size
+        of its move before the frame, in radian.
 
         ``"parallactic_rate"`` and ``"derotator_rate"`` are the changes of that angle from
         one frame to the next, in radian, in the order in which the frames were taken.
@@ -79,6 +86,10 @@ def frame_coordinate(observations, name):
         # affine in time, so that a drift has the same parameter whatever the unit of the clock
         passed = time - time.min()
         return passed / passed.max() if passed.max() > 0 else passed
+    if name == "frame":
+        return np.arange(observations.n_frames, dtype=float)
+    if name in MOVES:
+        return _last_move(time, observations.position(name.rpartition("_")[0]), name)
     if name.endswith("_rate"):
         return angle_change(observations, observations.position(name.removesuffix("_rate")))
     # (2, B, F): beam, wavelength, frame, as the optics of a chain want them
@@ -95,6 +106,20 @@ def frame_coordinate(observations, name):
     ratio = np.ones_like(fluxes)
     ratio[..., order[1:]] = fluxes[..., order[1:]] / fluxes[..., order[:-1]]
     return np.where(np.isnan(ratio), 1.0, ratio)
+
+
+def _last_move(time, angle, name):
+    """Return of every frame the last move of a stage: whether it was backwards, or its size."""
+    order = np.argsort(time, kind="stable")
+    steps = np.diff(angle[order], prepend=angle[order[:1]])
+    out = np.zeros_like(angle)
+    if name.endswith("_move"):
+        out[order] = np.abs(steps)
+        return out
+    # a stage that stays where it is was last moved as before
+    moved = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
+    out[order] = steps[moved] < 0
+    return out
 
 
 def angle_change(observations, angle):

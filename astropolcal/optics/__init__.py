@@ -23,6 +23,7 @@ from astropolcal.optics.modulated import (
     HarmonicRotator,
 )
 from astropolcal.optics.modulators import FerroelectricLiquidCrystal
+from astropolcal.optics.perturbations import GENERATORS, Dependence, Perturbation
 from astropolcal.optics.polarizers import (
     Diattenuator,
     DiattenuatorRetarder,
@@ -35,8 +36,10 @@ from astropolcal.optics.sources import PolarizedSource, StarSource
 
 __all__ = [
     "COORDINATES",
+    "GENERATORS",
     "OPTICS",
     "BeamGain",
+    "Dependence",
     "Depolarizer",
     "Diattenuator",
     "DiattenuatorRetarder",
@@ -56,6 +59,7 @@ __all__ = [
     "MuellerElement",
     "Optic",
     "ParityFlip",
+    "Perturbation",
     "PolarizedBackground",
     "PolarizedSource",
     "PowerLawMirror",
@@ -90,6 +94,7 @@ OPTICS = {
         MetalMirror,
         MuellerElement,
         ParityFlip,
+        Perturbation,
         PolarizedBackground,
         PolarizedSource,
         PowerLawMirror,

@@ -6,7 +6,7 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import angle_to_rad, to_unit
 
-__all__ = ["COORDINATES", "FLUXES", "RATES"]
+__all__ = ["COORDINATES", "FLUXES", "MOVES", "RATES"]
 
 #: Positions that differ between wavelengths and beams: the flux of the beam, and that flux
 #: over the one in the frame before.
@@ -15,9 +15,13 @@ FLUXES = ("flux", "total_flux", "previous_flux")
 #: By how much an angle changes from one frame to the next.
 RATES = ("parallactic_rate", "derotator_rate")
 
+#: The last move of a stage: 1 where it went backwards, else 0; and its size in radian.
+MOVES = tuple(f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move"))
+
 #: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
-#: modulator (0 or 1), the change of an angle from frame to frame, and the fluxes.
-COORDINATES = ("sequence", "flc_state", *RATES, *FLUXES)
+#: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame, the
+#: last moves of the stages, and the fluxes.
+COORDINATES = ("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES)
 
 
 def finite_position(value, name, stage=None):

@@ -1,0 +1,257 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+r"""
+A small error of any optic: a generator of Mueller matrices times a function of the frame.
+
+Every small change of a Mueller matrix is a sum of a few generators: three of retardance, three of
+diattenuation and four of depolarization (Gil & Ossikovski 2016, Polarized Light and the Mueller
+Matrix Approach, Chap. 5). A `Perturbation` is :math:`\exp(a\,f\,G)` with a size a, which may
+change with the wavelength, a function f of the frame, and one of the generators G.
+"""
+
+import re
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.modeling import Parameter
+
+from astropolcal.exceptions import ParameterError
+from astropolcal.optics.beamsplitters import BEAMS, _BeamOptic
+from astropolcal.optics.modulated import FrameOptic
+from astropolcal.optics.positions import COORDINATES
+from astropolcal.words import did_you_mean
+
+__all__ = ["GENERATORS", "Dependence", "Perturbation"]
+
+_I, _Q, _U, _V = range(4)
+
+
+def _generator(*entries):
+    out = np.zeros((4, 4))
+    for row, column, value in entries:
+        out[row, column] = value
+    return out
+
+
+#: Generator of each kind of perturbation. Those of retardance and rotation turn the Poincare
+#: sphere, those of diattenuation exchange intensity with polarization, and those of depolarization
+#: shrink one component against another. ``gain`` acts with opposite signs on the two beams.
+GENERATORS = {
+    "retardance_h": _generator((_U, _V, 1.0), (_V, _U, -1.0)),
+    "retardance_d": _generator((_Q, _V, -1.0), (_V, _Q, 1.0)),
+    # of T(angle), twice the angle on the sphere
+    "rotation": _generator((_Q, _U, 2.0), (_U, _Q, -2.0)),
+    "diattenuation_h": _generator((_I, _Q, 1.0), (_Q, _I, 1.0)),
+    "diattenuation_d": _generator((_I, _U, 1.0), (_U, _I, 1.0)),
+    "diattenuation_c": _generator((_I, _V, 1.0), (_V, _I, 1.0)),
+    "depolarization_linear": _generator((_Q, _Q, -1.0), (_U, _U, -1.0)),
+    "depolarization_h": _generator((_Q, _Q, -1.0), (_U, _U, 1.0)),
+    "depolarization_d": _generator((_Q, _U, -1.0), (_U, _Q, -1.0)),
+    "depolarization_circular": _generator((_V, _V, -1.0)),
+    "gain": np.eye(4),
+}
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """
+    How a perturbation depends on the frame.
+
+    Parameters
+    ----------
+    text : str
+        ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
+        ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``,
+        cosine and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last
+        move of the stage was backwards; ``"move:STAGE"``, the size of that move in radian;
+        ``"dataset:NAME"``, in one dataset only.
+
+    Raises
+    ------
+    ParameterError
+        If the text is none of these.
+
+    Examples
+    --------
+    >>> from astropolcal.optics.perturbations import Dependence
+    >>> turn = Dependence("harmonic:hwp:2")
+    >>> turn.driver, turn.count
+    ('hwp', 2)
+    >>> turn.waves(0.0).tolist()
+    [1.0, 0.0]
+    """
+
+    text: str
+
+    def __post_init__(self):
+        if not isinstance(self.text, str) or not _FORMS.fullmatch(self.text):
+            raise ParameterError(
+                f"dependence = {self.text!r}; allowed are constant, time, time2, step:FRAME, "
+                "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE and dataset:NAME"
+            )
+
+    @property
+    def parts(self):
+        """The words of the text between its colons."""
+        return self.text.split(":")
+
+    @property
+    def kind(self):
+        """The first word of the text."""
+        return self.parts[0]
+
+    @property
+    def driver(self):
+        """Name of the position that it follows, None where it is constant."""
+        if self.kind in ("constant", "dataset"):
+            return None
+        if self.kind == "harmonic":
+            return self.parts[1]
+        if self.kind in ("direction", "move"):
+            return f"{self.parts[1]}_{self.kind}"
+        return "frame" if self.kind in ("step", "frame") else "sequence"
+
+    @property
+    def count(self):
+        """Number of functions of the frame: two for a harmonic, else one."""
+        return 2 if self.kind == "harmonic" else 1
+
+    def waves(self, position):
+        """
+        Return the functions at positions of the driver, shape (count, ...).
+
+        Parameters
+        ----------
+        position : `~numpy.ndarray`
+            Radian or a number.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+        """
+        x = np.asarray(position, dtype=float)
+        if self.kind == "harmonic":
+            angle = int(self.parts[2]) * x
+            return np.stack([np.cos(angle), np.sin(angle)])
+        t = 2 * x - 1
+        wave = {
+            "constant": lambda: np.ones_like(x),
+            "dataset": lambda: np.ones_like(x),
+            "time": lambda: t,
+            "time2": lambda: t**2 - 1 / 3,
+            "step": lambda: (x >= int(self.parts[1])).astype(float),
+            "frame": lambda: (x == int(self.parts[1])).astype(float),
+            "direction": lambda: x,
+            "move": lambda: x,
+        }[self.kind]()
+        return wave[None]
+
+
+_FORMS = re.compile(
+    r"constant|time2?|(step|frame):\d+|harmonic:\w+:[1-9]\d?|(direction|move):\w+|dataset:.+"
+)
+
+
+class Perturbation(_BeamOptic, FrameOptic):
+    r"""
+    A small error of an optic: :math:`\exp\left[(a f_1 + b f_2)\,G\right]`.
+
+    G is a generator of Mueller matrices and the f are functions of the frame, see `Dependence`.
+
+    Parameters
+    ----------
+    amplitude : float or array_like
+        Size a: radian for retardance and rotation, else a share; scalar, or one value a
+        wavelength.
+    quadrature : float or array_like
+        Size b of the second function, the sine of a harmonic; 0 for all other dependences.
+    kind : str
+        Key of `GENERATORS`.
+    dependence : str
+        As `Dependence` takes it; the ``mount`` has to be its driver.
+    beam : {"right", "left"}
+        The beam that goes on in a chain; of consequence for ``"gain"`` only.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes.
+
+    Raises
+    ------
+    ParameterError
+        If kind or dependence is unknown.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import Perturbation
+    >>> drift = Perturbation(amplitude=0.02, kind="retardance_h", dependence="time", name="drift")
+    >>> drift.mount
+    'sequence'
+    >>> float(drift.mueller(position=1.0)[2, 3].round(5))
+    0.02
+    """
+
+    amplitude = Parameter(default=0.0, description="size of the first function")
+    quadrature = Parameter(default=0.0, description="size of the second function")
+
+    def __init__(self, *args, kind="retardance_h", dependence="constant", **kwargs):
+        if kind not in GENERATORS:
+            raise ParameterError(
+                f"Perturbation.kind = {kind!r}{did_you_mean(kind, GENERATORS)}; allowed are "
+                f"{', '.join(GENERATORS)}"
+            )
+        self._kind, self._dependence = kind, Dependence(dependence)
+        kwargs.setdefault("mount", self._dependence.driver)
+        super().__init__(*args, **kwargs)
+
+    @property
+    def kind(self):
+        """Key of the generator."""
+        return self._kind
+
+    @property
+    def dependence(self):
+        """How it depends on the frame (str)."""
+        return self._dependence.text
+
+    @property
+    def depends_on_beam(self):
+        """True for a gain, which has opposite signs in the two beams."""
+        return self._kind == "gain"
+
+    def _settings(self):
+        return super()._settings() | {"kind": self.kind, "dependence": self.dependence}
+
+    def _waves(self, coordinate):
+        waves = self._dependence.waves(coordinate)
+        return waves if len(waves) == 2 else (waves[0], np.zeros_like(waves[0]))
+
+    def _exponent(self, coordinate, amplitude, quadrature):
+        first, second = self._waves(coordinate)
+        return amplitude * first + quadrature * second
+
+    def _matrix(self, coordinate, amplitude, quadrature):
+        return self._exponential(self._exponent(coordinate, amplitude, quadrature))
+
+    def _exponential(self, x):
+        """Return exp(x G); G G G is G, -G (4 times that for rotations), or G is diagonal."""
+        generator = GENERATORS[self._kind]
+        x = np.asarray(x)[..., None, None]
+        if self._kind == "gain":
+            return (1 + BEAMS[self._beam] * x) * np.eye(4)
+        if self._kind in ("retardance_h", "retardance_d", "rotation"):
+            rate = 2.0 if self._kind == "rotation" else 1.0
+            unit = generator / rate
+            return np.eye(4) + np.sin(rate * x) * unit + (1 - np.cos(rate * x)) * unit @ unit
+        square = generator @ generator
+        # for a projector and its negative, sinh and cosh are those of the exponential as well
+        return np.eye(4) + np.sinh(x) * generator + (np.cosh(x) - 1) * square
+
+    def _derivatives(self, coordinate, amplitude, quadrature):
+        x = self._exponent(coordinate, amplitude, quadrature)
+        if self._kind == "gain":
+            slope = np.broadcast_to(BEAMS[self._beam] * np.eye(4), (*np.shape(x), 4, 4))
+        else:
+            slope = GENERATORS[self._kind] @ self._exponential(x)
+        return tuple(
+            np.broadcast_to(wave, np.shape(x))[..., None, None] * slope
+            for wave in self._waves(coordinate)
+        )
