@@ -317,7 +317,31 @@ class Sweep:
         #: Fluxes of the right and the left beam, (n_wavelengths, n_columns) each.
         self.fluxes = tuple(fluxes)
 
-    def derivatives(self, wanted, weights):
+    def crossings(self, wanted, weights):
+        """
+        Return what any small change of the matrix of an optic does to a weighted sum of fluxes.
+
+        A change of the matrix by E changes the sum by a . E s, with the light s that enters the
+        optic and the analyser row a behind it.
+
+        Parameters
+        ----------
+        wanted : sequence of int
+            Index of the optic in the chain; it has to stand in front of the beam splitter.
+        weights : pair of `~numpy.ndarray`
+            Weights of the right and the left flux, (n_wavelengths, n_columns).
+
+        Returns
+        -------
+        dict of int to tuple
+            a and s, (n_wavelengths, n_columns, 4) each, in the frame of the optic.
+        """
+        found = {}
+        self.derivatives([(index, _CROSSING) for index in wanted], weights, found)
+        shape = (*self._propagator.shape, 4)
+        return {i: tuple(np.broadcast_to(x, shape) for x in pair) for i, pair in found.items()}
+
+    def derivatives(self, wanted, weights, crossings=None):
         """
         Return derivatives of a weighted sum of the two fluxes of each column.
 
@@ -327,6 +351,8 @@ class Sweep:
             Index of the optic in the chain and of its parameter.
         weights : pair of `~numpy.ndarray`
             Weights of the right and the left flux, (n_wavelengths, n_columns).
+        crossings : dict, optional
+            Takes up what `crossings` returns.
 
         Returns
         -------
@@ -343,7 +369,7 @@ class Sweep:
             row[..., 0] = weight
             inward, pairs = _back(steps, row, [], by_optic, result)
             adjoint, behind = adjoint + inward, behind + pairs
-        _back(self._common, adjoint, behind, by_optic, result)
+        _back(self._common, adjoint, behind, by_optic, result, crossings)
         shape = self._propagator.shape
         return {key: np.broadcast_to(value, shape) for key, value in result.items()}
 
@@ -430,7 +456,11 @@ def _whole(flux, shape):
     return flux if flux.shape == shape else np.broadcast_to(flux, shape)
 
 
-def _back(steps, adjoint, behind, by_optic, result):
+# stands for a parameter where the crossing of an optic is asked for
+_CROSSING = -1
+
+
+def _back(steps, adjoint, behind, by_optic, result, crossings=None):
     """
     Carry the adjoint back through ``steps``, adding derivatives to ``result``.
 
@@ -445,6 +475,8 @@ def _back(steps, adjoint, behind, by_optic, result):
                 _add(result, (step.node.index, 0), 2 * _crossed(behind))
             continue
         pair = [(act_back(step.matrix, adjoint), step.light)]
+        if _CROSSING in wanted:
+            crossings[step.node.index] = (adjoint, step.light)
         if 0 in wanted:
             # d/dtheta of T(-theta) M T(theta), with T' = 2 G T
             _add(result, (step.node.index, 0), 2 * (_crossed(pair) - _crossed(behind)))
@@ -459,7 +491,7 @@ def _at_optic(step, wanted, adjoint, result):
     """Add the derivatives to the wanted parameters of one optic other than ``theta``."""
     derivatives = step.node.derivatives(step.values)
     for parameter in wanted:
-        if parameter:
+        if parameter > 0:
             changed = act(derivatives[parameter - 1], step.light)
             # a product with ones sums the four of a column faster than sum or einsum
             slope = (adjoint * changed) @ np.ones(4)

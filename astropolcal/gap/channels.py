@@ -129,13 +129,19 @@ class Channels:
         `~numpy.ndarray`
             Of the same shape; what is left has unit noise.
         """
-        weight, _ = self._whitening
-        out = np.empty(array.shape)
-        out[..., 0, :, :] = array[..., 0, :, :] * weight[0]
-        sums = self._sum_whitened(array[..., 1, :, :])
+        out = self.scaled(array)
+        sums = out[..., 1, :, :]
         flat = sums.reshape(*sums.shape[:-2], sums.shape[-2] * sums.shape[-1])
         flat = flat - (flat @ self.nuisance) @ self.nuisance.T
         out[..., 1, :, :] = flat.reshape(sums.shape)
+        return out
+
+    def scaled(self, array):
+        """Return residuals or derivatives over the noise, as `whiten` does, with the lamp in."""
+        weight, _ = self._whitening
+        out = np.empty(array.shape)
+        out[..., 0, :, :] = array[..., 0, :, :] * weight[0]
+        out[..., 1, :, :] = self._sum_whitened(array[..., 1, :, :])
         return out
 
     def _sum_whitened(self, array):

@@ -35,8 +35,8 @@ def frame_coordinate(observations, name):
         ``"frame"`` is the number of the frame, from 0.
 
         ``"hwp_direction"`` and ``"derotator_direction"`` are 1 where the last move of that stage
-        was towards smaller angles, else 0; ``"hwp_move"`` and ``"derotator_move"`` are the size
-        of its move before the frame, in radian.
+        was towards smaller angles, else 0; ``"hwp_move"`` and ``"derotator_move"`` are how far
+        it was moved before the frame, in radian with its sign.
 
         ``"parallactic_rate"`` and ``"derotator_rate"`` are the changes of that angle from
         one frame to the next, in radian, in the order in which the frames were taken.
@@ -109,12 +109,12 @@ def frame_coordinate(observations, name):
 
 
 def _last_move(time, angle, name):
-    """Return of every frame the last move of a stage: whether it was backwards, or its size."""
+    """Return of every frame the last move of a stage: whether it was backwards, or how far."""
     order = np.argsort(time, kind="stable")
     steps = np.diff(angle[order], prepend=angle[order[:1]])
     out = np.zeros_like(angle)
     if name.endswith("_move"):
-        out[order] = np.abs(steps)
+        out[order] = steps
         return out
     # a stage that stays where it is was last moved as before
     moved = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))

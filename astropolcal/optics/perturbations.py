@@ -63,7 +63,7 @@ class Dependence:
         ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
         ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``,
         cosine and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last
-        move of the stage was backwards; ``"move:STAGE"``, the size of that move in radian;
+        move of the stage was backwards; ``"move:STAGE"``, how far it was moved, in radian;
         ``"dataset:NAME"``, in one dataset only.
 
     Raises

@@ -15,7 +15,7 @@ FLUXES = ("flux", "total_flux", "previous_flux")
 #: By how much an angle changes from one frame to the next.
 RATES = ("parallactic_rate", "derotator_rate")
 
-#: The last move of a stage: 1 where it went backwards, else 0; and its size in radian.
+#: The last move of a stage: 1 where it went backwards, else 0; and how far, in radian.
 MOVES = tuple(f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move"))
 
 #: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a

@@ -162,6 +162,8 @@ class Context:
     tracking : tuple of (float, float)
         Law by which the half-wave plate of each dataset follows the sky, see
         `tracking_laws`.
+    datasets : tuple of str
+        Names of the datasets.
 
     Examples
     --------
@@ -175,12 +177,18 @@ class Context:
     flux: float = 1.0
     degree: object = "default"
     tracking: tuple = ()
+    datasets: tuple = ()
 
     @classmethod
     def of(cls, wavelength, observations):
         """Return what the datasets tell, on their common grid of wavelengths."""
         fluxes = [np.nanmedian(o.flux_right + o.flux_left) / 2 for o in observations]
-        return cls(wavelength, float(np.median(fluxes)), tracking=tracking_laws(observations))
+        return cls(
+            wavelength,
+            float(np.median(fluxes)),
+            tracking=tracking_laws(observations),
+            datasets=tuple(o.name for o in observations),
+        )
 
     def basis(self, degree, constant=True):
         """Return the law's basis; without its constant where that is known already."""
