@@ -6,7 +6,7 @@ Where the two differ, which effect that the model lacks causes it, how far the
 gap shrinks once the effect is in, and what stays unexplained.
 """
 
-from astropolcal.gap.attribution import Candidate, Score, scan
+from astropolcal.gap.attribution import Candidate, Scan, scan
 from astropolcal.gap.challenge import make_challenge, run_challenge
 from astropolcal.gap.diagnosis import Cause, Diagnosis, diagnose
 from astropolcal.gap.effects import EFFECTS, Effect, check_effect, get_effect, register_effect
@@ -28,7 +28,7 @@ __all__ = [
     "GapProblem",
     "HeldOut",
     "Model",
-    "Score",
+    "Scan",
     "Where",
     "check_effect",
     "diagnose",

@@ -11,6 +11,8 @@ _DETERMINED = 0.1
 _TINY = 1e-99
 # below this the residuals are more than noise
 _REMAINDER = 1e-4
+# above this the sum of squares alone is not conspicuous
+_CONSPICUOUS = 0.01
 _WIDTH = 80
 # the longest name of an effect in a table
 _LONGEST = 26
@@ -131,7 +133,7 @@ def has_sizes(entry):
     """Return whether the data determine each parameter of a cause somewhere, a list."""
     return [
         any(is_determined(std, one["limit"]) for std in np.ravel(np.array(one["std"], object)))
-        for one in entry["parameters"].values()
+        for one in entry["size"].values()
     ]
 
 
@@ -143,13 +145,12 @@ def cause(entry, ranks):
     title = entry["title"][0].upper() + entry["title"][1:]
     parts = [f"{title} ({entry['place']})."]
     parts.append(f"It explains {share(entry['explained'])} of what exceeds the noise.")
-    if None not in (entry["gap_cv_before_percent"], entry["gap_cv_after_percent"]):
+    if None not in (entry["left_out_before_percent"], entry["left_out_after_percent"]):
         parts.append(
-            f"Left-out frames: {percent(entry['gap_cv_before_percent'])} % without it, "
-            f"{percent(entry['gap_cv_after_percent'])} % with it."
+            f"Left-out frames: {percent(entry['left_out_before_percent'])} % without it, "
+            f"{percent(entry['left_out_after_percent'])} % with it."
         )
-    if entry["kind"] != "discrete":
-        parts.append(f"Scan, corrected for the number of effects: {p_is(entry['p_value'])}.")
+    parts.append(f"Its probability is {share(entry['probability'])}.")
     return " ".join([*parts, *details(entry, ranks)])
 
 
@@ -164,15 +165,14 @@ def details(entry, ranks):
 
 def open_aliases(entry, ranks):
     """Return the titles of the aliases of a cause that are no causes themselves."""
-    pairs = zip(entry["aliases"], entry["alias_titles"], strict=True)
-    return [title for name, title in pairs if name not in ranks]
+    return [one["title"] for one in entry["aliases"] if one["name"] not in ranks]
 
 
 def _of_aliases(entry, ranks):
     found, others = [], open_aliases(entry, ranks)
     if others:
         found.append(f"These data cannot tell it from: {'; '.join(others)}.")
-    both = [f"cause {ranks[name]}" for name in entry["aliases"] if name in ranks]
+    both = [f"cause {ranks[a['name']]}" for a in entry["aliases"] if a["name"] in ranks]
     if both:
         found.append(
             f"It resembles {listed(both)}: the data ask for both, "
@@ -204,7 +204,7 @@ def _of_size(entry):
 
 def _at_bound(entry):
     """Return at how many of its values a size is at a bound of the optic, in words."""
-    n = np.sum([np.size(one["value"]) for one in entry["parameters"].values()])
+    n = np.sum([np.size(one["value"]) for one in entry["size"].values()])
     at = entry.get("at_bound")
     if not at:
         return ""
@@ -244,7 +244,7 @@ def _how_large(content):
         )
     real = f"the gap is real (residuals as large by noise alone: {chance})"
     # a pattern can be certain where the sum of squares is not conspicuous
-    if content["gap_p_value"] > content["alpha"]:
+    if content["gap_p_value"] > _CONSPICUOUS:
         real = f"the residuals are no larger than noise ({chance}), but their pattern is not one"
     return (
         f"The model misses {_of_differences(frames)} by {before} % of polarization where the "
@@ -277,7 +277,7 @@ def _what(content):
             f"{_doubt(causes)}."
         )
     if causes[0]["aliases"]:
-        group = [causes[0]["title"], *causes[0]["alias_titles"]]
+        group = [causes[0]["title"], *(one["title"] for one in causes[0]["aliases"])]
         several = listed(group, "or", _NAMED)
         return (
             "The model lacks one of these, which the data cannot tell apart: "
@@ -288,7 +288,7 @@ def _what(content):
 
 def _doubt(causes):
     """Return how many of several causes may as well be other effects."""
-    names = {entry["effect"] for entry in causes}
+    names = {entry["name"] for entry in causes}
     several = sum(bool(open_aliases(entry, names)) for entry in causes)
     if not several:
         return ""
@@ -305,13 +305,9 @@ def _clearest(content):
 
 
 def _nothing(content):
-    least = min((s["p_value"] for s in content["scores"]), default=None)
-    if least is None:
-        return "There was no effect to try that the model does not contain."
-    return (
-        f"None of the {content['n_effects']} effects that were tried is needed (the least, "
-        f"corrected for their number: {p_is(least)})."
-    )
+    if not content["scores"]:
+        return "There was no cause to try that the model does not contain."
+    return f"None of the {content['n_effects']} causes that were tried is needed."
 
 
 def _what_is_left(content):
@@ -380,9 +376,9 @@ def _table_lines(content):
         return []
     rows = [("effect", "place", "explains", "left-out (%)")]
     for entry in causes:
-        errors = (entry["gap_cv_before_percent"], entry["gap_cv_after_percent"])
+        errors = (entry["left_out_before_percent"], entry["left_out_after_percent"])
         told = "-" if errors == (None, None) else " -> ".join(map(percent, errors))
-        rows.append((entry["effect"], entry["place"], short_share(entry["explained"]), told))
+        rows.append((entry["name"], entry["place"], short_share(entry["explained"]), told))
     # the place has what the other columns leave of the width
     a, _, c, d = (max(map(len, column)) for column in zip(*rows, strict=True))
     a = min(a, _LONGEST)
@@ -396,13 +392,12 @@ def _table_lines(content):
 
 
 def _cause_lines(entry, called):
-    lines = [f"  {sentence}" for sentence in entry["details"]]
-    if entry["kind"] != "discrete":
-        lines = [f"  Scan, corrected for the number of effects: {p_is(entry['p_value'])}.", *lines]
+    lines = [f"  Probability {share(entry['probability'])}."]
+    lines += [f"  {sentence}" for sentence in entry["details"]]
     return [
-        f"{called} {entry['rank']}: {entry['title']} ({entry['effect']})",
+        f"{called} {entry['rank']}: {entry['title']} ({entry['name']})",
         *lines,
-        *(f"  - {line}" for line in sizes(entry["parameters"])),
+        *(f"  - {line}" for line in sizes(entry["size"])),
     ]
 
 

@@ -14,7 +14,6 @@ from astropolcal.calibration import Calibration
 from astropolcal.calibration._directions import ranked
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import GapError
-from astropolcal.gap.attribution import Candidate, Score
 from astropolcal.gap.effects import Context, adapted, tracking_laws
 from astropolcal.gap.model import nominal_calibration, nominal_model
 from astropolcal.observations import common_wavelengths
@@ -51,8 +50,10 @@ def starting_model(calibration, observations, library, say):
     -------
     nominal : Model
         The nominal model.
-    alternatives : list of Candidate
-        The alternative with its aliases, or nothing.
+    base : Model
+        That of the alternative that beats it, or the nominal model again.
+    alternatives : list of Effect
+        The alternative and its aliases, or nothing.
 
     Raises
     ------
@@ -71,7 +72,7 @@ def starting_model(calibration, observations, library, say):
     >>> chain = charis.chain(derotator="linear")
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> observations = simulate(chain, charis.wavelength, frames, seed=1)
-    >>> starting_model(chain, [observations], EFFECTS.values(), print)[1]
+    >>> starting_model(chain, [observations], EFFECTS.values(), print)[2]
     []
     """
     given = calibration if isinstance(calibration, Calibration) else None
@@ -92,7 +93,8 @@ def starting_model(calibration, observations, library, say):
             best = nominal_calibration(edited, observations)
             if _misfit(best) < _FAR_BETTER * _misfit(given):
                 return _with_alternative(chains, observations, given, best, found)
-    return nominal_model(chains, observations, calibration=given), []
+    nominal = nominal_model(chains, observations, calibration=given)
+    return nominal, nominal, []
 
 
 def _tried(chains, observations, effects, say):
@@ -137,15 +139,8 @@ def _with_alternative(chains, observations, given, best, found):
     # what fits badly need not converge to be left behind
     nominal = nominal_model(chains, observations, calibration=given, like=model, fit=False)
     least, effect = found[0]
-    score = Score(effect, nominal.fit.chi2 - model.fit.chi2, 1, None, 1.0, 0.0)
-    top = Candidate(score, model, score.statistic, score.statistic, True)
     model.added[effect.name] = []
-    top.aliases = [
-        Candidate(Score(other, 0.0, 1, None, 1.0), None, 0.0, 0.0, True)
-        for misfit, other in found[1:]
-        if misfit < _ALIKE * least
-    ]
-    return nominal, [top]
+    return nominal, model, [effect, *(o for misfit, o in found[1:] if misfit < _ALIKE * least)]
 
 
 def thinned(chains, observations, count):

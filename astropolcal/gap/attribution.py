@@ -1,150 +1,330 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""
-Which effect causes the gap: scan of the library, alias groups, forward selection.
+r"""
+Evidence for every cause that a model may lack: cells and named effects.
 
-Every effect is scored at the fitted model: the squared length of the whitened
-residual's projection on what the effect adds to the model's tangent space is
-chi-square with its rank where the effect is absent (Rao 1948; the Lagrange
-multiplier test). The best few are fitted in full. What fits nearly as well as
-the best cannot be told from it and forms its alias group. An effect stays if
-frames left out of the fit are predicted better with it.
+The logarithm of the Bayes factor of a cause, beside all that the model can do already, has a
+closed form where the data are linear in it. With the normal equations S x = b of what the cause
+adds, sizes of standard deviation s, and eigenvalues l of S with the components p of b along their
+vectors, it is half the sum of :math:`s^2 p^2/(1 + s^2 l) - \ln(1 + s^2 l)`: the first term is what
+the cause explains, the second what its freedom costs. The size s is known within two orders of
+magnitude only and is averaged over.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
-from astropolcal.calibration._directions import ranked
-from astropolcal.gap.model import effect_tangent
+from astropolcal.gap.cells import Cell, Probes
+from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.problem import GapProblem
 
-__all__ = [
-    "Candidate",
-    "Score",
-    "best_of",
-    "choose",
-    "contenders",
-    "false_discovery",
-    "freed",
-    "scan",
-]
+__all__ = ["Candidate", "Scan", "false_discovery", "scan"]
 
-#: False discovery rate of the scan.
-ALPHA = 0.01
-#: The best candidates that are fitted in full.
-MOST_REFITTED = 8
-#: An effect fits nearly as well as another if it is this close in evidence.
-SAME_EVIDENCE = 10.0
-#: Fits of what gives the same data end with evidences that differ by less.
-EQUAL_EVIDENCE = 0.1
-_WORTH_A_REFIT = 0.4
-# lowering of chi-square by a full fit that is none
-_LEAST_GAIN = 1.0
-# the first fits end after so many steps; those this close to the best are carried on
-_FIRST_STEPS, _NEARLY = 12, 0.8
+# sizes of the prior, in units of the usual one
+_SIZES = (0.1, 1.0, 10.0)
+# laws in wavelength of a cell: one number, or a smooth curve
+_DEGREES = (0, 2)
+# named effects in one chain: building a chain costs as the square of its length
+_TOGETHER = 10
+#: Prior odds of a name against a cell of the table.
+NAMED = 5.0
+# log prior odds of dependences: what changes needs a reason
+_DEPENDENCE = {"constant": 0.0, "step": -5.0, "direction": -1.5, "move": -1.5, "time2": -1.0}
+_OTHER = -0.5
+# a direction of which model and lamp leave less than this is theirs
+_ABSORBED = 1e-9
 
 
 @dataclass
-class Score:
+class Candidate:
     """
-    Score of one effect.
+    A cause that a model may lack, and the evidence for it.
 
     Parameters
     ----------
     effect : Effect
-        The effect.
+        The cause as an effect that can be fitted.
+    cell : Cell or None
+        Its place, kind and dependence; None where it is no single cell.
     statistic : float
-        Expected lowering of chi-square.
+        By how much it lowers chi-square.
     rank : int
-        Number of directions that the effect adds.
-    basis : `~numpy.ndarray`
-        These directions, (n_rows, rank).
-    scale : float
-        Variance of the residuals around the model with the effect, at least 1.
-    p_value : float
-        Of the scan, corrected for the number of effects.
+        Number of directions that it adds.
+    evidence : float
+        Logarithm of the Bayes factor, with the prior odds of its kind.
+    prior : float
+        Logarithm of these odds.
+    spectrum : tuple
+        Eigenvalues of its normal equations, what lies along each, and the usual size.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from astropolcal.gap.attribution import Score
-    >>> Score(None, 30.0, 2, np.zeros((3, 2)), 1.0).single_p < 1e-6
-    True
+    >>> from astropolcal.gap.attribution import Candidate
+    >>> Candidate(None, None, 30.0, 2, 10.0).evidence
+    10.0
     """
 
     effect: object
+    cell: object
     statistic: float
     rank: int
-    basis: np.ndarray
-    scale: float
-    p_value: float = 1.0
+    evidence: float
+    prior: float = 0.0
+    spectrum: tuple = ()
+
+    def tempered(self, temper):
+        """
+        Return the same with residuals of another variance, in units of the noise.
+
+        Parameters
+        ----------
+        temper : float
+            The variance.
+
+        Returns
+        -------
+        Candidate
+        """
+        values, share, scale = self.spectrum
+        evidence = _log_factor(values[None], share[None], scale, temper)[0] + self.prior
+        return replace(self, evidence=float(evidence))
 
     @property
-    def single_p(self):
-        """Probability of the statistic by chance, for this effect alone."""
-        return float(stats.chi2.sf(self.statistic / self.scale, self.rank))
+    def name(self):
+        """Name of the effect; of a cell, its place, kind and dependence."""
+        return self.effect.name
 
-    def evidence(self, n_data):
-        """Return the statistic less what the parameters cost (Schwarz 1978)."""
-        return self.statistic / self.scale - self.rank * np.log(n_data)
+    @property
+    def is_named(self):
+        """Whether it has a name in the library."""
+        return not isinstance(self.effect, CellEffect)
+
+    @property
+    def p_value(self):
+        """Probability of the statistic by chance, for this cause alone."""
+        return float(stats.chi2.sf(self.statistic, max(self.rank, 1)))
 
 
-def scan(model, effects, *, residual=None, nominal=None, context=None):
+@dataclass
+class Scan:
     """
-    Score all effects at a fitted model.
+    Evidence for all causes at a fitted model.
+
+    Parameters
+    ----------
+    candidates : list of Candidate
+        Best first.
+    inflation : float
+        How far the statistics of all cells together exceed those of noise: 1 where noise is all
+        that is left.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.attribution import Scan
+    >>> Scan([], 1.0).best is None
+    True
+    """
+
+    candidates: list
+    inflation: float
+
+    @property
+    def best(self):
+        """The best candidate, or None."""
+        return self.candidates[0] if self.candidates else None
+
+
+def scan(model, effects=(), *, cells=True, temper=1.0):
+    """
+    Return the evidence for all cells and named effects beside a fitted model.
 
     Parameters
     ----------
     model : Model
         The fitted model.
     effects : sequence of Effect
-        Effects to score; those that are in the model or have no place in its
-        chains are left out, as are those that the model takes up entirely.
-    residual, nominal : `~numpy.ndarray`, optional
-        Whitened residual and tangent space, if known already.
-    context : Context, optional
-        By default that of the data.
+        Named effects; those that are in the model or have no place in it are left out.
+    cells : bool
+        Whether to ask for the cells as well.
+    temper : float
+        Variance of the residuals about the model with the cause, in units of the noise.
 
     Returns
     -------
-    list of Score
-        Best first.
+    Scan
 
     Examples
     --------
     >>> import astropy.units as u
     >>> from astropolcal import instruments
-    >>> from astropolcal.gap.attribution import scan
-    >>> from astropolcal.gap.effects import EFFECTS
+    >>> from astropolcal.gap import scan
     >>> from astropolcal.gap.model import nominal_model
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> model = nominal_model([charis.chain()], [observations])
-    >>> scores = scan(model, [EFFECTS["beam_gain"], EFFECTS["hwp_diattenuation"]])
-    >>> all(score.p_value > 0.001 for score in scores)
+    >>> model = nominal_model([chain], [simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)])
+    >>> bool(scan(model).best.evidence < 5)
     True
     """
-    nominal = model.problem.tangent(model.fit.coefficients) if nominal is None else nominal
-    residual = model.residual if residual is None else residual
-    # where the fit has not quite arrived the rest of the step is no effect
-    residual = residual - nominal @ (nominal.T @ residual)
-    total, freedom = residual @ residual, model.degrees_of_freedom(nominal)
-    context, chains, scores = context or model.context, model.chains, []
+    probes = Probes(model)
+    found, levels = [], []
+    if cells:
+        found = _cells(probes, temper)
+        levels = [(one.statistic, one.rank) for one in found]
+    found += _named(probes, effects, temper)
+    found.sort(key=lambda one: -one.evidence)
+    return Scan(found, _inflation(levels))
+
+
+def _cells(probes, temper):
+    """Return the candidate of every cell, with the better of its laws."""
+    problem, waves = probes.problem, probes.waves
+    single = [name for name, w in waves.items() if len(w[0]) == 1]
+    several = [name for name in waves if name not in single]
+    stacked = [np.concatenate([waves[n][i] for n in single]) for i in range(len(problem.datasets))]
+    own, best = set(probes.model.added), {}
+    for place, kind, degree, reduced in probes.reduced(_DEGREES):
+        scale = Cell(place, kind, "constant").scale
+        if probes.is_detector(kind):
+            # a constant in front of a derivative that follows the flux
+            parts = [(probes.dependence_of(kind), *(x[0] for x in reduced.normal(probes.ones)))]
+        else:
+            parts = list(zip(single, *reduced.normal(stacked), strict=True))
+            parts += [(name, *reduced.pair(waves[name])) for name in several]
+        for name, one in _candidates(place, kind, degree, parts, scale, temper):
+            if name not in best or best[name].evidence < one.evidence:
+                best[name] = one
+    return [one for one in best.values() if one.name not in own]
+
+
+def _candidates(place, kind, degree, parts, scale, temper):
+    """Yield name and candidate of normal equations (dependence, gram, target)."""
+    for size in dict.fromkeys(len(target) for _, _, target in parts):
+        same = [part for part in parts if len(part[2]) == size]
+        values, share = _spectra(np.stack([g for _, g, _ in same]), np.stack([t for *_, t in same]))
+        factors = _log_factor(values, share, scale, temper)
+        ranks = _rank(values, scale)
+        for (name, *_), own, part, factor, rank in zip(
+            same, values, share, factors, ranks, strict=True
+        ):
+            if rank:
+                cell, prior = Cell(place, kind, name), _prior(name)
+                yield (
+                    cell,
+                    Candidate(
+                        CellEffect(cell, degree),
+                        cell,
+                        float(part.sum()),
+                        int(rank),
+                        float(factor) + prior,
+                        prior,
+                        (own, part, scale),
+                    ),
+                )
+
+
+def _prior(dependence):
+    return _DEPENDENCE.get(dependence.partition(":")[0], _OTHER)
+
+
+def _spectra(gram, target):
+    """Return eigenvalues and what chi-square loses along each vector, of (n, k, k) and (n, k)."""
+    values, vectors = np.linalg.eigh(gram)
+    square = np.einsum("nij,ni->nj", vectors, target) ** 2
+    seen = values > _ABSORBED * np.maximum(values.max(axis=1, keepdims=True), 1.0)
+    values = np.where(seen, values, 0.0)
+    return values, np.divide(square, values, out=np.zeros_like(square), where=seen)
+
+
+def _log_factor(values, share, scale, temper):
+    """Return the log Bayes factor against no such cause, shape (n,)."""
+    spreads = np.square(scale * np.array(_SIZES))[:, None, None] / temper
+    gains = share / temper * (spreads * values / (1 + spreads * values))
+    each = 0.5 * (gains - np.log1p(spreads * values)).sum(axis=2)
+    return np.logaddexp.reduce(each, axis=0) - np.log(len(_SIZES))
+
+
+def _rank(values, scale):
+    """Return in how many directions even a large size would show."""
+    return (np.square(scale * _SIZES[-1]) * values > 1).sum(axis=-1)
+
+
+def _named(probes, effects, temper):
+    """Return the candidates of named effects, all of them at zero in the same chains."""
+    model, found = probes.model, []
+    chains = model.chains
+    waiting = [
+        effect
+        for effect in effects
+        if effect.name not in model.added and not effect.absorbed_by and effect.applies(chains)
+    ]
+    while waiting:
+        edited, parameters, ties, later = list(model.held_chains), {}, {}, []
+        for effect in waiting:
+            # what is absent does nothing to another, but two may free the same parameter
+            edit = effect.edit(edited, model.context)
+            names = {p.name for p in edit.parameters}
+            taken = {p.name for own in parameters.values() for p in own}
+            if names & taken or len(parameters) == _TOGETHER:
+                later.append(effect)
+                continue
+            edited, parameters[effect.name] = edit.chains, edit.parameters
+            ties |= {name: tie for name, tie in edit.ties.items() if tie.source in names}
+        found += _of_batch(probes, edited, parameters, ties, waiting, temper)
+        waiting = later
+    return found
+
+
+def _of_batch(probes, edited, parameters, ties, effects, temper):
+    """Return the candidates of effects that are in the same chains."""
+    laws = {p.name: p.basis for own in parameters.values() for p in own if p.basis is not None}
+    model = probes.model
+    problem = GapProblem(
+        edited, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
+    )
+    if not problem.size:
+        return []
+    slopes = problem.jacobian(problem.start)
+    seen = probes.tangent.T @ slopes
+    gram, target = slopes.T @ slopes - seen.T @ seen, slopes.T @ probes.residual
+    found = []
     for effect in effects:
-        if effect.name in model.added or effect.absorbed_by or not effect.applies(chains):
+        own = [p for p in parameters.get(effect.name, ()) if p.name in problem.slices]
+        if not own:
             continue
-        basis = effect_tangent(model, effect, nominal, context)
-        rank = basis.shape[1]
-        if rank:
-            statistic = float(np.sum((basis.T @ residual) ** 2))
-            # among structure everything is significant: it is measured by what it leaves
-            scale = max(1.0, (total - statistic) / max(freedom - rank, 1))
-            scores.append(Score(effect, statistic, rank, basis, scale))
-    for score, p in zip(scores, false_discovery([s.single_p for s in scores]), strict=True):
-        score.p_value = p
-    return [scores[i] for i in ranked([s.evidence(freedom) for s in scores], EQUAL_EVIDENCE)]
+        parts = [(problem.slices[p.name], p.canonical_scale) for p in own]
+        rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
+        size = np.concatenate([np.full(w.stop - w.start, scale) for w, scale in parts])
+        square = gram[np.ix_(rows, rows)] * size[:, None] * size
+        values, share = (part[0] for part in _spectra(square[None], (target[rows] * size)[None]))
+        if _rank(values, 1.0):
+            found.append(_with_name(effect, model, values, share, temper))
+    return found
+
+
+def _with_name(effect, model, values, share, temper):
+    cells = effect.cells(model.chains) if hasattr(effect, "cells") else ()
+    one = Candidate(
+        effect,
+        cells[0] if cells else None,
+        float(share.sum()),
+        int(_rank(values, 1.0)),
+        0.0,
+        float(np.log(NAMED)),
+        (values, share, 1.0),
+    )
+    return one.tempered(temper)
+
+
+def _inflation(levels):
+    """Return the median of statistics over what noise gives; the empirical null of Efron (2004)."""
+    if not levels:
+        return 1.0
+    statistic, rank = np.array(levels).T
+    # as fractions of the chi-square law: a level of noise has the quantile one half
+    middle = stats.chi2.median(np.maximum(rank, 1))
+    return max(1.0, float(np.median(statistic / middle)))
 
 
 def false_discovery(p_values):
@@ -172,235 +352,3 @@ def false_discovery(p_values):
     if not len(p_values):
         return []
     return [float(p) for p in stats.false_discovery_control(p_values, method="by")]
-
-
-@dataclass
-class Candidate:
-    """
-    An effect that was fitted in full, with those that cannot be told from it.
-
-    Parameters
-    ----------
-    score : Score
-        Its score.
-    model : Model
-        The model with the effect.
-    gain : float
-        Lowering of chi-square by the full fit, over the remaining scatter.
-    evidence : float
-        The same, less what the parameters cost.
-    physical : bool
-        Whether the fitted sizes are within the effect's limits.
-    aliases : list of Candidate
-        Those that fit nearly as well.
-    context : Context, optional
-        With which it was added, None for that of the data.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.attribution import Candidate
-    >>> Candidate(None, None, 30.0, 12.0, True).aliases
-    []
-    """
-
-    score: Score
-    model: object
-    gain: float
-    evidence: float
-    physical: bool
-    aliases: list = field(default_factory=list)
-    context: object = None
-
-    @property
-    def name(self):
-        """Name of the effect."""
-        return self.score.effect.name
-
-    @property
-    def recipe(self):
-        """Effect and context, as `Model.with_effects` takes them."""
-        return self.score.effect, self.context
-
-
-def choose(model, scores, **limits):
-    """
-    Fit the best effects in full, and return the best with its alias group.
-
-    Parameters
-    ----------
-    model, scores, **limits
-        As `contenders` takes them.
-
-    Returns
-    -------
-    Candidate or None
-        None if no effect is significant.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.attribution import choose
-    >>> choose(None, []) is None
-    True
-    """
-    return best_of(contenders(model, scores, **limits))
-
-
-def best_of(fitted):
-    """
-    Return the best of fitted effects with its alias group.
-
-    Parameters
-    ----------
-    fitted : list of Candidate
-        As `contenders` gives them.
-
-    Returns
-    -------
-    Candidate or None
-        None if there is none.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.attribution import best_of
-    >>> best_of([]) is None
-    True
-    """
-    if not fitted:
-        return None
-    top = fitted[0]
-    top.aliases = [
-        c for c in fitted[1:] if c.physical and top.evidence - c.evidence < SAME_EVIDENCE
-    ]
-    return top
-
-
-def contenders(model, scores, *, alpha=ALPHA, most=MOST_REFITTED):
-    """
-    Fit the best effects in full.
-
-    Parameters
-    ----------
-    model : Model
-        The model so far.
-    scores : list of Score
-        As `scan` gives them.
-    alpha : float
-        False discovery rate.
-    most : int
-        So many are fitted in full.
-
-    Returns
-    -------
-    list of Candidate
-        Best first; those of physical size before the others.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.attribution import contenders
-    >>> contenders(None, [])
-    []
-    """
-    significant = [s for s in scores if s.p_value < alpha]
-    if not significant:
-        return []
-    freedom = model.problem.n_data - model.problem.size
-    best = max(s.evidence(freedom) for s in significant)
-    # the scan is linear, a full fit may change the order: those not far behind are fitted too
-    worth = [s for s in significant if s.evidence(freedom) > min(_WORTH_A_REFIT * best, best - 20)][
-        :most
-    ]
-    fitted = [_fitted(model, score, freedom) for score in worth]
-    # an effect that data ask for beyond a bound of its optic, where it is absent, does nothing
-    fitted = [c for c in fitted if c.gain > _LEAST_GAIN]
-    if not fitted:
-        return []
-    best = max(c.evidence for c in fitted)
-    fitted = [
-        _polished(model, c, freedom) if c.evidence > min(_NEARLY * best, best - 20) else c
-        for c in fitted
-    ]
-    # what is out of its physical limits is no explanation while another one is left
-    top = _best_first(fitted)[0]
-    # all are measured by the scatter that the best one leaves
-    scale = max(1.0, top.model.fit.chi2 / max(freedom, 1))
-    for one in fitted:
-        one.gain = (model.fit.chi2 - one.model.fit.chi2) / scale
-        one.evidence = one.gain - one.score.rank * np.log(freedom)
-    return _best_first(fitted)
-
-
-def _best_first(fitted):
-    # what fits equally well stays in the order of the library
-    fitted = [fitted[i] for i in ranked([c.evidence for c in fitted], EQUAL_EVIDENCE)]
-    return sorted(fitted, key=lambda c: not c.physical)
-
-
-def _fitted(model, score, freedom):
-    return _candidate(model, score, model.with_effect(score.effect, steps=_FIRST_STEPS), freedom)
-
-
-def _polished(model, candidate, freedom):
-    if candidate.model.fit.converged:
-        return candidate
-    return _candidate(model, candidate.score, candidate.model.polished(), freedom)
-
-
-def _candidate(model, score, fresh, freedom):
-    physical = fresh.is_physical(score.effect.name)
-    gain = model.fit.chi2 - fresh.fit.chi2
-    scale = max(1.0, fresh.fit.chi2 / max(freedom, 1))
-    return Candidate(score, fresh, gain, gain / scale - score.rank * np.log(freedom), physical)
-
-
-def freed(model, candidate):
-    """
-    Give an effect one value a wavelength where the data ask for it.
-
-    Parameters
-    ----------
-    model : Model
-        The model without the effect.
-    candidate : Candidate
-        The effect with its stiff law.
-
-    Returns
-    -------
-    Candidate
-        The same where the stiff law is enough.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.attribution import choose, freed, scan
-    >>> from astropolcal.gap.effects import EFFECTS
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.optics import BeamGain
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> truth = charis.chain() | BeamGain(imbalance=0.01, name="flat")
-    >>> observations = simulate(truth, charis.wavelength, frames, seed=1)
-    >>> model = nominal_model([charis.chain()], [observations])
-    >>> candidate = choose(model, scan(model, [EFFECTS["beam_gain"]]))
-    >>> freed(model, candidate) is candidate
-    True
-    """
-    stiff, context = candidate.model, replace(model.context, degree=None)
-    names = [parameter.name for parameter in stiff.added[candidate.name]]
-    known = [stiff.problem.slices[name] for name in names]
-    before = sum(where.stop - where.start for where in known)
-    loose = model.with_effect(candidate.score.effect, context)
-    after = sum(
-        where.stop - where.start for where in (loose.problem.slices[name] for name in names)
-    )
-    freedom = max(model.problem.n_data - loose.problem.size, 1)
-    scale = max(1.0, loose.fit.chi2 / freedom)
-    gain = (stiff.fit.chi2 - loose.fit.chi2) / scale
-    if after == before or gain < (after - before) * np.log(freedom):
-        return candidate
-    if not loose.is_physical(candidate.name):
-        return candidate
-    lowered = (model.fit.chi2 - loose.fit.chi2) / scale
-    evidence = lowered - (candidate.score.rank + after - before) * np.log(freedom)
-    return Candidate(candidate.score, loose, lowered, evidence, True, candidate.aliases, context)

@@ -357,6 +357,8 @@ class Probes:
         self.tangent = problem.tangent(coefficients) if tangent is None else tangent
         residual = problem.residual(coefficients)
         self.residual = residual - self.tangent @ (self.tangent.T @ residual)
+        #: A function of the frame that is one everywhere, of each dataset.
+        self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
         self.waves = dependences(problem, most_steps)
         self.slopes = self._at_places()
@@ -409,9 +411,46 @@ class Probes:
                     slope = np.stack([_bilinear(*part[j], generator) for part in both])
                     found.setdefault((place, kind), {})[i] = slope * channel.valid
             right, left = sweep.fluxes
-            gain = np.stack([(r * right - l * left) for r, l in channel.slopes(sweep)])
+            gain = np.stack([(one * right - other * left) for one, other in channel.slopes(sweep)])
             found.setdefault(("detector", "gain"), {})[i] = gain * channel.valid
+            for kind, slope in self._at_detector(i, channel, sweep):
+                found.setdefault(("detector", kind), {})[i] = slope * channel.valid
         return found
+
+    def _at_detector(self, i, channel, sweep):
+        """Yield what background, nonlinearity, afterglow and crosstalk do to the channels."""
+        right, left = sweep.fluxes
+        fluxes = self.problem.fluxes[i]
+        if fluxes is None:
+            return
+        usual = np.median(fluxes)
+        # light that is added counts as much as the source gives in the frame, in these units
+        added = usual * (right + left) / np.maximum(fluxes.sum(axis=0), 1e-9 * usual)
+        order = np.argsort(channel.sequence, kind="stable")
+        before = np.zeros_like(fluxes)
+        before[..., order[1:]] = fluxes[..., order[:-1]]
+        afterglow = np.divide(before, fluxes, out=np.zeros_like(fluxes), where=fluxes > 0)
+        half = (left - right) / 2
+        changes = {
+            "background": (added, added),
+            "background_of_one_beam": (added, 0 * added),
+            "nonlinearity": (right * fluxes[0] / usual, left * fluxes[1] / usual),
+            "persistence": (right * afterglow[0], left * afterglow[1]),
+            "crosstalk": (half, -half),
+        }
+        for kind, (one, other) in changes.items():
+            slopes = [a * one + b * other for a, b in channel.slopes(sweep)]
+            yield kind, np.stack(slopes)
+
+    @staticmethod
+    def is_detector(kind):
+        """Whether a kind belongs to a detector, and has one dependence only."""
+        return kind in _DETECTOR
+
+    @staticmethod
+    def dependence_of(kind):
+        """Return the one dependence of a kind that belongs to a detector."""
+        return _DETECTOR[kind]
 
     # ---- normal equations --------------------------------------------------------------------
 

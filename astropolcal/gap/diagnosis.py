@@ -14,32 +14,38 @@ import numpy as np
 
 from astropolcal.exceptions import GapError
 from astropolcal.gap.alternatives import starting_model
-from astropolcal.gap.attribution import ALPHA, scan
+from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
+from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.model import Model
 from astropolcal.gap.selection import REMAINDER, select
 from astropolcal.gap.shrinkage import frame_groups
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
 
-# effects that explain less of the gap than this share, and leave no noise, are stand-ins for
-# what the library does not hold
-_EXPLAINED = 0.8
+# probabilities from which a cause is named, and from which it is located
+_SURE, _LIKELY = 0.9, 0.5
 
 
 @dataclass
 class Cause:
     """
-    One effect that the model lacked, with what cannot be told from it.
+    One cause that the model lacked, with what cannot be told from it.
 
     Parameters
     ----------
     effect : Effect
-        The effect.
-    aliases : list of str
-        Effects that explain the data nearly as well.
+        The cause as an effect, named or a cell.
+    cell : Cell or None
+        Its place, kind and dependence.
+    probability : float
+        That it, or one of its aliases, is a cause of the gap.
+    aliases : list of (Candidate, float)
+        What explains the data nearly as well, with its probability within the group.
+    share : float
+        Its own probability within the group.
     p_value : float
-        Of the scan, corrected for the number of effects.
+        Of the scan, for this cause alone.
     explained : float
         Share of the gap (excess of chi-square over the noise) that it explains.
     before, after : HeldOut or None
@@ -47,29 +53,40 @@ class Cause:
     physical : bool
         Whether its fitted size is a possible one.
     evidence : float
-        Lowering of chi-square over the remaining scatter, less the cost of the parameters.
+        Logarithm of the Bayes factor.
+    stability : float or None
+        Share of the halves of the wavelengths and of the left-out angles in which it is found.
 
     Examples
     --------
     >>> from astropolcal.gap import Cause
     >>> from astropolcal.gap.effects import get_effect
-    >>> Cause(get_effect("beam_gain"), [], 1e-9, 0.9).name
+    >>> Cause(get_effect("beam_gain"), None, 0.99, [], 1.0, 1e-9, 0.9).name
     'beam_gain'
     """
 
     effect: object
+    cell: object
+    probability: float
     aliases: list
+    share: float
     p_value: float
     explained: float
     before: object = None
     after: object = None
     physical: bool = True
     evidence: float = 0.0
+    stability: float | None = None
 
     @property
     def name(self):
-        """Name of the effect."""
+        """Name of the effect; of a cell, its place, kind and dependence."""
         return self.effect.name
+
+    @property
+    def is_named(self):
+        """Whether it has a name in the library."""
+        return not isinstance(self.effect, CellEffect)
 
 
 @dataclass
@@ -79,15 +96,15 @@ class Diagnosis:
 
     Parameters
     ----------
-    verdict : {"effect", "none", "unexplained"}
-        Whether an effect of the library explains the gap, there is none, or it
-        is real and stays unexplained.
+    verdict : {"none", "named", "located", "unexplained"}
+        There is no gap; its causes have names; they have a place, a kind and a dependence each;
+        or there is a gap that no cause of the table explains.
     nominal, improved : Model
         The model before, and with all causes in it.
     causes : list of Cause
         Largest first.
-    scores : list of Score
-        The scan at the nominal model.
+    scan : Scan
+        Evidence for all causes beside the nominal model.
     held_out : list of HeldOut
         Prediction errors before and after.
     gap_p_value : float
@@ -96,6 +113,10 @@ class Diagnosis:
         The same for the improved model.
     seconds : float
         Time spent.
+    frames : list of FrameFault
+        Frames that are not what the table says.
+    settings : dict
+        How it was asked.
 
     Examples
     --------
@@ -115,11 +136,12 @@ class Diagnosis:
     nominal: Model
     improved: Model
     causes: list
-    scores: list
+    scan: object
     held_out: list
     gap_p_value: float
     remainder_p_value: float
     seconds: float = 0.0
+    frames: list = field(default_factory=list)
     settings: dict = field(default_factory=dict)
 
     @property
@@ -162,7 +184,7 @@ def _gap_of_fit(model):
 
 
 def diagnose(
-    calibration, observations, *, effects="all", alpha=ALPHA, cross_validate=True, progress=None
+    calibration, observations, *, effects="all", cells=True, cross_validate=True, progress=None
 ):
     """
     Diagnose the gap between a model and measurements.
@@ -175,9 +197,10 @@ def diagnose(
     observations : Observations or sequence of Observations
         The datasets, used together.
     effects : "all" or sequence of str or Effect
-        The library to ask.
-    alpha : float
-        False discovery rate.
+        The names to ask for.
+    cells : bool
+        Whether to ask for every cell of places, kinds and dependences too; without it
+        the answer is one of the names, or none.
     cross_validate : bool
         Whether to check on left-out frames; without it the gaps are those of
         the fit itself.
@@ -218,16 +241,12 @@ def diagnose(
     groups = frame_groups(observations) if cross_validate else None
     _check_instruments(observations)
     say("fitting the nominal model")
-    nominal, causes = starting_model(calibration, observations, library, say)
-    base = causes[-1].model if causes else nominal
-    say("scanning the effects")
-    # what has a place depends on the alternative that was taken
-    library = adapted(library, base.chains)
-    # the alternatives were tried already, from the start: a scan of derivatives cannot see them
-    smooth = [effect for effect in library if effect.kind != "discrete"]
-    scores = scan(base, smooth)
-    selected, improved, history = select(base, scores, smooth, alpha, groups, say)
-    return _conclude(nominal, improved, causes, selected, scores, history, alpha, started)
+    nominal, base, exchanged = starting_model(calibration, observations, library, say)
+    say("looking for causes")
+    # what has a place depends on the alternative that was taken; the discrete ones were tried
+    smooth = [effect for effect in adapted(library, base.chains) if effect.kind != "discrete"]
+    selection = select(base, smooth, groups, say, cells=cells)
+    return _conclude(nominal, base, exchanged, selection, [], started)
 
 
 def _library(effects):
@@ -248,45 +267,65 @@ def _check_instruments(observations):
 # ---- conclusion --------------------------------------------------------------------------------
 
 
-def _conclude(nominal, improved, causes, selected, scores, history, alpha, started):
-    chosen = [*causes, *selected]
+def _conclude(nominal, base, exchanged, selection, frames, started):
+    improved = selection.model
     total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
     # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
-    before, found = nominal, []
-    errors = [None] * len(causes) + history[1:]
-    previous = [None] * len(causes) + history[:-1]
-    for candidate, after, earlier in zip(chosen, errors, previous, strict=True):
-        share = (before.fit.chi2 - candidate.model.fit.chi2) / total
-        found.append(
-            Cause(
-                effect=candidate.score.effect,
-                aliases=[alias.name for alias in candidate.aliases],
-                p_value=candidate.score.p_value,
-                explained=float(share),
-                before=earlier,
-                after=after,
-                # what was possible when it was chosen need not be so next to the others
-                physical=candidate.physical and improved.is_physical(candidate.name),
-                evidence=float(candidate.evidence),
-            )
-        )
-        before = candidate.model
-    gap_p, left_p = nominal.p_value, improved.p_value
-    explained = sum(cause.explained for cause in found)
-    if found and (explained > _EXPLAINED or left_p > REMAINDER):
-        verdict = "effect"
-    else:
-        verdict = "unexplained" if left_p < REMAINDER else "none"
+    causes = [_exchanged(nominal, base, exchanged, total)] if exchanged else []
+    before = base
+    errors = [None] * len(selection.groups) if None in selection.history else selection.history
+    for i, group in enumerate(selection.groups):
+        explained = (before.fit.chi2 - group.model.fit.chi2) / total
+        causes.append(_cause(group, improved, explained, *errors[i : i + 2]))
+        before = group.model
+    left_p = improved.p_value
     return Diagnosis(
-        verdict=verdict,
+        verdict=_verdict(causes, nominal, left_p),
         nominal=nominal,
         improved=improved,
-        causes=found,
-        scores=scores,
-        held_out=[h for h in history if h is not None],
-        gap_p_value=gap_p,
+        causes=causes,
+        scan=selection.scan,
+        held_out=[h for h in selection.history if h is not None],
+        gap_p_value=nominal.p_value,
         remainder_p_value=left_p,
         seconds=time.perf_counter() - started,
-        settings={"alpha": alpha},
+        frames=frames,
+        settings={"unlisted": selection.unlisted},
     )
+
+
+def _exchanged(nominal, base, exchanged, total):
+    """Return the cause that an exchanged optic or sign is."""
+    effect, *others = exchanged
+    aliases = [(Candidate(other, None, 0.0, 1, 0.0), 1 / len(exchanged)) for other in others]
+    share = (nominal.fit.chi2 - base.fit.chi2) / total
+    return Cause(effect, None, 0.99, aliases, 1 / len(exchanged), 0.0, float(share))
+
+
+def _cause(group, improved, explained, before=None, after=None):
+    (best, share), *aliases = group.members
+    return Cause(
+        effect=best.effect,
+        cell=best.cell,
+        probability=group.probability,
+        aliases=aliases,
+        share=share,
+        p_value=best.p_value,
+        explained=float(explained),
+        before=before,
+        after=after,
+        physical=improved.is_physical(best.name) if best.name in improved.added else True,
+        evidence=float(best.evidence),
+        stability=group.stability,
+    )
+
+
+def _verdict(causes, nominal, left_p):
+    """Return what can be said of the gap."""
+    if not causes:
+        return "unexplained" if left_p < REMAINDER else "none"
+    sure = min(cause.probability for cause in causes)
+    if sure >= _SURE and all(cause.is_named for cause in causes):
+        return "named"
+    return "located" if sure >= _LIKELY else "unexplained"

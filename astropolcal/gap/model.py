@@ -16,6 +16,7 @@ from astropolcal.gap.effects import Context
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
+from astropolcal.optics import Perturbation
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
@@ -248,8 +249,13 @@ class Model:
             beyond = np.maximum(low - vector, vector - high)[where]
             if np.any(beyond > _AT_LIMIT * parameter.canonical_limit):
                 return False
-        # bounds that an effect sets itself may be those of no optic
-        matrices = [leaf.mueller(self.problem.wavelength * u.um) for leaf in self._carriers(name)]
+        # bounds that an effect sets itself may be those of no optic; a perturbation is a change of
+        # an optic, and need not be one by itself
+        matrices = [
+            leaf.mueller(self.problem.wavelength * u.um)
+            for leaf in self._carriers(name)
+            if not isinstance(leaf, Perturbation)
+        ]
         return all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
 
     def _carriers(self, name):

@@ -19,7 +19,7 @@ from astropolcal.calibration._directions import ranked
 from astropolcal.chain import stages
 from astropolcal.exceptions import GapError, ParameterError
 from astropolcal.gap._forecast import LEAST_GAIN, MODULATOR, STATES, Foreseen, Known, separation
-from astropolcal.gap.effects import EFFECTS, Roles, get_effect
+from astropolcal.gap.effects import Roles, get_effect
 from astropolcal.gap.model import nominal_model
 from astropolcal.optics import COORDINATES
 
@@ -205,8 +205,8 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=4):
     ----------
     model : Model
         The fitted model without the effects.
-    effects : sequence of str
-        Names of an alias group.
+    effects : sequence of str or Effect
+        An alias group.
     members : dict of str to Model, optional
         The model fitted with each of the effects, if known already.
     candidates : sequence of Exposure, optional
@@ -243,9 +243,10 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=4):
     []
     """
     members = dict(members or {})
-    for name in effects:
+    known = {one.name: one for one in map(get_effect, effects)}
+    for name, effect in known.items():
         if name not in members:
-            members[name] = _with_effect(model, name)
+            members[name] = _with_effect(model, effect)
     pairs = list(combinations(members, 2))
     everyone = [model, *members.values()]
     if candidates is None:
@@ -270,7 +271,7 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=4):
             for a, b in pairs:
                 # whichever of both is the truth, the other has to fail
                 gain = min(separation(old, new, a, b, j), separation(old, new, b, a, j))
-                purpose = f"tells {_titled(a)} from {_titled(b)}"
+                purpose = f"tells {_titled(a, known)} from {_titled(b, known)}"
                 _note(lists[a, b], exposure, (a, b), gain, purpose)
             if n_open:
                 names, gain, count = old[None].fixes(new[None].columns(j))
@@ -282,8 +283,8 @@ def plan(model, effects=(), *, members=None, candidates=None, limit=4):
     return _best([*lists.values(), fixing], limit)
 
 
-def _with_effect(model, name):
-    effect = get_effect(name)
+def _with_effect(model, effect):
+    name = effect.name
     if not effect.applies(model.chains):
         raise GapError(f"effect {name!r} has no place in these chains")
     if effect.kind == "discrete":
@@ -319,8 +320,8 @@ def _groups(candidates):
     return list(setups.values())
 
 
-def _titled(name):
-    return f"{EFFECTS[name].title} ({name})" if name in EFFECTS else name
+def _titled(name, known):
+    return f"{known[name].title} ({name})" if name in known else name
 
 
 def _note(rows, exposure, names, gain, purpose):

@@ -27,6 +27,8 @@ _DPI = 130
 # pixels of a page to an inch
 _CSS = 96
 _MOST_SCORES = 8
+# aliases that exposures are sought to tell apart
+_MOST_RIVALS = 3
 
 
 # ---- for machines ------------------------------------------------------------------------
@@ -73,7 +75,7 @@ def to_dict(diagnosis):
     after = before if same else _numbers.accuracies(diagnosis.improved, crossed)
     fitted = _numbers.Fitted(diagnosis.improved)
     causes = [_cause(diagnosis, i, fitted) for i in range(len(diagnosis.causes))]
-    ranks = {cause["effect"]: cause["rank"] for cause in causes}
+    ranks = {cause["name"]: cause["rank"] for cause in causes}
     for cause in causes:
         cause["details"] = _words.details(cause, ranks)
         cause["words"] = _words.cause(cause, ranks)
@@ -91,11 +93,13 @@ def to_dict(diagnosis):
         "shrinkage_percent": _shrinkage(diagnosis, before, after),
         "gap_p_value": diagnosis.gap_p_value,
         "remainder_p_value": diagnosis.remainder_p_value,
-        "where": _where(diagnosis),
+        "unlisted_probability": diagnosis.settings.get("unlisted"),
+        "frames": [fault.to_dict() for fault in diagnosis.frames],
+        "where": _where(diagnosis.nominal),
+        "where_left": [] if same else _where(diagnosis.improved),
         "causes": causes,
-        "scores": [_score(score) for score in diagnosis.scores[:_MOST_SCORES]],
-        "n_effects": len(diagnosis.scores),
-        "alpha": diagnosis.settings.get("alpha"),
+        "scores": [_score(one) for one in diagnosis.scan.candidates[:_MOST_SCORES]],
+        "n_effects": len(diagnosis.scan.candidates),
         "accuracy_before": before,
         "accuracy_after": after,
         "next_observations": _next(diagnosis),
@@ -128,20 +132,24 @@ def _cause(diagnosis, i, fitted):
         after = diagnosis.held_out[0]
     entry = {
         "rank": i + 1,
-        "effect": cause.name,
+        "probability": cause.probability,
+        "name": cause.name,
+        "effect": cause.name if cause.is_named else None,
         "title": cause.effect.title,
+        "cell": cause.cell.to_dict() if cause.cell else None,
         "place": cause.effect.place,
         "kind": cause.effect.kind,
         "shows": cause.effect.shows,
         "reference": cause.effect.reference,
-        "aliases": list(cause.aliases),
-        "alias_titles": [_title(name) for name in cause.aliases],
+        "share": cause.share,
+        "aliases": [_alias(one, chance) for one, chance in cause.aliases],
         "p_value": cause.p_value,
         "explained": cause.explained,
         "evidence": cause.evidence,
-        "gap_cv_before_percent": before.percent if before else None,
-        "gap_cv_after_percent": after.percent if after else None,
-        "parameters": fitted.sizes(cause.name),
+        "left_out_before_percent": before.percent if before else None,
+        "left_out_after_percent": after.percent if after else None,
+        "stability": cause.stability,
+        "size": fitted.sizes(cause.name),
         "significance": fitted.significance(cause.name),
         "physical": bool(cause.physical),
         "at_bound": diagnosis.improved.at_bound(cause.name),
@@ -152,25 +160,30 @@ def _cause(diagnosis, i, fitted):
     return entry | {"trades_with": fitted.trades(cause.name) if open_size else []}
 
 
-def _title(name):
-    from astropolcal.gap.effects import EFFECTS, get_effect
-
-    return get_effect(name).title if name.partition(":")[0] in EFFECTS else name
-
-
-def _score(score):
+def _alias(candidate, chance):
     return {
-        "effect": score.effect.name,
-        "title": score.effect.title,
-        "statistic": score.statistic,
-        "rank": score.rank,
-        "p_value": score.p_value,
+        "name": candidate.name,
+        "effect": candidate.name if candidate.is_named else None,
+        "title": candidate.effect.title,
+        "cell": candidate.cell.to_dict() if candidate.cell else None,
+        "probability": chance,
     }
 
 
-def _where(diagnosis):
-    """Return where the gap of the nominal model lies."""
-    return list(locate(diagnosis.nominal).entries)
+def _score(one):
+    return {
+        "name": one.name,
+        "effect": one.name if one.is_named else None,
+        "title": one.effect.title,
+        "statistic": one.statistic,
+        "rank": one.rank,
+        "evidence": one.evidence,
+    }
+
+
+def _where(model):
+    """Return where the gap of a model lies."""
+    return list(locate(model).entries)
 
 
 def _next(diagnosis):
@@ -185,7 +198,8 @@ def _next(diagnosis):
         last = i + 1 == len(smooth)
         fresh = diagnosis.improved if last else model.with_effect(cause.effect)
         if cause.aliases:
-            found += plan(model, [cause.name, *cause.aliases], members={cause.name: fresh})
+            rivals = [one.effect for one, _ in cause.aliases[:_MOST_RIVALS]]
+            found += plan(model, [cause.effect, *rivals], members={cause.name: fresh})
         model = fresh
     return few(found) or plan(diagnosis.improved)
 
@@ -216,7 +230,7 @@ def causes_table(diagnosis):
     Returns
     -------
     `~astropy.table.QTable`
-        Columns ``rank``, ``effect``, ``place``, ``cannot_be_told_from``, ``p_value``,
+        Columns ``rank``, ``effect``, ``place``, ``cannot_be_told_from``, ``probability``,
         ``explained``, ``physical``, ``gap_before`` and ``gap_after`` (percent of
         polarization on left-out frames, NaN where there was no cross-validation).
 
@@ -242,8 +256,10 @@ def causes_table(diagnosis):
             "rank": np.arange(1, len(causes) + 1),
             "effect": np.array([c.name for c in causes], dtype=str),
             "place": np.array([c.effect.place for c in causes], dtype=str),
-            "cannot_be_told_from": np.array([", ".join(c.aliases) for c in causes], dtype=str),
-            "p_value": np.array([c.p_value for c in causes], dtype=float),
+            "cannot_be_told_from": np.array(
+                [", ".join(one.name for one, _ in c.aliases) for c in causes], dtype=str
+            ),
+            "probability": np.array([c.probability for c in causes], dtype=float),
             "explained": np.array([c.explained for c in causes], dtype=float),
             "physical": np.array([c.physical for c in causes], dtype=bool),
             "gap_before": before,

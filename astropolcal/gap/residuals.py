@@ -23,13 +23,15 @@ from scipy import stats
 from astropolcal.calibration._directions import ranked
 from astropolcal.exceptions import GapError
 from astropolcal.gap._places import most_uneven, places
-from astropolcal.gap.attribution import ALPHA, false_discovery
+from astropolcal.gap.attribution import false_discovery
 from astropolcal.gap.channels import CHANNELS
 from astropolcal.gap.patterns import badly_separated, frame_patterns
 from astropolcal.gap.problem import law_basis
 
 __all__ = ["Where", "locate"]
 
+#: False discovery rate below which a look counts.
+ALPHA = 0.01
 _SMOOTH = 2
 # a direction of which the model takes up more than this is none of the axis
 _ABSORBED = 1e-3

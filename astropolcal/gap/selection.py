@@ -1,83 +1,153 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Forward selection of effects, checked on left-out frames, with exchanges.
+Joint choice of the causes that a model lacks, with probabilities.
 
-The best effect is added, the scan repeated at the better model, and so on while
-left-out frames are predicted better. What was chosen first was chosen while the
-others were missing: next to all the others, each effect is then exchanged if
-another one explains the data clearly better, and dropped if it is not needed.
+Sets of causes grow side by side: the best few sets are kept, each is fitted in full, and the scan
+is repeated beside it until no cause is missed any more. Then every cause of the best set is looked
+at beside all the others: what explains the data nearly as well in its place is its alias group. An
+answer of several unrelated causes is less probable than one cause that no table has, and what the
+set leaves lowers the probability of all its causes.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
-from astropolcal.calibration._directions import ranked
-from astropolcal.gap.attribution import (
-    EQUAL_EVIDENCE,
-    SAME_EVIDENCE,
-    best_of,
-    choose,
-    contenders,
-    freed,
-    scan,
-)
+from astropolcal.gap.attribution import scan
+from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.shrinkage import held_out
 
-__all__ = ["REMAINDER", "select"]
+__all__ = ["Group", "Selection", "select"]
 
 #: Residuals less probable than this are no noise.
 REMAINDER = 1e-4
-_MOST_CAUSES = 6
-# so many effects may be refused by left-out frames before the selection ends
-_MOST_REFUSED = 3
-# an effect that explains less of a significant gap than this is no cause of it
-_LEAST_SHARE = 0.05
-# above this mean square the residuals are no noise, and held-out frames have the last word
+#: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
+ENOUGH = 9.0
+_MOST = 6
+# so many sets grow side by side, and so many of their continuations are fitted in full
+_WIDTH, _FITTED = 3, 6
+# causes that lower chi-square by shares closer than this are the same for these data
+_SAME = 1e-6
+# an alias is no less probable than this against the best; so many are listed
+_ALIAS, _MOST_ALIASES = np.exp(-7.0), 40
+# prior probability that a gap has no cause of the table, by the number of causes that an answer
+# needs
+_UNLISTED = (0.0, 0.02, 0.06, 0.4, 0.7, 0.85, 0.9)
+# above this mean square the residuals are no noise
 _STRUCTURED = 1.5
-# so many are fitted in full where an effect might be exchanged
-_RIVALS = 4
-# so many first effects are tried with a second one
-_LOOKED_AHEAD = 4
-_EXCHANGED_AT = (2,)
-# an effect that explains this share gives way to one other alone, and only if that is simpler
-# or what is left falls to this share; what takes another out of its limits has to do as well
-_MAIN, _CLEARLY = 0.5, 2 / 3
+# share of the gap that an answer may leave before it is doubtful
+_LEFT = 0.1
 
 
-def select(base, scores, library, alpha, groups, say):
+@dataclass
+class Group:
     """
-    Choose the effects that a model lacks.
+    One cause, with all that cannot be told from it.
+
+    Parameters
+    ----------
+    members : list of (Candidate, float)
+        Candidates and their probabilities among each other, best first.
+    probability : float
+        That one of the members is a cause of the gap.
+    model : Model
+        The model with this cause and all chosen before it.
+    stability : float
+        Share of the halves of the wavelengths and of left-out angles in which it is found.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.attribution import Candidate
+    >>> from astropolcal.gap.selection import Group
+    >>> Group([(Candidate(None, None, 30.0, 2, 10.0), 1.0)], 0.9).best.evidence
+    10.0
+    """
+
+    members: list
+    probability: float
+    model: object = None
+    stability: float = 1.0
+
+    @property
+    def best(self):
+        """The most probable candidate."""
+        return self.members[0][0]
+
+
+@dataclass
+class Selection:
+    """
+    The causes that were chosen.
+
+    Parameters
+    ----------
+    groups : list of Group
+        The causes, in the order in which they were added.
+    model : Model
+        With all of them.
+    scan : Scan
+        Evidence beside the base.
+    left : Scan
+        Evidence beside the model.
+    unlisted : float
+        Probability that the gap has a cause that no table has.
+    history : list of HeldOut or None
+        Errors on left-out frames of the base and after each cause.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.selection import Selection
+    >>> Selection([], None, None, None, 0.0, []).groups
+    []
+    """
+
+    groups: list
+    model: object
+    scan: object
+    left: object
+    unlisted: float
+    history: list
+
+
+@dataclass
+class _State:
+    """A set of causes, its model, and the logarithm of its evidence."""
+
+    model: object
+    chosen: list = field(default_factory=list)
+    evidence: float = 0.0
+
+    @property
+    def outline(self):
+        return frozenset(one.name for one in self.chosen)
+
+
+def select(base, library, groups, say, *, cells=True):
+    """
+    Choose the causes that a model lacks.
 
     Parameters
     ----------
     base : Model
         The fitted model.
-    scores : list of Score
-        The scan at it.
     library : sequence of Effect
-        Effects that are not discrete.
-    alpha : float
-        False discovery rate.
+        Named effects that are not discrete.
     groups : tuple or None
-        As `frame_groups` gives them; None to trust the scan alone.
+        As `frame_groups` gives them; None to trust the evidence alone.
     say : callable
         Called with a line on what is done next.
+    cells : bool
+        Whether to ask for cells as well as for names.
 
     Returns
     -------
-    selected : list of Candidate
-        In the order in which they were added.
-    model : Model
-        With all of them.
-    history : list of HeldOut or None
-        Errors on left-out frames of the base and after each effect.
+    Selection
 
     Examples
     --------
     >>> import astropy.units as u
     >>> from astropolcal import instruments
-    >>> from astropolcal.gap.effects import EFFECTS
     >>> from astropolcal.gap.model import nominal_model
     >>> from astropolcal.gap.selection import select
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -85,197 +155,192 @@ def select(base, scores, library, alpha, groups, say):
     >>> chain = charis.chain(derotator="linear")
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> model = nominal_model([chain], [simulate(chain, charis.wavelength, frames, seed=1)])
-    >>> select(model, [], EFFECTS.values(), 0.01, None, print)[0]
-    looking for effect 1, at most 6
+    >>> select(model, [], None, lambda line: None).groups
     []
     """
-    selected, history = _forward(base, scores, library, alpha, groups, say)
-    selected, history = _exchanged(base, selected, history, library, alpha, groups, say)
-    return selected, selected[-1].model if selected else base, history
-
-
-def _forward(base, scores, library, alpha, groups, say):
-    """Add effects one by one; return candidates and held-out errors."""
-    model, selected, refused = base, [], 0
-    history = [_errors(base, groups)]
-    while len(selected) < _MOST_CAUSES and refused < _MOST_REFUSED:
-        say(f"looking for effect {len(selected) + 1}, at most {_MOST_CAUSES}")
-        pick = choose if selected else _looking_ahead
-        candidate = pick(model, scores, alpha=alpha)
-        if candidate is None or not _worthy(model, candidate):
-            break
-        candidate = freed(model, candidate)
-        say(f"left-out frames with: {candidate.score.effect.title}")
-        possible = candidate.physical and not _pushes(candidate.model, model)
-        errors = _errors(candidate.model, groups) if possible else None
-        scatter = candidate.model.mean_square
-        if not (possible and _holds(errors, history[-1], scatter)):
-            refused += 1
-            scores = [score for score in scores if score.effect.name != candidate.name]
-            continue
-        selected.append(candidate)
-        history.append(errors)
-        # the first choices are the least certain while much is unexplained
-        if scatter > _STRUCTURED and len(selected) in _EXCHANGED_AT:
-            selected, history = _exchanged(base, selected, history, library, alpha, groups, say)
-        model = selected[-1].model
-        scores = scan(model, _without_aliases(library, selected))
-    return selected, history
-
-
-def _looking_ahead(model, scores, *, alpha):
-    """
-    Return the first effect: where much is left, the one that does best with a second one.
-
-    What a single effect explains best while another large one is missing is often a
-    makeshift for both.
-    """
-    fitted = contenders(model, scores, alpha=alpha)
-    if not fitted or fitted[0].model.mean_square < _STRUCTURED:
-        return best_of(fitted)
-    library = [score.effect for score in scores]
-    ends = []
-    for one in [c for c in fitted if c.physical][:_LOOKED_AHEAD]:
-        second = choose(one.model, scan(one.model, library), alpha=alpha, most=_RIVALS)
-        # with its name, and the model with both
-        end = (None, one.model) if second is None else (second.name, second.model)
-        ends.append((one, *end))
-    if not ends:
-        return fitted[0]
-    evidence = [_advantage(item[2], model) for item in ends]
-    best, next_to, end = ends[ranked(evidence, EQUAL_EVIDENCE)[0]]
-    # next to the same second effect: two that are both needed do as well in either order
-    best.aliases = [
-        one
-        for one, second, other in ends
-        if one is not best and second == next_to and _advantage(end, other) < SAME_EVIDENCE
-    ]
-    return best
-
-
-def _without_aliases(library, chosen):
-    """Return the library less what cannot be told from an effect that is in the model."""
-    known = {alias.name for candidate in chosen for alias in candidate.aliases}
-    return [effect for effect in library if effect.name not in known]
-
-
-def _worthy(model, candidate):
-    """Whether a candidate explains enough of what is left, or all that is to be explained."""
-    excess = model.fit.chi2 - (model.problem.n_data - model.problem.size)
-    lowered = model.fit.chi2 - candidate.model.fit.chi2
-    left = candidate.model.p_value
-    return left > REMAINDER or lowered > _LEAST_SHARE * max(excess, 1e-300)
-
-
-def _pushes(new, old):
-    """Whether a model takes an effect out of its limits that another leaves within, for little."""
-    pushed = (new.impossible() & old.added.keys()) - old.impossible()
-    return bool(pushed) and new.fit.chi2 > _CLEARLY * old.fit.chi2
-
-
-def _holds(errors, before, scatter):
-    if errors is None:
-        return True
-    # among pure noise the scan is to be trusted, unless left-out frames speak against it
-    if scatter < _STRUCTURED:
-        return errors.better_than(before) > -2
-    return errors.better_than(before) > 1 and errors.squares.sum() < before.squares.sum()
+    first = _scanned(base, library, cells)
+    best, left = _search(base, library, first, say, cells)
+    if not best.chosen:
+        return Selection([], base, first, first, 0.0, [_errors(base, groups)])
+    best = _freed(base, best)
+    best, models, history = _checked(base, best, groups, say)
+    left = left if best.model is models[-1] and left is not None else None
+    unlisted = _unlisted(base, best)
+    found = _grouped(base, best, models, library, first, unlisted, cells)
+    return Selection(found, best.model, first, left, unlisted, history)
 
 
 def _errors(model, groups):
     return None if groups is None else held_out(model, groups)
 
 
-# ---- exchanges -------------------------------------------------------------------------------
+def _checked(base, best, groups, say):
+    """
+    Return the set without causes that left-out frames speak against.
+
+    With it, the models with one cause more each, and their errors on left-out frames.
+    """
+    while True:
+        say("left-out frames")
+        models = _growing(base, best)
+        history = [_errors(model, groups) for model in (base, *models)]
+        worse = [
+            i
+            for i, (before, after) in enumerate(pairwise(history))
+            if before is not None and _worsens(after, before, models[i].mean_square)
+        ]
+        if not worse:
+            return best, models, history
+        chosen = [one for i, one in enumerate(best.chosen) if i != worse[-1]]
+        model = base.with_effects([(o.effect, None) for o in chosen], like=best.model)
+        best = _State(model, chosen, best.evidence - best.chosen[worse[-1]].evidence)
 
 
-def _exchanged(base, selected, history, library, alpha, groups, say):
-    """Return the candidates, each the best next to all the others, and held-out errors."""
-    chosen, now = list(selected), selected[-1].model if selected else base
-    # the last one was chosen next to all the others already; the first ones explain the most
-    # and are the last to be dropped
-    for i in reversed(range(len(chosen) - 1)):
-        say(f"in exchange for: {chosen[i].score.effect.title}")
-        model, others = _with(base, chosen[:i] + chosen[i + 1 :], now)
-        main = _is_main(base, selected, chosen[i])
-        if _advantage(model, now) > 0 and not main and not _pushes(model, now):
-            chosen, now = others, model
-            continue
-        if chosen[i].context is None:
-            # a law that was stiff enough while others were missing need not be so now
-            loose = freed(model, replace(chosen[i], model=now))
-            if not _pushes(loose.model, now):
-                chosen[i], now = loose, loose.model
-        rival = _rival(model, chosen[i], others, library, alpha)
-        if rival is None or (main and not _supersedes(rival.model, now)):
-            continue
-        if _advantage(rival.model, now) > SAME_EVIDENCE and not _pushes(rival.model, now):
-            place = len({one.name for one in others} & {one.name for one in chosen[:i]})
-            chosen, now = [*others[:place], rival, *others[place:]], rival.model
-    if _outline(chosen) == _outline(selected):
-        return selected, history
-    # a law that was freed may do what needed another effect before
-    for i in reversed(range(len(chosen))):
-        model, others = _with(base, chosen[:i] + chosen[i + 1 :], now)
-        main = _is_main(base, selected, chosen[i])
-        if others and _advantage(model, now) > 0 and not main and not _pushes(model, now):
-            chosen, now = others, model
-    return _retraced(base, chosen, now, groups, history[0])
+def _worsens(after, before, scatter):
+    """Whether frames that were left out of the fit speak against a cause."""
+    better = after.better_than(before)
+    # among noise the evidence is to be trusted; among structure it has to hold elsewhere too
+    return better < (-2.0 if scatter < _STRUCTURED else 0.0)
 
 
-def _with(base, chosen, like):
-    """Return the model with effects, and those of them that have a place in it."""
-    model = base.with_effects([c.recipe for c in chosen], like=like)
-    return model, [c for c in chosen if c.name in model.added]
+def _growing(base, best):
+    """Return the models with the first cause, the first two, and so on."""
+    recipes = [(one.effect, None) for one in best.chosen]
+    models = [base.with_effects(recipes[:i], like=best.model) for i in range(1, len(recipes))]
+    return [*models, best.model] if recipes else []
 
 
-def _supersedes(new, old):
-    """Whether a model is simpler than another, or leaves clearly less."""
-    return new.problem.size < old.problem.size or new.fit.chi2 < _CLEARLY * old.fit.chi2
+def _scanned(model, library, cells):
+    """Return the evidence beside a model, measured by the residuals that the best cause leaves."""
+    found = scan(model, library, cells=cells)
+    if found.best is None:
+        return found
+    most = max(found.candidates, key=lambda one: one.statistic)
+    freedom = max(model.problem.n_data - model.problem.size - most.rank, 1)
+    temper = max(1.0, (model.fit.chi2 - most.statistic) / freedom)
+    if temper == 1.0:
+        return found
+    again = sorted((one.tempered(temper) for one in found.candidates), key=_evidence)
+    return replace(found, candidates=again)
 
 
-def _outline(chosen):
-    return [(candidate.name, candidate.context is None) for candidate in chosen]
+def _evidence(candidate):
+    return -candidate.evidence
 
 
-def _is_main(base, selected, candidate):
-    """Whether an effect explained most of the gap: that is not left to several others."""
-    names = [one.name for one in selected]
-    if candidate.name not in names:
-        return False
-    i = names.index(candidate.name)
-    before = selected[i - 1].model if i else base
-    lowered = before.fit.chi2 - candidate.model.fit.chi2
-    return lowered > _MAIN * (base.fit.chi2 - selected[-1].model.fit.chi2)
+def _distinct(candidates, most):
+    """Return the best candidates of which none does the same as another."""
+    found = []
+    for one in candidates:
+        if all(abs(one.statistic / other.statistic - 1) > _SAME for other in found):
+            found.append(one)
+        if len(found) == most:
+            break
+    return found
 
 
-def _rival(model, candidate, others, library, alpha):
-    """Return the best effect next to the others, None if that is the candidate."""
-    scores = scan(model, _without_aliases(library, others))
-    rival = choose(model, scores, alpha=alpha, most=_RIVALS)
-    if rival is None or rival.name == candidate.name or not rival.physical:
+def _search(base, library, first, say, cells):
+    """Return the best set of causes, and the scan beside it where it is known."""
+    best = _State(base)
+    states, known = [best], {best.outline: first}
+    for k in range(_MOST):
+        say(f"looking for cause {k + 1}, at most {_MOST}")
+        grown = {}
+        for state in states:
+            found = known.get(state.outline)
+            if found is None:
+                found = known[state.outline] = _scanned(state.model, library, cells)
+            for one in _distinct(found.candidates, _FITTED):
+                if one.evidence > ENOUGH:
+                    evidence = state.evidence + one.evidence
+                    outline = state.outline | {one.name}
+                    if outline not in grown or grown[outline][0] < evidence:
+                        grown[outline] = (evidence, state, one)
+        order = sorted(grown.values(), key=lambda item: -item[0])[:_FITTED]
+        fitted = [state for item in order if (state := _extended(*item)) is not None]
+        fitted.sort(key=lambda state: -state.evidence)
+        if not fitted or fitted[0].evidence < best.evidence + ENOUGH:
+            break
+        best, states = fitted[0], fitted[:_WIDTH]
+        if best.model.p_value > REMAINDER:
+            # what is left may be noise: one look beside the best set will tell
+            states = states[:1]
+    return best, known.get(best.outline)
+
+
+def _extended(evidence, state, candidate):
+    """Return a set with one more cause, fitted in full, None where that is impossible."""
+    model = state.model.with_effect(candidate.effect)
+    if not model.is_physical(candidate.name):
         return None
-    return freed(model, rival)
+    # what the full fit gains over the linear promise
+    gained = state.model.fit.chi2 - model.fit.chi2 - candidate.statistic
+    temper = max(1.0, model.mean_square)
+    return _State(model, [*state.chosen, candidate], evidence + 0.5 * gained / temper)
 
 
-def _advantage(new, old):
-    """Return by how much the evidence for a model is above that for another."""
-    freedom = max(new.problem.n_data - new.problem.size, 1)
-    scale = max(1.0, min(new.mean_square, old.mean_square))
-    cost = (new.problem.size - old.problem.size) * np.log(freedom)
-    return (old.fit.chi2 - new.fit.chi2) / scale - cost
+def _freed(base, best):
+    """Give causes one value a wavelength where the data ask for it."""
+    for i, one in enumerate(best.chosen):
+        effect = one.effect
+        if not isinstance(effect, CellEffect) or effect.degree is None:
+            continue
+        loose = CellEffect(effect.cell, None)
+        recipes = [(loose if other is one else other.effect, None) for other in best.chosen]
+        model = base.with_effects(recipes, like=best.model)
+        more = model.problem.size - best.model.problem.size
+        if more <= 0 or not model.is_physical(loose.name):
+            continue
+        scale = max(1.0, model.mean_square)
+        freedom = max(model.problem.n_data - model.problem.size, 1)
+        gain = (best.model.fit.chi2 - model.fit.chi2) / scale - more * np.log(freedom)
+        if gain > 0:
+            chosen = list(best.chosen)
+            chosen[i] = replace(one, effect=loose, evidence=one.evidence + gain / 2)
+            best = _State(model, chosen, best.evidence + gain / 2)
+    return best
 
 
-def _retraced(base, chosen, last, groups, first):
-    """Return candidates and held-out errors as if they had been added in this order."""
-    model, selected, history = base, [], [first]
-    for i, candidate in enumerate(chosen):
-        fresh = base.with_effects([c.recipe for c in chosen[: i + 1]], like=last)
-        freedom = max(fresh.problem.n_data - fresh.problem.size, 1)
-        gain = (model.fit.chi2 - fresh.fit.chi2) / max(1.0, fresh.mean_square)
-        cost = (fresh.problem.size - model.problem.size) * np.log(freedom)
-        candidate.model, candidate.gain, candidate.evidence = fresh, gain, gain - cost
-        selected.append(candidate)
-        history.append(_errors(fresh, groups))
-        model = fresh
-    return selected, history
+def _unlisted(base, best):
+    """Return the probability that the gap has a cause that no table has."""
+    count = min(len(best.chosen), len(_UNLISTED) - 1)
+    prior = _UNLISTED[count]
+    freedom = best.model.problem.n_data - best.model.problem.size
+    excess = max(base.fit.chi2 - freedom, 1.0)
+    if best.model.p_value > REMAINDER:
+        return prior
+    share = max(best.model.fit.chi2 - freedom, 0.0) / excess
+    return 1 - (1 - prior) * np.exp(-share / _LEFT)
+
+
+def _grouped(base, best, models, library, first, unlisted, cells):
+    """Return the causes with their alias groups and probabilities."""
+    found = []
+    for i, one in enumerate(best.chosen):
+        others = [other for other in best.chosen if other is not one]
+        if others:
+            model = base.with_effects([(o.effect, None) for o in others], like=best.model)
+            beside = _scanned(model, library, cells)
+        else:
+            model, beside = base, first
+        members = _members(one, beside)
+        chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
+        found.append(Group(members, float((1 - unlisted) * chance), models[i]))
+    return found
+
+
+def _members(chosen, beside):
+    """Return the chosen candidate and its aliases, with probabilities that sum to one."""
+    rivals = beside.candidates
+    own = next((one for one in rivals if one.name == chosen.name), chosen)
+    # fits in full were compared already: nothing that is listed is better than what was chosen
+    top = max(own.evidence, rivals[0].evidence) if rivals else own.evidence
+    own = replace(own, evidence=top, effect=chosen.effect)
+    weights = {own.name: (own, 1.0)}
+    for one in rivals:
+        weight = np.exp(min(one.evidence - top, 0.0))
+        if one.name != own.name and weight >= _ALIAS and len(weights) <= _MOST_ALIASES:
+            weights[one.name] = (one, weight)
+    total = sum(weight for _, weight in weights.values())
+    members = [(one, float(weight / total)) for one, weight in weights.values()]
+    return sorted(members, key=lambda item: -item[1])

@@ -11,14 +11,12 @@ change with the wavelength, a function f of the frame, and one of the generators
 import re
 from dataclasses import dataclass
 
-import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.optics.beamsplitters import BEAMS, _BeamOptic
 from astropolcal.optics.modulated import FrameOptic
-from astropolcal.optics.positions import COORDINATES
 from astropolcal.words import did_you_mean
 
 __all__ = ["GENERATORS", "Dependence", "Perturbation"]

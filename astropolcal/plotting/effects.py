@@ -9,6 +9,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap._numbers import Fitted
 from astropolcal.gap._words import in_title, is_determined
+from astropolcal.gap.selection import ENOUGH
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
@@ -34,7 +35,8 @@ def verdict_line(diagnosis):
     names = in_title([cause.name for cause in largest])
     several = "effects are" if len(largest) > 1 else "effect is"
     return {
-        "effect": f"{len(largest)} {several} missing: {names}",
+        "named": f"{len(largest)} {several} missing: {names}",
+        "located": f"{len(largest)} {several} missing: {names}",
         "none": "no gap beyond the noise",
         "unexplained": "a real gap that no effect explains"
         + (f"\n(in part: {names})" if names else ""),
@@ -47,8 +49,8 @@ def plot_effect_scores(diagnosis, *, limit=12, figure=None):
 
     The length of a bar is the signal-to-noise ratio of the effect in the scan,
     the square root of the expected lowering of chi-square over the scatter that
-    remains. Effects that were found and their aliases have their own colours,
-    effects that are not significant are pale.
+    remains. Causes that were found and their aliases have their own colours,
+    those for which there is no evidence are pale.
 
     Parameters
     ----------
@@ -78,10 +80,9 @@ def plot_effect_scores(diagnosis, *, limit=12, figure=None):
     >>> plot_effect_scores(diagnosis).axes[0].get_xlabel()[:8]
     'signal-t'
     """
-    scores = sorted(diagnosis.scores[:limit], key=lambda s: -_strength(s))
-    alpha = diagnosis.settings.get("alpha", 0.01)
+    scores = sorted(diagnosis.scan.candidates[:limit], key=lambda s: -_strength(s))
     found = {cause.name for cause in diagnosis.causes}
-    aliases = {name for cause in diagnosis.causes for name in cause.aliases} - found
+    aliases = {one.name for cause in diagnosis.causes for one, _ in cause.aliases} - found
     # only the kinds that are there are explained
     used = set()
     with style():
@@ -89,26 +90,23 @@ def plot_effect_scores(diagnosis, *, limit=12, figure=None):
         axes = figure.subplots()
         for i, score in enumerate(scores):
             name, size = score.effect.name, _strength(score)
-            kind = _kind(name, score.p_value < alpha, found, aliases)
+            kind = _kind(name, score.evidence > ENOUGH, found, aliases)
             used.add(kind)
             axes.barh(i, size, **_LOOKS[kind])
-            axes.text(size, i, f"  {_chance(score.p_value)}", va="center", fontsize=9.5)
+            axes.text(size, i, f"  {score.evidence:.0f}", va="center", fontsize=9.5)
         axes.set_yticks(range(len(scores)), labels=[s.effect.name for s in scores])
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
-        axes.set_xlabel("signal-to-noise ratio in the scan; at the bars: corrected probability")
-        # room for the probabilities at the ends of the bars
+        axes.set_xlabel(
+            "signal-to-noise ratio in the scan; at the bars: log Bayes factor"
+        )
+        # room for the numbers at the ends of the bars
         axes.set_xlim(0, 1.18 * max(map(_strength, scores), default=1.0))
         legend_outside(figure, _keys(used), columns=4)
         figure.suptitle(f"Scan of the effects\n{verdict_line(diagnosis)}")
         if not scores:
             axes.text(0.5, 0.5, "no effect to score", transform=axes.transAxes, ha="center")
     return figure
-
-
-def _chance(p):
-    # smaller ones are rounding of the distribution function
-    return "p < 1e-15" if p < 1e-15 else f"p = {p:.1g}"
 
 
 _LOOKS = {
@@ -121,7 +119,7 @@ _LOOKS = {
 
 def _strength(score):
     # chi-square is the square of a signal-to-noise ratio
-    return float(np.sqrt(score.statistic / score.scale))
+    return float(np.sqrt(score.statistic))
 
 
 def _kind(name, significant, found, aliases):
@@ -203,7 +201,7 @@ def _sizes_by_wavelength(diagnosis, effect, content):
     if content is None:
         sizes = Fitted(diagnosis.improved).sizes(effect)
     else:
-        sizes = content["causes"][names.index(effect)]["parameters"]
+        sizes = content["causes"][names.index(effect)]["size"]
     found = {name: size for name, size in sizes.items() if isinstance(size["value"], list)}
     if not found:
         raise ParameterError(f"effect = {effect!r} has no size that depends on wavelength")

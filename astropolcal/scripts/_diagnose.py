@@ -255,7 +255,7 @@ def _figures(diagnosis):
         "Residuals of the differences, by wavelength and frame": gap.plot_gap_maps(diagnosis),
         "Where the gap of the nominal model lies": gap.plot_where(diagnosis),
     }
-    if diagnosis.scores:
+    if diagnosis.scan.candidates:
         figures["Evidence for each effect that was tried"] = gap.plot_effect_scores(diagnosis)
     return figures
 
@@ -266,9 +266,9 @@ def _size_figures(diagnosis, content):
     from astropolcal.plotting.gap import plot_effect_sizes
 
     return {
-        entry["effect"]: plot_effect_sizes(diagnosis, entry["effect"], content=content)
+        entry["name"]: plot_effect_sizes(diagnosis, entry["name"], content=content)
         for entry in content["causes"]
-        if any(has_sizes(entry)) and any(map(_varies, entry["parameters"].values()))
+        if any(has_sizes(entry)) and any(map(_varies, entry["size"].values()))
     }
 
 

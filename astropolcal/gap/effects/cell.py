@@ -7,6 +7,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import insert_optic, join, leaves
 from astropolcal.gap.cells import places
+from astropolcal.gap.effects._detector_cells import detector_optic
 from astropolcal.gap.effects.base import Edit, Effect, EffectParameter, label_of
 from astropolcal.optics import Dependence
 
@@ -67,6 +68,8 @@ class CellEffect(Effect):
 
     def edit(self, chains, context):
         """Return the chains with the perturbation at zero; see `Effect.edit`."""
+        if self.cell.kind not in optics.GENERATORS:
+            return self._at_detector(chains, context)
         edited, dependence = [], Dependence(self.cell.dependence)
         # chains of the same source stand for several datasets: the place of the dataset counts
         names = context.datasets or (None,) * len(chains)
@@ -79,6 +82,17 @@ class CellEffect(Effect):
         keys = ("amplitude", "quadrature")[: dependence.count]
         parameters = [EffectParameter(f"{self.label}.{k}", scale, limit, basis) for k in keys]
         return Edit(edited, parameters)
+
+    def _at_detector(self, chains, context):
+        """Return the chains with what only a detector has."""
+        edited = []
+        for chain in chains:
+            optic, side, key, ties = detector_optic(self.cell.kind, self.label, context)
+            split = next(o.name for o in leaves(chain) if o.splits_light)
+            edited.append(insert_optic(chain, optic, **{side: split}))
+        basis = None if self.degree is None else context.basis(self.degree)
+        name = f"{self.label}.{key}"
+        return Edit(edited, [EffectParameter(name, self.cell.scale, _LIMIT, basis)], ties)
 
     def _with(self, chain, place, context):
         dependence = Dependence(self.cell.dependence)
