@@ -60,12 +60,44 @@ def leaves(chain):
     >>> [optic.name for optic in leaves(chain)]
     ['polarizer', 'wollaston']
     """
-    found = list(_walk(chain))
+    found = list(chain) if isinstance(chain, Train) else list(_walk(chain))
     names = [optic.name for optic in found if optic.name]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ChainError(f"optics need different names; {', '.join(twice)} occurs more than once")
     return found
+
+
+class Train(tuple):
+    """
+    Optics in the order of the light that are not joined yet.
+
+    What is tried by the hundred need not be a compound model each time: its making costs as the
+    square of the number of optics.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.chain import Train, join
+    >>> join(Train([optics.LinearPolarizer(), optics.WollastonPrism()])).n_submodels
+    2
+    """
+
+    __slots__ = ()
+
+    def copy(self):
+        """Return a train of copies of the optics."""
+        return Train(optic.copy() for optic in self)
+
+    def __getitem__(self, key):
+        if isinstance(key, str):
+            return find_optic(self, key)
+        return super().__getitem__(key)
+
+
+def _again(chain, found):
+    """Return optics as what the chain was: a train, or a compound model."""
+    return Train(found) if isinstance(chain, Train) else join(found)
 
 
 def _walk(model):
@@ -114,10 +146,10 @@ def join(optics):
         raise ChainError("a chain needs at least one optic")
     for optic in optics:
         leaves(optic)
+    leaves(Train(optics))
     chain = optics[0]
     for optic in optics[1:]:
         chain = chain | optic
-    leaves(chain)
     return chain
 
 
@@ -189,7 +221,7 @@ def replace_optic(chain, name, optic):
     'relay'
     """
     old = find_optic(chain, name)
-    return join(optic if leaf is old else leaf for leaf in leaves(chain))
+    return _again(chain, [optic if leaf is old else leaf for leaf in leaves(chain)])
 
 
 def insert_optic(chain, optic, *, after=None, before=None):
@@ -230,7 +262,7 @@ def insert_optic(chain, optic, *, after=None, before=None):
     for leaf in leaves(chain):
         pair = [leaf, optic] if after else [optic, leaf]
         result.extend(pair if leaf is neighbour else [leaf])
-    return join(result)
+    return _again(chain, result)
 
 
 def remove_optic(chain, name):
@@ -262,7 +294,7 @@ def remove_optic(chain, name):
     'wollaston'
     """
     gone = find_optic(chain, name)
-    return join(leaf for leaf in leaves(chain) if leaf is not gone)
+    return _again(chain, [leaf for leaf in leaves(chain) if leaf is not gone])
 
 
 def stages(chain):

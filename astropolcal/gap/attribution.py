@@ -11,11 +11,13 @@ magnitude only and is averaged over.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import stats
 
-from astropolcal.gap.cells import Cell, Probes
+from astropolcal.gap._bases import law_basis
+from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.problem import GapProblem
 
@@ -23,10 +25,11 @@ __all__ = ["Candidate", "Scan", "false_discovery", "scan"]
 
 # sizes of the prior, in units of the usual one
 _SIZES = (0.1, 1.0, 10.0)
-# laws in wavelength of a cell: one number, or a smooth curve
-_DEGREES = (0, 2)
-# named effects in one chain: building a chain costs as the square of its length
-_TOGETHER = 10
+# laws in wavelength of a cell: one number, or a smooth curve; for the best cells more freedom,
+# None for one value a wavelength
+_DEGREES, _FREER = (0, 2), (4, None)
+# so many named effects stand in the same chain: each sees the light through all the others
+_TOGETHER = 20
 #: Prior odds of a name against a cell of the table.
 NAMED = 5.0
 # log prior odds of dependences: what changes needs a reason
@@ -43,8 +46,8 @@ class Candidate:
 
     Parameters
     ----------
-    effect : Effect
-        The cause as an effect that can be fitted.
+    named : Effect or None
+        The effect of the library, None for a cell without a name.
     cell : Cell or None
         Its place, kind and dependence; None where it is no single cell.
     statistic : float
@@ -57,6 +60,10 @@ class Candidate:
         Logarithm of these odds.
     spectrum : tuple
         Eigenvalues of its normal equations, what lies along each, and the usual size.
+    degree : int or None
+        Degree of the law in wavelength of a cell, None for one value a wavelength.
+    context : Context or None
+        With which a named effect is added, None for that of the data.
 
     Examples
     --------
@@ -65,13 +72,31 @@ class Candidate:
     10.0
     """
 
-    effect: object
+    named: object
     cell: object
     statistic: float
     rank: int
     evidence: float
     prior: float = 0.0
     spectrum: tuple = ()
+    degree: object = 2
+    context: object = None
+
+    @property
+    def recipe(self):
+        """Effect and context, as `Model.with_effects` takes them."""
+        return self.effect, self.context
+
+    def freed(self, context):
+        """Return the same with one value a wavelength."""
+        if self.named is None:
+            return replace(self, degree=None)
+        return replace(self, context=replace(context, degree=None))
+
+    @cached_property
+    def effect(self):
+        """The cause as an effect that can be fitted."""
+        return CellEffect(self.cell, self.degree) if self.named is None else self.named
 
     def tempered(self, temper):
         """
@@ -93,12 +118,12 @@ class Candidate:
     @property
     def name(self):
         """Name of the effect; of a cell, its place, kind and dependence."""
-        return self.effect.name
+        return self.cell.name if self.named is None else self.named.name
 
     @property
     def is_named(self):
         """Whether it has a name in the library."""
-        return not isinstance(self.effect, CellEffect)
+        return self.named is not None
 
     @property
     def p_value(self):
@@ -118,6 +143,10 @@ class Scan:
     inflation : float
         How far the statistics of all cells together exceed those of noise: 1 where noise is all
         that is left.
+    probes : Probes
+        Derivatives of the data to the cells.
+    temper : float
+        Variance of the residuals about the model with the cause, in units of the noise.
 
     Examples
     --------
@@ -128,6 +157,30 @@ class Scan:
 
     candidates: list
     inflation: float
+    probes: object = None
+    temper: float = 1.0
+
+    def freer(self, candidate):
+        """
+        Return a cause with the law in wavelength for which there is most evidence.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            One of the candidates.
+
+        Returns
+        -------
+        Candidate
+        """
+        best = candidate
+        for degree in _FREER if self.probes is not None else ():
+            if candidate.is_named:
+                found = _named(self.probes, [candidate.named], self.temper, degree)
+            else:
+                found = _of_cell(self.probes, candidate.cell, degree, self.temper)
+            best = max([best, *found], key=lambda one: one.evidence)
+        return best
 
     @property
     def best(self):
@@ -174,7 +227,7 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
         levels = [(one.statistic, one.rank) for one in found]
     found += _named(probes, effects, temper)
     found.sort(key=lambda one: -one.evidence)
-    return Scan(found, _inflation(levels))
+    return Scan(found, _inflation(levels), probes, temper)
 
 
 def _cells(probes, temper):
@@ -198,6 +251,16 @@ def _cells(probes, temper):
     return [one for one in best.values() if one.name not in own]
 
 
+def _of_cell(probes, cell, degree, temper):
+    """Return the candidate of one cell with a law of some degree, in a list."""
+    slopes = probes.slopes[cell.place, cell.kind]
+    reduced = Reduced(probes, slopes, law_basis(probes.problem.wavelength, degree))
+    detector = probes.is_detector(cell.kind)
+    gram, target = reduced.pair(probes.ones if detector else probes.waves[cell.dependence])
+    parts = [(cell.dependence, gram, target)]
+    return [one for _, one in _candidates(cell.place, cell.kind, degree, parts, cell.scale, temper)]
+
+
 def _candidates(place, kind, degree, parts, scale, temper):
     """Yield name and candidate of normal equations (dependence, gram, target)."""
     for size in dict.fromkeys(len(target) for _, _, target in parts):
@@ -213,13 +276,14 @@ def _candidates(place, kind, degree, parts, scale, temper):
                 yield (
                     cell,
                     Candidate(
-                        CellEffect(cell, degree),
+                        None,
                         cell,
                         float(part.sum()),
                         int(rank),
                         float(factor) + prior,
                         prior,
                         (own, part, scale),
+                        degree,
                     ),
                 )
 
@@ -250,9 +314,10 @@ def _rank(values, scale):
     return (np.square(scale * _SIZES[-1]) * values > 1).sum(axis=-1)
 
 
-def _named(probes, effects, temper):
+def _named(probes, effects, temper, degree="default"):
     """Return the candidates of named effects, all of them at zero in the same chains."""
     model, found = probes.model, []
+    context = replace(model.context, degree=degree)
     chains = model.chains
     waiting = [
         effect
@@ -263,7 +328,7 @@ def _named(probes, effects, temper):
         edited, parameters, ties, later = list(model.held_chains), {}, {}, []
         for effect in waiting:
             # what is absent does nothing to another, but two may free the same parameter
-            edit = effect.edit(edited, model.context)
+            edit = effect.edit(edited, context)
             names = {p.name for p in edit.parameters}
             taken = {p.name for own in parameters.values() for p in own}
             if names & taken or len(parameters) == _TOGETHER:
@@ -273,7 +338,9 @@ def _named(probes, effects, temper):
             ties |= {name: tie for name, tie in edit.ties.items() if tie.source in names}
         found += _of_batch(probes, edited, parameters, ties, waiting, temper)
         waiting = later
-    return found
+    if degree == "default":
+        return found
+    return [replace(one, context=context) for one in found]
 
 
 def _of_batch(probes, edited, parameters, ties, effects, temper):

@@ -71,6 +71,11 @@ class Cell:
     dependence: str
 
     @property
+    def name(self):
+        """Place, kind and dependence as one word."""
+        return f"{self.place}/{self.kind}/{self.dependence}"
+
+    @property
     def optic(self):
         """Name of the optic of the place, None where it is none."""
         return self.place.partition(":")[2] or None
@@ -360,7 +365,7 @@ class Probes:
         #: A function of the frame that is one everywhere, of each dataset.
         self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
-        self.waves = dependences(problem, most_steps)
+        self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
         self.slopes = self._at_places()
         parts = list(zip(problem.channels, problem.segments, strict=True))
         #: Tangent and lamp with the frames first, (F, rows of a frame, rank), one a dataset.

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from astropolcal.calibration import calibrate
-from astropolcal.chain import leaves
+from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap.effects import Context
 from astropolcal.gap.problem import Fit, GapProblem
@@ -68,13 +68,18 @@ class Model:
     @property
     def chains(self):
         """The chains, with the fitted values in them."""
+        return [join(leaves(train)) for train in self.trains]
+
+    @property
+    def trains(self):
+        """The optics of the chains, not joined, with the fitted values in them."""
         measurement = self.problem.measurement
         return measurement.put_back(self.problem.vector(self.fit.coefficients))
 
     @cached_property
     def held_chains(self):
-        """Copies of the chains with every parameter fixed."""
-        return [_held(chain) for chain in self.chains]
+        """Copies of the optics of the chains with every parameter fixed."""
+        return [_held(train) for train in self.trains]
 
     @property
     def observations(self):
@@ -122,7 +127,7 @@ class Model:
         problem : GapProblem
         parameters : list of EffectParameter
         """
-        edit = effect.edit(self.chains, self.context if context is None else context)
+        edit = effect.edit(self.trains, self.context if context is None else context)
         problem = GapProblem(
             edit.chains,
             self.observations,
@@ -176,7 +181,7 @@ class Model:
         """
         model = self
         for effect, context in effects:
-            if not effect.applies(model.chains):
+            if not effect.applies(model.trains):
                 continue
             problem, parameters = model.edited(effect, context)
             added = model.added | {effect.name: parameters}
@@ -263,7 +268,7 @@ class Model:
         own = {parameter.name for parameter in self.added[name]}
         own |= {target for target, tie in self.problem.ties.items() if tie.source in own}
         names = {parameter.partition(".")[0] for parameter in own}
-        return [leaf for chain in self.chains for leaf in leaves(chain) if leaf.name in names]
+        return [leaf for chain in self.trains for leaf in leaves(chain) if leaf.name in names]
 
     def at_bound(self, name):
         """Return how many values of an effect are at a bound of their optic."""

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import null_space, qr, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
-from astropolcal.chain import leaves
+from astropolcal.chain import Train, leaves
 from astropolcal.gap._bases import law_basis, orthonormal
 from astropolcal.gap._noise import expected_fluxes, noise, settings
 from astropolcal.gap.channels import Channels
@@ -46,7 +46,7 @@ def _exact(chain):
     """Return the chain, or a copy in which what is known beforehand is held."""
     found = leaves(chain)
     known = any(leaf.theta.prior is not None or isinstance(leaf, StarSource) for leaf in found)
-    return as_exact(chain.copy()) if known else chain
+    return Train(leaves(as_exact(chain.copy()))) if known else Train(found)
 
 
 class GapProblem:
@@ -111,6 +111,8 @@ class GapProblem:
         # what the model holds is held; an effect is what frees it
         chains, observations = [_exact(chain) for chain in chains], list(observations)
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
+        #: Functions of the frame on which a cause may depend, once they are known.
+        self.waves = None if like is None else like.waves
         self.measurement = Measurement(
             chains,
             observations,

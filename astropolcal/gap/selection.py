@@ -15,7 +15,6 @@ from itertools import pairwise
 import numpy as np
 
 from astropolcal.gap.attribution import scan
-from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.shrinkage import held_out
 
 __all__ = ["Group", "Selection", "select"]
@@ -192,7 +191,7 @@ def _checked(base, best, groups, say):
         if not worse:
             return best, models, history
         chosen = [one for i, one in enumerate(best.chosen) if i != worse[-1]]
-        model = base.with_effects([(o.effect, None) for o in chosen], like=best.model)
+        model = base.with_effects([o.recipe for o in chosen], like=best.model)
         best = _State(model, chosen, best.evidence - best.chosen[worse[-1]].evidence)
 
 
@@ -205,7 +204,7 @@ def _worsens(after, before, scatter):
 
 def _growing(base, best):
     """Return the models with the first cause, the first two, and so on."""
-    recipes = [(one.effect, None) for one in best.chosen]
+    recipes = [one.recipe for one in best.chosen]
     models = [base.with_effects(recipes[:i], like=best.model) for i in range(1, len(recipes))]
     return [*models, best.model] if recipes else []
 
@@ -221,7 +220,7 @@ def _scanned(model, library, cells):
     if temper == 1.0:
         return found
     again = sorted((one.tempered(temper) for one in found.candidates), key=_evidence)
-    return replace(found, candidates=again)
+    return replace(found, candidates=again, temper=temper)
 
 
 def _evidence(candidate):
@@ -250,7 +249,7 @@ def _search(base, library, first, say, cells):
             found = known.get(state.outline)
             if found is None:
                 found = known[state.outline] = _scanned(state.model, library, cells)
-            for one in _distinct(found.candidates, _FITTED):
+            for one in map(found.freer, _distinct(found.candidates, _FITTED)):
                 if one.evidence > ENOUGH:
                     evidence = state.evidence + one.evidence
                     outline = state.outline | {one.name}
@@ -270,7 +269,7 @@ def _search(base, library, first, say, cells):
 
 def _extended(evidence, state, candidate):
     """Return a set with one more cause, fitted in full, None where that is impossible."""
-    model = state.model.with_effect(candidate.effect)
+    model = state.model.with_effect(*candidate.recipe)
     if not model.is_physical(candidate.name):
         return None
     # what the full fit gains over the linear promise
@@ -282,12 +281,9 @@ def _extended(evidence, state, candidate):
 def _freed(base, best):
     """Give causes one value a wavelength where the data ask for it."""
     for i, one in enumerate(best.chosen):
-        effect = one.effect
-        if not isinstance(effect, CellEffect) or effect.degree is None:
-            continue
-        loose = CellEffect(effect.cell, None)
-        recipes = [(loose if other is one else other.effect, None) for other in best.chosen]
-        model = base.with_effects(recipes, like=best.model)
+        loose = one.freed(base.context)
+        chosen = [loose if other is one else other for other in best.chosen]
+        model = base.with_effects([o.recipe for o in chosen], like=best.model)
         more = model.problem.size - best.model.problem.size
         if more <= 0 or not model.is_physical(loose.name):
             continue
@@ -295,8 +291,7 @@ def _freed(base, best):
         freedom = max(model.problem.n_data - model.problem.size, 1)
         gain = (best.model.fit.chi2 - model.fit.chi2) / scale - more * np.log(freedom)
         if gain > 0:
-            chosen = list(best.chosen)
-            chosen[i] = replace(one, effect=loose, evidence=one.evidence + gain / 2)
+            chosen[i] = replace(loose, evidence=one.evidence + gain / 2)
             best = _State(model, chosen, best.evidence + gain / 2)
     return best
 
@@ -319,7 +314,7 @@ def _grouped(base, best, models, library, first, unlisted, cells):
     for i, one in enumerate(best.chosen):
         others = [other for other in best.chosen if other is not one]
         if others:
-            model = base.with_effects([(o.effect, None) for o in others], like=best.model)
+            model = base.with_effects([o.recipe for o in others], like=best.model)
             beside = _scanned(model, library, cells)
         else:
             model, beside = base, first
@@ -335,7 +330,7 @@ def _members(chosen, beside):
     own = next((one for one in rivals if one.name == chosen.name), chosen)
     # fits in full were compared already: nothing that is listed is better than what was chosen
     top = max(own.evidence, rivals[0].evidence) if rivals else own.evidence
-    own = replace(own, evidence=top, effect=chosen.effect)
+    own = replace(chosen, evidence=top)
     weights = {own.name: (own, 1.0)}
     for one in rivals:
         weight = np.exp(min(one.evidence - top, 0.0))

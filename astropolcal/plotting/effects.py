@@ -97,9 +97,7 @@ def plot_effect_scores(diagnosis, *, limit=12, figure=None):
         axes.set_yticks(range(len(scores)), labels=[s.effect.name for s in scores])
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
-        axes.set_xlabel(
-            "signal-to-noise ratio in the scan; at the bars: log Bayes factor"
-        )
+        axes.set_xlabel("signal-to-noise ratio in the scan; at the bars: log Bayes factor")
         # room for the numbers at the ends of the bars
         axes.set_xlim(0, 1.18 * max(map(_strength, scores), default=1.0))
         legend_outside(figure, _keys(used), columns=4)

@@ -45,7 +45,7 @@ class CellEffect(Effect):
 
     def __init__(self, cell, degree=2):
         self.cell, self.degree = cell, degree
-        self.name = f"{cell.place}/{cell.kind}/{cell.dependence}"
+        self.name = cell.name
         self.title, self.place = cell.title, cell.place
 
     @property
