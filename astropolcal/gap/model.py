@@ -13,7 +13,7 @@ from astropolcal.calibration import calibrate
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap.effects import Context
-from astropolcal.gap.problem import Fit, GapProblem
+from astropolcal.gap.problem import Fit, GapProblem, as_mounted
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
 from astropolcal.optics import Perturbation
@@ -408,6 +408,7 @@ def nominal_calibration(chains, observations):
     >>> nominal_calibration([chain], [simulate(chain, charis.wavelength, frames, seed=1)]).converged
     True
     """
+    chains = [as_mounted(chain) for chain in chains]
     measurement = Measurement(chains, observations)
     if not measurement.free.size:
         return _AsGiven(measurement)

@@ -42,8 +42,40 @@ _AT_WALL = 1e-7
 _GUESSES, _ROUNDING = 10, 1e-13
 
 
+def as_mounted(chain):
+    """
+    Return a chain in which what is mounted as well as it can be stands at its nominal angle.
+
+    Where a model lacks something, the fit turns a mirror to make up for it; a diagnosis asks for
+    that angle as for any other cause.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain; it is not changed.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+        The same, or a copy.
+    """
+    if not any(_is_mounted(leaf) for leaf in leaves(chain)):
+        return chain
+    chain = chain.copy()
+    for leaf in leaves(chain):
+        if _is_mounted(leaf):
+            leaf.theta.value = float(leaf.theta.prior.mean())
+            leaf.theta.fixed, leaf.theta.prior = True, None
+    return chain
+
+
+def _is_mounted(leaf):
+    return leaf.theta.prior is not None and leaf.mount is None and not isinstance(leaf, StarSource)
+
+
 def _exact(chain):
-    """Return the chain, or a copy in which what is known beforehand is held."""
+    """Return the optics of a chain, copies of them where what is known beforehand is held."""
+    chain = as_mounted(chain)
     found = leaves(chain)
     known = any(leaf.theta.prior is not None or isinstance(leaf, StarSource) for leaf in found)
     return Train(leaves(as_exact(chain.copy()))) if known else Train(found)
