@@ -161,7 +161,7 @@ class Model:
         fit = problem.fit(problem.start, **settings)
         return Model(problem, fit, self.added | {effect.name: parameters})
 
-    def with_effects(self, effects, like=None):
+    def with_effects(self, effects, like=None, **settings):
         """
         Return the model with several effects added, and fitted once.
 
@@ -174,6 +174,8 @@ class Model:
         like : Model, optional
             A model from whose solution the fit starts, where the two share
             parameters.
+        **settings
+            Of `GapProblem.fit`.
 
         Returns
         -------
@@ -189,7 +191,7 @@ class Model:
             model = Model(problem, Fit(problem.start, np.inf, False), added)
         if like is not None:
             model = Model(model.problem, like.start_of(model.problem), model.added)
-        return self if model is self else model.polished()
+        return self if model is self else model.polished(**settings)
 
     def start_of(self, problem):
         """Return a start for another problem: this solution where the two share parameters."""
@@ -202,11 +204,12 @@ class Model:
                 theirs[slot.slice] = vector[known.slice]
         return Fit(problem.coefficients(theirs), np.inf, False)
 
-    def polished(self):
-        """Return the model with its fit carried on to the end."""
+    def polished(self, **settings):
+        """Return the model with its fit carried on to the end, see `GapProblem.fit`."""
         if self.fit.converged:
             return self
-        return Model(self.problem, self.problem.fit(self.fit.coefficients), self.added)
+        fit = self.problem.fit(self.fit.coefficients, **settings)
+        return Model(self.problem, fit, self.added)
 
     def sizes(self, name):
         """

@@ -15,17 +15,22 @@ from itertools import pairwise
 import numpy as np
 
 from astropolcal.gap.attribution import scan
-from astropolcal.gap.shrinkage import held_out
+from astropolcal.gap.shrinkage import foreseen
 
 __all__ = ["Group", "Selection", "select"]
 
+# the best candidates count where residuals are no noise
+_RETEMPERED = 400
+# fits on the way to the answer need not be carried to the end
+_QUICK = {"steps": 6, "share": 1e-3}
 #: Residuals less probable than this are no noise.
 REMAINDER = 1e-4
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
 ENOUGH = 9.0
 _MOST = 6
-# so many sets grow side by side, and so many of their continuations are fitted in full
-_WIDTH, _FITTED = 3, 6
+# by the number of causes: so many sets grow side by side, and so many of their continuations
+# are fitted in full
+_WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
 # causes that lower chi-square by shares closer than this are the same for these data
 _SAME = 1e-6
 # an alias is no less probable than this against the best; so many are listed
@@ -162,6 +167,7 @@ def select(base, library, groups, say, *, cells=True):
     if not best.chosen:
         return Selection([], base, first, first, 0.0, [_errors(base, groups)])
     best = _freed(base, best)
+    best = replace(best, model=best.model.polished())
     best, models, history = _checked(base, best, groups, say)
     left = left if best.model is models[-1] and left is not None else None
     unlisted = _unlisted(base, best)
@@ -170,7 +176,7 @@ def select(base, library, groups, say, *, cells=True):
 
 
 def _errors(model, groups):
-    return None if groups is None else held_out(model, groups)
+    return None if groups is None else foreseen(model, groups)
 
 
 def _checked(base, best, groups, say):
@@ -205,7 +211,8 @@ def _worsens(after, before, scatter):
 def _growing(base, best):
     """Return the models with the first cause, the first two, and so on."""
     recipes = [one.recipe for one in best.chosen]
-    models = [base.with_effects(recipes[:i], like=best.model) for i in range(1, len(recipes))]
+    ends = range(1, len(recipes))
+    models = [base.with_effects(recipes[:i], like=best.model, **_QUICK) for i in ends]
     return [*models, best.model] if recipes else []
 
 
@@ -219,7 +226,7 @@ def _scanned(model, library, cells):
     temper = max(1.0, (model.fit.chi2 - most.statistic) / freedom)
     if temper == 1.0:
         return found
-    again = sorted((one.tempered(temper) for one in found.candidates), key=_evidence)
+    again = sorted((one.tempered(temper) for one in found.candidates[:_RETEMPERED]), key=_evidence)
     return replace(found, candidates=again, temper=temper)
 
 
@@ -243,24 +250,25 @@ def _search(base, library, first, say, cells):
     best = _State(base)
     states, known = [best], {best.outline: first}
     for k in range(_MOST):
+        width, most = (part[min(k, len(part) - 1)] for part in (_WIDTH, _FITTED))
         say(f"looking for cause {k + 1}, at most {_MOST}")
         grown = {}
         for state in states:
             found = known.get(state.outline)
             if found is None:
                 found = known[state.outline] = _scanned(state.model, library, cells)
-            for one in map(found.freer, _distinct(found.candidates, _FITTED)):
+            for one in map(found.freer, _distinct(found.candidates, most)):
                 if one.evidence > ENOUGH:
                     evidence = state.evidence + one.evidence
                     outline = state.outline | {one.name}
                     if outline not in grown or grown[outline][0] < evidence:
                         grown[outline] = (evidence, state, one)
-        order = sorted(grown.values(), key=lambda item: -item[0])[:_FITTED]
+        order = sorted(grown.values(), key=lambda item: -item[0])[:most]
         fitted = [state for item in order if (state := _extended(*item)) is not None]
         fitted.sort(key=lambda state: -state.evidence)
         if not fitted or fitted[0].evidence < best.evidence + ENOUGH:
             break
-        best, states = fitted[0], fitted[:_WIDTH]
+        best, states = fitted[0], fitted[:width]
         if best.model.p_value > REMAINDER:
             # what is left may be noise: one look beside the best set will tell
             states = states[:1]
@@ -269,7 +277,7 @@ def _search(base, library, first, say, cells):
 
 def _extended(evidence, state, candidate):
     """Return a set with one more cause, fitted in full, None where that is impossible."""
-    model = state.model.with_effect(*candidate.recipe)
+    model = state.model.with_effect(*candidate.recipe, **_QUICK)
     if not model.is_physical(candidate.name):
         return None
     # what the full fit gains over the linear promise
@@ -283,7 +291,7 @@ def _freed(base, best):
     for i, one in enumerate(best.chosen):
         loose = one.freed(base.context)
         chosen = [loose if other is one else other for other in best.chosen]
-        model = base.with_effects([o.recipe for o in chosen], like=best.model)
+        model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
         more = model.problem.size - best.model.problem.size
         if more <= 0 or not model.is_physical(loose.name):
             continue
@@ -314,7 +322,7 @@ def _grouped(base, best, models, library, first, unlisted, cells):
     for i, one in enumerate(best.chosen):
         others = [other for other in best.chosen if other is not one]
         if others:
-            model = base.with_effects([o.recipe for o in others], like=best.model)
+            model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
             beside = _scanned(model, library, cells)
         else:
             model, beside = base, first

@@ -14,12 +14,14 @@ import numpy as np
 
 from astropolcal.exceptions import GapError
 
-__all__ = ["HeldOut", "frame_groups", "held_out", "left_out_fits"]
+__all__ = ["HeldOut", "foreseen", "frame_groups", "held_out", "left_out_fits"]
 
 # degree; angles that differ by less are one group
 _SAME_ANGLE = 0.5
 # next to the solution of all frames the fit to most of them takes few steps
 _STEPS, _SHARE = 8, 1e-5
+# a direction that a group determines by more than this share is its own
+_MOST_LEVER = 0.99
 
 
 @dataclass
@@ -209,6 +211,57 @@ def held_out(model, groups):
             # two channels a datum: half, so that noise gives 1 a datum
             whitened[i] += np.sum(channel.whiten(gap)[:, seen] ** 2) / 2
             counts[i] += seen.sum()
+    keep = counts > 0
+    labels = [label for label, here in zip(labels, keep, strict=True) if here]
+    return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
+
+
+def foreseen(model, groups):
+    """
+    Return the prediction errors on left-out frames to first order, without a fit for each group.
+
+    With an orthonormal basis N of the derivatives, residuals r of a group become
+    :math:`(1 - N N^T)^{-1} r` where the group does not take part in the fit: exact in a linear
+    model (Cook & Weisberg 1982, Residuals and Influence in Regression, Sec. 2.2).
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    groups : tuple
+        As `frame_groups` gives them.
+
+    Returns
+    -------
+    HeldOut
+    """
+    labels, numbers = groups
+    problem = model.problem
+    tangent = problem.tangent(model.fit.coefficients)
+    residual, sizes = model.residual, [c.shape for c in problem.channels]
+    squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
+    for i in range(len(labels)):
+        rows, scale = [], []
+        for number, channel, shape, segment in zip(
+            numbers, problem.channels, sizes, problem.segments, strict=True
+        ):
+            seen = np.broadcast_to(channel.valid & (number == i), shape)
+            here = np.arange(segment.start, segment.stop).reshape(shape)[seen]
+            rows.append(here)
+            # whitened differences are divided by their noise; sums have none of their own here
+            size = np.zeros(shape)
+            size[0] = channel.sigma[0]
+            scale.append(size[seen])
+            counts[i] += seen[0].sum()
+        rows, scale = np.concatenate(rows), np.concatenate(scale)
+        if not rows.size:
+            continue
+        left, share, right = np.linalg.svd(tangent[rows], full_matrices=False)
+        # what the group alone determines cannot be foreseen at all; it is not counted
+        lever = np.minimum(share**2, _MOST_LEVER)
+        gap = residual[rows] + left @ ((lever / (1 - lever)) * (left.T @ residual[rows]))
+        squares[i] = np.sum((gap * scale) ** 2)
+        whitened[i] = np.sum(gap**2) / 2
     keep = counts > 0
     labels = [label for label, here in zip(labels, keep, strict=True) if here]
     return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
