@@ -129,13 +129,30 @@ class Channels:
         `~numpy.ndarray`
             Of the same shape; what is left has unit noise.
         """
-        weight, _ = self._whitening
-        out = np.empty(array.shape)
-        out[..., 0, :, :] = array[..., 0, :, :] * weight[0]
-        sums = self._sum_whitened(array[..., 1, :, :])
+        out = self.whiten_frames(array)
+        sums = out[..., 1, :, :]
         flat = sums.reshape(*sums.shape[:-2], sums.shape[-2] * sums.shape[-1])
         flat = flat - (flat @ self.nuisance) @ self.nuisance.T
         out[..., 1, :, :] = flat.reshape(sums.shape)
+        return out
+
+    def whiten_frames(self, array):
+        """
+        Divide by the noise and by the flicker, frame by frame: the lamp's drift stays.
+
+        Parameters
+        ----------
+        array : `~numpy.ndarray`
+            Residuals or derivatives, shape (..., 2, W, F).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Of the same shape.
+        """
+        out = np.empty(array.shape)
+        out[..., 0, :, :] = array[..., 0, :, :] * self._whitening[0][0]
+        out[..., 1, :, :] = self._sum_whitened(array[..., 1, :, :])
         return out
 
     def _sum_whitened(self, array):

@@ -365,15 +365,17 @@ class GapProblem:
 
     # ---- what follows from a fit --------------------------------------------------------
 
-    def tangent(self, coefficients):
+    def tangent(self, coefficients, rows=None):
         """
         Return an orthonormal basis of the derivatives, shape (n_rows, rank).
 
         A coefficient, or a value of a law, at its bound cannot take anything up and is left out.
+        Where only some ``rows`` (n_rows,) take part, the others are zero.
         """
         inside = (coefficients > self.low + _AT_BOUND) & (coefficients < self.high - _AT_BOUND)
-        slopes, (rows, ends) = self.jacobian(coefficients)[:, inside], self._walls
-        held = rows[rows @ coefficients > ends - _AT_WALL][:, inside]
+        slopes, (walls, ends) = self.jacobian(coefficients)[:, inside], self._walls
+        slopes = slopes if rows is None else slopes * rows[:, None]
+        held = walls[walls @ coefficients > ends - _AT_WALL][:, inside]
         return orthonormal(slopes @ null_space(held) if len(held) else slopes)
 
     @property
