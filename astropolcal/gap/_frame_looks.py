@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 from astropolcal.chain import leaves
-from astropolcal.gap._bases import law_basis, orthonormal
+from astropolcal.gap._bases import law_basis
 from astropolcal.optics import COORDINATES
 
 __all__ = ["BEAM_DEGREE", "Look", "angle_stages", "kept_rows"]
@@ -81,16 +81,15 @@ class Look:
         self.coefficients, self.out = coefficients, out
         self.vector = self.problem.vector(coefficients)
         rows = kept_rows(self.problem, out)
-        tangent = self.problem.tangent(coefficients, rows)
-        flux = self._of_flux() * rows[:, None]
-        flux = orthonormal(flux - tangent @ (tangent.T @ flux), keep=_SEEN)
-        # what is left of a column by rounding need not be orthogonal
-        flux = orthonormal(flux - tangent @ (tangent.T @ flux))
-        self.tangent = np.concatenate([tangent, flux], axis=1)
-        residual = self.problem.residual(coefficients) * rows
-        self.residual = residual - self.tangent @ (self.tangent.T @ residual)
+        columns = np.concatenate([self.problem.open_slopes(coefficients), self._of_flux()], axis=1)
+        #: What the model takes up of a frame that takes part, (n_rows, rank); of one that does
+        #: not, how its prediction hangs on the others.
+        self.tangent, weight = _basis(columns, rows)
+        residual = self.problem.residual(coefficients)
+        #: What is left of frames that take part; of others, by how far they miss the prediction.
+        self.residual = residual - self.tangent @ (weight.T @ residual)
         #: Sum of squares and degrees of freedom of the frames that take part.
-        self.chi2 = float(self.residual @ self.residual)
+        self.chi2 = float(np.sum(self.residual[rows] ** 2))
         lost = sum(
             2 * int(c.valid[:, o].sum()) for c, o in zip(self.problem.channels, out, strict=True)
         )
@@ -196,15 +195,21 @@ class Look:
         return np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0).sum(axis=1)
 
     def deleted(self, i):
-        """Return by how much chi-square falls if a frame's differences are free, and their number."""
+        """
+        Return by how much each frame's differences raise chi-square, and their number, (F,).
+
+        That is by how much it falls if a frame that takes part is left out, and by how much it
+        rises if one that does not is taken in.
+        """
         residual, tangent, _ = self._parts[i]
         channel = self.problem.channels[i]
         n = channel.shape[1]
         residual, tangent = residual[:n].T, tangent[:n].transpose(1, 0, 2)
-        values, vectors = np.linalg.eigh(np.eye(n) - tangent @ tangent.swapaxes(1, 2))
+        values, vectors = np.linalg.eigh(tangent @ tangent.swapaxes(1, 2))
         along = np.einsum("fab,fa->fb", vectors, residual)
-        seen = values > _SEEN
-        fall = np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0).sum(axis=1)
+        share = np.where(self.out[i][:, None], 1 + values, 1 - values)
+        seen = share > _SEEN
+        fall = np.where(seen, along**2 / np.where(seen, share, 1.0), 0.0).sum(axis=1)
         return fall, channel.valid.sum(axis=0)
 
     def kept(self, i):
@@ -212,12 +217,44 @@ class Look:
         return self.problem.channels[i].valid.any(axis=0) & ~self.out[i]
 
     def of_frame(self, i, f):
-        """Return residual, tangent and weight of a frame's differences: (W,), (W, rank), (W,)."""
+        """
+        Return what the other frames say of the differences of one.
+
+        Returns
+        -------
+        missed : `~numpy.ndarray`
+            By how far the frame misses what is predicted from the others, (W,), whitened.
+        sight : `~numpy.ndarray`
+            Inverse of the covariance of these, with the errors of the prediction, (W, W).
+        weight : `~numpy.ndarray`
+            Inverse of the noise, (W,).
+        """
         residual, tangent, _ = self._parts[i]
         channel = self.problem.channels[i]
         n = channel.shape[1]
-        weight = channel.whiten_frames(channel.valid.astype(float)[None] * np.ones((2, 1, 1)))
-        return residual[:n, f], tangent[:n, f], weight[0, :, f]
+        weight = channel.whiten_frames(np.ones(channel.shape) * channel.valid)[0, :, f]
+        values, vectors = np.linalg.eigh(tangent[:n, f] @ tangent[:n, f].T)
+        if self.out[i][f]:
+            return residual[:n, f], (vectors / (1 + values)) @ vectors.T, weight
+        share = np.where(1 - values > _SEEN, 1 - values, np.inf)
+        missed = (vectors / share) @ vectors.T @ residual[:n, f]
+        return missed, (vectors * np.maximum(1 - values, 0.0)) @ vectors.T, weight
+
+
+def _basis(columns, rows):
+    """
+    Return the basis that is orthonormal in some rows, in all of them, and in these rows only.
+
+    A coefficient that these rows do not determine is left out.
+    """
+    kept = columns * rows[:, None]
+    norm = np.linalg.norm(kept, axis=0)
+    seen = norm > 0
+    left, singular, right = np.linalg.svd(kept[:, seen] / norm[seen], full_matrices=False)
+    good = singular > _SEEN * singular.max(initial=0.0)
+    full = columns[:, seen] / norm[seen] @ (right[good].T / singular[good])
+    # what was in the basis need not be worked out again, and is more exact
+    return np.where(rows[:, None], left[:, good], full), left[:, good]
 
 
 def kept_rows(problem, out):

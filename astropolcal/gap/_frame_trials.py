@@ -22,7 +22,6 @@ _FACTORS = np.array([1e-4, 2.0])
 _NEWTON = 8
 # differences that are wrong for no known reason, wavelength by wavelength
 _ANY = 0.3
-_TINY = 1e-6
 
 
 @dataclass
@@ -70,7 +69,7 @@ class Frame:
     Parameters
     ----------
     look : Look
-        Of the frame and all that are not accused, at the fit without it.
+        At the fit without the frame, or nearly so.
     i, f : int
         Dataset and frame.
     scatter : float
@@ -95,21 +94,17 @@ class Frame:
     """
 
     def __init__(self, look, i, f, scatter=1.0):
-        self.look, self.i, self.f = look, i, f
+        self.look, self.i, self.f, self.scatter = look, i, f, scatter
         self.dataset, self.channel = look.problem.datasets[i], look.problem.channels[i]
         self.valid = self.channel.valid[:, f]
         self.sigma = self.channel.sigma[0, :, f] * np.sqrt(scatter)
         self.weight = np.where(self.valid, 1 / self.sigma, 0.0)
         self.observed = self.channel.observed[0, :, f]
-        rest, tangent, lengths = look.of_frame(i, f)
-        self._sight = np.eye(len(rest)) - tangent @ tangent.T
-        # what the other frames say of it, be it of the optics or of background and the like
-        values, vectors = np.linalg.eigh(self._sight)
-        seen = values > _TINY
-        back = (vectors[:, seen] / values[seen]) @ (vectors[:, seen].T @ rest)
-        back = np.where(lengths > 0, back / np.where(lengths > 0, lengths, 1.0), 0.0)
+        missed, self._sight, weight = look.of_frame(i, f)
         plain = self.predicted(self._positions([f]))[:, 0]
-        self._offset = np.where(self.valid, back - (self.observed - plain), 0.0)
+        # what others say beyond the optics, of background and the like
+        missed = np.divide(missed, weight, out=np.zeros(len(weight)), where=weight > 0)
+        self._offset = np.where(self.valid, missed - (self.observed - plain), 0.0)
 
     # ---- predictions ------------------------------------------------------------------------
 

@@ -34,6 +34,8 @@ _RARE, _UNEXPLAINED = 10.0, 0.1
 # an exchange makes either frame better by so much, and is tried for so many frames
 _BETTER, _PARTNERS = 10.0, 5
 _CERTAIN = 0.99
+# of very many frames several are taken at once, those nearly as bad as the worst
+_AT_ONCE, _NEARLY = 12, 0.5
 _STEPS, _SHARE = 12, 1e-5
 _STAGES = {"hwp": "the half-wave plate", "derotator": "the derotator"}
 
@@ -182,14 +184,14 @@ class _Search:
         first = last = Look(self.model, self.model.fit.coefficients, nobody)
         accused = []
         # a frame that is far off makes others look bad; these are heard and let go
-        for _ in range(2 * self.most + 1):
-            suspect = _worst(last, self.n_frames)
-            if suspect is None:
+        while True:
+            suspects = _worst(last, self.n_frames)[: max(1, self.most // _AT_ONCE)]
+            if not suspects:
                 break
-            accused.append(suspect)
+            if len(accused) >= 2 * self.most or _is_hopeless(first, last, len(accused), self.most):
+                return []
+            accused += suspects
             last = self._look(accused, last.coefficients)
-        else:
-            return []
         if not accused:
             return []
         found = self._heard(accused, last)
@@ -207,11 +209,10 @@ class _Search:
 
     def _heard(self, accused, last):
         """Return what each of the accused frames is accused of, those that are guilty."""
-        frames = {place: self._frame(place, accused, last) for place in accused}
+        scatter = [_scatter(*last.deleted(i), last.kept(i)) for i in range(len(last.out))]
+        frames = {(i, f): Frame(last, i, f, scatter[i]) for i, f in accused}
         trials = {place: [one.as_told(), *one.trials()] for place, one in frames.items()}
-        exchanged = {
-            place: _exchanges(place, frames, trials, last, self._frame) for place in accused
-        }
+        exchanged = {place: _exchanges(place, frames, trials) for place in accused}
         found = []
         for place in accused:
             fault = self._verdict(place, trials[place], exchanged[place])
@@ -219,17 +220,9 @@ class _Search:
                 found.append(fault)
         return sorted(self._with_partners(found), key=lambda fault: -fault.evidence)
 
-    def _frame(self, place, accused, last):
-        others = [one for one in accused if one != place]
-        look = last
-        if place in accused:
-            look = Look(self.model, last.coefficients, _marked(self.problem, others))
-        scatter = _scatter(*last.deleted(place[0]), last.kept(place[0]))
-        return Frame(look, *place, scatter=scatter)
-
     def _verdict(self, place, trials, exchanged):
         """Weigh the trials of a frame against each other (Bayes), or return None: no fault."""
-        i, f = place
+        i, _ = place
         kinds = len(angle_stages(self.model.chains[i])) + 2
         none, *rest = [*trials, *exchanged]
         prior = 1 / (_RARE * self.n_frames * kinds)
@@ -276,7 +269,7 @@ class _Search:
         for fault in found:
             other = fault.partner_place
             known = places.get(other)
-            if other is None or known is not None and known.what == "exchanged":
+            if other is None or (known is not None and known.what == "exchanged"):
                 continue
             trial = Trial("exchanged", 0.0, 0.0, partner=fault.place[1])
             places[other] = self._fault(other, trial, fault.evidence, fault.probability)
@@ -292,26 +285,34 @@ def _marked(problem, places):
 
 
 def _worst(look, n_frames):
-    """Return the frame that stands out most, or None: all are as noise and the others are."""
-    best, place, looks = 0.0, None, 0
-    for i in range(len(look.problem.channels)):
+    """Return the frames that stand out most, none if all are as noise and the others are."""
+    scores, looks = [], 1
+    for i in range(len(look.out)):
         keep = look.kept(i)
-        tests = []
+        tests = [look.deleted(i)]
         for kind, columns in look.columns(i).items():
             tests.append((look.lowering(i, columns[:1]), np.ones(len(keep))))
             if kind.endswith("beam"):
                 tests.append((look.lowering(i, columns), np.full(len(keep), len(columns))))
-        tests.append(look.deleted(i))
         looks = max(looks, len(tests))
-        for fall, freedom in tests:
-            freedom = np.maximum(freedom, 1)
-            score = -stats.chi2.logsf(fall / _scatter(fall, freedom, keep), freedom)
-            score = np.where(keep, np.minimum(score, fall / 2), 0.0)
-            # far out the chance is no number any more: there the fall itself is compared
-            score = np.where(np.isfinite(score), score, fall)
-            if score.max(initial=0.0) > best:
-                best, place = score.max(), (i, int(np.argmax(score)))
-    return place if best > np.log(n_frames * max(looks, 1) / _ALPHA) else None
+        scores.append(np.max([_surprise(*test, keep) for test in tests], axis=0))
+    places = [(i, f) for i, score in enumerate(scores) for f in range(len(score))]
+    every = np.concatenate(scores)
+    least = max(np.log(n_frames * looks / _ALPHA), _NEARLY * every.max())
+    return [places[k] for k in np.argsort(-every, kind="stable") if every[k] > least]
+
+
+def _surprise(fall, freedom, keep):
+    """Return minus the logarithm of the chance of every frame's fall among the others, (F,)."""
+    fall = np.where(keep, fall, 0.0) / _scatter(fall, freedom, keep)
+    # far out the chance is no number any more
+    return np.minimum(-stats.chi2.logsf(fall, np.maximum(freedom, 1)), fall / 2)
+
+
+def _is_hopeless(first, last, n, most):
+    """Return whether the frames left out so far took so little with them that no few will do."""
+    excess = [one.chi2 - one.freedom for one in (first, last)]
+    return last.chance < _NOISE and n > 2 and 1 - excess[1] / excess[0] < 0.5 * n / most
 
 
 def _scatter(fall, freedom, keep):
@@ -329,20 +330,12 @@ def _is_settled(first, last, places):
     excess = [one.chi2 / one.freedom - 1 for one in (first, last)]
     if excess[1] > (1 - _GONE) * excess[0]:
         return False
-    # the frames named, as they were seen without each other, against all that are left
-    left = max(
-        np.max(np.where(last.kept(i), last.deleted(i)[0], 0.0)) for i in range(len(last.out))
-    )
-    own = [
-        Look(last.model, last.coefficients, _marked(last.problem, set(places) - {p}))
-        for p in places
-    ]
-    return all(
-        look.deleted(i)[0][f] > _APART * left for look, (i, f) in zip(own, places, strict=True)
-    )
+    falls = [last.deleted(i)[0] for i in range(len(last.out))]
+    left = max(np.max(fall, where=last.kept(i), initial=0.0) for i, fall in enumerate(falls))
+    return all(falls[i][f] > _APART * left for i, f in places)
 
 
-def _exchanges(place, frames, trials, last, hear):
+def _exchanges(place, frames, trials):
     """Return the trials in which the stages stood as in another frame, and there as in this."""
     i, f = place
     one, told = frames[place], trials[place][0].chi2
@@ -356,7 +349,7 @@ def _exchanges(place, frames, trials, last, hear):
             break
         other = (i, int(j))
         if other not in frames:
-            partner = hear(other, list(frames), last)
+            partner = Frame(one.look, *other, one.scatter)
             known = [partner.as_told()]
         else:
             partner, known = frames[other], trials[other]

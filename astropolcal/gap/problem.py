@@ -365,18 +365,20 @@ class GapProblem:
 
     # ---- what follows from a fit --------------------------------------------------------
 
-    def tangent(self, coefficients, rows=None):
+    def tangent(self, coefficients):
         """
         Return an orthonormal basis of the derivatives, shape (n_rows, rank).
 
         A coefficient, or a value of a law, at its bound cannot take anything up and is left out.
-        Where only some ``rows`` (n_rows,) take part, the others are zero.
         """
+        return orthonormal(self.open_slopes(coefficients))
+
+    def open_slopes(self, coefficients):
+        """Return the derivatives in the directions that no bound closes, shape (n_rows, k)."""
         inside = (coefficients > self.low + _AT_BOUND) & (coefficients < self.high - _AT_BOUND)
-        slopes, (walls, ends) = self.jacobian(coefficients)[:, inside], self._walls
-        slopes = slopes if rows is None else slopes * rows[:, None]
-        held = walls[walls @ coefficients > ends - _AT_WALL][:, inside]
-        return orthonormal(slopes @ null_space(held) if len(held) else slopes)
+        slopes, (rows, ends) = self.jacobian(coefficients)[:, inside], self._walls
+        held = rows[rows @ coefficients > ends - _AT_WALL][:, inside]
+        return slopes @ null_space(held) if len(held) else slopes
 
     @property
     def n_data(self):

@@ -294,7 +294,7 @@ def off_the_drift(model):
 
 
 def _far_off(channel, name, table):
-    """Return which frames are far off the others in a channel, by how much, and by how many sigma."""
+    """Return which frames are far off in a channel, by how much, and by how many sigma."""
     sigma = channel.sigma[CHANNELS.index(name)]
     known = channel.valid & np.isfinite(sigma)
     common, error, agree = _common(np.where(known, table, np.nan), sigma)
