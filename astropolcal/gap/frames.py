@@ -16,27 +16,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from astropolcal.gap._frame_looks import Look, angle_stages, kept_rows
+from astropolcal.gap._frame_looks import angle_stages
+from astropolcal.gap._frame_search import Search, usual
 from astropolcal.gap._frame_trials import Frame, Trial
 from astropolcal.gap.remainders import off_the_drift
 
 __all__ = ["FrameFault", "suspect_frames", "without_frames"]
 
-# chance of a false accusation in a run, and the share of the frames that may be accused
-_ALPHA = 1e-3
-_MOST, _LEAST_MOST = 0.05, 2
-# a fit is down to the noise at this chance; else so much of the excess has to be gone, and the
-# accused have to stand so far above the others
-_NOISE, _GONE, _APART = 1e-3, 0.8, 10.0
 # one frame in so many runs of any length is thought to be wrong beforehand, and the share of
 # these that nobody can explain
 _RARE, _UNEXPLAINED = 10.0, 0.1
 # an exchange makes either frame better by so much, and is tried for so many frames
 _BETTER, _PARTNERS = 10.0, 5
 _CERTAIN = 0.99
-# of very many frames several are taken at once, those nearly as bad as the worst
-_AT_ONCE, _NEARLY = 12, 0.5
-_STEPS, _SHARE = 12, 1e-5
 _STAGES = {"hwp": "the half-wave plate", "derotator": "the derotator"}
 
 
@@ -127,7 +119,10 @@ def suspect_frames(model):
     >>> [(fault.frame, fault.what) for fault in suspect_frames(nominal_model([chain], [data]))]
     [(5, 'hwp angle')]
     """
-    found = _Search(model).faults()
+    search = Search(model)
+    accused, last = search.accused()
+    found = _Hearing(search).faults(accused, last) if accused else []
+    found = found if search.is_settled([fault.place for fault in found], last) else []
     named = {fault.place for fault in found}
     return found + [fault for fault in _lamp(model) if fault.place not in named]
 
@@ -166,50 +161,18 @@ def without_frames(observations, faults):
     return observations
 
 
-# ---- search ----------------------------------------------------------------------------------
+# ---- hearing ---------------------------------------------------------------------------------
 
 
-class _Search:
-    """Frames are accused one after the other, and then each is heard."""
+class _Hearing:
+    """What each frame that was accused is accused of."""
 
-    def __init__(self, model):
-        self.model, self.problem = model, model.problem
-        seen = [channel.valid.any(axis=0) for channel in self.problem.channels]
-        self.n_frames = int(sum(s.sum() for s in seen))
-        self.most = max(_LEAST_MOST, int(_MOST * self.n_frames))
+    def __init__(self, search):
+        self.model, self.problem, self.n_frames = search.model, search.problem, search.n_frames
 
-    def faults(self):
-        """Return the faults of single frames, the most evident first."""
-        nobody = [np.zeros(c.shape[2], dtype=bool) for c in self.problem.channels]
-        first = last = Look(self.model, self.model.fit.coefficients, nobody)
-        accused = []
-        # a frame that is far off makes others look bad; these are heard and let go
-        while True:
-            suspects = _worst(last, self.n_frames)[: max(1, self.most // _AT_ONCE)]
-            if not suspects:
-                break
-            if len(accused) >= 2 * self.most or _is_hopeless(first, last, len(accused), self.most):
-                return []
-            accused += suspects
-            last = self._look(accused, last.coefficients)
-        if not accused:
-            return []
-        found = self._heard(accused, last)
-        places = [fault.place for fault in found]
-        if not places or len(places) > self.most:
-            return []
-        last = last if set(places) == set(accused) else self._look(places, last.coefficients)
-        return found if _is_settled(first, last, places) else []
-
-    def _look(self, accused, coefficients):
-        out = _marked(self.problem, accused)
-        rows = kept_rows(self.problem, out)
-        fit = self.problem.fit(coefficients, rows=rows, steps=_STEPS, share=_SHARE)
-        return Look(self.model, fit.coefficients, out)
-
-    def _heard(self, accused, last):
+    def faults(self, accused, last):
         """Return what each of the accused frames is accused of, those that are guilty."""
-        scatter = [_scatter(*last.deleted(i), last.kept(i)) for i in range(len(last.out))]
+        scatter = [usual(*last.deleted(i), last.kept(i)) for i in range(len(last.out))]
         frames = {(i, f): Frame(last, i, f, scatter[i]) for i, f in accused}
         trials = {place: [one.as_told(), *one.trials()] for place, one in frames.items()}
         exchanged = {place: _exchanges(place, frames, trials) for place in accused}
@@ -274,65 +237,6 @@ class _Search:
             trial = Trial("exchanged", 0.0, 0.0, partner=fault.place[1])
             places[other] = self._fault(other, trial, fault.evidence, fault.probability)
         return list(places.values())
-
-
-def _marked(problem, places):
-    """Return which frames are among some places, one array a dataset."""
-    out = [np.zeros(c.shape[2], dtype=bool) for c in problem.channels]
-    for i, f in places:
-        out[i][f] = True
-    return out
-
-
-def _worst(look, n_frames):
-    """Return the frames that stand out most, none if all are as noise and the others are."""
-    scores, looks = [], 1
-    for i in range(len(look.out)):
-        keep = look.kept(i)
-        tests = [look.deleted(i)]
-        for kind, columns in look.columns(i).items():
-            tests.append((look.lowering(i, columns[:1]), np.ones(len(keep))))
-            if kind.endswith("beam"):
-                tests.append((look.lowering(i, columns), np.full(len(keep), len(columns))))
-        looks = max(looks, len(tests))
-        scores.append(np.max([_surprise(*test, keep) for test in tests], axis=0))
-    places = [(i, f) for i, score in enumerate(scores) for f in range(len(score))]
-    every = np.concatenate(scores)
-    least = max(np.log(n_frames * looks / _ALPHA), _NEARLY * every.max())
-    return [places[k] for k in np.argsort(-every, kind="stable") if every[k] > least]
-
-
-def _surprise(fall, freedom, keep):
-    """Return minus the logarithm of the chance of every frame's fall among the others, (F,)."""
-    fall = np.where(keep, fall, 0.0) / _scatter(fall, freedom, keep)
-    # far out the chance is no number any more
-    return np.minimum(-stats.chi2.logsf(fall, np.maximum(freedom, 1)), fall / 2)
-
-
-def _is_hopeless(first, last, n, most):
-    """Return whether the frames left out so far took so little with them that no few will do."""
-    excess = [one.chi2 - one.freedom for one in (first, last)]
-    return last.chance < _NOISE and n > 2 and 1 - excess[1] / excess[0] < 0.5 * n / most
-
-
-def _scatter(fall, freedom, keep):
-    """Return how much larger than noise a statistic is in most frames, at least 1."""
-    if not keep.any():
-        return 1.0
-    usual = stats.chi2.median(np.maximum(np.median(freedom[keep]), 1))
-    return float(max(np.median(fall[keep]) / usual, 1.0))
-
-
-def _is_settled(first, last, places):
-    """Return whether what was wrong is gone without the frames that are named."""
-    if last.chance > _NOISE:
-        return True
-    excess = [one.chi2 / one.freedom - 1 for one in (first, last)]
-    if excess[1] > (1 - _GONE) * excess[0]:
-        return False
-    falls = [last.deleted(i)[0] for i in range(len(last.out))]
-    left = max(np.max(fall, where=last.kept(i), initial=0.0) for i, fall in enumerate(falls))
-    return all(falls[i][f] > _APART * left for i, f in places)
 
 
 def _exchanges(place, frames, trials):
