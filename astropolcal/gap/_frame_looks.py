@@ -240,6 +240,20 @@ class Look:
         missed = (vectors / share) @ vectors.T @ residual[:n, f]
         return missed, (vectors * np.maximum(1 - values, 0.0)) @ vectors.T, weight
 
+    def sums_of_frame(self, i, f):
+        """
+        Return what the sums of a frame miss, (W,), what the lamp leaves of sums, and whitening.
+
+        The latter two are (W, W).
+        """
+        residual, _, lamp = self._parts[i]
+        channel = self.problem.channels[i]
+        n = channel.shape[1]
+        left = np.eye(n) - lamp[n:, f] @ lamp[n:, f].T
+        single = np.zeros((n, 2, n, channel.shape[2]))
+        single[:, 1, :, f] = np.diag(channel.valid[:, f].astype(float))
+        return residual[n:, f], left, channel.whiten_frames(single)[:, 1, :, f].T
+
 
 def _basis(columns, rows):
     """

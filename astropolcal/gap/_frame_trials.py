@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from astropolcal.gap._frame_looks import BEAM_DEGREE, angle_stages
+from astropolcal.gap._frame_looks import angle_stages
 from astropolcal.propagation import Propagator
 
 __all__ = ["Frame", "Trial"]
@@ -22,6 +22,8 @@ _FACTORS = np.array([1e-4, 2.0])
 _NEWTON = 8
 # differences that are wrong for no known reason, wavelength by wavelength
 _ANY = 0.3
+_TINY = 1e-6
+_BEAMS = {1: "right", -1: "left"}
 
 
 @dataclass
@@ -41,6 +43,8 @@ class Trial:
         Angle in radian, or factor of the beam; NaN where there is none.
     partner : int, optional
         Index of the other frame of an exchange.
+    beam : str
+        The beam that was off.
 
     Examples
     --------
@@ -55,6 +59,7 @@ class Trial:
     value: float = np.nan
     error: float = np.nan
     partner: int | None = None
+    beam: str = ""
 
     @property
     def total(self):
@@ -105,6 +110,14 @@ class Frame:
         # what others say beyond the optics, of background and the like
         missed = np.divide(missed, weight, out=np.zeros(len(weight)), where=weight > 0)
         self._offset = np.where(self.valid, missed - (self.observed - plain), 0.0)
+        self._plain, self._root = plain, _root(self._sight)
+        missed, left, whiten = look.sums_of_frame(i, f)
+        root = _root(left) / np.sqrt(scatter)
+        self._sums = (
+            np.linalg.pinv(_root(left), rcond=_TINY) @ missed / np.sqrt(scatter),
+            whiten,
+            root,
+        )
 
     # ---- predictions ------------------------------------------------------------------------
 
@@ -137,7 +150,9 @@ class Frame:
     def trials(self):
         """Return all trials that need no other frame."""
         stages = [self.angle(stage) for stage in angle_stages(self.look.chains[self.i])]
-        return [*stages, *(self.beam(degree) for degree in range(BEAM_DEGREE + 1)), self.anything()]
+        degrees = range(self.look.law(self.i).shape[1])
+        beams = [self.beam(degree, side) for degree in degrees for side in _BEAMS]
+        return [*stages, *beams, self.anything()]
 
     def angle(self, stage):
         """Return the trial in which a stage stood elsewhere."""
@@ -172,26 +187,47 @@ class Frame:
             offset, half = grid[best], 2 * half / (_POINTS - 1)
         return float(offset), float(chi2[best])
 
-    def beam(self, degree):
-        """Return the trial in which one beam was off by a factor, a law in wavelength."""
+    def beam(self, degree, side):
+        """
+        Return the trial in which the right (1) or left (-1) beam was off by a factor.
+
+        The logarithm of the factor is a law in wavelength. The sums take part, too: they tell
+        which of the beams it was where the lamp is steady.
+        """
         law = self.look.law(self.i)[:, : degree + 1]
-        plain = self.predicted(self._positions([self.f]))[:, 0]
         size = np.zeros(law.shape[1])
         for _ in range(_NEWTON):
-            shifted = _shifted(plain, law @ size)
-            slopes = law * ((1 - shifted**2) / 2 * self.weight)[:, None]
-            left = (self.observed - shifted + self._offset) * self.weight
-            inner = slopes.T @ self._sight @ slopes
-            step = np.linalg.lstsq(inner, slopes.T @ self._sight @ left, rcond=1e-12)[0]
+            left, slopes = self._of_beam(law, size, side)
+            inner = slopes.T @ slopes
+            step = np.linalg.lstsq(inner, slopes.T @ left, rcond=1e-12)[0]
             size = size + np.clip(step, -1.0, 1.0)
-        chi2 = float(self.chi2(_shifted(plain, law @ size)[:, None])[0])
+        before, after = (self._of_beam(law, x, side)[0] for x in (0 * size, size))
+        chi2 = self.as_told().chi2 - float(before @ before - after @ after)
         errors = np.sqrt(np.diag(np.linalg.pinv(inner, hermitian=True)))
         # the law is about its mean: other coefficients are of its size or below
         biggest = max(np.abs(size).max(), errors[0])
         cost = _occam(size[0], errors[0], _FACTORS)
         cost += sum(_share(error, 2 * biggest) for error in errors[1:])
-        mean = float(np.mean((law @ size)[self.valid]))
-        return Trial("one beam", chi2, cost, float(np.exp(mean)), float(errors[0] * np.exp(mean)))
+        mean = float(np.exp(np.mean((law @ size)[self.valid])))
+        return Trial("one beam", chi2, cost, mean, float(errors[0] * mean), beam=_BEAMS[side])
+
+    def _of_beam(self, law, size, side):
+        """Return what a law leaves of differences and sums, and its derivatives; unit noise."""
+        factor = law @ size
+        shifted = _shifted(self._plain, side * factor)
+        left = (self.observed - shifted + self._offset) * self.weight
+        slopes = side * law * ((1 - shifted**2) / 2 * self.weight)[:, None]
+        share = (1 + side * self._plain) / 2
+        brighter = np.log1p(share * np.expm1(factor))
+        missed, whiten, root = self._sums
+        brighter, slope = (
+            root @ whiten @ x
+            for x in (brighter, law * (share * np.exp(factor - brighter))[:, None])
+        )
+        return (
+            np.concatenate([self._root @ left, missed - brighter]),
+            np.concatenate([self._root @ slopes, slope]),
+        )
 
     def anything(self):
         """Return the trial in which every wavelength of the frame is off by its own amount."""
@@ -201,6 +237,12 @@ class Frame:
     def with_positions_of(self, frames):
         """Return what is left of the frame if its stages stood as in others, (n,)."""
         return self.chi2(self.predicted(self._positions(frames)))
+
+
+def _root(matrix):
+    """Return the symmetric root of a symmetric matrix."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
 def _shifted(difference, log_ratio):

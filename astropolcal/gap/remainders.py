@@ -8,6 +8,7 @@ doi:10.1007/BF02099545; Johnstone 2001, doi:10.1214/aos/1009210544). A frame at
 odds with the others speaks of the lamp or of the exposure, not of the optics.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -297,7 +298,10 @@ def _far_off(channel, name, table):
     """Return which frames are far off in a channel, by how much, and by how many sigma."""
     sigma = channel.sigma[CHANNELS.index(name)]
     known = channel.valid & np.isfinite(sigma)
-    common, error, agree = _common(np.where(known, table, np.nan), sigma)
+    with warnings.catch_warnings():
+        # a frame that is masked at all wavelengths has no median
+        warnings.simplefilter("ignore", RuntimeWarning)
+        common, error, agree = _common(np.where(known, table, np.nan), sigma)
     curve = _drift(channel.sequence, common, _LARGEST_DRIFT if name == "sum" else 0)
     spread = max(MAD_TO_SIGMA * np.nanmedian(np.abs(common - curve)), np.nanmedian(error))
     score = (common - curve) / spread
