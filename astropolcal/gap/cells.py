@@ -525,7 +525,7 @@ class Reduced:
             if slope is None:
                 slope = np.zeros(channel.shape)
             columns = law[dataset.bins].T[:, None, :, None] * slope
-            white = channel.scaled(columns)
+            white = channel.whiten_frames(columns)
             n_frames = channel.shape[2]
             # frames last, then a product of matrices a frame
             flat = white.reshape(k, -1, n_frames)

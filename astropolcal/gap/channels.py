@@ -129,18 +129,29 @@ class Channels:
         `~numpy.ndarray`
             Of the same shape; what is left has unit noise.
         """
-        out = self.scaled(array)
+        out = self.whiten_frames(array)
         sums = out[..., 1, :, :]
         flat = sums.reshape(*sums.shape[:-2], sums.shape[-2] * sums.shape[-1])
         flat = flat - (flat @ self.nuisance) @ self.nuisance.T
         out[..., 1, :, :] = flat.reshape(sums.shape)
         return out
 
-    def scaled(self, array):
-        """Return residuals or derivatives over the noise, as `whiten` does, with the lamp in."""
-        weight, _ = self._whitening
+    def whiten_frames(self, array):
+        """
+        Divide by the noise and by the flicker, frame by frame: the lamp's drift stays.
+
+        Parameters
+        ----------
+        array : `~numpy.ndarray`
+            Residuals or derivatives, shape (..., 2, W, F).
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Of the same shape.
+        """
         out = np.empty(array.shape)
-        out[..., 0, :, :] = array[..., 0, :, :] * weight[0]
+        out[..., 0, :, :] = array[..., 0, :, :] * self._whitening[0][0]
         out[..., 1, :, :] = self._sum_whitened(array[..., 1, :, :])
         return out
 

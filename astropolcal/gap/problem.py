@@ -405,10 +405,14 @@ class GapProblem:
 
         A coefficient, or a value of a law, at its bound cannot take anything up and is left out.
         """
+        return orthonormal(self.open_slopes(coefficients))
+
+    def open_slopes(self, coefficients):
+        """Return the derivatives in the directions that no bound closes, shape (n_rows, k)."""
         inside = (coefficients > self.low + _AT_BOUND) & (coefficients < self.high - _AT_BOUND)
         slopes, (rows, ends) = self.jacobian(coefficients)[:, inside], self._walls
         held = rows[rows @ coefficients > ends - _AT_WALL][:, inside]
-        return orthonormal(slopes @ null_space(held) if len(held) else slopes)
+        return slopes @ null_space(held) if len(held) else slopes
 
     @property
     def n_data(self):

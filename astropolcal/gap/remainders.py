@@ -8,6 +8,7 @@ doi:10.1007/BF02099545; Johnstone 2001, doi:10.1214/aos/1009210544). A frame at
 odds with the others speaks of the lamp or of the exposure, not of the optics.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -243,20 +244,70 @@ def outlying_frames(model):
     for dataset, channel, gap in zip(
         problem.datasets, problem.channels, problem.differences(model.fit.coefficients), strict=True
     ):
-        for i, (name, table) in enumerate(zip(CHANNELS, gap, strict=True)):
-            known = channel.valid & np.isfinite(channel.sigma[i])
-            common, error, agree = _common(np.where(known, table, np.nan), channel.sigma[i])
-            curve = _drift(channel.sequence, common, _LARGEST_DRIFT if name == "sum" else 0)
-            spread = max(MAD_TO_SIGMA * np.nanmedian(np.abs(common - curve)), np.nanmedian(error))
-            score = (common - curve) / spread
-            far = np.abs(np.nan_to_num(score)) > _FAR
-            far &= agree if name == "difference" else True
-            rows += _runs(dataset.observations, name, far, common - curve, score)
+        for name, table in zip(CHANNELS, gap, strict=True):
+            rows += _runs(dataset.observations, name, *_far_off(channel, name, table))
     rows.sort(key=lambda row: -row["sigma"])
     names = ("dataset", "frames", "channel", "deviation", "sigma", "words")
     if not rows:
         return QTable(names=names, dtype=("U1", "U1", "U1", float, float, "U1"))
     return QTable({name: [row[name] for row in rows] for name in names})
+
+
+def off_the_drift(model):
+    """
+    Find frames whose brightness is off the drift of the lamp.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+
+    Returns
+    -------
+    list of tuple
+        One a dataset: the observations, which frames are far off, by how much (logarithm of
+        the flux) and in robust standard deviations, (F,) each.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.model import nominal_model
+    >>> from astropolcal.gap.remainders import off_the_drift
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> lamp = np.where(np.arange(24) == 5, 0.9, 1.0)
+    >>> data = simulate(chain, charis.wavelength, frames, lamp=lamp, seed=3)
+    >>> (_, far, *_), = off_the_drift(nominal_model([chain], [data]))
+    >>> np.flatnonzero(far).tolist()
+    [5]
+    """
+    gaps = model.problem.differences(model.fit.coefficients)
+    return [
+        (dataset.observations, *_far_off(channel, "sum", gap[1]))
+        for dataset, channel, gap in zip(
+            model.problem.datasets, model.problem.channels, gaps, strict=True
+        )
+    ]
+
+
+def _far_off(channel, name, table):
+    """Return which frames are far off in a channel, by how much, and by how many sigma."""
+    sigma = channel.sigma[CHANNELS.index(name)]
+    known = channel.valid & np.isfinite(sigma)
+    with warnings.catch_warnings():
+        # a frame that is masked at all wavelengths has no median
+        warnings.simplefilter("ignore", RuntimeWarning)
+        common, error, agree = _common(np.where(known, table, np.nan), sigma)
+    curve = _drift(channel.sequence, common, _LARGEST_DRIFT if name == "sum" else 0)
+    spread = max(MAD_TO_SIGMA * np.nanmedian(np.abs(common - curve)), np.nanmedian(error))
+    score = (common - curve) / spread
+    far = np.abs(np.nan_to_num(score)) > _FAR
+    far &= agree if name == "difference" else True
+    return far, common - curve, score
 
 
 def _common(table, sigma):

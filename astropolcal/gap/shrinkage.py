@@ -256,7 +256,7 @@ def foreseen(model, groups):
         rows, scale = np.concatenate(rows), np.concatenate(scale)
         if not rows.size:
             continue
-        left, share, right = np.linalg.svd(tangent[rows], full_matrices=False)
+        left, share, _ = np.linalg.svd(tangent[rows], full_matrices=False)
         # what the group alone determines cannot be foreseen at all; it is not counted
         lever = np.minimum(share**2, _MOST_LEVER)
         gap = residual[rows] + left @ ((lever / (1 - lever)) * (left.T @ residual[rows]))

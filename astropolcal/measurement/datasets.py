@@ -247,10 +247,14 @@ class Dataset:
 
     def forward(self, vector):
         """Return the forward sweep at a vector of free parameters."""
+        return self.propagator.forward(self.current_values(vector))
+
+    def current_values(self, vector):
+        """Return the parameter values of all optics at a vector of free parameters."""
         values = [list(optic) for optic in self._constants]
         for (i, j), where, factor, offset in self._live:
             values[i][j] = factor * vector[where] + offset
-        return self.propagator.forward(values)
+        return values
 
     def jacobian(self, sweep):
         """Return the derivative of the data to the flat vector, (n_free, n_data)."""

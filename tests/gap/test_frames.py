@@ -1,0 +1,203 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Single frames that are not what the table says, found and told apart from missing optics."""
+
+import json
+from functools import cache
+
+import astropy.units as u
+import gap_data as data
+import numpy as np
+import pytest
+
+from astropolcal import instruments
+from astropolcal.gap.frames import suspect_frames, without_frames
+from astropolcal.gap.model import nominal_model
+from astropolcal.observations import Observations
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+DEROTATOR = [45, 55, 65, 75, 85, 95] * u.deg
+N = 48
+
+
+def table(**errors):
+    """Frames of a run; by stage: the frame and the error of its angle in degree."""
+    frames = half_wave_plate_cycles(derotator=DEROTATOR)
+    for stage, (frame, error) in errors.items():
+        frames[f"{stage}_true"] = frames[stage] + np.where(np.arange(N) == frame, error, 0) * u.deg
+    return frames
+
+
+def exchanged(one, other):
+    frames = table()
+    order = np.arange(N)
+    order[[one, other]] = other, one
+    for stage in ("hwp", "derotator"):
+        frames[f"{stage}_true"] = frames[stage][order]
+    return frames
+
+
+def observed(frames=None, true=None, flux=1e6, **options):
+    frames = table() if frames is None else frames
+    seen = data.observed(true, table=frames, flux=flux, **options).to_table()
+    seen.remove_columns([name for name in seen.colnames if name.endswith("_true")])
+    return Observations.from_table(seen, name="lamp")
+
+
+def with_beam(frame, factor):
+    return data.with_flux(observed(), np.where(np.arange(N) == frame, factor, 1.0))
+
+
+def found(observations):
+    return suspect_frames(data.fitted(observations))
+
+
+@cache
+def plate_off():
+    return observed(table(hwp=(18, 0.7)))
+
+
+def harmful(faults):
+    return [fault for fault in faults if fault.what != "lamp"]
+
+
+def test_angle_of_any_size_is_found_with_its_value():
+    for stage, error in (("hwp", 0.3), ("hwp", -22.5), ("derotator", 4.0), ("hwp", 30.0)):
+        frames = table(**{stage: (21, error)})
+        (fault,) = found(observed(frames))
+        assert (fault.frame, fault.what, fault.with_) == (21, f"{stage} angle", None)
+        stood = frames[f"{stage}_true"][21].to_value(u.deg)
+        # where the plate is near half a wave it looks the same 90 deg on
+        assert abs((fault.value - stood + 45) % 90 - 45) < 5 * fault.error + 0.02
+        assert fault.probability > 0.9
+
+
+def test_exchanged_frames_are_named_with_each_other():
+    for one, other in ((12, 13), (3, 40)):
+        faults = found(observed(exchanged(one, other)))
+        pairs = {(f.frame, f.with_) for f in faults}
+        assert pairs == {(one, other), (other, one)}
+        assert all(f.what == "exchanged" and f.value is None for f in faults)
+
+
+def test_beam_that_was_off_in_one_frame():
+    for frame, factor in ((30, 1.01), (7, 0.95)):
+        (fault,) = harmful(found(with_beam(frame, factor)))
+        assert (fault.frame, fault.what) == (frame, "one beam")
+        assert abs(fault.value - factor) < 5 * fault.error
+
+
+def test_clean_frames_are_not_accused():
+    assert not any(found(observed(seed=seed)) for seed in range(6))
+
+
+def test_missing_optic_is_not_blamed_on_frames():
+    effects = {
+        "hwp_encoder_two_lobe": {"cosine": 0.01, "sine": 0.01},
+        "beam_gain": {"imbalance": 0.05},
+        "source_rotation_drift": {},
+    }
+    for name, values in effects.items():
+        true = data.with_effect(name, **values)
+        if not values:
+            continue
+        assert harmful(found(observed(true=true))) == []
+
+
+def test_dim_lamp_with_background_is_no_fault_of_frames():
+    lamp = np.where(np.arange(N) < 2, 0.5, 1.0)
+    seen = observed(lamp=lamp).to_table()
+    for beam in ("flux_right", "flux_left"):
+        seen[beam] = seen[beam] + 500 * seen[beam].unit
+    faults = found(Observations.from_table(seen, name="lamp"))
+    assert harmful(faults) == []
+    assert {fault.frame for fault in faults} == {0, 1}
+
+
+def test_two_faults_of_different_kind():
+    seen = data.with_flux(plate_off(), np.where(np.arange(N) == 33, 1.02, 1.0))
+    assert {(f.frame, f.what) for f in harmful(found(seen))} == {
+        (18, "hwp angle"),
+        (33, "one beam"),
+    }
+
+
+def test_many_bad_frames_are_no_single_faults():
+    frames = table()
+    wrong = np.random.default_rng(3).normal(0, 2, N) * (np.arange(N) % 3 == 0)
+    frames["hwp_true"] = frames["hwp"] + wrong * u.deg
+    assert harmful(found(observed(frames))) == []
+
+
+def test_lamp_is_named_and_not_masked():
+    seen = observed(lamp=np.where(np.arange(N) == 9, 0.9, 1.0))
+    (fault,) = found(seen)
+    assert (fault.frame, fault.what) == (9, "lamp")
+    np.testing.assert_allclose(fault.value, 0.9, atol=0.01)
+    assert not without_frames([seen], [fault])[0].mask.any()
+
+
+def test_fit_without_the_frames_is_down_to_the_noise():
+    model = data.fitted(plate_off())
+    faults = suspect_frames(model)
+    (left,) = without_frames(model.observations, faults)
+    assert np.flatnonzero(left.mask.all(axis=1)).tolist() == [18]
+    again = data.fitted(left)
+    assert model.p_value < 1e-6 < 1e-3 < again.p_value
+    assert suspect_frames(again) == []
+
+
+def test_model_is_left_as_it_was():
+    model = data.fitted(plate_off())
+    before = model.residual, model.fit.coefficients.copy()
+    suspect_frames(model)
+    np.testing.assert_array_equal(model.residual, before[0])
+    np.testing.assert_array_equal(model.fit.coefficients, before[1])
+
+
+def test_dictionary_is_json_and_frames_go_by_their_numbers():
+    seen = plate_off().to_table()
+    seen["frame"] = seen["frame"] + 100
+    (fault,) = found(Observations.from_table(seen, name="lamp"))
+    entry = json.loads(json.dumps(fault.to_dict()))
+    assert (entry["frame"], entry["what"], entry["with"]) == (118, "hwp angle", None)
+    assert entry["dataset"] == "lamp"
+    assert 0.9 < entry["probability"] <= 1
+
+
+def test_single_wavelength_of_another_instrument():
+    irdis = instruments.get("irdis")
+    chain = irdis.chain("polarized", wavelength=irdis.wavelength[2:3])
+    frames = half_wave_plate_cycles(
+        hwp=np.arange(0, 90, 11.25) * u.deg, derotator=np.arange(0, 180, 22.5) * u.deg
+    )
+    frames["hwp_true"] = frames["hwp"] + np.where(np.arange(64) == 21, 5.0, 0) * u.deg
+    seen = simulate(chain, irdis.wavelength[2:3], frames, seed=4).to_table()
+    seen.remove_column("hwp_true")
+    seen = Observations.from_table(seen, name="irdis")
+    # with one number a frame the kind cannot be told, but the frame can
+    (fault,) = found_of(chain, seen)
+    assert fault.frame == 21
+
+
+def found_of(chain, observations):
+    return harmful(suspect_frames(data.fitted(observations, [chain])))
+
+
+@pytest.mark.parametrize("folder", ["gap-cases-2"])
+def test_cases_of_another_simulator(shared_data, folder):
+    root = shared_data / folder
+    if not root.exists():
+        pytest.skip(f"no {folder} in the shared folder")
+    expected = {
+        "case005": {(38, "exchanged"), (41, "exchanged")},
+        "case008": {(36, "one beam")},
+        "case044": {(18, "hwp angle")},
+        "case000": set(),
+        "case019": set(),
+        "case046": set(),
+    }
+    for case, named in expected.items():
+        seen = [Observations.read(root / case / f"{s}polarized.ecsv") for s in ("", "un")]
+        chains = instruments.get("charis").chains_for(seen, derotator="linear")
+        faults = harmful(suspect_frames(nominal_model(chains, seen)))
+        assert {(fault.frame, fault.what) for fault in faults} == named, case
