@@ -318,7 +318,7 @@ def _named(probes, effects, temper, degree="default"):
     """Return the candidates of named effects, all of them at zero in the same chains."""
     model, found = probes.model, []
     context = replace(model.context, degree=degree)
-    chains = model.chains
+    chains = model.trains
     waiting = [
         effect
         for effect in effects
@@ -371,7 +371,7 @@ def _of_batch(probes, edited, parameters, ties, effects, temper):
 
 
 def _with_name(effect, model, values, share, temper):
-    cells = effect.cells(model.chains) if hasattr(effect, "cells") else ()
+    cells = effect.cells(model.trains)
     one = Candidate(
         effect,
         cells[0] if cells else None,

@@ -17,9 +17,11 @@ from astropolcal.gap.alternatives import starting_model
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.cell import CellEffect
-from astropolcal.gap.model import Model
+from astropolcal.gap.frames import suspect_frames, without_frames
+from astropolcal.gap.model import Model, nominal_model
 from astropolcal.gap.selection import REMAINDER, select
 from astropolcal.gap.shrinkage import frame_groups
+from astropolcal.words import counted
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
 
@@ -242,11 +244,25 @@ def diagnose(
     _check_instruments(observations)
     say("fitting the nominal model")
     nominal, base, exchanged = starting_model(calibration, observations, library, say)
+    say("looking for frames that are not what the table says")
+    frames = suspect_frames(base)
+    wrong = [fault for fault in frames if fault.what != "lamp"]
+    if wrong:
+        say(f"without {counted(len(wrong), 'frame')}: fitting the nominal model again")
+        kept = without_frames(observations, wrong)
+        again, groups = _refitted(base, kept), frame_groups(kept) if cross_validate else None
+        nominal, base = (again if nominal is base else nominal), again
     say("looking for causes")
     # what has a place depends on the alternative that was taken; the discrete ones were tried
     smooth = [effect for effect in adapted(library, base.chains) if effect.kind != "discrete"]
     selection = select(base, smooth, groups, say, cells=cells)
-    return _conclude(nominal, base, exchanged, selection, [], started)
+    return _conclude(nominal, base, exchanged, selection, frames, started)
+
+
+def _refitted(model, observations):
+    """Return a model fitted to some of the frames, with noise and effects of its own."""
+    fresh = nominal_model(model.chains, observations)
+    return Model(fresh.problem, fresh.fit, model.added)
 
 
 def _library(effects):

@@ -366,6 +366,29 @@ class Effect(ABC):
         Edit
         """
 
+    def cells(self, chains):
+        """
+        Return the cells of the table of places, kinds and dependences that the effect is.
+
+        Parameters
+        ----------
+        chains : sequence
+            One a dataset.
+
+        Returns
+        -------
+        tuple of Cell
+            The main one first; those that it is nearest to where it is none. Empty for
+            discrete alternatives.
+        """
+        from astropolcal.gap.effects._cells import filled_in
+
+        return filled_in(self, chains)
+
+    def cell(self, chains):
+        """Return the main one of `cells`, None where there is none."""
+        return next(iter(self.cells(chains)), None)
+
     def variants(self, context):
         """
         Return the effect in all the settings among which the data may choose.

@@ -44,9 +44,13 @@ class CellEffect(Effect):
     reference = "a perturbation of no name"
 
     def __init__(self, cell, degree=2):
-        self.cell, self.degree = cell, degree
+        self._cell, self.degree = cell, degree
         self.name = cell.name
         self.title, self.place = cell.title, cell.place
+
+    def cells(self, chains):
+        """Return the cell."""
+        return (self._cell,)
 
     @property
     def label(self):
@@ -62,22 +66,22 @@ class CellEffect(Effect):
         return self._place(join(roles.leaves)) is not None
 
     def _place(self, chain):
-        if self.cell.place == "detector":
-            return self.cell.place
-        return next((p for p in places(chain) if p.name == self.cell.place), None)
+        if self._cell.place == "detector":
+            return self._cell.place
+        return next((p for p in places(chain) if p.name == self._cell.place), None)
 
     def edit(self, chains, context):
         """Return the chains with the perturbation at zero; see `Effect.edit`."""
-        if self.cell.kind not in optics.GENERATORS:
+        if self._cell.kind not in optics.GENERATORS:
             return self._at_detector(chains, context)
-        edited, dependence = [], Dependence(self.cell.dependence)
+        edited, dependence = [], Dependence(self._cell.dependence)
         # chains of the same source stand for several datasets: the place of the dataset counts
         names = context.datasets or (None,) * len(chains)
         for chain, name in zip(chains, names, strict=True):
             place = self._place(chain)
             own = dependence.kind != "dataset" or dependence.text.partition(":")[2] == name
             edited.append(self._with(chain, place, context) if place and own else chain)
-        scale, limit = self.cell.scale, _LIMITS.get(self.cell.kind.partition("_")[0], _LIMIT)
+        scale, limit = self._cell.scale, _LIMITS.get(self._cell.kind.partition("_")[0], _LIMIT)
         basis = None if self.degree is None else context.basis(self.degree)
         keys = ("amplitude", "quadrature")[: dependence.count]
         parameters = [EffectParameter(f"{self.label}.{k}", scale, limit, basis) for k in keys]
@@ -87,15 +91,15 @@ class CellEffect(Effect):
         """Return the chains with what only a detector has."""
         edited = []
         for chain in chains:
-            optic, side, key, ties = detector_optic(self.cell.kind, self.label, context)
+            optic, side, key, ties = detector_optic(self._cell.kind, self.label, context)
             split = next(o.name for o in leaves(chain) if o.splits_light)
             edited.append(insert_optic(chain, optic, **{side: split}))
         basis = None if self.degree is None else context.basis(self.degree)
         name = f"{self.label}.{key}"
-        return Edit(edited, [EffectParameter(name, self.cell.scale, _LIMIT, basis)], ties)
+        return Edit(edited, [EffectParameter(name, self._cell.scale, _LIMIT, basis)], ties)
 
     def _with(self, chain, place, context):
-        dependence = Dependence(self.cell.dependence)
+        dependence = Dependence(self._cell.dependence)
         size = np.zeros(len(context.wavelength))
         values = {"amplitude": size}
         if dependence.count == 2:
@@ -103,8 +107,8 @@ class CellEffect(Effect):
         theta = 0.0 if place == "detector" else place.theta
         optic = optics.Perturbation(
             **values,
-            kind=self.cell.kind,
-            dependence=self.cell.dependence,
+            kind=self._cell.kind,
+            dependence=self._cell.dependence,
             theta=theta * u.rad,
             name=self.label,
         )
