@@ -74,30 +74,30 @@ class Search:
         trail = self._trail([], self.first)
         # the first few, without which nearly all is gone: in a fit that they have bent, more
         # frames look bad than are
-        few = [one for one in trail if one[0] and self._is_nearly_gone(one[1])]
-        if not few:
+        few = (one for one in trail if one[0] and self._is_nearly_gone(one[1]))
+        places, look = next(few, ([], self.first))
+        if not places:
             return [], self.first
-        places, look = few[0]
         self.worst = set(places)
         self._start_again(places, look)
         self.first = Look(self.model, look.coefficients, _marked(self.problem, []))
         few = places, self._look(places, look.coefficients)
-        places, look = self._trail(*few)[-1]
+        *_, (places, look) = self._trail(*few)
         return (places, look) if places else few
 
     def _trail(self, places, look):
-        """Return the frames that are accused step by step, with the look without them."""
-        trail = [(list(places), look)]
+        """Yield the frames that are accused step by step, with the look without them."""
         while True:
+            yield places, look
             # a frame that is far off makes others look bad; these are heard and let go
             suspects = _worst(look, self.n_frames)[: max(1, self.most // _AT_ONCE)]
             if not suspects:
-                return trail
-            if len(trail[-1][0]) >= 2 * self.most or self._is_hopeless(look, len(trail[-1][0])):
-                return [*trail, ([], look)]
-            places = trail[-1][0] + suspects
+                return
+            if len(places) >= 2 * self.most or self._is_hopeless(look, len(places)):
+                yield [], look
+                return
+            places = places + suspects
             look = self._look(places, look.coefficients)
-            trail.append((places, look))
 
     def _is_nearly_gone(self, look):
         excess = [one.chi2 / one.freedom - 1 for one in (self.first, look)]
