@@ -8,7 +8,7 @@ from scipy import stats
 
 from astropolcal.gap._frame_looks import Look, kept_rows
 from astropolcal.gap._noise import noise, settings
-from astropolcal.gap.model import Model
+from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
 
 __all__ = ["Search", "usual"]
@@ -21,6 +21,8 @@ _MOST, _LEAST_MOST = 0.05, 2
 _NOISE, _GONE, _APART = 1e-3, 0.8, 10.0
 # of very many frames several are taken at once, those nearly as bad as the worst
 _AT_ONCE, _NEARLY = 12, 0.5
+# as bad frames are found, so little of the excess is left that the noise is measured anew
+_NEARLY_GONE = 0.1
 _STEPS, _SHARE = 20, 1e-5
 
 
@@ -55,6 +57,8 @@ class Search:
         self.most = max(_LEAST_MOST, int(_MOST * self.n_frames))
         nobody = _marked(self.problem, [])
         self.first = Look(model, model.fit.coefficients, nobody)
+        #: The frames that bent the fit most.
+        self.worst = set()
 
     def accused(self):
         """
@@ -67,25 +71,37 @@ class Search:
             stands out, or too many.
         look : Look
         """
-        places, look = self._more([], self.first)
+        trail = self._trail([], self.first)
+        # the first few, without which nearly all is gone: in a fit that they have bent, more
+        # frames look bad than are
+        few = (one for one in trail if one[0] and self._is_nearly_gone(one[1]))
+        places, look = next(few, ([], self.first))
         if not places:
-            return [], look
-        # frames that are far off spoil the measure of the noise as well
-        self._settle_noise(places, look.coefficients)
+            return [], self.first
+        self.worst = set(places)
+        self._start_again(places, look)
         self.first = Look(self.model, look.coefficients, _marked(self.problem, []))
-        return self._more(places, self._look(places, look.coefficients))
+        few = places, self._look(places, look.coefficients)
+        *_, (places, look) = self._trail(*few)
+        return (places, look) if places else few
 
-    def _more(self, places, look):
-        places = list(places)
+    def _trail(self, places, look):
+        """Yield the frames that are accused step by step, with the look without them."""
         while True:
+            yield places, look
             # a frame that is far off makes others look bad; these are heard and let go
             suspects = _worst(look, self.n_frames)[: max(1, self.most // _AT_ONCE)]
             if not suspects:
-                return places, look
+                return
             if len(places) >= 2 * self.most or self._is_hopeless(look, len(places)):
-                return [], look
-            places += suspects
+                yield [], look
+                return
+            places = places + suspects
             look = self._look(places, look.coefficients)
+
+    def _is_nearly_gone(self, look):
+        excess = [one.chi2 / one.freedom - 1 for one in (self.first, look)]
+        return look.chance > _NOISE or excess[1] < _NEARLY_GONE * excess[0]
 
     def _look(self, places, coefficients):
         out = _marked(self.problem, places)
@@ -98,11 +114,16 @@ class Search:
         other = self.problem.fit(self.problem.start, rows=rows, steps=_STEPS, share=_SHARE)
         return Look(self.model, other.coefficients, out) if other.chi2 < fit.chi2 else look
 
-    def _settle_noise(self, places, coefficients):
-        """Measure the noise without some frames, in a problem of its own."""
+    def _start_again(self, places, look):
+        """Measure the noise without some frames, and find a start for the fit that has them not."""
         old, out = self.problem, _marked(self.problem, places)
+        chains = self.model.chains
+        if look.chance < _NOISE and not self.model.added:
+            seen = zip(self.model.observations, out, strict=True)
+            left = [o.with_mask(mask, "accused") if mask.any() else o for o, mask in seen]
+            chains = nominal_calibration(chains, left).chains
         problem = GapProblem(
-            self.model.chains,
+            chains,
             self.model.observations,
             ties=old.ties,
             laws=old.laws,
@@ -110,8 +131,9 @@ class Search:
             neutral=old.neutral,
             limits=old.limits,
         )
+        q = problem.start if look.chance < _NOISE else look.coefficients
         for channel, dataset, residual, without in zip(
-            problem.channels, problem.datasets, problem.differences(coefficients), out, strict=True
+            problem.channels, problem.datasets, problem.differences(q), out, strict=True
         ):
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             sigma = _noise_of_others(channel, residual, angles, without)

@@ -29,6 +29,8 @@ _RARE, _UNEXPLAINED = 10.0, 0.1
 # an exchange makes either frame better by so much, and is tried for so many frames
 _BETTER, _PARTNERS = 10.0, 5
 _CERTAIN = 0.99
+# a beam is called by its name where it is it with this share
+_TELLS = 0.95
 _STAGES = {"hwp": "the half-wave plate", "derotator": "the derotator"}
 
 
@@ -122,7 +124,10 @@ def suspect_frames(model):
     search = Search(model)
     accused, last = search.accused()
     found = _Hearing(search).faults(accused, last) if accused else []
-    found = found if search.is_settled([fault.place for fault in found], last) else []
+    if not search.is_settled([fault.place for fault in found], last):
+        # where the fit does not find back from where they had bent it, others look bad, too
+        found = [fault for fault in found if fault.place in search.worst]
+        found = found if search.is_settled([fault.place for fault in found], last) else []
     named = {fault.place for fault in found}
     return found + [fault for fault in _lamp(model) if fault.place not in named]
 
@@ -203,6 +208,8 @@ class _Hearing:
         what = max(by_kind, key=by_kind.get)
         best = min((t for t in rest if t.what == what), key=lambda trial: trial.total)
         evidence = none.total - best.total + 2 * np.log(prior)
+        sides = [w for t, w in zip(rest, weight[1:], strict=True) if t.beam == best.beam]
+        best.beam = best.beam if sum(sides) > _TELLS * by_kind[what] else ""
         return self._fault(place, best, float(evidence), min(by_kind[what], 1.0))
 
     def _fault(self, place, trial, evidence, probability):
@@ -222,7 +229,7 @@ class _Hearing:
             probability,
             place=place,
         )
-        fault.words = _words(fault, told)
+        fault.words = _words(fault, told, trial.beam)
         fault.partner_place = None if trial.partner is None else (i, trial.partner)
         return fault
 
@@ -282,12 +289,13 @@ def _as_told(trial, observations, f, dataset):
     return tuple(float(np.rad2deg(x)) for x in (told + trial.value - stood, trial.error, told))
 
 
-def _words(fault, told):
+def _words(fault, told, beam=""):
     head = f"frame {fault.frame}: "
     if fault.what == "exchanged":
         return f"{head}its data are those of frame {fault.with_}, and the other way round"
     if fault.what == "one beam":
-        return f"{head}one beam is off by {100 * abs(fault.value - 1):.2g} %"
+        which = f"the {beam} beam" if beam else "one beam"
+        return f"{head}{which} is off by {100 * abs(fault.value - 1):.2g} %"
     if fault.what == "lamp":
         return f"{head}the lamp is off its drift by {100 * abs(fault.value - 1):.2g} %"
     if fault.what == "unknown":
