@@ -16,7 +16,7 @@ from numpydoc.docscrape import NumpyDocString
 from astropolcal import optics
 from astropolcal.chain import leaves
 from astropolcal.converters.optics import node_from_optic
-from astropolcal.gap.effects import EFFECTS, Context, Insertion
+from astropolcal.gap.effects import EFFECTS, Context
 from astropolcal.gap.problem import law_basis
 from astropolcal.optics import OPTICS
 from gallery.examples import example_of
@@ -319,7 +319,7 @@ def effect_page(name, words):
     changed = _edited(effect)
     shown = changed[0][0] if changed else None
     cells = (effect.kind, effect.place, effect.shows, effect.reference, effect.absorbed_by or "")
-    added = isinstance(effect, Insertion) or (changed and not changed[0][1])
+    added = changed and not changed[0][1]
     return render(
         "effect",
         name=name,

@@ -5,6 +5,7 @@ Every effect of the library: laws, recovery from noisy data, serialization.
 `CASES` has an entry for each registered effect; a test fails where one lacks.
 """
 
+import json
 from dataclasses import dataclass
 from functools import cache
 
@@ -19,18 +20,28 @@ from astropolcal import Calibration, calibrate, instruments, optics
 from astropolcal.chain import insert_optic, leaves, remove_optic
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import scan
+from astropolcal.gap.cells import places
 from astropolcal.gap.effects import (
     EFFECTS,
     KINDS,
     Context,
     Effect,
-    EffectParameter,
-    Insertion,
     Roles,
+    after,
+    before,
     check_effect,
+    detector,
     get_effect,
+    harmonic,
+    inside,
     register_effect,
+    source,
+    step,
+    telescope,
+    time,
 )
+from astropolcal.gap.effects._laws import Held
+from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.model import Model, effect_tangent
 from astropolcal.gap.problem import Fit, GapProblem, orthonormal
 from astropolcal.observations import Observations
@@ -349,52 +360,43 @@ def fixed_tangent(model):
 # ---- the registry --------------------------------------------------------------------------
 
 
-def test_every_effect_has_a_case():
+def test_library_is_large_and_in_words(repository, shared_data):
     assert sorted(EFFECTS) == sorted(CASES), "add an entry to CASES for each registered effect"
-
-
-def test_library_is_large_and_in_words():
-    assert len(EFFECTS) >= 25
-    for effect in EFFECTS.values():
+    page = (repository / "docs" / "effects.rst").read_text(encoding="utf-8")
+    for name, effect in EFFECTS.items():
         assert effect.kind in KINDS
         for words in (effect.title, effect.place, effect.shows, effect.reference):
             assert words
             assert not words.endswith(".")
+        assert name in page, f"docs/effects.rst lacks {name}"
     titles = [effect.title for effect in EFFECTS.values()]
     assert len(set(titles)) == len(titles)
-
-
-def test_effects_of_the_gap_cases_keep_their_names(shared_data):
-    import json
-
     key = json.loads((shared_data / "gap-cases" / "key.json").read_text(encoding="utf-8"))
     known = {case["effect"] for case in key.values()} - {"none", "unlisted_hysteresis"}
     assert known <= set(EFFECTS)
 
 
-def test_documentation_shows_every_effect(repository):
-    page = (repository / "docs" / "effects.rst").read_text(encoding="utf-8")
-    text = " ".join(page.split())
-    for name, effect in EFFECTS.items():
-        for words in (f"``{name}``", effect.title, effect.shows, effect.reference):
-            assert words in text, f"docs/effects.rst lacks {words!r} of {name}"
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_checks(name):
+def test_checks_of_every_effect():
     """Identity at zero, names, derivatives of both channels against differences."""
-    check_effect(name, *clean(name))
+    for name in CASES:
+        check_effect(name, *clean(name))
 
 
-@pytest.mark.parametrize("name", SMOOTH)
-def test_sizes_are_within_bounds_and_limits(name):
-    chains, data = clean(name)
-    edit = EFFECTS[name].edit(chains, context_of(data))
-    problem = problem_of(edit, data)
-    assert edit.parameters
-    for parameter in edit.parameters:
-        assert 0 < canonical(parameter.scale) < canonical(parameter.limit)
-        assert parameter.name in problem.free.by_name
+def test_places_and_sizes_of_every_effect():
+    alone = optics.Depolarizer(name="relay") | optics.ParityFlip(name="nbs")
+    for name in SMOOTH:
+        effect, (chains, data) = EFFECTS[name], clean(name)
+        assert not effect.applies([alone]), name
+        edit = effect.edit(chains, context_of(data))
+        problem = problem_of(edit, data)
+        assert edit.parameters
+        for parameter in edit.parameters:
+            assert 0 < canonical(parameter.scale) < canonical(parameter.limit)
+            assert parameter.name in problem.free.by_name
+        names = [leaf.name for leaf in leaves(edit.chains[0])]
+        assert len(set(names)) == len(names)
+        if isinstance(effect, Held) or name.startswith("derotator_45"):
+            assert not effect.applies(edit.chains), name
 
 
 def test_no_effect_is_possible_beyond_the_bounds_of_its_optic():
@@ -441,20 +443,46 @@ def _with_value(problem, parameter, size):
     return q
 
 
-@pytest.mark.parametrize("name", SMOOTH)
-def test_has_no_place_without_its_optic(name):
-    alone = optics.Depolarizer(name="relay") | optics.ParityFlip(name="nbs")
-    assert not EFFECTS[name].applies([alone])
+# ---- cells ---------------------------------------------------------------------------------
+
+#: Effects that are nearest to their cells, and no more.
+NEAREST = {
+    "derotator_motion", "hwp_transmission", "hwp_transmission_once", "m3_diattenuation",
+    "m3_recoating", "m3_retardance", "sky_background", "sky_motion", "source_linear",
+    "polarizer_misalignment", "polarizer_angle_bound",
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SMOOTH)
-def test_is_not_offered_again_once_it_is_in_the_model(name):
-    chains, data = clean(name)
-    edit = EFFECTS[name].edit(chains, context_of(data)).chains
-    if EFFECTS[name].kind == "parameter" and not isinstance(EFFECTS[name], Insertion):
-        assert not EFFECTS[name].applies(edit)
-    names = [leaf.name for leaf in leaves(edit[0])]
-    assert len(set(names)) == len(names)
+def seen(effect, chains, data, like, tangent, size=None):
+    """Return what the parameters of an effect do, less what the nominal ones can."""
+    edit = effect.edit(chains, Context.of(like.wavelength, data))
+    laws = {p.name: p.basis for p in edit.parameters if p.basis is not None}
+    problem = GapProblem(edit.chains, data, ties=edit.ties, laws=laws, like=like)
+    q, own = with_size(problem, edit.parameters, (1.0,) if size is None else size)
+    slopes = problem.jacobian(problem.start)
+    slopes = slopes[:, own] if size is None else (slopes @ (q - problem.start))[:, None]
+    return slopes - tangent @ (tangent.T @ slopes)
+
+
+def test_every_effect_is_the_cells_that_it_says():
+    for name in SMOOTH:
+        effect, (chains, data) = EFFECTS[name], clean(name)
+        cells = effect.cells(chains)
+        assert effect.cell(chains) == cells[0]
+        there = {place.name for chain in chains for place in places(chain)} | {"detector"}
+        assert {cell.place for cell in cells} <= there, name
+        if effect.absorbed_by or name in NEAREST or cells[0].dependence in ("flux", "previous"):
+            continue
+        nominal = GapProblem(chains, data)
+        nominal.settle_noise()
+        inside = (nominal.start > nominal.low + 1e-9) & (nominal.start < nominal.high - 1e-9)
+        tangent = orthonormal(nominal.jacobian(nominal.start)[:, inside])
+        own = seen(effect, chains, data, nominal, tangent, CASES[name].size)
+        probes = [seen(CellEffect(c, None), chains, data, nominal, tangent) for c in cells]
+        basis = orthonormal(np.hstack(probes))
+        assert np.sum((basis.T @ own) ** 2) > 0.9 * np.sum(own**2), name
+    for name in set(CASES) - set(SMOOTH):
+        assert EFFECTS[name].cell(clean(name)[0]) is None
 
 
 # ---- recovery ------------------------------------------------------------------------------
@@ -583,19 +611,11 @@ def test_improved_chains_calibrate(name, tmp_path):
 # ---- what is refused -----------------------------------------------------------------------
 
 
-def _tinted(degrees, name, kind=optics.LinearRetarder):
-    return kind(retardance=degrees * u.deg, theta=45 * u.deg, name=name)
-
-
-class Tinted(Insertion):
-    """A retarder behind the derotator."""
-
-    name, kind, place = "test_tinted", "optic", "relay"
-    title, shows, reference = "a test", "nowhere", "none"
-    free = {"retardance": (1 * u.deg, 10 * u.deg)}
-
-    def build(self, size, anchor, context):
-        return _tinted(np.zeros(size), self.label)
+def tinted(degrees=0.0, kind=optics.LinearRetarder, **settings):
+    """Return a retarder behind the derotator as an effect."""
+    optic = kind(retardance=degrees * u.deg, theta=45 * u.deg, name="test_tinted")
+    settings = {"title": "a test", "limit": 10 * u.deg, "name": "test_tinted"} | settings
+    return Effect(place=after("derotator"), inserted=optic, **settings)
 
 
 class Crooked(optics.LinearRetarder):
@@ -605,154 +625,102 @@ class Crooked(optics.LinearRetarder):
         return tuple(1.01 * one for one in super()._derivatives(dispersion, retardance))
 
 
-class WrongDerivative(Tinted):
-    """Gives a wrong derivative."""
+class Named(Effect):
+    """Names another parameter than that of its optic."""
 
-    name = "test_derivative"
+    other = "hwp.theta"
 
-    def build(self, size, anchor, context):
-        return _tinted(np.zeros(size), self.label, Crooked)
-
-
-class NoIdentity(Tinted):
-    """Is not the identity at zero."""
-
-    name = "test_identity"
-
-    def build(self, size, anchor, context):
-        return _tinted(np.ones(size), self.label)
+    def parameters(self, names, chains, context):
+        return super().parameters([self.other], chains, context)
 
 
-class Clash(Tinted):
-    """Names a parameter that is free already."""
-
-    name = "test_clash"
-
-    def parameters(self, context):
-        return [EffectParameter("hwp.theta", 1 * u.deg, 5 * u.deg)]
-
-
-class Unknown(Tinted):
-    """Names a parameter that is not there."""
-
-    name = "test_unknown"
-
-    def parameters(self, context):
-        return [EffectParameter("relay.theta", 1 * u.deg, 5 * u.deg)]
-
-
-class WrongUnit(Tinted):
-    """Gives its size in a unit that does not fit."""
-
-    name = "test_unit"
-    free = {"retardance": (1 * u.um, 10 * u.um)}
-
-
-class SameOptic(Tinted):
-    """Names its optic as another one."""
-
-    name = "test_same"
-    label = "hwp"
-
-
-class Vandal(Tinted):
+class Vandal(Effect):
     """Changes the chains that it is given."""
 
-    name = "test_vandal"
-
     def edit(self, chains, context):
-        edit = super().edit(chains, context)
         for chain in chains:
             Roles(chain).splitter.theta = 1 * u.deg
-        return edit
+        return super().edit(chains, context)
 
 
-class Duplicate(Tinted):
-    """Has a name that is taken."""
-
-    name = "beam_gain"
-
-
-class Discrete(Tinted):
-    """Says that it is discrete, and has a parameter."""
-
-    name, kind = "test_discrete", "discrete"
-
-
-class NoPlace(Tinted):
-    """Finds no place."""
-
-    name = "test_place"
-
-    def applies_to(self, roles):
-        return False
+def refused():
+    """Yield effects that are not right, and what is said of them."""
+    known = {"title": "a test", "limit": 10 * u.deg, "place": after("derotator")}
+    optic = optics.LinearRetarder(retardance=0 * u.deg, name="test")
+    yield tinted(kind=Crooked), "test_tinted: derivative to .* differs .* by (1|1\\.0.*) %"
+    yield tinted(1.0), "at zero parameters"
+    yield Named("test", inserted=optic, **known), "hwp.theta is free in the chains without it"
+    unknown = Named("test", inserted=optic, **known).changed(other="relay.theta")
+    yield unknown, "relay.theta is not free in its chains; new and free: gap_test.retardance"
+    yield tinted(limit=1 * u.um), "um"
+    yield Vandal("test", inserted=optic, **known), "changes the chains that it is given"
+    yield Vandal("beam_gain", inserted=optic, **known), "'beam_gain' is registered already"
+    yield tinted(category="discrete"), "discrete and has parameters"
+    yield tinted(when=lambda roles: False), "has no place"
+    yield tinted(title=""), "lacks title"
+    yield tinted(category="magic"), "kind 'magic'; allowed are optic"
 
 
-class NoTitle(Tinted):
-    """Lacks its title."""
-
-    name, title = "test_title", ""
-
-
-class NoKind(Tinted):
-    """Is of no known kind."""
-
-    name, kind = "test_kind", "magic"
-
-
-REFUSED = [
-    (WrongDerivative, "test_derivative: derivative to .* differs .* by (1|1\\.0.*) %"),
-    (NoIdentity, "at zero parameters"),
-    (Clash, "hwp.theta is free in the chains without it already"),
-    (Unknown, "relay.theta is not free in its chains; new and free: gap_test_unknown.retardance"),
-    (WrongUnit, "um"),
-    (SameOptic, "cannot edit|cannot be fitted"),
-    (Vandal, "changes the chains that it is given"),
-    (Duplicate, "'beam_gain' is registered already"),
-    (Discrete, "discrete and has parameters"),
-    (NoPlace, "has no place"),
-    (NoTitle, "lacks title"),
-    (NoKind, "kind 'magic'; allowed are optic"),
-]
-
-
-def test_check_accepts_an_effect_that_is_not_registered():
-    check_effect(Tinted, *clean("beam_gain"))
-    check_effect(Tinted(), *clean("beam_gain"))
-
-
-@pytest.mark.parametrize(("effect", "words"), REFUSED, ids=lambda x: getattr(x, "__name__", ""))
-def test_check_refuses(effect, words):
+def test_check_refuses():
     chains, data = clean("beam_gain")
-    chains = [chain.copy() for chain in chains]
-    with pytest.raises(GapError, match=words):
+    check_effect(tinted(), chains, data)
+    for effect, words in refused():
+        with pytest.raises(GapError, match=words):
+            check_effect(effect, [chain.copy() for chain in chains], data)
+
+
+def test_declarations_that_are_refused():
+    with pytest.raises(GapError, match="kind 'diattenuatoin'; did you mean 'diattenuation'"):
+        Effect("x", "x", after("hwp"), "diattenuatoin")
+    with pytest.raises(GapError, match="effect x: dependence = 'tiem'"):
+        Effect("x", "x", after("hwp"), "diattenuation", "tiem")
+    with pytest.raises(GapError, match=r"place = 'hwp' is none; say after\(optic\)"):
+        Effect("x", "x", "hwp", "diattenuation")
+    with pytest.raises(GapError, match="no setting 'limits'; did you mean 'limit'"):
+        Effect("x", "x", after("hwp"), "diattenuation", limits=3)
+    with pytest.raises(GapError, match="it must do nothing"):
+        Effect.insert(optics.LinearRetarder(retardance=9 * u.deg, name="x"), after="hwp")
+    with pytest.raises(GapError, match="no parameter of ParityFlip is free"):
+        Effect.insert(optics.ParityFlip(name="x"), after="hwp")
+    with pytest.raises(GapError, match="give one of after=, before= and inside="):
+        Effect.insert(optics.Diattenuator(name="x"))
+
+
+def test_effects_of_ones_own():
+    """Declared ones at every sort of place, with every sort of dependence, and inserted ones."""
+    chains, data = clean("beam_gain")
+    some = [
+        Effect("a", "a", after("hwp"), "diattenuation", harmonic("derotator", 1), limit=0.1),
+        Effect("a", "a", inside("derotator"), "retardance", time(), limit=10 * u.deg),
+        Effect("a", "a", inside("hwp"), "orientation", harmonic("hwp", 4), "number"),
+        Effect("a", "a", source(), "depolarization_linear", step(7), 0),
+        Effect("a", "a", detector(), "gain", harmonic("hwp", 3), None),
+        Effect("a", "a", before("wollaston"), ("rotation", "retardance_d"), degree=1),
+        Effect.insert(optics.Diattenuator(name="a"), before="wollaston", limit=0.1),
+        Effect.insert(optics.LinearRetarder(retardance=0 * u.deg, name="a"), inside="derotator"),
+        Effect.insert(optics.BeamGain(name="a"), after="wollaston", degree="number"),
+    ]
+    for effect in some:
         check_effect(effect, chains, data)
+        if effect.kinds:
+            assert len(effect.cells(chains)) == len(effect.kinds) * (1 + effect.around)
+    assert not Effect("a", "a", telescope(), "rotation").applies(chains)
+    assert not Effect("a", "a", after("hwp"), "rotation", harmonic("other", 1)).applies(chains)
 
 
-@pytest.mark.parametrize("effect", [Duplicate, NoTitle, NoKind])
-def test_registration_refuses(effect):
+def test_registration():
     before = dict(EFFECTS)
-    with pytest.raises(GapError):
-        register_effect(effect)
+    for one in (tinted(title=""), tinted(category="magic"), tinted(name="beam_gain"), dict):
+        with pytest.raises(GapError, match=r"lacks|kind|registered|is no Effect"):
+            register_effect(one)
     assert before == EFFECTS
-
-
-def test_registration_refuses_what_is_no_effect():
-    with pytest.raises(GapError, match="is no Effect"):
-        register_effect(dict)
-
-
-def test_registration_of_ones_own():
     try:
-        assert register_effect(Tinted) is Tinted
-        assert isinstance(get_effect("test_tinted"), Effect)
+        one = register_effect(tinted())
+        assert get_effect("test_tinted") is one
         with pytest.raises(GapError, match="another name"):
-            register_effect(Tinted)
+            register_effect(one)
     finally:
         EFFECTS.pop("test_tinted", None)
-
-
-def test_unknown_name():
     with pytest.raises(GapError, match="did you mean 'beam_gain'"):
         get_effect("beam_gian")
 

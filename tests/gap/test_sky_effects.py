@@ -239,7 +239,7 @@ def test_fringes_whose_phase_drifts_are_a_cosine_and_a_sine():
     """To first order, with the phase of the middle of the run."""
     effect = get_effect("fringes_drift")
     context = context_of(clean("fringes_drift")[1])
-    law = effect.law("horizontal", context)
+    law = effect.law(context)
     x, rate, amplitude = np.linspace(0, 1, 5), 0.1, 2.0
     phase = 2 * np.pi * effect.thickness / context.wavelength
     exact = amplitude * np.cos(phase[:, None] + rate * (x - 0.5))

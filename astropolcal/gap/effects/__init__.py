@@ -2,30 +2,34 @@
 """
 The library of effects that a model of a polarimeter may lack.
 
-One class each, registered in `EFFECTS`; `register_effect` adds your own.
+One row each of `astropolcal.gap.effects.library`, in `EFFECTS`; `register_effect` adds your own.
 """
 
 from astropolcal.exceptions import GapError
-from astropolcal.gap.effects import (
-    derotator,
-    detector,
-    discrete,
-    held,
-    plate,
-    relay,
-    source,
-    telescope,
-)
 from astropolcal.gap.effects.base import (
     KINDS,
     Context,
     Edit,
-    Effect,
     EffectParameter,
-    Insertion,
     tracking_laws,
 )
 from astropolcal.gap.effects.check import check_against, check_declared
+from astropolcal.gap.effects.effect import (
+    Effect,
+    Where,
+    after,
+    before,
+    detector,
+    direction,
+    harmonic,
+    inside,
+    move,
+    source,
+    step,
+    telescope,
+    time,
+)
+from astropolcal.gap.effects.library import LIBRARY
 from astropolcal.gap.effects.roles import Roles, adapted
 from astropolcal.words import did_you_mean
 
@@ -36,12 +40,23 @@ __all__ = [
     "Edit",
     "Effect",
     "EffectParameter",
-    "Insertion",
     "Roles",
+    "Where",
     "adapted",
+    "after",
+    "before",
     "check_effect",
+    "detector",
+    "direction",
     "get_effect",
+    "harmonic",
+    "inside",
+    "move",
     "register_effect",
+    "source",
+    "step",
+    "telescope",
+    "time",
     "tracking_laws",
 ]
 
@@ -75,11 +90,9 @@ def register_effect(effect):
 
     Examples
     --------
-    >>> from astropolcal.gap.effects import EFFECTS, register_effect
-    >>> from astropolcal.gap.effects.relay import Fringes
-    >>> thick = register_effect(Fringes(15.0))
-    >>> "fringes_15_um" in EFFECTS
-    True
+    >>> from astropolcal.gap.effects import EFFECTS, get_effect, register_effect
+    >>> register_effect(get_effect("fringes").of(15.0)).name
+    'fringes_15_um'
     >>> removed = EFFECTS.pop("fringes_15_um")
     """
     one = effect() if isinstance(effect, type) else effect
@@ -176,10 +189,5 @@ def get_effect(name):
     )
 
 
-for _module in (plate, derotator, relay, source, telescope, detector, held, discrete):
-    for _name in _module.__all__:
-        register_effect(getattr(_module, _name))
-# the class itself is registered for 8 um
-for _thickness in (4.0, 12.0):
-    register_effect(relay.Fringes(_thickness))
-    register_effect(relay.FringesDrift(_thickness))
+for _effect in LIBRARY:
+    register_effect(_effect)

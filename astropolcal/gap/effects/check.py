@@ -5,7 +5,8 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, GapError
-from astropolcal.gap.effects.base import KINDS, Context, Effect
+from astropolcal.gap.effects.base import KINDS, Context
+from astropolcal.gap.effects.effect import Effect
 from astropolcal.gap.problem import GapProblem
 from astropolcal.units import canonical_factor, to_unit
 
@@ -41,7 +42,7 @@ def check_declared(effect):
     >>> check_declared(EFFECTS["beam_gain"])
     """
     if not isinstance(effect, Effect):
-        raise GapError(f"{effect!r} is no Effect; derive its class from Effect or Insertion")
+        raise GapError(f"{effect!r} is no Effect")
     lacking = [key for key in _NEEDED if not getattr(effect, key)]
     if lacking:
         raise GapError(f"effect {effect.name or type(effect).__name__} lacks {', '.join(lacking)}")

@@ -58,11 +58,25 @@ class Roles:
             name = chosen.get(role)
             own = (o for o in found if name in (None, o.name))
             setattr(self, role, next(own, None))
+        #: Rotations by the parallactic angle and the altitude, and the star in front of them.
+        self.parallactic = self.altitude = self.star = None
+        self._look_at_the_sky()
         self.splitter = next((o for o in self._own if isinstance(o, optics.WollastonPrism)), None)
         #: What static optics of the relay stand behind.
         self.relay = self.derotator or self.plate
         #: The plate, where the model has nothing in front of it that could polarize.
         self.entrance = self.plate if self._is_entrance() else None
+
+    def _look_at_the_sky(self):
+        turns = [o if isinstance(o, optics.Rotator) else None for o in self.leaves]
+        first = next((i for i, o in enumerate(turns) if o and o.stage == "parallactic"), None)
+        # without a rotation by the parallactic angle the light is that of an internal source
+        if first is None:
+            return
+        self.parallactic = turns[first]
+        self.altitude = next((o for o in turns[first:] if o and o.stage == "altitude"), None)
+        stars = (o for o in self.leaves[:first] if isinstance(o, optics.PolarizedSource))
+        self.star = next(stars, None)
 
     def all(self, role):
         """Return all optics of a role, in the order in which light meets them."""

@@ -1,0 +1,495 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Effects that are laws of physics, or exchange optics, and no perturbations at a place."""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import optics
+from astropolcal.calibration._directions import ranked
+from astropolcal.chain import insert_optic, leaves, remove_optic, replace_optic
+from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
+from astropolcal.gap.effects.effect import Effect, Where
+from astropolcal.gap.effects.roles import is_held
+from astropolcal.measurement import Tie
+from astropolcal.observations.pointings import TRACKING
+
+#: Lag of an angle in frames, written as an angle over that of one frame: 0.25, at most 2.
+LAG = {"scale": 0.25 * u.rad, "limit": 2 * u.rad}
+# a retardance that changes by less than this (radian) from bin to bin is flat
+_FLAT = 1e-3
+# nearer to a bound than this share of the limit is at the bound
+_NEAR = 1e-4
+
+
+def lagging(mount):
+    """Return a rotator by the change of an angle, times a lag in frames (1 rad is one frame)."""
+    turn = optics.DriftRotator(mount=f"{mount}_rate")
+    turn.rate.bounds = (-360, 360)
+    return turn
+
+
+# ---- what else effects need --------------------------------------------------------------------
+
+
+def mirror_leaves(*keys):
+    """Return whether no parameter of the telescope's mirror is free, its angle and keys aside."""
+
+    def when(roles):
+        mirror = roles.telescope_mirror
+        # nothing is free in what is not there; what is free takes the effect up
+        names = () if mirror is None else set(mirror.param_names) - {"theta", *keys}
+        return all(is_held(getattr(mirror, key)) for key in names)
+
+    return when
+
+
+def may_be_polarized(roles):
+    """Return whether the star is not held at zero polarization."""
+    star = roles.star
+    if isinstance(star, optics.StarSource):
+        # nothing interstellar: unpolarized as far as the catalogue knows
+        return not (star.p_max.fixed and not np.any(star.p_max.value))
+    return star is None or not all(is_held(p) and not np.any(p.value) for p in (star.q, star.u))
+
+
+# ---- laws in wavelength ------------------------------------------------------------------------
+
+
+def every_wavelength(context):
+    """Return one value a wavelength, whatever degree the context asks for."""
+    return np.eye(len(context.wavelength))
+
+
+def without_constant(context):
+    """Return a law of degree 2 less its constant, which is an orientation."""
+    return context.basis(2, constant=False)
+
+
+class WavelengthScale(Effect):
+    """Retarder whose law is the derivative of the plate's retardance to wavelength."""
+
+    def law(self, context, chains=()):
+        """Return the slope of the plate's retardance, times a line."""
+        plate = next(p for c in chains if has_law(p := self.where.anchor(self.roles(c))))
+        # relative: small against the course of the indices, large against rounding
+        step = 1e-4
+        up, down = (
+            plate.retardance(context.wavelength * (1 + s) * u.um).to_value(u.rad)
+            for s in (step, -step)
+        )
+        # d retardance / d ln(wavelength), radian; a shift and a stretch are this times a line
+        slope = (up - down) / (2 * step)
+        return slope[:, None] * context.basis(1) / np.abs(slope).max()
+
+
+def has_law(plate):
+    """Return whether the retardance of a plate is a law in wavelength."""
+    return isinstance(plate, optics.TwoLayerWaveplate)
+
+
+class Fringes(Effect):
+    """
+    Etalon: retardance that oscillates with the wavenumber.
+
+    The difference of path between the two reflections, in micrometre, decides on the period, and
+    no derivative at zero tells it: `variants` gives one effect for each that the wavelengths tell.
+    The phase of a fringe that drifts linearly turns a cosine in the wavenumber into a sine: to
+    first order both have amplitudes that change linearly with time.
+    """
+
+    stem, thickness = None, 8.0
+
+    def of(self, thickness):
+        """Return the same for another difference of path, twice the optical thickness."""
+        stem = self.stem or self.name
+        title = self.title.partition(",")[0]
+        return self.changed(
+            stem=stem,
+            thickness=float(thickness),
+            name=stem if thickness == 8 else f"{stem}_{thickness:.3g}_um",
+            title=f"{title}, period 1/({thickness:.3g} um)",
+        )
+
+    def law(self, context, chains=()):
+        """Return a sine and a cosine in the wavenumber."""
+        # fewer wavelengths than a sine, a cosine and what they must be told from
+        if len(context.wavelength) < 5:
+            return None
+        # two reflections interfere with the phase of their difference of path
+        phase = 2 * np.pi * self.thickness / context.wavelength
+        return np.stack([np.cos(phase), np.sin(phase)], axis=1)
+
+    def variants(self, context):
+        """Return fringes of all periods that the wavelengths resolve."""
+        wavenumber = np.sort(1 / np.asarray(context.wavelength))
+        if len(wavenumber) < 5:
+            return [self]
+        # one fringe more over the band for each step; the largest has two bins a fringe (Nyquist)
+        step = 1 / np.ptp(wavenumber)
+        largest = 1 / (2 * np.diff(wavenumber).max())
+        return [self.of(step * (i + 1)) for i in range(int(largest / step))]
+
+
+# ---- optics that are exchanged -----------------------------------------------------------------
+
+
+class Elliptical(Effect):
+    """A derotator that is an elliptical retarder: exchanged in place, as two do not commute."""
+
+    components = ("diagonal",)
+
+    def applies_to(self, roles):
+        """Return whether the derotator lacks this component."""
+        derotator = self.where.anchor(roles)
+        if isinstance(derotator, optics.EllipticalRetarder):
+            return all(getattr(derotator, key).fixed for key in self.components)
+        return derotator is not None and not any(o.name == self.label for o in roles.leaves)
+
+    def put(self, chain, roles, context, label):
+        """Return the chain with an elliptical derotator; see `Effect.put`."""
+        old, ties = self.where.anchor(roles), {}
+        values = dict.fromkeys(self.components, np.zeros(len(context.wavelength)) * u.deg)
+        if isinstance(old, optics.EllipticalRetarder):
+            held = {k: np.broadcast_to(getattr(old, k).value, v.shape) for k, v in values.items()}
+            new = old.with_parameters(**{key: value * u.deg for key, value in held.items()})
+        else:
+            own = {"theta": old.theta.value * u.deg, "mount": old.mount}
+            is_retarder = isinstance(old, optics.LinearRetarder)
+            if is_retarder:
+                own |= {"horizontal": old.retardance.value * u.deg, "name": old.name}
+            new = optics.EllipticalRetarder(**{"name": label} | own, **values)
+            for key in {"theta", "horizontal", "diagonal", "circular"} - set(self.components):
+                getattr(new, key).fixed = True
+            if is_retarder:
+                # what was free stays free, so that the nominal parameters keep their meaning
+                for ours, theirs in (("theta", "theta"), ("horizontal", "retardance")):
+                    was, now = getattr(old, theirs), getattr(new, ours)
+                    now.fixed, now.bounds = was.fixed, was.bounds
+        for key in self.components:
+            getattr(new, key).fixed = False
+        if new.name == old.name:
+            return replace_optic(chain, old.name, new), [new], ties
+        # what is more than a retarder stays, and the new one turns with it
+        new.theta.bounds = (None, None)
+        if not old.theta.fixed:
+            ties[f"{label}.theta"] = Tie(f"{old.name}.theta")
+        return insert_optic(chain, new, after=old.name), [new], ties
+
+    def free_of(self, optic):
+        """Return the components."""
+        return self.components
+
+
+class BandAverage(Effect):
+    r"""
+    Retarder whose retardance changes within a wavelength bin.
+
+    Averaged over a bin in which it changes by s, a retarder keeps the polarization along its axis
+    and loses the share :math:`1 - \mathrm{sinc}(s/2) \approx s^2/24` of what is at 45 deg to it,
+    or circular: a depolarizer with its axes and a law in wavelength that is tied to the square of
+    its slope. The constant of the law is a loss at all wavelengths.
+    """
+
+    def retarder(self, roles):
+        """Return the derotator, or the steepest retarder behind it that stands still."""
+        if self.where.relation == "inside" or roles.derotator is None:
+            return roles.derotator
+        names = [leaf.name for leaf in roles.leaves]
+        behind = roles.leaves[names.index(roles.derotator.name) + 1 :]
+        # a dict by slope: the steepest one is where the average over a bin matters most
+        steep = {
+            np.abs(slopes).max(): leaf
+            for leaf in behind
+            if leaf.stage is None and (slopes := retardance_slopes(leaf)) is not None
+        }
+        return steep[max(steep)] if steep else None
+
+    def applies_to(self, roles):
+        """Return whether there is a retarder whose retardance depends on the wavelength."""
+        present = any(leaf.name == self.label for leaf in roles.leaves)
+        return not present and retardance_slopes(self.retarder(roles)) is not None
+
+    def put(self, chain, roles, context, label):
+        """Return the chain with a depolarizer along the axis of the retarder."""
+        retarder = self.retarder(roles)
+        slopes, axis = retardance_slopes(retarder), _steep_axis(retarder)
+        keep = np.ones(len(slopes))
+        optic = optics.Depolarizer(
+            retained_u=keep,
+            retained_v=keep,
+            theta=retarder.theta.value * u.deg + np.arctan2(axis[1], axis[0]) / 2 * u.rad,
+            mount=retarder.mount,
+            name=label,
+        )
+        # along the axis nothing is lost
+        optic.retained_q.fixed, optic.theta.bounds = True, (None, None)
+        tie = {f"{label}.retained_v": Tie(f"{label}.retained_u")}
+        return insert_optic(chain, optic, after=retarder.name), [optic], tie
+
+    def law(self, context, chains=()):
+        """Return a constant, and the square of the slope of the last of the retarders."""
+        found = [self.roles(chain) for chain in chains]
+        retarder = [self.retarder(roles) for roles in found if self.applies_to(roles)][-1]
+        square = (retardance_slopes(retarder) @ _steep_axis(retarder)) ** 2
+        return np.column_stack([np.ones(len(square)), square / square.max()])
+
+
+def _steep_axis(retarder):
+    """Return the direction in the (H, 45) plane along which the linear retardance moves."""
+    axis = np.linalg.svd(retardance_slopes(retarder), full_matrices=False)[2][0]
+    # a singular vector has any sign, and with it the optic would be turned by 90 deg
+    return axis * np.sign(axis[ranked(np.abs(axis))[0]])
+
+
+def retardance_slopes(retarder):
+    """
+    Return the change of both linear retardances within a bin, radian, shape (W, 2).
+
+    None where there is no retarder, or its retardance does not depend on the wavelength.
+    """
+    if isinstance(retarder, optics.LinearRetarder):
+        parts = retarder.retardance.value, 0.0
+    elif isinstance(retarder, optics.EllipticalRetarder):
+        parts = retarder.horizontal.value, retarder.diagonal.value
+    else:
+        return None
+    parts = np.stack(np.broadcast_arrays(*parts), axis=-1)
+    if parts.ndim == 1 or len(parts) < 3:
+        return None
+    # a retardance known modulo a turn has no jump of a turn from bin to bin
+    slopes = np.gradient(np.unwrap(np.deg2rad(parts), axis=0), axis=0)
+    return slopes if np.abs(slopes).max() > _FLAT else None
+
+
+class Recoating(Effect):
+    """
+    A mirror that changes from one dataset to the next, as when it is coated anew or washed.
+
+    The datasets of stars are taken in the order in which they are given; the first one is the
+    reference, and each of the others has a change of its own.
+    """
+
+    def applies(self, chains):
+        """Return whether there are two datasets of stars; see `Effect.applies`."""
+        # the first night is the reference: a change needs two
+        return sum(self.applies_to(self.roles(chain)) for chain in chains) > 1
+
+    def edit(self, chains, context):
+        """Return the chains with a diattenuator in all but the first; see `Effect.edit`."""
+        edited, names, seen = [], [], 0
+        for chain in chains:
+            roles = self.roles(chain)
+            if self.applies_to(roles):
+                # the first dataset keeps the nominal mirror
+                if seen:
+                    label = f"{self.label}_{seen}"
+                    chain, _, _ = self.put(chain, roles, context, label)
+                    names += [f"{label}.{key}" for key in self.free]
+                seen += 1
+            edited.append(chain)
+        return Edit(edited, self.parameters(names, chains, context))
+
+
+class StandardPolarization(Effect):
+    """Polarization of a star itself, which the model holds at zero or at a catalogue's value."""
+
+    def applies_to(self, roles):
+        """Return whether the polarization of a star is held."""
+        return held_star(roles.leaves) is not None
+
+    def edit(self, chains, context):
+        """Return the chains with q and u of the stars free; see `Effect.edit`."""
+        edited, added = [], {}
+        for chain in chains:
+            star = held_star(leaves(chain))
+            if star is not None:
+                size = len(context.wavelength)
+                values = {k: np.broadcast_to(getattr(star, k).value, size) for k in self.free}
+                fresh = star.with_parameters(**values)
+                for key, held in values.items():
+                    getattr(fresh, key).fixed, getattr(fresh, key).prior = False, None
+                    # the law must hold the catalogue's values, from which the size counts
+                    law = None if size == 1 else able_to_hold(held, context.basis(self.degree))
+                    name = f"{star.name}.{key}"
+                    added[name] = EffectParameter(name, self.scale, self.limit, law, np.array(held))
+                chain = replace_optic(chain, star.name, fresh)
+            edited.append(chain)
+        return Edit(edited, list(added.values()))
+
+
+def held_star(optics_of_chain):
+    """Return the first star whose polarization is fixed."""
+    stars = (o for o in optics_of_chain if isinstance(o, optics.PolarizedSource))
+    return next((star for star in stars if is_held(star.q) and is_held(star.u)), None)
+
+
+def able_to_hold(values, basis):
+    """Return a basis that can represent the values as well."""
+    left = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+    size = np.abs(left).max()
+    return basis if size < 1e-12 else np.column_stack([basis, left / size])
+
+
+# ---- parameters that the model holds, or that have run into a bound ------------------------------
+
+
+class Held(Effect):
+    """Parameters of one optic that become free, within their bounds or wider ones."""
+
+    def is_open(self, parameter):
+        """Return whether the effect may act on a parameter: one that is fixed, or at a bound."""
+        if self.kind != "bound":
+            return is_held(parameter)
+        # a bounded fit may end a little before its bound
+        value, near = np.asarray(parameter.value), _NEAR * _in_unit(self.limit, parameter)
+        low, high = parameter.bounds
+        at_low = low is not None and np.any(value <= low + near)
+        return bool(at_low or (high is not None and np.any(value >= high - near)))
+
+    def _keys(self, optic):
+        own = [key for key in self.free if key in optic.param_names]
+        return [key for key in own if self.is_open(getattr(optic, key))]
+
+    def applies_to(self, roles):
+        """Return whether one of the parameters is held."""
+        optic = self.where.anchor(roles)
+        return optic is not None and bool(self._keys(optic))
+
+    def edit(self, chains, context):
+        """Return the chains with the parameters free; see `Effect.edit`."""
+        edited, added = [], {}
+        for chain in chains:
+            optic = self.where.anchor(self.roles(chain))
+            if optic is not None:
+                fresh = optic.copy()
+                # a dict, for the same parameter in two datasets is one
+                added |= self._release(fresh)
+                chain = replace_optic(chain, optic.name, fresh)
+            edited.append(chain)
+        return Edit(edited, list(added.values()))
+
+    def _release(self, optic):
+        """Free the parameters of one optic, and return them by name."""
+        found = {}
+        for key in self._keys(optic):
+            parameter = getattr(optic, key)
+            # where it was held is where the effect is absent
+            value = u.Quantity(parameter.value, parameter.unit or u.one)
+            parameter.fixed, parameter.prior = False, None
+            parameter.bounds = around(parameter, self.limit, getattr(type(optic), key).bounds)
+            name = f"{optic.name}.{key}"
+            found[name] = EffectParameter(name, self.scale, self.limit, neutral=value)
+        return found
+
+
+def _in_unit(quantity, parameter):
+    return u.Quantity(quantity).to_value(parameter.unit or u.one)
+
+
+def around(parameter, limit, possible):
+    """
+    Return bounds that leave room on both sides of the value, and are no tighter than before.
+
+    The room ends where the optic itself has its bounds.
+    """
+    room, (low, high) = _in_unit(limit, parameter), parameter.bounds
+    least = -np.inf if possible[0] is None else possible[0]
+    most = np.inf if possible[1] is None else possible[1]
+    value = np.asarray(parameter.value)
+    return (
+        None if low is None else min(low, max(least, float(value.min()) - room)),
+        None if high is None else max(high, min(most, float(value.max()) + room)),
+    )
+
+
+# ---- discrete alternatives -----------------------------------------------------------------------
+
+
+class Alternative(Effect):
+    """An alternative without parameters: it is fitted from the start, or not at all."""
+
+    kind = "discrete"
+    reference = "McIntosh et al. 2026, Sec. 4; the reflections and signs of a chain"
+    #: Function of chain, roles, the optic and the law of its tracking that changes the chain.
+    change = None
+
+    def __init__(self, name, title, words, role, change, **settings):
+        where = Where("inside", role, True) if isinstance(role, str) else role
+        super().__init__(name, title, where, words=words, change=change, **settings)
+
+    def cells(self, chains):
+        """Return none: an alternative is no perturbation."""
+        return ()
+
+    def edit(self, chains, context):
+        """Return the changed chains; nothing is added that could be fitted."""
+        # tables hold true angles; the law tells which part of them came from the sky
+        laws = () if context is None else context.tracking
+        laws = laws if len(laws) == len(chains) else [TRACKING] * len(chains)
+        edited = []
+        for chain, law in zip(chains, laws, strict=True):
+            roles = self.roles(chain)
+            if self.applies_to(roles):
+                optic = self.where.anchor(roles)
+                index = next(i for i, leaf in enumerate(roles.leaves) if leaf is optic)
+                chain = chain.copy()
+                own = leaves(chain)[index]
+                chain = self.change(chain, own, roles=roles, law=law, label=label_of(self.name))
+            edited.append(chain)
+        return Edit(edited, [])
+
+
+def flipped_before(chain, optic, *, label, **_):
+    """Return a chain with a reflection in front of an optic."""
+    return insert_optic(chain, optics.ParityFlip(name=label), before=optic.name)
+
+
+def flipped_behind(chain, optic, *, roles, label, **_):
+    """Return a chain with a reflection behind an optic taken out, or put in."""
+    order = [leaf.name for leaf in roles.leaves]
+    behind = roles.leaves[order.index(optic.name) :]
+    flips = [leaf for leaf in behind if isinstance(leaf, optics.ParityFlip)]
+    # a flip twice is none: one too many and one too few are the same alternative
+    if flips:
+        return remove_optic(chain, flips[0].name)
+    return insert_optic(chain, optics.ParityFlip(name=label), before=roles.splitter.name)
+
+
+def other_sign(chain, optic, **_):
+    """Return a chain with the sign of the stage of an optic turned."""
+    optic.mount = optic.stage if optic.stage_sign < 0 else f"-{optic.stage}"
+    return chain
+
+
+def turned_by(degrees):
+    """Return what turns an optic, and the bounds of its angle with it."""
+
+    def change(chain, optic, **_):
+        # bounds of a misalignment are about the nominal zero, which is what moves
+        bounds = [None if b is None else b + degrees for b in optic.theta.bounds]
+        optic.theta = (optic.theta.value + degrees) * u.deg
+        optic.theta.bounds = tuple(bounds)
+        return chain
+
+    return change
+
+
+def following(*factors):
+    """Return what multiplies the factors of parallactic angle and altitude in a plate's law."""
+
+    def change(chain, plate, *, law, label, **_):
+        for stage, factor, old in zip(("parallactic", "altitude"), factors, law, strict=True):
+            # a law without this angle cannot have its sign wrong
+            if factor * old == old:
+                continue
+            # rotators before and behind turn the plate without turning the light
+            for side, sign in {"before": 1, "after": -1}.items():
+                turn = optics.DriftRotator(mount=stage, name=f"{label}_{stage}_{side}")
+                # a whole number of turns included
+                turn.rate.bounds = (None, None)
+                turn.rate = sign * (factor - 1) * old * u.rad
+                turn.rate.fixed = True
+                chain = insert_optic(chain, turn, **{side: plate.name})
+        return chain
+
+    return change

@@ -1,0 +1,813 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What an unmodelled effect is: the declaration of a place, a kind and a dependence on the frame.
+
+At zero parameters the edited chains are the old ones, so that derivatives at zero tell what the
+effect would do to the data; fitted, the edited chains are ordinary chains again.
+"""
+
+import copy
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import optics
+from astropolcal.chain import Train, insert_optic
+from astropolcal.exceptions import GapError, ParameterError
+from astropolcal.gap.cells import Cell, Place, places
+from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
+from astropolcal.gap.effects.roles import SEVERAL, Roles
+from astropolcal.measurement import Tie
+from astropolcal.optics import GENERATORS, Dependence
+from astropolcal.words import did_you_mean
+
+__all__ = [
+    "Effect",
+    "Where",
+    "after",
+    "before",
+    "detector",
+    "direction",
+    "harmonic",
+    "inside",
+    "move",
+    "source",
+    "step",
+    "telescope",
+    "time",
+]
+
+# the most that a kind may be: beyond it is no perturbation
+_LIMITS = {"retardance": np.pi, "rotation": np.pi / 4, "diattenuation": 3.0, "depolarization": 3.0}
+_LIMIT = 0.5
+# kinds that are several generators; an error of an orientation is a rotation and one back
+_SEVERAL = {
+    "diattenuation": ("diattenuation_h", "diattenuation_d"),
+    "retardance": ("retardance_h", "retardance_d"),
+    "orientation": ("rotation",),
+}
+#: Degree of what is one number for all wavelengths, and no law.
+NUMBER = "number"
+# largest change of an optic's Mueller matrix from the identity that is none
+_SAME = 1e-9
+
+
+# ---- places ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Where:
+    """
+    A place in chains, told by an optic.
+
+    Parameters
+    ----------
+    relation : {"after", "before", "inside", "source", "telescope", "detector"}
+        Inside is the frame that turns with the optic.
+    optic : str or None
+        Its name, or its role.
+    is_role : bool
+        Whether only the role counts, see `Roles`.
+    in_front : bool
+        Whether what is inside an optic stands in front of it.
+    turned : float
+        Orientation to that of the optic, degree.
+    otherwise : Where or None
+        The place of chains that lack the optic.
+
+    See Also
+    --------
+    after, before, inside, source, telescope, detector : make one.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import Where
+    >>> Where("inside", "hwp").words
+    'hwp'
+    """
+
+    relation: str
+    optic: str | None = None
+    is_role: bool = False
+    in_front: bool = False
+    turned: float | None = None
+    otherwise: object = None
+
+    @property
+    def words(self):
+        """The place in words."""
+        side = {"after": "behind the ", "before": "in front of the "}.get(self.relation, "")
+        return f"{side}{self.optic or self.relation}"
+
+    @property
+    def follows(self):
+        """Whether the orientation is that of the optic, whatever that is."""
+        return self.relation == "inside" and self.turned is None
+
+    def anchor(self, roles):
+        """Return the optic by which the place is told, None where there is none."""
+        own = [] if self.is_role else [o for o in roles.leaves if o.name == self.optic]
+        return next(iter(own), getattr(roles, self.optic or "", None))
+
+    def find(self, roles, chosen=None):
+        """Return the `Place` in a chain, or None; no other where an optic was chosen."""
+        if self.relation == "detector":
+            split = next((o for o in roles.leaves if o.splits_light), None)
+            return split and Place("detector", after=split.name)
+        if self.optic is None:
+            there = {place.name: place for place in places(Train(roles.leaves))}
+            return there.get(self.relation)
+        optic = self.anchor(roles)
+        if optic is None:
+            other = self.otherwise if chosen is None else None
+            return other and other.find(roles)
+        in_front = self.in_front or self.relation == "before"
+        side = {"before" if in_front else "after": optic.name}
+        theta, mount = 0.0, None
+        if self.relation == "inside" or self.turned is not None:
+            theta = np.deg2rad(np.mean(optic.theta.value) + (self.turned or 0.0))
+            mount = optic.mount
+        return Place(self.cell_place(roles, optic), mount=mount, theta=float(theta), **side)
+
+    def cell_place(self, roles, optic=None):
+        """Return the name of the place in the vocabulary of `Cell`, the nearest that there is."""
+        optic = self.anchor(roles) if optic is None else optic
+        if optic is None:
+            return self.relation if self.optic is None else "source"
+        if self.relation == "inside" and optic.stage is not None:
+            return f"in:{optic.name}"
+        index = {o.name: i for i, o in enumerate(roles.leaves)}
+        mine = index[optic.name] + (not (self.in_front or self.relation == "before"))
+        found = "source"
+        for place in places(Train(roles.leaves)):
+            its = index[place.before] if place.after is None else index[place.after] + 1
+            if its <= mine and not place.name.startswith("in:"):
+                found = place.name
+        return found
+
+    def in_front_of(self, roles):
+        """Return the name of the place in front of the optic."""
+        return Where("before", self.optic, self.is_role).cell_place(roles)
+
+
+def after(optic):
+    """
+    Return the place behind an optic, by its name or role, in the frame that stands still.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import after
+    >>> after("hwp").words
+    'behind the hwp'
+    """
+    return Where("after", optic)
+
+
+def before(optic):
+    """
+    Return the place in front of an optic, in the frame that stands still.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import before
+    >>> before("wollaston").words
+    'in front of the wollaston'
+    """
+    return Where("before", optic)
+
+
+def inside(optic):
+    """
+    Return the place of an optic, in the frame that turns with it.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import inside
+    >>> inside("derotator").words
+    'derotator'
+    """
+    return Where("inside", optic)
+
+
+def source():
+    """
+    Return the place behind the source.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import source
+    >>> source().words
+    'source'
+    """
+    return Where("source")
+
+
+def telescope():
+    """
+    Return the place behind the telescope, in front of the half-wave plate.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import telescope
+    >>> telescope().words
+    'telescope'
+    """
+    return Where("telescope")
+
+
+def detector():
+    """
+    Return the place behind the beam splitter.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import detector
+    >>> detector().words
+    'detector'
+    """
+    return Where("detector")
+
+
+# ---- dependences -------------------------------------------------------------------------------
+
+
+def harmonic(stage, n):
+    """
+    Return the dependence on cosine and sine of n times the angle of a stage.
+
+    Parameters
+    ----------
+    stage : str
+        Its name.
+    n : int
+        Periods in a turn.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import harmonic
+    >>> harmonic("derotator", 1)
+    'harmonic:derotator:1'
+    """
+    return f"harmonic:{stage}:{n}"
+
+
+def time():
+    """
+    Return the dependence on time, a trend through the run.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import time
+    >>> time()
+    'time'
+    """
+    return "time"
+
+
+def step(frame):
+    """
+    Return the dependence of what is there from a frame on.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import step
+    >>> step(24)
+    'step:24'
+    """
+    return f"step:{frame}"
+
+
+def direction(stage):
+    """
+    Return the dependence on whether the last move of a stage was backwards.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import direction
+    >>> direction("hwp")
+    'direction:hwp'
+    """
+    return f"direction:{stage}"
+
+
+def move(stage):
+    """
+    Return the dependence on how far a stage was moved last.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import move
+    >>> move("derotator")
+    'move:derotator'
+    """
+    return f"move:{stage}"
+
+
+# ---- effects -----------------------------------------------------------------------------------
+
+
+class Effect:
+    """
+    An effect that the model of an instrument may lack, told by its place, kind and dependence.
+
+    Parameters
+    ----------
+    name : str
+        Identifier.
+    title : str
+        What it is, for a reader.
+    place : Where
+        Such as ``after("hwp")``.
+    kind : str or tuple of str
+        Key of `~astropolcal.optics.GENERATORS`; ``"diattenuation"`` and ``"retardance"`` are of
+        any axis; ``"orientation"`` is an error of the orientation of the optic inside which it is.
+    dependence : str
+        On the frame, such as ``harmonic("derotator", 1)``.
+    degree : int, "number" or None
+        Degree of the law in wavelength; "number" is one number for all wavelengths, and None one
+        for each.
+    scale, limit : float or `~astropy.units.Quantity`
+        Size to expect, and the largest that is physical; by default those of the kind.
+    shows, reference : str
+        Where in the data, and which paper.
+    **settings
+        Rarer ones, by the names of the attributes below.
+
+    Attributes
+    ----------
+    kind : str
+        One of ``KINDS``, not the kind of the perturbation, which is in ``kinds``.
+    place : str
+        The place in words; ``where`` is the `Where`.
+    optic : str or None
+        Name of the optic that it acts on, where that is not the first of its kind.
+    inserted : Optic or callable
+        The optic that it inserts, or what makes it of the optic at its place.
+    free : tuple of str
+        Parameters of that optic that it frees, by default those that are free.
+    equal : dict
+        Parameters of the inserted optic that follow another one.
+    when : callable
+        Whether the optics of a chain, by `Roles`, have what else is needed.
+    near : tuple
+        `Where`, kinds and dependence of the cell to which it is nearest, if it is none.
+    absorbed_by : str or None
+        The parameters of a usual nominal model that take the effect up entirely, so that data
+        never show it; None where there are none.
+
+    Raises
+    ------
+    GapError
+        If place, kind or dependence is none.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import Effect, after, harmonic
+    >>> flexure = Effect("flexure", "mirror that bends as the derotator turns",
+    ...                  place=after("hwp"), kind="diattenuation",
+    ...                  dependence=harmonic("derotator", 1), limit=0.05)
+    >>> flexure.cell([instruments.get("charis").chain()]).title
+    'diattenuation along the axes behind the half-wave plate that changes once in a turn of the derotator'
+    """  # noqa: E501
+
+    name = title = place = where = optic = inserted = near = absorbed_by = scale = limit = None
+    kind, kinds, dependence, degree = "optic", (), "constant", 2
+    shows, reference = "what a perturbation at its place does", "declared by its user"
+    free, equal = None, {}
+    #: Flux at which a coefficient counts, in units of the usual flux of a beam.
+    flux = None
+    #: Whether it is an error of the orientation of its optic: undone behind it.
+    around = False
+
+    def __init__(
+        self, name=None, title=None, place=None, kind=None, dependence=None, degree=2, **settings
+    ):
+        given = {"name": name, "title": title, "where": place, "dependence": dependence}
+        # None is a degree, too
+        if degree != 2:
+            self.degree = degree
+        for key, value in (given | settings).items():
+            if key not in _SETTINGS:
+                raise GapError(f"effect {name}: no setting {key!r}{did_you_mean(key, _SETTINGS)}")
+            if value is not None:
+                setattr(self, {"category": "kind", "words": "place"}.get(key, key), value)
+        if kind is not None:
+            wanted = (kind,) if isinstance(kind, str) else tuple(kind)
+            self.around = "orientation" in wanted
+            self.kinds = tuple(g for one in wanted for g in _SEVERAL.get(one, (one,)))
+        self._check()
+        if self.place is None and self.where is not None:
+            self.place = self.where.words
+
+    def _check(self):
+        if self.where is not None and not isinstance(self.where, Where):
+            raise GapError(f"effect {self.name}: place = {self.where!r} is none; say after(optic)")
+        known = (*GENERATORS, *_SEVERAL)
+        for one in self.kinds if self.inserted is None else ():
+            if one not in known:
+                near = did_you_mean(one, known)
+                raise GapError(f"effect {self.name}: kind {one!r}{near}; known: {', '.join(known)}")
+        if self.inserted is None:
+            try:
+                Dependence(self.dependence)
+            except ParameterError as error:
+                raise GapError(f"effect {self.name}: {error}") from None
+
+    @classmethod
+    def insert(cls, optic, after=None, before=None, inside=None, **settings):
+        """
+        Return the effect of an optic that a chain lacks; its free parameters are what it adds.
+
+        Parameters
+        ----------
+        optic : Optic
+            Any optic, at parameters at which it does nothing.
+        after, before, inside : str
+            Name or role of the optic next to which it stands, or with which it turns.
+        **settings
+            Others of an `Effect`; by default name and title are those of the optic.
+
+        Returns
+        -------
+        Effect
+
+        Raises
+        ------
+        GapError
+            If the optic does something, has no free parameter, or not one place is given.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal import optics
+        >>> from astropolcal.gap.effects import Effect
+        >>> film = optics.Diattenuator(theta=30 * u.deg, name="film")
+        >>> Effect.insert(film, before="wollaston", limit=0.1, degree=1)
+        <Effect film: Diattenuator in front of the wollaston>
+        """
+        given = {"after": after, "before": before, "inside": inside}
+        told = [Where(key, value) for key, value in given.items() if value is not None]
+        name = settings.pop("name", optic.name)
+        if len(told) != 1:
+            raise GapError(f"effect {name}: give one of after=, before= and inside=")
+        title = settings.pop("title", f"{type(optic).__name__} {told[0].words}")
+        effect = cls(name, title, told[0], inserted=optic, **settings)
+        if not effect.free_of(optic):
+            raise GapError(f"effect {name}: no parameter of {type(optic).__name__} is free")
+        # one position stands for all: a number for what follows one, else an angle
+        matrix = optic.mueller(1.6 * u.um, 0.5 if optic.stage in optics.COORDINATES else None)
+        change = np.abs(matrix - np.eye(4)).max()
+        if change > _SAME:
+            raise GapError(
+                f"effect {name}: its optic changes the light by {change:.2g}; at the values given, "
+                "from which sizes count, it must do nothing"
+            )
+        return effect
+
+    # ---- which optics ------------------------------------------------------------------------
+
+    @property
+    def label(self):
+        """Name of the optic in the chain."""
+        return label_of(self.name)
+
+    @property
+    def acts_on(self):
+        """Role of the optic that it acts on, where there may be several of a kind."""
+        where = self.where
+        return where.optic if where and where.is_role and where.optic in SEVERAL else None
+
+    def roles(self, chain):
+        """Return the optics of a chain by what they are for, with the one that it acts on."""
+        chosen = {} if self.optic is None else {self.acts_on: self.optic}
+        return Roles(chain, **chosen)
+
+    def changed(self, **attributes):
+        """Return a copy with other attributes."""
+        new = copy.copy(self)
+        for key, value in attributes.items():
+            setattr(new, key, value)
+        return new
+
+    def at(self, optic):
+        """
+        Return the effect of one optic of its kind, with the name ``"effect:optic"``.
+
+        Parameters
+        ----------
+        optic : str
+            Its name.
+
+        Returns
+        -------
+        Effect
+        """
+        return self.changed(
+            optic=optic, name=f"{self.name}:{optic}", title=f"{self.title} ({optic})"
+        )
+
+    def per_optic(self, chains):
+        """
+        Return the effect once for each optic of the kind that it acts on.
+
+        Parameters
+        ----------
+        chains : sequence
+            One a dataset.
+
+        Returns
+        -------
+        list of Effect
+            Itself for the optic that is the first of its kind, and one for each other.
+        """
+        if self.acts_on is None or self.optic is not None:
+            return [self]
+        every = [Roles(chain).all(self.acts_on) for chain in chains]
+        # the first of a kind keeps the plain name, in whichever dataset it is
+        first = {found[0].name for found in every if found}
+        others = dict.fromkeys(o.name for found in every for o in found if o.name not in first)
+        return [self, *(self.at(name) for name in others)]
+
+    def applies(self, chains):
+        """
+        Return whether the chains have the place for this effect.
+
+        Parameters
+        ----------
+        chains : sequence
+            One a dataset.
+
+        Returns
+        -------
+        bool
+        """
+        return any(self.applies_to(self.roles(chain)) for chain in chains)
+
+    def applies_to(self, roles):
+        """Return whether one chain has the place, and the stage on which the effect depends."""
+        place = self.where.find(roles, self.optic)
+        if place is None or (self.when is not None and not self.when(roles)):
+            return False
+        what, stage, *_ = (*self._dependence(roles).split(":"), "")
+        needed = what in ("harmonic", "direction", "move")
+        return not needed or any(o.stage == stage for o in roles.leaves)
+
+    #: Function of the `Roles` of a chain that says whether it has what else is needed.
+    when = None
+
+    def _dependence(self, roles):
+        """Return the dependence, with the name of the stage of the effect's own optic."""
+        if ":own" not in self.dependence:
+            return self.dependence
+        return self.dependence.replace(":own", f":{self.where.anchor(roles).stage}")
+
+    # ---- cells -------------------------------------------------------------------------------
+
+    def cells(self, chains):
+        """
+        Return the cells of the table of places, kinds and dependences that the effect is.
+
+        Parameters
+        ----------
+        chains : sequence
+            One a dataset.
+
+        Returns
+        -------
+        tuple of Cell
+            The main one first; those that it is nearest to where it is none. Empty for
+            discrete alternatives.
+        """
+        every = [self.roles(chain) for chain in chains]
+        roles = next((one for one in every if self.applies_to(one)), next(iter(every), None))
+        if roles is None or not (self.kinds or self.near):
+            return ()
+        where, kinds, text, *_ = (*(self.near or (self.where, self.kinds)), None)
+        text = self._dependence(roles) if text is None else text
+        at = [where.cell_place(roles)]
+        if self.around and not self.near:
+            at.append(where.in_front_of(roles))
+        texts = (text,) if isinstance(text, str) else text
+        cells = [Cell(place, one, text) for text in texts for place in at for one in kinds]
+        return tuple(dict.fromkeys(cells))
+
+    def cell(self, chains):
+        """Return the main one of `cells`, None where there is none."""
+        return next(iter(self.cells(chains)), None)
+
+    # ---- the edit ----------------------------------------------------------------------------
+
+    def edit(self, chains, context):
+        """
+        Return the chains with the effect at zero.
+
+        Parameters
+        ----------
+        chains : sequence
+            One a dataset; not changed.
+        context : Context
+            Wavelengths and fluxes.
+
+        Returns
+        -------
+        Edit
+        """
+        edited, ties, keys = [], {}, {}
+        for i, chain in enumerate(chains):
+            roles = self.roles(chain)
+            if self.applies_to(roles) and self._in_dataset(context, i):
+                chain, parts, more = self.put(chain, roles, context, self.label)
+                ties |= more
+                keys |= dict.fromkeys(
+                    f"{part.name}.{key}" for part in parts for key in self.free_of(part)
+                )
+            edited.append(chain)
+        return Edit(edited, self.parameters(keys, chains, context), ties)
+
+    def _in_dataset(self, context, i):
+        """Return whether a dataset is that of the dependence, where this names one."""
+        what, _, name = self.dependence.partition(":")
+        return what != "dataset" or context.datasets[i : i + 1] in ((), (name,))
+
+    def parameters(self, names, chains, context):
+        """Return the parameters of these names, with their sizes and laws."""
+        law = None if self.degree is None else self.law(context, chains)
+        return [EffectParameter(name, *self._sizes(), law) for name in names]
+
+    def _sizes(self):
+        """Return size to expect and limit, a tenth of which is expected if nothing is said."""
+        kind = self.kinds[0] if self.kinds else ""
+        scale, limit = self.scale, self.limit
+        if limit is None:
+            # those of a usual perturbation, in radian or as a share
+            limit = _LIMITS.get(kind.partition("_")[0], _LIMIT)
+            scale = Cell("", kind, "").scale if scale is None else scale
+            if isinstance(self.inserted, optics.Optic):
+                unit = getattr(self.inserted, self.free_of(self.inserted)[0]).unit
+                return scale * (u.rad if unit else 1), limit * (u.rad if unit else 1)
+        sizes = limit / 10 if scale is None else scale, limit
+        # perturbations are plain numbers, in radian where they are angles
+        return sizes if self.inserted is not None else tuple(_plain(size) for size in sizes)
+
+    def law(self, context, chains=()):
+        """Return the law of its parameters in wavelength, None for a single number."""
+        # one wavelength has no law
+        if self.degree is NUMBER or self.degree is None or len(context.wavelength) == 1:
+            return None
+        return self.degree(context) if callable(self.degree) else context.basis(self.degree)
+
+    def free_of(self, optic):
+        """Return the names of the parameters of its optic that the effect frees."""
+        if self.free is not None:
+            return self.free
+        return tuple(
+            k for k in optic.param_names if not getattr(optic, k).fixed and k not in self.equal
+        )
+
+    def put(self, chain, roles, context, label):
+        """
+        Return a chain with the optics in it, those with parameters, and the ties of these.
+
+        Parameters
+        ----------
+        chain : Optic or `~astropy.modeling.CompoundModel`
+            The chain.
+        roles : Roles
+            Its optics.
+        context : Context
+            Wavelengths and fluxes.
+        label : str
+            Name of the first optic.
+
+        Returns
+        -------
+        chain : `~astropy.modeling.CompoundModel`
+        parts : list of Optic
+        ties : dict of str to Tie
+        """
+        place = self.where.find(roles, self.optic)
+        anchor = self.where.anchor(roles)
+        if self.inserted is None:
+            parts = self._perturbations(place, roles, context, label)
+            added = parts if place.mount is None or self.around else _in_frame(place, parts, label)
+        else:
+            parts = added = [self._own_optic(place, anchor, context, label)]
+        ties = {
+            f"{part.name}.{key}": Tie(f"{part.name}.{other}")
+            for part in parts
+            for key, other in self.equal.items()
+        }
+        # turned with its optic: an effect of a plate has the axes of that plate
+        follows = anchor is not None and self.where.follows and not self.around
+        if follows and self.inserted is not None and not anchor.theta.fixed and _has_axes(added[0]):
+            added[0].theta.bounds = (None, None)
+            ties[f"{label}.theta"] = Tie(f"{anchor.name}.theta")
+        if self.around:
+            # equal and opposite: what turns the light in front is turned back behind
+            for part in parts:
+                chain = insert_optic(chain, part, before=anchor.name)
+                back = part.copy()
+                back.name = f"{part.name}_back"
+                chain = insert_optic(chain, back, after=anchor.name)
+                ties |= {
+                    f"{back.name}.{key}": Tie(f"{part.name}.{key}", factor=-1.0)
+                    for key in self.free_of(part)
+                }
+            return chain, parts, ties
+        for one in added if place.after is None else reversed(added):
+            chain = place.insert(chain, one)
+        return chain, parts, ties
+
+    def _own_optic(self, place, anchor, context, label):
+        """Return the optic that is inserted, at its place and with its parameters free."""
+        one = self.inserted
+        one = one(anchor) if callable(one) and not isinstance(one, optics.Optic) else one
+        free = self.free_of(one)
+        grows = self.degree is not NUMBER
+        size = len(context.wavelength)
+        values = {
+            key: np.broadcast_to(parameter.value, size) * (parameter.unit or 1)
+            for key in (*free, *self.equal)
+            if grows and (parameter := getattr(one, key)).size == 1
+        }
+        one = one.with_parameters(**values)
+        one.name, one.mount = label, one.mount or place.mount
+        if self.flux is not None:
+            one.reference = self.flux * context.flux
+        if (_has_axes(one) and self.where.relation == "inside") or self.where.turned is not None:
+            one.theta = np.rad2deg(place.theta) * u.deg
+        for key in one.param_names:
+            getattr(one, key).fixed = key not in (*free, *self.equal)
+        return one
+
+    def _perturbations(self, place, roles, context, label):
+        """Return one optic for each generator, at zero."""
+        text = self._dependence(roles)
+        keys = ("amplitude", "quadrature")[: Dependence(text).count]
+        zero = 0.0 if self.degree is NUMBER else np.zeros(len(context.wavelength))
+        found = []
+        for kind in self.kinds:
+            one = optics.Perturbation(
+                **dict.fromkeys(keys, zero),
+                kind=kind,
+                dependence=text,
+                theta=place.theta * u.rad,
+                name=label if len(self.kinds) == 1 else f"{label}_{kind}",
+            )
+            for key in one.param_names:
+                getattr(one, key).fixed = key not in keys
+            found.append(one)
+        return found
+
+    def variants(self, context):
+        """
+        Return the effect in all the settings among which the data may choose.
+
+        Parameters
+        ----------
+        context : Context
+            Wavelengths and fluxes.
+
+        Returns
+        -------
+        list of Effect
+            Only itself, unless a setting enters the law in a way that is not linear, as the
+            thickness of a window does.
+        """
+        return [self]
+
+    def __repr__(self):
+        return f"<Effect {self.name}: {self.title}>"
+
+
+_SETTINGS = (
+    *("name", "title", "where", "dependence", "scale", "limit", "shows", "reference", "words"),
+    *("category", "inserted", "free", "equal", "when", "near", "absorbed_by", "flux"),
+    *("components", "change"),
+)
+
+
+def _plain(size):
+    size = u.Quantity(size)
+    return size.to_value(u.rad if size.unit.is_equivalent(u.rad) else u.one)
+
+
+def _has_axes(optic):
+    """Return whether an optic turns with its mount, and has axes."""
+    return not isinstance(optic, optics.FrameOptic) or optic.turns
+
+
+def _in_frame(place, parts, label):
+    """Return optics between a rotator into the frame of a stage and one back."""
+    back = place.mount[1:] if place.mount.startswith("-") else f"-{place.mount}"
+    ends = [optics.Rotator(mount=m, name=f"{label}_{n}") for m, n in
+            ((place.mount, "in"), (back, "out"))]  # fmt: skip
+    for one in ends:
+        one.theta.fixed = True
+    return [ends[0], *parts, ends[1]]
