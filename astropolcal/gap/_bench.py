@@ -6,8 +6,9 @@ Nothing of the diagnosis is used: Stokes vectors go through the Mueller matrices
 a fault is the matrix exponential of a generator of its own, or something that no such matrix is.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
+from inspect import signature
 
 import astropy.units as u
 import numpy as np
@@ -71,8 +72,9 @@ class Setup:
     ----------
     instrument : str
         Name of the instrument.
-    options : dict
-        Passed to its ``chain``: the nominal model.
+    options : dict, optional
+        Passed to its ``chain``: the nominal model. By default a linear derotator, where the
+        instrument knows one.
     n_wavelengths, n_derotator : int
         Numbers of wavelengths and of derotator angles; at each of these one
         cycle of the half-wave plate. An instrument with filters keeps its own wavelengths.
@@ -92,7 +94,7 @@ class Setup:
     """
 
     instrument: str = "charis"
-    options: dict = field(default_factory=lambda: {"derotator": "linear"})
+    options: dict | None = None
     n_wavelengths: int = 8
     n_derotator: int = 8
     flux: float = 1e7
@@ -104,6 +106,11 @@ class Setup:
         for key in ("n_wavelengths", "n_derotator"):
             if getattr(self, key) < 3:
                 raise GapError(f"{key} = {getattr(self, key)}; allowed are whole numbers from 3 up")
+        if self.options is None:
+            known = signature(instruments.get(self.instrument).chain).parameters
+            # a frozen dataclass is filled in like this
+            options = {"derotator": "linear"} if "derotator" in known else {}
+            object.__setattr__(self, "options", options)
 
     @property
     def wavelength(self):
@@ -113,7 +120,7 @@ class Setup:
             return usual[: self.n_wavelengths]
         return np.geomspace(usual.min(), usual.max(), self.n_wavelengths)
 
-    @property
+    @cached_property
     def sources(self):
         """The sources of the instrument that need no telescope."""
         known = instruments.get(self.instrument).sources
@@ -153,7 +160,11 @@ class Bench:
         # a lamp is not white
         flux = setup.flux * np.clip(self.law @ [1, *rng.normal(0, 0.2, _DEGREE)], 0.3, 3.0)
         self.flicker = rng.uniform(0, 2 * setup.flicker)
-        name = instruments.get(setup.instrument).name
+        instrument = instruments.get(setup.instrument)
+        known = {leaf.name for leaf in leaves(self.chains[0])}
+        out = [name for name in instrument.optional_optics if name not in known]
+        # so that a table of it needs no more to be read
+        meta = {"instrument": instrument.name, **instrument.meta_without(out)}
         self.clean = [
             simulate(
                 chain,
@@ -163,7 +174,7 @@ class Bench:
                 lamp=self._lamp(len(frames)),
                 noise=False,
                 name=source,
-                meta={"instrument": name, "source": source},
+                meta=meta | {"source": source},
             )
             for chain, source in zip(self.chains, setup.sources, strict=True)
         ]
@@ -320,7 +331,8 @@ class Bench:
             for beam, one in zip(("right", "left"), flux * bright, strict=True):
                 electrons, read = one.ravel(), self.setup.read_noise
                 drawn = self.rng.poisson(electrons) + self.rng.normal(0, read, electrons.shape)
-                table[f"flux_{beam}"] = drawn * u.adu
+                # a beam that is dark must not drop out of the table
+                table[f"flux_{beam}"] = np.maximum(drawn, 1.0) * u.adu
                 table[f"flux_{beam}_err"] = np.sqrt(electrons + read**2) * u.adu
             found.append(Observations.from_table(table, name=clean.name))
         return found
@@ -401,8 +413,7 @@ class Bench:
     def _jacobian(self, vector):
         """Return the derivative of the whitened model, by finite differences."""
         base, columns, at = self._model(vector), [], 0
-        for name, i, shape in self._free:
-            # an error of a layer's thickness (um) turns the light much more than one of an angle
+        for _, _, shape in self._free:
             h, size = 1e-6, int(np.prod(shape))
             moved = vector.copy()
             moved[at : at + size] += h
@@ -429,13 +440,12 @@ class Bench:
         )
         return -fit.fun, fit
 
-    def _cells(self, vector):
+    def _cells(self, vector, own=None):
         """Yield name and whitened columns of each cell of places, kinds and dependences."""
         values, n_sets = self._values(vector), range(len(self.clean))
         flux = [self.path(d, values=values) for d in n_sets]
-        waves = {
-            name: [self.waves(d, name) for d in n_sets] for name in self.dependences
-        }
+        names = dict.fromkeys([*self.dependences, *([own] if own else [])])
+        waves = {name: [self.waves(d, name) for d in n_sets] for name in names}
         sweeps = [list(self._matrices(d, values=values)) for d in n_sets]
         for place in self.places:
             ends = [self._ends(d, sweeps[d], place) for d in n_sets]
@@ -473,7 +483,8 @@ class Bench:
         for _, _, matrices in sweep[cut:][::-1]:
             row = row @ matrices
         shape = (self.clean[dataset].n_frames, len(self.micron), 4)
-        turn = sweep[cut - 1][1] if place.startswith("in:") else np.zeros((1, 1))
+        turn = np.asarray(sweep[cut - 1][1] if place.startswith("in:") else 0.0)
+        turn = turn.reshape((1,) * (2 - turn.ndim) + turn.shape)
         row = np.broadcast_to(row[..., 0, :], (2, *shape))
         return row, np.broadcast_to(light[..., 0], shape), turn
 
@@ -493,20 +504,18 @@ class Bench:
         found = []
         for f, s, wave in zip(flux, slopes, waves, strict=True):
             total = f.sum(axis=0)
-            both = np.stack(
-                [2 * (f[1] * s[0] - f[0] * s[1]) / total**2, s.sum(axis=0) / total]
-            )
+            both = np.stack([2 * (f[1] * s[0] - f[0] * s[1]) / total**2, s.sum(axis=0) / total])
             each = np.einsum("fk,wl,cfw->klcfw", wave, self.law, both)
             found.append(each.reshape(-1, *both.shape))
         return self._whiten(found)
 
-    def shares(self, residual, fit):
-        """Return the share of a residual that each cell carries beside the nominal model."""
+    def shares(self, residual, fit, own=None):
+        """Return the share of a residual that each cell, or one's own, carries beside the model."""
         kept = fit.active_mask == 0
         taken = np.linalg.qr(fit.jac[:, kept])[0]
         signal = residual - taken @ (taken.T @ residual)
         found = {}
-        for name, columns in self._cells(fit.x):
+        for name, columns in self._cells(fit.x, own):
             length = np.linalg.norm(columns, axis=1)
             columns = (columns[length > 0] / length[length > 0, None]).T
             left, size, _ = np.linalg.svd(

@@ -12,7 +12,7 @@ from astropolcal.units import canonical_factor
 _FRAME_FAULTS = ("hwp angle", "derotator angle", "exchanged", "one beam")
 _MECHANISMS = ("smear", "ghost", "hysteresis", "wander", "jitter", "fringes")
 # the largest size: radian, or a share
-_LARGEST, _LARGEST_SHARE = 0.5, 0.3
+_LARGEST, _LARGEST_SHARE = 0.2, 0.3
 # what the nominal model takes up leaves less than this share of itself
 _TAKEN_UP = 0.02
 
@@ -82,11 +82,10 @@ class Fault:
             self._choose_dependence(rng)
             self._draw_law(rng)
             return
-        self.told["dependence"] = DETECTOR[self.told["kind"]]
-        self.told["dependence"], name = "constant", self.told["dependence"]
         # what is added is never negative
+        self.told["dependence"] = "constant"
         self._draw_law(rng, 0.2)
-        self.told["dependence"] = name
+        self.told["dependence"] = DETECTOR[self.told["kind"]]
         if self.told["kind"] == "background_of_one_beam":
             self._choose("beam", ("right", "left"))
 
@@ -154,6 +153,13 @@ class Fault:
     def is_whole(self):
         """Whether it is there or not, without a size."""
         return self.told.get("what") == "exchanged"
+
+    def cells(self, residual, fit):
+        """Return the share of its signal that each cell carries; its own is all of it."""
+        own = [self.told.get(key) for key in ("place", "kind", "dependence")]
+        step = own[2] if own[2] and own[2].startswith("step:") else None
+        found = self.bench.shares(residual, fit, step)
+        return {**found, "/".join(own): 1.0} if all(own) else found
 
     # ---- what it does ---------------------------------------------------------------------------
 

@@ -71,7 +71,7 @@ class ChallengeResult:
     @property
     def rates(self):
         """Table of the rates: all, by kind, and by SNR of what has a fault to be seen."""
-        kinds = dict.fromkeys(record["kind"] for record in self.records)
+        kinds = sorted({record["kind"] for record in self.records})
         rows = [("all", (), {}), *((kind, (kind,), {}) for kind in kinds)]
         for low, high in pairwise(_SNR_EDGES):
             name = f"SNR {low:g} to {high:g}" if np.isfinite(high) else f"SNR over {low:g}"
@@ -121,10 +121,15 @@ class ChallengeResult:
         lines = [f"{counted(len(self.records), 'challenge')}; rates with intervals at 68 %, in %"]
         lines.append(f"{'':14}{'n':>5}" + "".join(f"{_WORDS[name]:>20}" for name in RESULTS))
         for row in rates:
-            cells = [_percent(*(row[name + key] for key in ("", "_low", "_high"))) for name in RESULTS]
+            cells = [
+                _percent(*(row[name + key] for key in ("", "_low", "_high"))) for name in RESULTS
+            ]
             lines.append(f"{row['challenges']:14}{row['n']:5}" + "".join(f"{c:>20}" for c in cells))
         if len(claims):
-            lines += ["", "causes by the probability that was given, and how many of them are right"]
+            lines += [
+                "",
+                "causes by the probability that was given, and how many of them are right",
+            ]
         for row in claims:
             right = _percent(row["right"], row["right_low"], row["right_high"])
             lines.append(f"{100 * row['probability']:13.1f} {row['n']:5}{right:>20}")
@@ -152,7 +157,9 @@ class ChallengeResult:
             left = np.zeros(len(rows))
             for name in RESULTS:
                 width = 100 * np.asarray(rows[name])
-                ax.barh(range(len(rows)), width, 0.75, left, color=_COLORS[name], label=_WORDS[name])
+                ax.barh(
+                    range(len(rows)), width, 0.75, left, color=_COLORS[name], label=_WORDS[name]
+                )
                 dark = "black" if name == "silent" else "white"
                 for y, (x, w) in enumerate(zip(left, width, strict=True)):
                     if w > 6:

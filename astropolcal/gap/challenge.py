@@ -108,10 +108,10 @@ def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
     faults = [Fault(bench, {"type": str(k), **(fault or {})}) for k in kinds.get(kind, [kind])]
     told = []
     for one in faults:
-        residual, fit = bench.scale(one, snr)
+        residual, fit = bench.scale(one, 1.0 if kind == "absorbed" else snr)
         absorbed = one.snr < _INVISIBLE
         size = {"amplitude": one.amplitude, "snr": round(one.snr, 1), "absorbed": absorbed}
-        cells = {} if absorbed else bench.shares(residual, fit)
+        cells = {} if absorbed else one.cells(residual, fit)
         told.append({**one.told, **size, "cells": cells})
     case = {
         "kind": kind,
@@ -161,8 +161,10 @@ def _visible(case):
 
 def _probability(cause):
     # a tool that gives no probabilities is sure
-    given = cause.get("probability")
-    return 1.0 if given is None else float(given)
+    given = 1.0 if cause.get("probability") is None else float(cause["probability"])
+    if not 0 <= given <= 1:
+        raise ValueError(f"probability = {given}")
+    return given
 
 
 def score_answer(case, answer):
