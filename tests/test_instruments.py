@@ -441,6 +441,7 @@ ALLOWED = {
     ("scripts/_calibrate.py", "charis_example.ecsv"): "packaged data",
     ("scripts/_calibrate.py", "--m3"): "option of the command line, and of two chains",
     ("scripts/_calibrate.py", "m3"): "option of the command line, and of two chains",
+    ("scripts/_challenge.py", "charis"): DEFAULT,
     ("scripts/_choosing.py", "charis"): DEFAULT,
     ("scripts/_correct.py", "charis"): DEFAULT,
     ("scripts/_efficiency.py", "charis"): DEFAULT,

@@ -14,7 +14,7 @@ RESULTS = ("right", "silent", "wrong")
 _COLORS = {"right": "#0072B2", "silent": "#D9D9D9", "wrong": "#D55E00"}
 _WORDS = {"right": "right", "silent": "silent", "wrong": "confidently wrong"}
 _SNR_EDGES = np.array([0, 3, 10, 20, 40, 80, np.inf])
-_EDGES = np.array([0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1])
+_EDGES = np.array([0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 1])
 
 
 class ChallengeResult:

@@ -267,8 +267,7 @@ def _write_one(index, settings, folder=None):
     """Write the tables of a challenge, and return its case."""
     observations, _, case = _make_one(index, settings)
     own = Path(folder) / f"case{index:03d}"
-    with understood(folder, GapError, "cannot be written", reads=False):
-        own.mkdir(parents=True, exist_ok=True)
+    own.mkdir(exist_ok=True)
     for one, table in zip(observations, case["tables"], strict=True):
         one.write(own / table, overwrite=True)
     return {"index": index, "case": case}
@@ -315,6 +314,8 @@ def make_cases(
     path = Path(folder) / "key.json"
     if path.exists():
         raise GapError(f"{path}: is there already; remove it, or name another folder")
+    with understood(folder, GapError, "cannot be written", reads=False):
+        path.parent.mkdir(parents=True, exist_ok=True)
     made = _each(partial(_write_one, folder=str(folder)), range(n), n, settings, client, progress)
     key = {f"case{one['index']:03d}": one["case"] for one in made}
     with atomic_path(path, GapError) as new:

@@ -54,7 +54,9 @@ def add_parser(commands):
         help="run: make, diagnose and score (default); make DIR: write cases to files; "
         "score DIR OUTPUTS: score the answers of any tool to them",
     )
-    parser.add_argument("folders", nargs="*", metavar="DIR", help="of the cases, and of answers")
+    parser.add_argument(
+        "folders", nargs="*", default=[], metavar="FOLDER", help="of the cases, and of the answers"
+    )
     parser.add_argument(
         "-n",
         "--count",
