@@ -29,6 +29,7 @@ from astropolcal.gap.challenge import (
 )
 
 SMALL = Setup(n_wavelengths=5, n_derotator=3)
+LEAST = Setup(n_wavelengths=3, n_derotator=3)
 DRIFT = {"place": "in:derotator", "kind": "retardance_h", "dependence": "time"}
 CELL = "in:derotator/retardance_h/time"
 
@@ -66,20 +67,19 @@ def test_light_goes_through_the_chain_as_the_package_says():
 
 
 def test_each_kind_of_fault_stands_out_as_asked():
-    for kind in sorted(set(KINDS) - {"none", "absorbed"}):
+    for kind in sorted(set(KINDS) - {"none", "absorbed", "frame", "mechanism"}):
         data, _, case = make_challenge(5, kind=kind, setup=SMALL, snr=20)
         assert len(case["faults"]) == (2 if kind == "pair" else 1), kind
         for fault in case["faults"]:
-            whole = fault.get("what") == "exchanged"
-            assert fault["absorbed"] or whole or fault["snr"] < 21, kind
+            assert fault["absorbed"] or fault["snr"] < 21, kind
         assert [one.name for one in data] == ["polarized", "unpolarized"]
         assert json.loads(json.dumps(case)) == case
     for what in ("smear", "ghost", "hysteresis", "wander", "jitter", "fringes"):
         fault = {"what": what}
-        assert make_challenge(2, kind="mechanism", fault=fault, setup=SMALL)[2]["snr"] > 5, what
+        assert make_challenge(2, kind="mechanism", fault=fault, setup=LEAST)[2]["snr"] > 5, what
     for what in ("hwp angle", "derotator angle", "exchanged", "one beam"):
         fault = {"what": what, "frame": 4, "dataset": "polarized"}
-        case = make_challenge(2, kind="frame", fault=fault, setup=SMALL)[2]
+        case = make_challenge(2, kind="frame", fault=fault, setup=LEAST)[2]
         assert (case["snr"] > 5, case["faults"][0]["frame"]) == (True, 4), what
 
 
