@@ -37,7 +37,8 @@ from astropolcal.reduction.journal import Journal
 from astropolcal.scripts._common import write_json
 from tests.fuzz.readers import READERS, Checkpoint, calibration, lab
 
-RECORD = {"kind": "absorbed", "verdict": "not made"}
+RECORD = {"kind": "none", "verdict": "none", "result": "right", "snr": 0.0}
+RECORD |= {"faults": [], "causes": [], "claims": []}
 FORK = multiprocessing.get_context("fork")
 needs_h5py = pytest.mark.skipif(find_spec("h5py") is None, reason="h5py is not installed")
 

@@ -1,35 +1,66 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Instruments with random effects in them, for sealed challenges."""
+"""
+Simulated calibrations with faults in them, for the challenge.
 
-from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
+Nothing of the diagnosis is used: Stokes vectors go through the Mueller matrices of the optics, and
+a fault is the matrix exponential of a generator of its own, or something that no such matrix is.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from inspect import signature
 
 import astropy.units as u
 import numpy as np
+from numpy.polynomial.legendre import legval, legvander
+from scipy.linalg import expm
+from scipy.optimize import least_squares
 
 from astropolcal import instruments
-from astropolcal.chain import leaves, stages
+from astropolcal.chain import leaves, stages, with_beam
 from astropolcal.exceptions import GapError
-from astropolcal.gap.attribution import scan
-from astropolcal.gap.channels import Channels
-from astropolcal.gap.effects import EFFECTS, Context, get_effect
-from astropolcal.gap.model import Model
-from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.observations import Observations
-from astropolcal.propagation import Propagator
+from astropolcal.optics import COORDINATES
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 from astropolcal.units import canonical_factor
 
-#: An effect that explains this share of the evidence cannot be told from the true one.
-ENOUGH = 0.95
-#: What the library may explain of an effect that it is not to know.
-UNKNOWN = 0.3
-# an effect that lifts chi-square by less than this at its usual size is absorbed
-_INVISIBLE = 0.5
-_WEAKEST = 3.0
-# the scan is linear: a share as large as this is checked by a full fit
-_REFIT_FROM = 0.5
-_TRIES = 40
+#: Stages that a lamp on the bench knows.
+_BENCH_STAGES = {"hwp", "derotator", "flc_state"}
+# instruments with fewer wavelengths than this have filters, which stay where they are
+_FILTERS = 8
+_DEGREE = 2
+#: Shares below this are not in the key.
+_LEAST_SHARE = 0.3
+# directions of a cell below this share of its length are taken up by the nominal model
+_OPEN = 1e-4
+
+
+def _unit(row, column, sign):
+    matrix = np.zeros((4, 4))
+    matrix[row, column], matrix[column, row] = 1, sign
+    return matrix
+
+
+#: What optics can do to a Stokes vector, to first order.
+ACTIONS = {
+    "retardance_h": _unit(2, 3, -1),
+    "retardance_d": _unit(3, 1, -1),
+    "rotation": 2 * _unit(1, 2, -1),
+    "diattenuation_h": _unit(0, 1, 1),
+    "diattenuation_d": _unit(0, 2, 1),
+    "diattenuation_c": _unit(0, 3, 1),
+    "depolarization_linear": -np.diag([0.0, 1, 1, 0]),
+    "depolarization_h": -np.diag([0.0, 1, -1, 0]),
+    "depolarization_d": -_unit(1, 2, 1),
+    "depolarization_circular": -np.diag([0.0, 0, 0, 1]),
+}
+#: What a detector does, and the dependence under which the key has it; a gain may have any.
+DETECTOR = {
+    "background": "flux",
+    "background_of_one_beam": "flux",
+    "nonlinearity": "flux",
+    "persistence": "previous",
+}
 
 
 @dataclass(frozen=True)
@@ -41,11 +72,12 @@ class Setup:
     ----------
     instrument : str
         Name of the instrument.
-    options : dict
-        Passed to its ``chain``: the nominal model.
+    options : dict, optional
+        Passed to its ``chain``: the nominal model. By default a linear derotator, where the
+        instrument knows one.
     n_wavelengths, n_derotator : int
         Numbers of wavelengths and of derotator angles; at each of these one
-        cycle of the half-wave plate.
+        cycle of the half-wave plate. An instrument with filters keeps its own wavelengths.
     flux : float
         Median flux that enters, in electrons per wavelength and frame.
     read_noise : float
@@ -62,7 +94,7 @@ class Setup:
     """
 
     instrument: str = "charis"
-    options: dict = field(default_factory=lambda: {"derotator": "linear"})
+    options: dict | None = None
     n_wavelengths: int = 8
     n_derotator: int = 8
     flux: float = 1e7
@@ -74,22 +106,25 @@ class Setup:
         for key in ("n_wavelengths", "n_derotator"):
             if getattr(self, key) < 3:
                 raise GapError(f"{key} = {getattr(self, key)}; allowed are whole numbers from 3 up")
+        if self.options is None:
+            known = signature(instruments.get(self.instrument).chain).parameters
+            # a frozen dataclass is filled in like this
+            options = {"derotator": "linear"} if "derotator" in known else {}
+            object.__setattr__(self, "options", options)
 
     @property
     def wavelength(self):
-        """Wavelengths, evenly in the logarithm over the range of the instrument."""
+        """Wavelengths: evenly in the logarithm over the range of the instrument, or its filters."""
         usual = instruments.get(self.instrument).wavelength
+        if len(usual) < _FILTERS:
+            return usual[: self.n_wavelengths]
         return np.geomspace(usual.min(), usual.max(), self.n_wavelengths)
 
-    @property
+    @cached_property
     def sources(self):
-        """The sources of the instrument that need nothing but plate and derotator."""
-        return [
-            name for name in instruments.get(self.instrument).sources if self._is_internal(name)
-        ]
-
-    def _is_internal(self, source):
-        return set(stages(self._chain(source))) <= {"hwp", "derotator"}
+        """The sources of the instrument that need no telescope."""
+        known = instruments.get(self.instrument).sources
+        return [name for name in known if set(stages(self._chain(name))) <= _BENCH_STAGES]
 
     def _chain(self, source):
         instrument = instruments.get(self.instrument)
@@ -99,191 +134,463 @@ class Setup:
         """Return the nominal chain of each internal source, at its starting values."""
         return [self._chain(source) for source in self.sources]
 
-    def frames(self):
-        """Return the frames of one dataset."""
+    def frames(self, order=None):
+        """Return the frames of one dataset, the derotator's positions in an order."""
         turn = np.linspace(45, 132.5, self.n_derotator) * u.deg
-        return half_wave_plate_cycles(derotator=turn)
-
-
-@dataclass
-class Key:
-    """
-    The truth of a challenge, to be opened after the answer.
-
-    Parameters
-    ----------
-    kind : str
-        One of `KINDS`.
-    effects : list of str
-        What the data hold and the nominal model lacks.
-    snr : list of float
-        Square root of the chi-square that each effect adds after the nominal
-        model is fitted again.
-    alternatives : list of dict
-        Share of that chi-square which other effects explain, one dict an effect.
-    values : list of dict
-        True values of the parameters of each effect, canonical.
-    chains : list
-        The true chains.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.challenge import Key
-    >>> key = Key("single", ["beam_gain"], [9.0], [{"background": 0.97}], [{}])
-    >>> sorted(key.accepted[0])
-    ['background', 'beam_gain']
-    """
-
-    kind: str
-    effects: list
-    snr: list
-    alternatives: list
-    values: list
-    chains: list = field(default_factory=list, repr=False)
-
-    @property
-    def accepted(self):
-        """The right names for each effect: itself, and what cannot be told from it."""
-        return [
-            {name, *(other for other, share in shares.items() if share >= ENOUGH)}
-            for name, shares in zip(self.effects, self.alternatives, strict=True)
-        ]
-
-    @property
-    def library(self):
-        """Names of the effects that the diagnosis may ask."""
-        gone = set().union(*self.accepted) if self.kind == "withheld" else set()
-        return [name for name in EFFECTS if name not in gone]
-
-
-@dataclass
-class _Planted:
-    """An effect of a certain size, and what it does to the data."""
-
-    name: str
-    draw: object
-    size: float = 1.0
-    snr: float = 0.0
-    shares: dict = field(default_factory=dict)
-    values: dict = field(default_factory=dict)
+        frames = half_wave_plate_cycles(derotator=turn if order is None else turn[order])
+        if "flc_state" in stages(self._chain(self.sources[0])):
+            # both states of the modulator at each position of the plate
+            frames = frames[np.repeat(np.arange(len(frames)), 2)]
+            frames["flc_state"] = np.arange(len(frames)) % 2
+        return frames
 
 
 class Bench:
-    """A true instrument, its lamps, and the nominal problem at the truth."""
+    """A true instrument, its lamps and its nominal model, fitted to whatever the faults give."""
 
     def __init__(self, setup, rng):
         self.setup, self.rng = setup, rng
-        self.wavelength = setup.wavelength
-        self.chains = _varied(setup.chains(), self.wavelength.to_value(u.um), rng)
+        wavelength = setup.wavelength
+        self.micron = wavelength.to_value(u.um)
+        self.law = legvander(_scaled(np.log(self.micron)), min(_DEGREE, len(wavelength) - 1))
+        self.chains = _varied(setup.chains(), self.law, rng)
+        self.shuffled = bool(rng.random() < 0.5)
+        order = rng.permutation(setup.n_derotator) if self.shuffled else None
+        frames = setup.frames(order)
+        # a lamp is not white
+        flux = setup.flux * np.clip(self.law @ [1, *rng.normal(0, 0.2, _DEGREE)], 0.3, 3.0)
+        self.flicker = rng.uniform(0, 2 * setup.flicker)
         instrument = instruments.get(setup.instrument)
-        # a lamp is not white: a law of second degree, between 0.3 and 3 times the flux asked for
-        slope = law_basis(self.wavelength.to_value(u.um), 2) @ (1, *rng.normal(0, 0.2, 2))
-        flux = setup.flux * np.clip(slope, 0.3, 3.0)
+        known = {leaf.name for leaf in leaves(self.chains[0])}
+        out = [name for name in instrument.optional_optics if name not in known]
+        # so that a table of it needs no more to be read
+        meta = {"instrument": instrument.name, **instrument.meta_without(out)}
         self.clean = [
             simulate(
                 chain,
-                self.wavelength,
-                setup.frames(),
+                wavelength,
+                frames,
                 flux=flux,
-                lamp=self._lamp(len(setup.frames())),
+                lamp=self._lamp(len(frames)),
                 noise=False,
                 name=source,
-                meta={"instrument": instrument.name, "source": source},
+                meta=meta | {"source": source},
             )
             for chain, source in zip(self.chains, setup.sources, strict=True)
         ]
-        middle = [np.median(o.flux_right + o.flux_left) / 2 for o in self.clean]
-        self.context = Context(self.wavelength.to_value(u.um), float(np.median(middle)))
-        noisy = self.record(
-            [self.fluxes(c, o) for c, o in zip(self.chains, self.clean, strict=True)]
-        )
-        self.problem = GapProblem(self.chains, noisy)
-        self.problem.settle_noise(self.problem.start)
+        self.optics = [self.split(chain) for chain in self.chains]
+        self._slots()
+        ideal = self.expose()
+        #: Electrons for a flux of one, (F, W).
+        self.bright = [
+            (o.flux_right + o.flux_left) / f.sum(axis=0)
+            for o, f in zip(self.clean, ideal, strict=True)
+        ]
+        self._settle_noise(ideal)
 
     def _lamp(self, n_frames):
         # drift in the logarithm: higher orders fall as one over the degree
-        x = np.linspace(-1, 1, n_frames)
-        drift = np.polynomial.legendre.legval(x, [0, *self.rng.normal(0, 1, 3) / (1, 2, 3)])
-        flicker = self.rng.normal(0, self.rng.uniform(0, 2 * self.setup.flicker), n_frames)
+        drift = legval(np.linspace(-1, 1, n_frames), [0, *self.rng.normal(0, 1, 3) / (1, 2, 3)])
+        flicker = self.rng.normal(0, self.flicker, n_frames)
         return np.exp(self.rng.uniform(0, 2 * self.setup.drift) * drift + flicker)
 
-    def fluxes(self, chain, clean, positions=()):
-        """Return the fluxes of both beams for unit lamps, (2, W, F)."""
-        given = {leaf.stage: clean.position(leaf.stage) for leaf in leaves(chain) if leaf.stage}
-        sweep = Propagator(chain, self.context.wavelength, given | dict(positions)).forward()
-        return np.stack(sweep.fluxes)
+    @staticmethod
+    def split(chain):
+        """Return each optic as it acts on the right and the left beam."""
+        beams = [leaves(with_beam(chain, beam)) for beam in ("right", "left")]
+        return list(zip(*beams, strict=True))
 
-    def expose(self, planted):
-        """Return the fluxes of all datasets with the effects, and the chains that gave them."""
-        chains, bend = [chain.copy() for chain in self.chains], None
-        for one in planted:
-            if isinstance(one.draw, _Unlisted):
-                bend = one
-                continue
-            chains = one.draw.chains(chains, one.size)
-        if bend is not None:
-            return bend.draw.fluxes(self, bend.size), chains
-        return [self.fluxes(c, o) for c, o in zip(chains, self.clean, strict=True)], chains
+    # ---- light through the chain ---------------------------------------------------------------
+
+    def _matrices(self, dataset, positions=None, values=None, optics=None):
+        """Yield name, angle (F, W or 1) and matrices (beams, F, W, 4, 4) of each optic."""
+        for pair in self.optics[dataset] if optics is None else optics:
+            found = []
+            for beam, leaf in enumerate(pair):
+                where = None
+                if leaf.stage:
+                    where = (positions or {}).get(leaf.stage)
+                    where = self.clean[dataset].position(leaf.stage) if where is None else where
+                    # what differs between the beams is (2, W, F)
+                    where = where[beam].T if where.ndim == 3 else where[:, None]
+                    where = where * (1 if leaf.stage in COORDINATES else u.rad)
+                given = None if values is None else values.get(leaf.name)
+                found.append(leaf._resolve(self.micron * u.um, where, given))
+            both = np.array([leaf._oriented(*one) for leaf, one in zip(pair, found, strict=True)])
+            # frames, wavelengths, or both may be missing
+            missing = (1,) * (5 - both.ndim)
+            yield pair[0].name, found[0][1], both.reshape(2, *missing, *both.shape[1:])
+
+    def path(self, dataset, positions=None, values=None, kicks=(), optics=None, skip=None):
+        """Return the fluxes (2, F, W) of a dataset; kicks are (place, action, exponent)."""
+        n_frames, n_waves = self.clean[dataset].n_frames, len(self.micron)
+        light = np.broadcast_to([1.0, 0, 0, 0], (2, n_frames, n_waves, 4))[..., None]
+        for name, angle, matrices in self._matrices(dataset, positions, values, optics):
+            light = light if name == skip else matrices @ light
+            for place, action, exponent in kicks:
+                if name == self.anchor(dataset, place):
+                    turn = angle if place.startswith("in:") else 0.0
+                    kick = expm(exponent[..., None, None] * _turned(ACTIONS[action], turn))
+                    light = kick @ light
+        return light[..., 0, 0]
+
+    def anchor(self, dataset, place):
+        """Return the optic behind which a place is; the source ends where the first stage is."""
+        if place != "source":
+            return place.split(":")[1]
+        names = [pair[0].name for pair in self.optics[dataset]]
+        return names[[bool(pair[0].stage) for pair in self.optics[dataset]].index(True) - 1]
+
+    @cached_property
+    def places(self):
+        """Places where an optic may do what no parameter holds, in the order of the light."""
+        behind = [pair[0] for pair in self.optics[0] if not pair[0].splits_light]
+        first = [bool(leaf.stage) for leaf in behind].index(True)
+        found = ["source"]
+        for leaf in behind[first:]:
+            if hasattr(leaf, "beam"):
+                break
+            found += [f"in:{leaf.name}"] * bool(leaf.stage) + [f"after:{leaf.name}"]
+        return found
+
+    @cached_property
+    def dependences(self):
+        """How a perturbation may depend on the frame."""
+        found = ["constant", "time", "time2"]
+        for stage in ("hwp", "derotator"):
+            found += [f"harmonic:{stage}:{n}" for n in (1, 2, 4)]
+            found += [f"direction:{stage}", f"move:{stage}"]
+        cycle = self.clean[0].n_frames // self.setup.n_derotator
+        found += [f"step:{cycle * k}" for k in range(1, self.setup.n_derotator)]
+        several = self.setup.sources[1:]
+        return found + [f"dataset:{name}" for name in several]
+
+    def waves(self, dataset, dependence):
+        """Return the functions of the frame that a dependence is, (F, k)."""
+        clean = self.clean[dataset]
+        n = clean.n_frames
+        head, *rest = dependence.split(":")
+        t = np.linspace(-1, 1, n)
+        if head == "harmonic":
+            angle = int(rest[1]) * clean.position(rest[0])
+            return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        if head in ("direction", "move"):
+            move = np.diff(clean.position(rest[0]), prepend=clean.position(rest[0])[:1])
+            # what stands has moved last where it moved last
+            last = np.maximum.accumulate(np.where(move != 0, np.arange(n), 0))
+            wave = move[last] < 0 if head == "direction" else np.abs(move)
+        else:
+            wave = {
+                "constant": lambda: np.ones(n),
+                "time": lambda: t,
+                "time2": lambda: t**2 - 1 / 3,
+                "step": lambda: np.arange(n) >= int(rest[0]),
+                "dataset": lambda: np.full(n, clean.name == rest[0]),
+            }[head]()
+        return np.asarray(wave, dtype=float)[:, None]
+
+    def expose(self, faults=()):
+        """Return the fluxes (2, F, W) of each dataset for unit lamps, with faults."""
+        return [self._exposed(dataset, faults) for dataset in range(len(self.clean))]
+
+    def _exposed(self, dataset, faults):
+        positions, kicks, optics, spread, ghosts = {}, [], None, 0.0, []
+        for fault in faults:
+            what = fault.told.get("what")
+            kicks += fault.kicks(dataset)
+            optics = fault.optics(dataset) or optics
+            for stage, moved in fault.moves(dataset).items():
+                clean = self.clean[dataset].position(stage)
+                positions[stage] = positions.get(stage, clean) + moved
+            if what == "smear":
+                spread = fault.amplitude * self.waves(dataset, "move:hwp")[:, 0]
+            elif what == "ghost":
+                ghosts.append(fault)
+        still = positions.get("hwp", self.clean[dataset].position("hwp"))
+        nodes = (-1, -0.5, 0, 0.5, 1) if np.any(spread) else (0,)
+        flux = np.mean(
+            [
+                self.path(dataset, positions | {"hwp": still + x * spread}, None, kicks, optics)
+                for x in nodes
+            ],
+            axis=0,
+        )
+        for fault in ghosts:
+            skipped = self.path(dataset, positions, skip=fault.told["optic"])
+            flux = flux + fault.amplitude * skipped
+        for fault in faults:
+            flux = fault.detected(dataset, flux)
+        # light cannot be less than none
+        return np.maximum(flux, 1e-6)
 
     def record(self, fluxes):
         """Return observations with photon noise."""
         found = []
-        for clean, ideal, one in zip(self.clean, self.chains, fluxes, strict=True):
-            # what a unit lamp does not explain is the brightness, (W, F)
-            lamp = (clean.flux_right + clean.flux_left).T / self.fluxes(ideal, clean).sum(axis=0)
+        for clean, bright, flux in zip(self.clean, self.bright, fluxes, strict=True):
             table = clean.to_table()
-            for beam, flux in zip(("right", "left"), (one * lamp).clip(0.0), strict=True):
-                # rows are frame by frame
-                electrons = flux.T.ravel()
-                read = self.setup.read_noise
+            for beam, one in zip(("right", "left"), flux * bright, strict=True):
+                electrons, read = one.ravel(), self.setup.read_noise
                 drawn = self.rng.poisson(electrons) + self.rng.normal(0, read, electrons.shape)
-                table[f"flux_{beam}"] = drawn * u.adu
+                # a beam that is dark must not drop out of the table
+                table[f"flux_{beam}"] = np.maximum(drawn, 1.0) * u.adu
                 table[f"flux_{beam}_err"] = np.sqrt(electrons + read**2) * u.adu
             found.append(Observations.from_table(table, name=clean.name))
         return found
 
-    def signal(self, planted):
-        """Return the nominal model fitted to noiseless data with an effect."""
-        for channel, flux in zip(self.problem.channels, self.expose([planted])[0], strict=True):
-            lit = np.maximum(flux, 1e-9)
-            # noiseless data in the place of the noisy ones; their noise stays, so that chi-square
-            # is SNR squared
-            channel.observed = Channels.predicted(SimpleNamespace(fluxes=lit))
-        return Model(self.problem, self.problem.fit(self.problem.start))
+    # ---- what can be seen beside the nominal model ---------------------------------------------
 
-    def shares(self, model, degree="default"):
-        """Return the share of the chi-square that each effect of the library explains."""
-        smooth = [effect for effect in EFFECTS.values() if effect.kind != "discrete"]
-        context, found = replace(model.context, degree=degree), {}
-        for score in scan(model, smooth, context=context):
-            share = score.statistic / model.fit.chi2
-            if share > _REFIT_FROM:
-                share = 1 - model.with_effect(score.effect, context).fit.chi2 / model.fit.chi2
-            found[score.effect.name] = round(float(share), 4)
-        return found
+    def _settle_noise(self, fluxes):
+        self._weights, self._lamps = [], []
+        for bright, flux in zip(self.bright, fluxes, strict=True):
+            right, left = flux * bright
+            variance = flux * bright + self.setup.read_noise**2
+            total = right + left
+            difference = 4 * (left**2 * variance[0] + right**2 * variance[1]) / total**4
+            weight = np.stack([difference, variance.sum(axis=0) / total**2]) ** -0.5
+            n, waves = total.shape
+            # the lamp: its spectrum, and a smooth drift common to all wavelengths
+            spectrum = np.tile(np.eye(waves), (n, 1, 1))
+            drift = np.repeat(legvander(np.linspace(-1, 1, n), 3)[:, None, 1:], waves, axis=1)
+            shapes = np.moveaxis(np.concatenate([spectrum, drift], axis=2), 2, 0)
+            shapes = self._steadied(shapes * weight[1], weight[1])
+            self._weights.append(weight)
+            self._lamps.append(np.linalg.qr(shapes.reshape(len(shapes), -1).T)[0])
 
-    def best_shares(self, model):
-        """Return the larger share of each effect, with its usual law and without a law."""
-        stiff, free = self.shares(model), self.shares(model, None)
-        names = stiff.keys() | free.keys()
-        return {name: max(stiff.get(name, 0.0), free.get(name, 0.0)) for name in names}
+    def _steadied(self, sums, weight):
+        """Whiten sums in which all wavelengths of a frame flicker together."""
+        length = np.linalg.norm(weight, axis=1, keepdims=True)
+        unit = weight / length
+        common = (sums * unit).sum(axis=-1, keepdims=True)
+        return sums - (1 - 1 / np.sqrt(1 + (self.flicker * length) ** 2)) * common * unit
+
+    def _whiten(self, channels):
+        """Return both channels (..., 2, F, W) of each dataset as rows of unit noise."""
+        rows = []
+        for one, weight, lamp in zip(channels, self._weights, self._lamps, strict=True):
+            shape = one.shape[:-3]
+            scaled = one * weight
+            sums = self._steadied(scaled[..., 1, :, :], weight[1]).reshape(*shape, -1)
+            rows += [scaled[..., 0, :, :].reshape(*shape, -1), sums - (sums @ lamp) @ lamp.T]
+        return np.concatenate(rows, axis=-1)
+
+    def _slots(self):
+        """Collect the free parameters: name of the optic, place among its values, size."""
+        self._known, self._free, start, bounds = {}, [], [], []
+        for optics in self.optics:
+            for leaf, _ in optics:
+                if leaf.name in self._known:
+                    continue
+                self._known[leaf.name] = leaf.canonical_values()
+                for i, key in enumerate(leaf.param_names):
+                    parameter = getattr(leaf, key)
+                    if parameter.fixed:
+                        continue
+                    value = np.atleast_1d(self._known[leaf.name][i])
+                    self._free.append((leaf.name, i, np.shape(self._known[leaf.name][i])))
+                    start.append(value)
+                    unit = 1.0 if parameter.unit is None else canonical_factor(parameter.unit)
+                    limits = [
+                        default if b is None else b * unit
+                        for b, default in zip(parameter.bounds, (-np.inf, np.inf), strict=True)
+                    ]
+                    bounds += [limits] * value.size
+        self._start, self._bounds = np.concatenate(start), np.array(bounds, dtype=float).T
+
+    def _values(self, vector):
+        values, at = {name: list(known) for name, known in self._known.items()}, 0
+        for name, i, shape in self._free:
+            size = int(np.prod(shape))
+            values[name][i] = vector[at : at + size].reshape(shape)
+            at += size
+        return values
+
+    def _model(self, vector):
+        values = self._values(vector)
+        return [
+            _channels(self.path(d, values=values), self.bright[d]) for d in range(len(self.clean))
+        ]
+
+    def _jacobian(self, vector):
+        """Return the derivative of the whitened model, by finite differences."""
+        base, columns, at = self._model(vector), [], 0
+        for _, _, shape in self._free:
+            h, size = 1e-6, int(np.prod(shape))
+            moved = vector.copy()
+            moved[at : at + size] += h
+            slopes = [(m - b) / h for m, b in zip(self._model(moved), base, strict=True)]
+            if shape:
+                # each wavelength has a value of its own
+                slopes = [np.eye(size)[:, None, None, :] * s for s in slopes]
+            columns.append(np.atleast_2d(self._whiten(slopes)))
+            at += size
+        return np.concatenate(columns).T
+
+    def residual(self, faults):
+        """Return what faults leave beside the refitted nominal model, whitened, and the fit."""
+        seen = [
+            _channels(flux, b) for flux, b in zip(self.expose(faults), self.bright, strict=True)
+        ]
+
+        def miss(vector):
+            model = self._model(vector)
+            return self._whiten([m - s for m, s in zip(model, seen, strict=True)])
+
+        fit = least_squares(
+            miss, self._start, self._jacobian, self._bounds, x_scale="jac", max_nfev=25, ftol=1e-6
+        )
+        return -fit.fun, fit
+
+    def _cells(self, vector, own=None):
+        """Yield name and whitened columns of each cell of places, kinds and dependences."""
+        values, n_sets = self._values(vector), range(len(self.clean))
+        flux = [self.path(d, values=values) for d in n_sets]
+        names = dict.fromkeys([*self.dependences, *([own] if own else [])])
+        waves = {name: [self.waves(d, name) for d in n_sets] for name in names}
+        sweeps = [list(self._matrices(d, values=values)) for d in n_sets]
+        for place in self.places:
+            ends = [self._ends(d, sweeps[d], place) for d in n_sets]
+            for kind, action in ACTIONS.items():
+                slopes = [
+                    np.einsum("bfwi,...fwij,fwj->bfw", row, _turned(action, turn), light)
+                    for row, light, turn in ends
+                ]
+                for name, wave in waves.items():
+                    yield f"{place}/{kind}/{name}", self._columns(flux, slopes, wave)
+        gain = [f * np.array([1, -1])[:, None, None] for f in flux]
+        for name, wave in waves.items():
+            yield f"detector/gain/{name}", self._columns(flux, gain, wave)
+        still = waves["constant"]
+        for kind, name in DETECTOR.items():
+            slopes = [self.glow(d, kind, flux[d]) for d in n_sets]
+            yield (
+                f"detector/{kind}/{name}",
+                np.concatenate(
+                    [
+                        self._columns(flux, [s * on[:, None, None] for s in slopes], still)
+                        for on in (np.eye(2) if kind != "background" else np.ones((1, 2)))
+                    ]
+                ),
+            )
+
+    def _ends(self, dataset, sweep, place):
+        """Return analyser rows behind a place, light in front of it, and the turn of its frame."""
+        names = [name for name, _, _ in sweep]
+        cut = names.index(self.anchor(dataset, place)) + 1
+        light = np.array([1.0, 0, 0, 0])[:, None]
+        for _, _, matrices in sweep[:cut]:
+            light = matrices[0] @ light
+        row = np.array([[1.0, 0, 0, 0]])
+        for _, _, matrices in sweep[cut:][::-1]:
+            row = row @ matrices
+        shape = (self.clean[dataset].n_frames, len(self.micron), 4)
+        turn = np.asarray(sweep[cut - 1][1] if place.startswith("in:") else 0.0)
+        turn = turn.reshape((1,) * (2 - turn.ndim) + turn.shape)
+        row = np.broadcast_to(row[..., 0, :], (2, *shape))
+        return row, np.broadcast_to(light[..., 0], shape), turn
+
+    def glow(self, dataset, kind, flux):
+        """Return what is added to the fluxes (2, F, W) for a coefficient of one."""
+        bright = self.bright[dataset]
+        usual = np.median(bright)
+        if kind == "nonlinearity":
+            return flux**2 * bright / usual
+        if kind == "persistence":
+            seen = flux * bright
+            return np.concatenate([0 * seen[:, :1], seen[:, :-1]], axis=1) / bright
+        return np.broadcast_to(usual / bright, flux.shape)
+
+    def _columns(self, flux, slopes, waves):
+        """Return the whitened columns of slopes (2, F, W) times waves and laws."""
+        found = []
+        for f, s, wave in zip(flux, slopes, waves, strict=True):
+            total = f.sum(axis=0)
+            both = np.stack([2 * (f[1] * s[0] - f[0] * s[1]) / total**2, s.sum(axis=0) / total])
+            each = np.einsum("fk,wl,cfw->klcfw", wave, self.law, both)
+            found.append(each.reshape(-1, *both.shape))
+        return self._whiten(found)
+
+    def shares(self, residual, fit, own=None):
+        """Return the share of a residual that each cell, or one's own, carries beside the model."""
+        kept = fit.active_mask == 0
+        taken = np.linalg.qr(fit.jac[:, kept])[0]
+        signal = residual - taken @ (taken.T @ residual)
+        found = {}
+        for name, columns in self._cells(fit.x, own):
+            length = np.linalg.norm(columns, axis=1)
+            columns = (columns[length > 0] / length[length > 0, None]).T
+            left, size, _ = np.linalg.svd(
+                columns - taken @ (taken.T @ columns), full_matrices=False
+            )
+            share = np.sum((left[:, size > _OPEN].T @ signal) ** 2) / np.sum(signal**2)
+            if share >= _LEAST_SHARE:
+                found[name] = round(float(share), 3)
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    def taken_up(self, share):
+        """Return place and kind of a constant cell that the nominal parameters take up."""
+        jacobian = self._jacobian(self._start)
+        taken, found = np.linalg.qr(jacobian)[0], []
+        for name, columns in self._cells(self._start):
+            place, kind, dependence = name.split("/")
+            left = np.linalg.norm(columns - (columns @ taken) @ taken.T)
+            if dependence == "constant" and place != "detector":
+                found.append((left / max(np.linalg.norm(columns), 1e-12), place, kind))
+        good = [one for one in found if one[0] < share] or [min(found)]
+        _, place, kind = good[self.rng.integers(len(good))]
+        return {"place": place, "kind": kind, "dependence": "constant"}
+
+    def scale(self, fault, snr):
+        """Scale a fault until it stands out by this much, or is as large as it can be."""
+        power, last = 1.0, None
+        for _ in range(12):
+            residual, fit = self.residual([fault])
+            fault.snr = float(np.linalg.norm(residual))
+            if last is not None and min(fault.snr, last[1]) > 0.1:
+                # some grow with the square of the size
+                steps = np.log(fault.amplitude / last[0]), np.log(fault.snr / last[1])
+                power = float(np.clip(steps[1] / steps[0], 0.7, 3))
+            step = (snr / max(fault.snr, 1e-9)) ** (1 / power)
+            wanted = min(float(fault.amplitude * np.clip(step, 0.05, 20)), fault.largest)
+            if abs(fault.snr / snr - 1) < 0.02 or wanted == fault.amplitude or fault.is_whole:
+                break
+            last, fault.amplitude = (fault.amplitude, fault.snr), wanted
+        return residual, fit
 
 
-def _varied(chains, wavelength, rng):
+def _scaled(x):
+    """Bring numbers to -1 to 1."""
+    return 2 * (x - x.min()) / np.ptp(x) - 1
+
+
+def _turned(matrix, angle):
+    """Return a matrix of an optic at an angle, (..., 4, 4)."""
+    angle = np.asarray(angle)
+    c, s, one, o = np.cos(2 * angle), np.sin(2 * angle), np.ones(angle.shape), np.zeros(angle.shape)
+    turn = np.array([[one, o, o, o], [o, c, s, o], [o, -s, c, o], [o, o, o, one]])
+    turn = np.moveaxis(turn, (0, 1), (-2, -1))
+    return turn.swapaxes(-1, -2) @ matrix @ turn
+
+
+def _channels(flux, bright):
+    """Return normalized difference and logarithm of the sum, (2, F, W)."""
+    total = flux.sum(axis=0)
+    return np.stack([(flux[0] - flux[1]) / total, np.log(total * bright)])
+
+
+def _varied(chains, law, rng):
     """Return the chains with other values of all free parameters, the same in all chains."""
     known = {}
-    for chain in chains:
-        for leaf in leaves(chain):
-            for key in leaf.param_names:
-                if not getattr(leaf, key).fixed:
-                    name = f"{leaf.name}.{key}"
-                    if name not in known:
-                        known[name] = _vary(leaf, key, wavelength, rng, known)
-                    setattr(leaf, key, known[name])
+    for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+        for key in leaf.param_names:
+            if not getattr(leaf, key).fixed:
+                name = f"{leaf.name}.{key}"
+                if name not in known:
+                    known[name] = _vary(leaf, key, law, rng, known)
+                setattr(leaf, key, known[name])
     return chains
 
 
-def _vary(leaf, key, wavelength, rng, known):
+def _vary(leaf, key, law, rng, known):
     parameter = getattr(leaf, key)
     unit = u.dimensionless_unscaled if parameter.unit is None else parameter.unit
     value = np.array(parameter.value, dtype=float)
@@ -295,205 +602,12 @@ def _vary(leaf, key, wavelength, rng, known):
     if not value.ndim:
         return (value * unit) + (rng.normal(0, 0.3) * u.deg if angle else rng.normal(0, 0.003))
     # smooth in wavelength, and a little that is not, so that a stiff law alone does not fit
-    law = law_basis(wavelength, 2) @ (rng.normal(0, 1, 3) / (1, 2, 3))
-    law = law + rng.normal(0, 0.2, value.shape)
-    new = value * unit + (2 * u.deg if angle else 0.005) * law
+    smooth = law @ (rng.normal(0, 1, law.shape[1]) / np.arange(1, law.shape[1] + 1))
+    rough = smooth + rng.normal(0, 0.2, value.shape)
+    new = (value * unit + (2 * u.deg if angle else 0.005) * rough).to_value(unit)
     low, high = (
-        np.inf * s if b is None else b for s, b in zip((-1, 1), parameter.bounds, strict=True)
+        s * np.inf if b is None else b for s, b in zip((-1, 1), parameter.bounds, strict=True)
     )
     # a truth at its bound could be fitted from one side only
     margin = 0.0 if angle else 0.002
-    return np.clip(new.to_value(unit), low + margin, high - margin) * unit
-
-
-# ---- effects of random size --------------------------------------------------------------------
-
-
-class _Drawn:
-    """An effect of the library with random laws, to be scaled."""
-
-    def __init__(self, effect, bench):
-        self.effect, self.context = effect, bench.context
-        rng = bench.rng
-        edit = effect.edit([chain.copy() for chain in bench.chains], self.context)
-        self.laws = {p.name: _law(p, _size(edit.chains, p.name), rng) for p in edit.parameters}
-        #: Values at which the effect is absent: a law says by how much they are left.
-        self.absent = {p.name: p.canonical_neutral for p in edit.parameters}
-        sizes = [p.canonical_limit / np.abs(self.laws[p.name]).max() for p in edit.parameters]
-        #: The largest size within the effect's limits.
-        self.largest = 0.9 * min(sizes) if sizes else 1.0
-
-    def chains(self, chains, size):
-        """Return the chains with the effect at a size."""
-        edit = self.effect.edit(chains, self.context)
-        for name, value in self.values(size).items():
-            _put(edit.chains, name, value)
-            for target, tie in edit.ties.items():
-                if tie.source == name:
-                    _put(edit.chains, target, tie.factor * value)
-        return edit.chains
-
-    def values(self, size):
-        """Return the canonical values of the parameters at a size."""
-        return {name: self.absent[name] + size * law for name, law in self.laws.items()}
-
-
-def _law(parameter, n, rng):
-    """Return a random law, in canonical units and of the parameter's usual size."""
-    scale = parameter.canonical_scale
-    if n == 1:
-        return scale * rng.normal()
-    k = n if parameter.basis is None else parameter.basis.shape[1]
-    # an effect that is free at each wavelength is tried where it is sharp
-    if n == k and k > 3:
-        # a resonance anywhere
-        at, width = rng.uniform(0, n), rng.uniform(0.5, 0.3 * n)
-        return scale * rng.normal() / (1 + ((np.arange(n) - at) / width) ** 2)
-    basis = np.eye(n) if parameter.basis is None else parameter.basis
-    law = basis @ (rng.normal(0, 1, k) / (1 + np.arange(k)))
-    if parameter.is_retained:
-        # no optic gives more polarization than there is
-        law = -(law - law.min() + 0.3 * (np.ptp(law) + 0.1))
-    return scale * law
-
-
-def _carriers(chains, name):
-    """Return the optics that have a parameter, and its key."""
-    optic, key = name.split(".")
-    return [leaf for chain in chains for leaf in leaves(chain) if leaf.name == optic], key
-
-
-def _size(chains, name):
-    found, key = _carriers(chains, name)
-    return np.size(getattr(found[0], key).value)
-
-
-def _put(chains, name, value):
-    found, key = _carriers(chains, name)
-    for leaf in found:
-        parameter = getattr(leaf, key)
-        unit = 1 if parameter.unit is None else parameter.unit
-        factor = 1.0 if parameter.unit is None else canonical_factor(unit)
-        setattr(leaf, key, np.broadcast_to(value / factor, parameter.shape) * unit)
-
-
-class _Unlisted:
-    """An effect that no physical library holds: a pattern in the order of the frames."""
-
-    names = ("hysteresis", "jitter", "beam_flicker", "polarization_flicker")
-    largest = 500.0
-
-    def __init__(self, name, bench):
-        self.name = name
-        self.noise = [bench.rng.normal(0, 1, o.n_frames) for o in bench.clean]
-
-    def fluxes(self, bench, size):
-        """Return the fluxes of all datasets."""
-        found = []
-        for chain, clean, noise in zip(bench.chains, bench.clean, self.noise, strict=True):
-            moved, gain = self._pattern(clean, noise, size)
-            ideal = bench.fluxes(chain, clean, moved)
-            found.append(ideal * np.stack([1 + gain, 1 - gain])[:, None, :])
-        return found
-
-    def _pattern(self, clean, noise, size):
-        plate, turn = clean.position("hwp"), clean.position("derotator")
-        # size 1 turns a stage by 0.05 deg, or changes a gain by 0.1 percent
-        angle, still = size * np.deg2rad(0.05), np.zeros(len(plate))
-        if self.name == "hysteresis":
-            # backlash has the sign of the motion; its random size keeps it out of every harmonic
-            way = np.sign(np.diff(plate, prepend=plate[0]))
-            return {"hwp": plate + angle * way * np.abs(noise)}, still
-        if self.name == "jitter":
-            return {"hwp": plate + angle * noise}, still
-        if self.name == "beam_flicker":
-            return {}, 1e-3 * size * noise
-        return {"derotator": turn + angle * noise}, still
-
-
-def plant(bench, kind, name, snr):
-    """Return the effects of a challenge, at their sizes."""
-    if kind == "pair":
-        return _pair(bench, name, snr)
-    for _ in range(_TRIES):
-        one = _candidate(bench, kind, name)
-        if one is None:
-            break
-        model = _scale(bench, one, kind, snr)
-        if _fits(bench, one, model, kind, snr):
-            return [one]
-    what = kind if name is None else f"{kind} with {name!r}"
-    raise GapError(f"no effect found for a challenge of kind {what}")
-
-
-def _candidate(bench, kind, name):
-    if kind == "unlisted":
-        chosen = str(bench.rng.choice(_Unlisted.names)) if name is None else name
-        if chosen not in _Unlisted.names:
-            raise GapError(f"no unlisted effect {chosen!r}; there are {_Unlisted.names}")
-        return _Planted(f"unlisted_{chosen}", _Unlisted(chosen, bench))
-    fitting = [
-        effect
-        for effect in (EFFECTS.values() if name is None else [get_effect(name)])
-        if effect.kind != "discrete" and effect.applies(bench.chains)
-    ]
-    if not fitting:
-        return None
-    effect = fitting[bench.rng.integers(len(fitting))]
-    return _Planted(effect.name, _Drawn(effect, bench))
-
-
-def _scale(bench, one, kind, snr):
-    """Scale an effect until it stands out by this much; return the model without it."""
-    model = bench.signal(one)
-    one.snr = float(np.sqrt(model.fit.chi2))
-    if kind == "absorbed":
-        return model
-    # the SNR is nearly proportional to the size: a few steps reach two percent
-    for _ in range(8):
-        if one.snr <= 0 or abs(one.snr / snr - 1) < 0.02:
-            break
-        # a step too far may reach another branch of the nominal model
-        wanted = min(one.size * np.clip(snr / one.snr, 0.02, 20), one.draw.largest)
-        if wanted == one.size:
-            break
-        one.size = wanted
-        model = bench.signal(one)
-        one.snr = float(np.sqrt(model.fit.chi2))
-    return model
-
-
-def _fits(bench, one, model, kind, snr):
-    """Fill in what the effect amounts to; return whether it is of the kind."""
-    if kind != "unlisted":
-        one.values = one.draw.values(one.size)
-    if kind == "absorbed":
-        return one.snr < _INVISIBLE
-    dark = min(flux.min() for flux in bench.expose([one])[0]) <= 0
-    if not _WEAKEST <= one.snr < 1.1 * snr or dark or not model.fit.converged:
-        return False
-    # what is to stay unexplained must not be explained by an effect that the selection frees
-    unknown = kind in ("unlisted", "withheld")
-    one.shares = bench.best_shares(model) if unknown else bench.shares(model)
-    # where it does not explain itself, the nominal model went to another branch
-    if kind != "unlisted" and one.shares.get(one.name, 0.0) < ENOUGH:
-        return False
-    if kind == "single":
-        return True
-    others = [
-        share
-        for name, share in one.shares.items()
-        if kind == "unlisted" or (name != one.name and share < ENOUGH)
-    ]
-    return max(others, default=0.0) < UNKNOWN
-
-
-def _pair(bench, name, snr):
-    """Return two effects that the data can tell from each other."""
-    for _ in range(_TRIES):
-        first = plant(bench, "single", name, snr)[0]
-        second = plant(bench, "single", None, snr)[0]
-        apart = first.shares.get(second.name, 0) < 0.5 and second.shares.get(first.name, 0) < 0.5
-        if first.name != second.name and apart and min(first.snr, second.snr) > 0.7 * snr:
-            return [first, second]
-    raise GapError("no two effects found that can be told from each other")
+    return np.clip(new, low + margin, high - margin) * unit

@@ -1,14 +1,20 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Outcome of sealed challenges: rates of right answers, pulls, shrinkage, a figure."""
+"""Outcome of challenges: rates of right and wrong answers, and how reliable probabilities are."""
 
-from collections import Counter
 from itertools import pairwise
 
-import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
 from astropolcal.words import counted
+
+#: What an answer may be; what is wrong is confidently wrong.
+RESULTS = ("right", "silent", "wrong")
+# Okabe & Ito (2008), distinct for all kinds of colour vision, and in grey
+_COLORS = {"right": "#0072B2", "silent": "#D9D9D9", "wrong": "#D55E00"}
+_WORDS = {"right": "right", "silent": "silent", "wrong": "confidently wrong"}
+_SNR_EDGES = np.array([0, 3, 10, 20, 40, 80, np.inf])
+_EDGES = np.array([0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 1])
 
 
 class ChallengeResult:
@@ -18,37 +24,40 @@ class ChallengeResult:
     Parameters
     ----------
     records : list of dict
-        One a challenge.
+        One a challenge: ``index``, ``kind``, ``snr``, ``faults``, ``verdict``, ``causes``,
+        ``result``, and ``claims``: the probability of each cause and whether it is right.
     settings : dict
         Seed, range of the signal-to-noise ratio, kinds and set-up.
 
     Examples
     --------
     >>> from astropolcal.gap.challenge import ChallengeResult
-    >>> record = {"kind": "none", "verdict": "none", "right": True, "snr": [], "index": 0}
-    >>> ChallengeResult([record], {}).rate("none")[0]
+    >>> record = {"index": 0, "kind": "none", "snr": 0.0, "faults": [], "verdict": "none"}
+    >>> result = ChallengeResult([record | {"causes": [], "result": "right", "claims": []}], {})
+    >>> result.rate("right")[0]
     1.0
     """
 
     def __init__(self, records, settings):
         self.records, self.settings = list(records), dict(settings)
 
-    def of(self, *kinds, least=0.0, below=np.inf):
-        """Return the records of some kinds whose weakest effect is in a range of SNR."""
-        # a challenge that could not be made has no answer
-        answered = [r for r in self.records if r["kind"] in kinds and "right" in r]
-        return [r for r in answered if not r["snr"] or least <= min(r["snr"]) < below]
+    def of(self, *kinds, least=-np.inf, below=np.inf):
+        """Return the records of some kinds (by default all) in a range of SNR."""
+        known = [r for r in self.records if not kinds or r["kind"] in kinds]
+        return [r for r in known if least <= r["snr"] < below]
 
-    def rate(self, *kinds, least=0.0, below=np.inf):
+    def rate(self, result, *kinds, **limits):
         """
-        Return the share of right answers.
+        Return the share of answers that are right, silent or wrong.
 
         Parameters
         ----------
+        result : str
+            ``"right"``, ``"silent"`` or ``"wrong"``.
         *kinds : str
-            Of ``KINDS``.
-        least, below : float
-            Range of the signal-to-noise ratio of the weakest effect.
+            Of ``KINDS``; by default all.
+        **limits : float
+            ``least`` and ``below``, a range of the signal-to-noise ratio.
 
         Returns
         -------
@@ -56,182 +65,170 @@ class ChallengeResult:
             With the interval of Wilson (1927) at 68 %; NaN where there are none.
         count : int
         """
-        right = [record["right"] for record in self.of(*kinds, least=least, below=below)]
-        return (*wilson(sum(right), len(right)), len(right))
+        found = [record["result"] for record in self.of(*kinds, **limits)]
+        return (*wilson(found.count(result), len(found)), len(found))
 
-    def pulls(self, least=8.0):
-        """Return fitted less true coefficients over their errors, shape (n,)."""
-        parts = [record.get("pulls", []) for record in self.of("single", "pair", least=least)]
-        return np.array([pull for part in parts for pull in part])
+    @property
+    def rates(self):
+        """Table of the rates: all, by kind, and by SNR of what has a fault to be seen."""
+        kinds = sorted({record["kind"] for record in self.records})
+        rows = [("all", (), {}), *((kind, (kind,), {}) for kind in kinds)]
+        for low, high in pairwise(_SNR_EDGES):
+            name = f"SNR {low:g} to {high:g}" if np.isfinite(high) else f"SNR over {low:g}"
+            rows.append((name, (), {"least": low or 1e-9, "below": high}))
+        rows = [row for row in rows if self.of(*row[1], **row[2])]
+        table = QTable({"challenges": [row[0] for row in rows]})
+        rates = {r: np.array([self.rate(r, *k, **s) for _, k, s in rows]) for r in RESULTS}
+        table["n"] = rates["right"].reshape(-1, 4)[:, 3].astype(int)
+        for name, values in rates.items():
+            for key, column in zip(("", "_low", "_high"), values.reshape(-1, 4).T, strict=False):
+                table[name + key] = column
+        return table
 
-    def shrinkage_ratio(self, least=8.0):
-        """Return how far the held-out mean squares shrink, over how far with the true effects."""
-        scored = self.of("single", "pair", least=least)
-        gaps = [r["gap_percent"] for r in scored if "gap_percent" in r]
-        if not gaps:
-            return np.nan
-        # percent to mean squares, which shrink by shares that add up
-        before, after, oracle = np.square(np.array(gaps)).T
-        return float(np.sum(1 - after / before) / np.sum(1 - oracle / before))
+    @property
+    def reliability(self):
+        """Table of all causes that were given, by probability, and how many of them are right."""
+        claims = np.array([c for record in self.records for c in record["claims"]], dtype=float)
+        claims = claims.reshape(-1, 2)
+        # the last bin holds certainty too
+        which = np.searchsorted(_EDGES, claims[:, 0], side="right").clip(1, len(_EDGES) - 1)
+        bins = [claims[which == i] for i in range(1, len(_EDGES))]
+        rows = [
+            (low, high, len(b), b[:, 0].mean(), *wilson(int(b[:, 1].sum()), len(b)))
+            for (low, high), b in zip(pairwise(_EDGES), bins, strict=True)
+            if len(b)
+        ]
+        names = ("from", "to", "n", "probability", "right", "right_low", "right_high")
+        return QTable(rows=rows or None, names=names, dtype=[float, float, int, *[float] * 4])
 
     @property
     def failures(self):
-        """Records whose answer was wrong."""
-        return [record for record in self.records if record.get("right") is False]
-
-    @property
-    def answered(self):
-        """Records of the challenges that could be made."""
-        return [record for record in self.records if "right" in record]
-
-    @property
-    def shortfall(self):
-        """How many challenges could be made, and why not the others; empty if all could."""
-        reasons = Counter(r.get("error", "not made") for r in self.records if "right" not in r)
-        if not reasons:
-            return ""
-        made, n = len(self.answered), len(self.records)
-        why = "; ".join(f"{reason} ({count})" for reason, count in reasons.items())
-        others = "; not the others" if made else ""
-        return f"{made} of {n} challenges could be made{others}: {why}"
-
-    @property
-    def table(self):
-        """One row a challenge that could be made."""
-        rows = self.answered
-        table = QTable()
-        table["index"] = [r["index"] for r in rows]
-        table["kind"] = [r["kind"] for r in rows]
-        table["effect"] = [" + ".join(r["effects"]) for r in rows]
-        table["snr"] = [min(r["snr"], default=0.0) for r in rows]
-        table["verdict"] = [r["verdict"] for r in rows]
-        table["answer"] = [" + ".join("|".join(g) for g in r["causes"]) for r in rows]
-        table["right"] = [r["right"] for r in rows]
-        gaps = [r.get("gap_percent", [np.nan] * 3) for r in rows]
-        for i, name in enumerate(("gap_before", "gap_after", "gap_oracle")):
-            table[name] = np.array([gap[i] for gap in gaps]) * u.percent
-        return table
-
-    def summary(self):
-        """Return rates (value, low, high, n) by name, and other numbers."""
-        pulls = self.pulls()
-        inside = int(np.sum(np.abs(pulls) < 1))
-        rates = {
-            # where the range of challenges begins by default
-            "recall": self.rate("single", least=8),
-            "recall of pairs": self.rate("pair", least=30),
-            "unexplained of unknown": self.rate("unlisted", "withheld", least=20),
-            "quiet on clean": self.rate("none"),
-            "quiet on absorbed": self.rate("absorbed"),
-            "coverage of sizes": (*wilson(inside, len(pulls)), len(pulls)),
-        }
-        ratio = self.shrinkage_ratio()
-        return {
-            "rates": {
-                name: dict(zip(("value", "low", "high", "n"), rate, strict=True))
-                for name, rate in rates.items()
-                if rate[-1]
-            },
-            "shrinkage over oracle": ratio if np.isfinite(ratio) else None,
-        }
+        """Records whose answer was not right."""
+        return [record for record in self.records if record["result"] != "right"]
 
     def to_dict(self):
-        """Return settings, summary and records as a dictionary that JSON takes."""
-        return {"settings": self.settings, "summary": self.summary(), "challenges": self.records}
+        """Return settings, tables and records as a dictionary that JSON takes."""
+        return {
+            "settings": self.settings,
+            "rates": _rows(self.rates),
+            "reliability": _rows(self.reliability),
+            "challenges": self.records,
+        }
 
     def words(self):
-        """Return the summary as lines of text."""
-        summary = self.summary()
-        made, wrong = len(self.answered), counted(len(self.failures), "wrong answer")
-        lines = [f"{counted(made, 'challenge')}, {wrong}"] if made else []
-        if self.shortfall:
-            # what was never asked was not answered rightly either
-            lines.insert(0, self.shortfall)
-        for name, rate in summary["rates"].items():
-            value, low, high = (100 * rate[key] for key in ("value", "low", "high"))
-            lines.append(f"{name:<24}{value:6.1f} % ({low:.1f} to {high:.1f}; {rate['n']})")
-        if summary["shrinkage over oracle"] is not None:
-            lines.append(
-                f"{'shrinkage over oracle':<24}{100 * summary['shrinkage over oracle']:6.1f} %"
-            )
+        """Return the tables as lines of text."""
+        rates, claims = self.rates, self.reliability
+        lines = [f"{counted(len(self.records), 'challenge')}; rates with intervals at 68 %, in %"]
+        lines.append(f"{'':14}{'n':>5}" + "".join(f"{_WORDS[name]:>20}" for name in RESULTS))
+        for row in rates:
+            cells = [
+                _percent(*(row[name + key] for key in ("", "_low", "_high"))) for name in RESULTS
+            ]
+            lines.append(f"{row['challenges']:14}{row['n']:5}" + "".join(f"{c:>20}" for c in cells))
+        if len(claims):
+            lines += [
+                "",
+                "causes by the probability that was given, and how many of them are right",
+            ]
+        for row in claims:
+            right = _percent(row["right"], row["right_low"], row["right_high"])
+            lines.append(f"{100 * row['probability']:13.1f} {row['n']:5}{right:>20}")
         return "\n".join(lines)
 
-    def plot(self, figure=None, bins=6):
+    def plot(self, figure=None):
         """
-        Draw the share of right answers against the signal-to-noise ratio.
+        Draw the rates by kind and by signal-to-noise ratio.
 
         Parameters
         ----------
         figure : `~matplotlib.figure.Figure`, optional
             An empty figure to draw into.
-        bins : int
-            Number of bins, evenly in the logarithm.
 
         Returns
         -------
         `~matplotlib.figure.Figure`
-            Points with the interval of Wilson (1927) at 68 %. Where no challenge has an
-            effect to be found, they are by kind.
         """
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(7.5, 5), layout="constrained") if figure is None else figure
-        axes = figure.subplots()
-        figure.suptitle(f"{len(self.answered)} sealed challenges, 68 % binomial intervals")
-        axes.set(ylim=(-4, 104), ylabel="right answers (%)")
-        axes.grid(color="0.88", linewidth=0.7)
-        if not any(record["snr"] for record in self.answered):
-            self._draw_quiet(axes)
-            return figure
-        edges = np.geomspace(*self.settings["snr"], bins + 1)
-        # a size is reached within two percent
-        edges[[0, -1]] *= 0.95, 1.05
-        for i, curve in enumerate(_CURVES):
-            self._draw(axes, edges, 1 + 0.04 * (i - 1), *curve)
-        quiet = self.rate("none", "absorbed")
-        if quiet[3]:
-            label = f"nothing to be found, and nothing said ({quiet[3]})"
-            axes.axhline(100 * quiet[0], color="0.45", linestyle="--", label=label)
-            axes.axhspan(100 * quiet[1], 100 * quiet[2], color="0.45", alpha=0.15, linewidth=0)
-        axes.set(xscale="log", xlim=edges[[0, -1]])
-        axes.set_xlabel("signal-to-noise ratio of the weakest effect")
-        axes.xaxis.set_major_formatter("{x:g}")
-        figure.legend(loc="outside lower center", ncols=1, frameon=False)
+        table = self.rates
+        by_snr = np.array([name.startswith("SNR") for name in table["challenges"]], dtype=bool)
+        heights = [max(np.sum(~by_snr), 1), max(np.sum(by_snr), 1)]
+        figure = _figure(figure, (7.5, 1.6 + 0.3 * sum(heights)))
+        axes = figure.subplots(2, 1, height_ratios=heights, sharex=True)
+        for ax, rows in zip(axes, (table[~by_snr], table[by_snr]), strict=True):
+            left = np.zeros(len(rows))
+            for name in RESULTS:
+                width = 100 * np.asarray(rows[name])
+                ax.barh(
+                    range(len(rows)), width, 0.75, left, color=_COLORS[name], label=_WORDS[name]
+                )
+                dark = "black" if name == "silent" else "white"
+                for y, (x, w) in enumerate(zip(left, width, strict=True)):
+                    if w > 6:
+                        ax.text(x + w / 2, y, f"{w:.0f}", ha="center", va="center", color=dark)
+                left += width
+            labels = [f"{row['challenges']} ({row['n']})" for row in rows]
+            ax.set_yticks(range(len(rows)), labels)
+            ax.invert_yaxis()
+            ax.spines[["top", "right"]].set_visible(False)
+        axes[1].set(xlim=(0, 100), xlabel="answers (%); in brackets: number of challenges")
+        if len(table):
+            handles = axes[0].get_legend_handles_labels()
+            figure.legend(*handles, loc="outside upper center", ncols=3, frameon=False)
         return figure
 
-    def _draw_quiet(self, axes):
-        """Draw the kinds without an effect to be found: they have no signal-to-noise ratio."""
-        kinds = [kind for kind in ("none", "absorbed") if self.of(kind)]
-        for i, kind in enumerate(kinds):
-            value, low, high, n = self.rate(kind)
-            bar = 100 * np.array([[max(value - low, 0)], [max(high - value, 0)]])
-            axes.errorbar(i, 100 * value, bar, color="0.3", marker="o", capsize=2.5)
-            axes.annotate(
-                counted(n, "challenge"), (i, 100 * value), (8, -12), textcoords="offset points"
-            )
-        axes.set_xticks(range(len(kinds)), labels=kinds)
-        axes.set(xlim=(-1, max(len(kinds), 1)), xlabel="kind of challenge, no effect to be found")
+    def plot_reliability(self, figure=None):
+        """
+        Draw how many of the causes are right against the probability that was given.
 
-    def _draw(self, axes, edges, shift, label, kinds, color, marker):
-        pairs = pairwise(edges)
-        rates = np.array([self.rate(*kinds, least=low, below=high) for low, high in pairs])
-        seen = rates[:, 3] > 0
-        if not seen.any():
-            return
-        # side by side, lest the bars of the curves cover each other
-        middle = shift * np.sqrt(edges[:-1] * edges[1:])[seen]
-        value, low, high = 100 * rates[seen, :3].T
-        bars = [np.maximum(value - low, 0), np.maximum(high - value, 0)]
-        label = f"{label} ({int(rates[:, 3].sum())})"
-        axes.errorbar(middle, value, bars, color=color, marker=marker, capsize=2.5, label=label)
+        Parameters
+        ----------
+        figure : `~matplotlib.figure.Figure`, optional
+            An empty figure to draw into.
+
+        Returns
+        -------
+        `~matplotlib.figure.Figure`
+            Points with the interval of Wilson (1927) at 68 %, numbers of causes below.
+        """
+        figure, table = _figure(figure, (7.5, 5.5)), self.reliability
+        top, below = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
+        top.plot([0, 100], [0, 100], color="0.5", linestyle="--", label="as it should be")
+        x, y, low, high = (
+            100 * np.asarray(table[name])
+            for name in ("probability", "right", "right_low", "right_high")
+        )
+        bars = np.maximum([y - low, high - y], 0)
+        top.errorbar(x, y, bars, fmt="o", color=_COLORS["right"], capsize=3, label="causes given")
+        top.set(ylim=(-3, 103), ylabel="of them right (%)")
+        top.legend(loc="upper left", frameon=False)
+        left, right = 100 * np.asarray(table["from"]), 100 * np.asarray(table["to"])
+        width = right - left
+        below.bar(left, table["n"], width, align="edge", color="0.8", edgecolor="0.4")
+        for a, w, n in zip(left, width, table["n"], strict=True):
+            below.annotate(str(n), (a + w / 2, n), (0, 2), textcoords="offset points", ha="center")
+        below.set(xlim=(-3, 103), xlabel="probability that was given (%)", ylabel="causes")
+        below.margins(y=0.25)
+        for ax in (top, below):
+            ax.grid(color="0.9", linewidth=0.7)
+            ax.set_axisbelow(True)
+        return figure
 
 
-# Okabe & Ito (2008), distinct for all kinds of colour vision
-_CURVES = (
-    ("one effect, named first or in the first group", ("single",), "#0072B2", "o"),
-    ("two effects, both named", ("pair",), "#D55E00", "s"),
-    ("effect that no library holds, called unexplained", ("unlisted", "withheld"), "#009E73", "^"),
-)
+def _figure(figure, size):
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained") if figure is None else figure
+
+
+def _rows(table):
+    return [{name: _plain(row[name]) for name in table.colnames} for row in table]
+
+
+def _plain(value):
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _percent(value, low, high):
+    return f"{100 * value:.0f} ({100 * low:.0f} to {100 * high:.0f})"
 
 
 def wilson(right, n, z=1.0):
@@ -243,3 +240,18 @@ def wilson(right, n, z=1.0):
     middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     return p, max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def check_record(record):
+    """Raise unless a record of a file has what a record has."""
+    texts = ("kind", "verdict", "result")
+    good = type(record["index"]) is int and record["result"] in RESULTS
+    good &= all(isinstance(record[key], str) for key in texts)
+    good &= isinstance(record["snr"], int | float) and np.isfinite(record["snr"])
+    for probability, right in record["claims"]:
+        good &= isinstance(probability, int | float) and 0 <= probability <= 1
+        good &= isinstance(right, bool)
+    for key in ("faults", "causes"):
+        good &= isinstance(record[key], list) and all(isinstance(x, str) for x in record[key])
+    if not good:
+        raise TypeError("no record of a challenge")

@@ -6,10 +6,9 @@ import multiprocessing
 import signal
 import sys
 import time
-import warnings
 from contextlib import contextmanager
 
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
+from astropolcal.exceptions import AstropolcalError, GapError
 from astropolcal.scripts._common import (
     Continued,
     Output,
@@ -21,12 +20,14 @@ from astropolcal.scripts._common import (
     write_json,
 )
 from astropolcal.units import plain_number
+from astropolcal.words import counted
 
 _EPILOG = """\
 examples:
   astropolcal challenge -n 20
-  astropolcal challenge -n 1000 --snr 8:300 --workers 8 --checkpoint run.jsonl
-  astropolcal challenge -n 50 --kinds none,absorbed --json alarms.json
+  astropolcal challenge run -n 1000 --workers 8 --checkpoint run.jsonl
+  astropolcal challenge make cases --count 100 --seed 7
+  astropolcal challenge score cases outputs --figure rates.png
 
 A run that was interrupted goes on if it is started again with the same
 checkpoint.
@@ -39,28 +40,48 @@ def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
     parser = commands.add_parser(
         "challenge",
-        help="test the diagnosis on sealed simulated data",
-        description="Simulate calibrations with random effects, diagnose each without the key,\n"
+        help="test the diagnosis, or another tool, on sealed simulated data",
+        description="Simulate calibrations with random faults, diagnose each without the key,\n"
         "and compare the answers with the truth.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "-n", type=int, default=20, metavar="N", help="how many (default: %(default)s)"
+        "action",
+        nargs="?",
+        default="run",
+        choices=("run", "make", "score"),
+        help="run: make, diagnose and score (default); make DIR: write cases to files; "
+        "score DIR OUTPUTS: score the answers of any tool to them",
+    )
+    parser.add_argument(
+        "folders", nargs="*", default=[], metavar="FOLDER", help="of the cases, and of the answers"
+    )
+    parser.add_argument(
+        "-n",
+        "--count",
+        dest="n",
+        type=int,
+        default=20,
+        metavar="N",
+        help="how many (default: %(default)s)",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="default: %(default)s")
     parser.add_argument(
         "--snr",
         type=_range,
-        default=(8.0, 300.0),
+        default=(12.0, 120.0),
         metavar="LOW:HIGH",
-        help="signal-to-noise ratio of each effect (default: 8:300)",
+        help="signal-to-noise ratio of each fault (default: 12:120)",
     )
     parser.add_argument(
         "--kinds",
         type=lambda text: text.split(","),
         metavar="KIND,KIND,...",
-        help="single, none, pair, absorbed, unlisted, withheld (default: all)",
+        help="none, cell, listed, pair, detector, frame, mechanism, absorbed (default: all)",
+    )
+    parser.add_argument(
+        "--instrument", default="charis", metavar="NAME", help="default: %(default)s"
     )
     parser.add_argument("--wavelengths", type=int, default=8, metavar="N", help="default: 8")
     parser.add_argument("--derotator-angles", type=int, default=8, metavar="N", help="default: 8")
@@ -68,11 +89,17 @@ def add_parser(commands):
         "--checkpoint",
         metavar="FILE",
         type=Continued,
-        help="append each outcome to this file, and go on from it",
+        help="append each outcome of a run to this file, and go on from it",
     )
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default: 1")
     parser.add_argument(
-        "--figure", metavar="FILE", type=Output, help="draw the outcome (PNG, PDF or SVG)"
+        "--figure", metavar="FILE", type=Output, help="draw the rates (PNG, PDF or SVG)"
+    )
+    parser.add_argument(
+        "--reliability",
+        metavar="FILE",
+        type=Output,
+        help="draw how many causes are right against their probability (PNG, PDF or SVG)",
     )
     add_json(parser)
     add_quiet(parser)
@@ -89,35 +116,60 @@ def _range(text):
 
 
 def run(arguments):
-    """Run the challenges, print how they went and write what was asked for."""
-    from astropolcal.gap.challenge import KINDS, Setup, run_challenge
+    """Make, run or score challenges, print how they went and write what was asked for."""
+    from astropolcal.gap.challenge import make_cases, run_challenge, score_cases
 
-    # processes are started once for all challenges
-    with _workers(arguments.workers) as client:
-        result = run_challenge(
-            arguments.n,
-            arguments.seed,
-            snr=arguments.snr,
-            kinds=arguments.kinds or tuple(KINDS),
-            setup=Setup(
-                n_wavelengths=arguments.wavelengths, n_derotator=arguments.derotator_angles
-            ),
-            client=client,
-            checkpoint=arguments.checkpoint,
-            progress=_progress(arguments),
+    action, folders = arguments.action, arguments.folders
+    wanted = {"run": 0, "make": 1, "score": 2}[action]
+    if len(folders) != wanted:
+        raise GapError(
+            f"challenge {action} takes {counted(wanted, 'folder')}, {len(folders)} given"
         )
+    result = None
+    if action == "score":
+        result = score_cases(*folders)
+    else:
+        # processes are started once for all challenges
+        with _workers(arguments.workers) as client:
+            options = _options(arguments) | {"client": client}
+            if action == "run":
+                result = run_challenge(**options, checkpoint=arguments.checkpoint)
+            else:
+                key = make_cases(folders[0], **options)
+    if result is None:
+        if not is_quiet(arguments):
+            show(f"{counted(len(key), 'case')} and key.json written to {folders[0]}")
+        return
     if arguments.json:
         write_json(result.to_dict(), arguments.json)
-    if not result.answered:
-        raise GapError(result.shortfall)
-    if result.shortfall:
-        warnings.warn(result.shortfall, AstropolcalWarning, stacklevel=2)
-    if arguments.figure:
-        from astropolcal.plotting._style import save
+    for path, draw in (
+        (arguments.figure, result.plot),
+        (arguments.reliability, result.plot_reliability),
+    ):
+        if path:
+            from astropolcal.plotting._style import save
 
-        save(result.plot(), arguments.figure)
+            save(draw(), path)
     if not is_quiet(arguments):
         show(_report(result))
+
+
+def _options(arguments):
+    """Return what is common to making and running challenges."""
+    from astropolcal.gap.challenge import KINDS, Setup
+
+    return {
+        "n": arguments.n,
+        "seed": arguments.seed,
+        "snr": arguments.snr,
+        "kinds": arguments.kinds or tuple(KINDS),
+        "setup": Setup(
+            instrument=arguments.instrument,
+            n_wavelengths=arguments.wavelengths,
+            n_derotator=arguments.derotator_angles,
+        ),
+        "progress": _progress(arguments),
+    }
 
 
 @contextmanager
@@ -170,16 +222,15 @@ class _Progress:
 
 
 def _report(result):
-    """Return the rates, and the wrong answers one by one."""
-    lines = [result.words()]
-    if result.summary()["rates"]:
-        lines.append("(in brackets: interval of each rate at 68 %; number it is from)")
+    """Return the tables, and what was not right one by one."""
+    lines = [result.words(), ""]
     for record in result.failures:
         # only what went wrong is listed; the rates hold the rest
-        truth = " + ".join(record["effects"]) or "nothing"
-        said = " + ".join("/".join(group) for group in record["causes"])
-        strength = f" (SNR {min(record['snr']):.0f})" if record["snr"] else ""
-        answer = f"{record['verdict']} {said}".strip()
-        line = f"  no. {record['index']}, {record['kind']}: {truth}{strength} -> {answer}"
+        truth = " + ".join(record["faults"]) or "nothing"
+        answer = f"{record['verdict']} {' + '.join(record['causes'])}".strip()
+        line = (
+            f"  no. {record['index']}, {record['result']}: {record['kind']} {truth} "
+            f"(SNR {record['snr']:.0f}) -> {answer}"
+        )
         lines.append(wrapped(line, indent=6))
-    return "\n".join(lines)
+    return "\n".join(lines).rstrip()

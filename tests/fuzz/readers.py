@@ -899,7 +899,7 @@ class Challenges(Reader):
     """Checkpoints of challenges."""
 
     suffix = ".jsonl"
-    settings = {"seed": 1, "snr": [8.0, 300.0], "kinds": ["single"], "setup": {"n_wavelengths": 5}}
+    settings = {"seed": 1, "snr": [8.0, 300.0], "kinds": ["none"], "setup": {"n_wavelengths": 5}}
 
     def seeds(self):
         from astropolcal.gap.challenge import Setup, run_challenge
@@ -908,7 +908,7 @@ class Challenges(Reader):
             path = Path(folder) / "run.jsonl"
             setup = Setup(n_wavelengths=5, n_derotator=3)
             result = run_challenge(
-                2, seed=2, kinds=["single"], snr=(60, 60), setup=setup, checkpoint=path
+                2, seed=2, kinds=["none"], snr=(60, 60), setup=setup, checkpoint=path
             )
             type(self).settings = result.settings
             return {"two": path.read_bytes()}
@@ -928,7 +928,8 @@ class Challenges(Reader):
         assert all(isinstance(index, int) for index in records)
         repr(result)
         if records:
-            result.summary()
+            result.to_dict()
+            result.words()
 
 
 class Journal(Reader):

@@ -1,266 +1,393 @@
-"""Sealed challenges: what is made, how it is scored, and how a run goes on."""
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Challenges: what is made, how answers are scored, what many of them tell, how a run goes on."""
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
+import astropy.units as u
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.linalg import expm
 
+from astropolcal.chain import system_mueller, with_beam
 from astropolcal.exceptions import GapError
-from astropolcal.gap.challenge import ChallengeResult, Key, Setup, make_challenge, run_challenge
-from astropolcal.gap.effects import get_effect
-from astropolcal.gap.model import nominal_model
+from astropolcal.gap import challenge
+from astropolcal.gap._bench import ACTIONS, Bench
+from astropolcal.gap._faults import Fault
+from astropolcal.gap._outcome import wilson
+from astropolcal.gap.challenge import (
+    KINDS,
+    ChallengeResult,
+    Setup,
+    make_cases,
+    make_challenge,
+    run_challenge,
+    score_answer,
+    score_cases,
+)
 
-SMALL = Setup(n_wavelengths=5, n_derotator=4)
-RUN = {"setup": SMALL, "kinds": ["single", "none"], "snr": (40, 60)}
+SMALL = Setup(n_wavelengths=5, n_derotator=3)
+LEAST = Setup(n_wavelengths=3, n_derotator=3)
+DRIFT = {"place": "in:derotator", "kind": "retardance_h", "dependence": "time"}
+CELL = "in:derotator/retardance_h/time"
 
 pytestmark = pytest.mark.filterwarnings("ignore::astropolcal.exceptions.AstropolcalWarning")
 
 
-@pytest.fixture(scope="module")
-def result():
-    return run_challenge(3, 5, **RUN)
-
-
-def record(kind="single", right=True, snr=20.0, **more):
-    effects = {"none": [], "pair": ["a", "b"]}.get(kind, ["a"])
-    return {
-        "index": 0,
-        "kind": kind,
-        "effects": effects,
-        "snr": [snr] * len(effects),
-        "verdict": "effect",
-        "causes": [["a"]],
-        "right": right,
-        **more,
-    }
+def bench(seed=1, **more):
+    return Bench(
+        Setup(**{"n_wavelengths": 4, "n_derotator": 3} | more), np.random.default_rng(seed)
+    )
 
 
 # ---- what is made -----------------------------------------------------------------------------
 
 
 def test_a_seed_makes_the_same_challenge_again():
-    (one, _, key), (two, _, other), (three, _, _) = (
-        make_challenge(seed, effect="beam_gain", setup=SMALL) for seed in (3, 3, 4)
-    )
-    assert [o.content_hash for o in one] == [o.content_hash for o in two]
-    np.testing.assert_equal(key.values, other.values)
-    assert one[0].content_hash != three[0].content_hash
+    one, two, three = (make_challenge(seed, setup=SMALL, fault=DRIFT) for seed in (3, 3, 4))
+    assert one[2] == two[2]
+    assert [o.content_hash for o in one[0]] == [o.content_hash for o in two[0]]
+    assert one[0][0].content_hash != three[0][0].content_hash
 
 
-@pytest.mark.parametrize("effect", ["beam_gain", "hwp_diattenuation"])
-def test_the_effect_stands_out_as_asked_in_noisy_data_too(effect):
-    data, chains, key = make_challenge(6, effect=effect, snr=40, setup=SMALL)
-    assert key.snr[0] == pytest.approx(40, rel=0.03)
-    without = nominal_model(chains, data)
-    with_it = without.with_effect(get_effect(effect))
-    # the noise moves the square root of chi-square by one
-    assert np.sqrt(without.fit.chi2 - with_it.fit.chi2) == pytest.approx(40, abs=6)
+def test_light_goes_through_the_chain_as_the_package_says():
+    for instrument in ("charis", "vampires", "irdis"):
+        made = bench(instrument=instrument)
+        for dataset, (chain, clean) in enumerate(zip(made.chains, made.clean, strict=True)):
+            places = {
+                name: clean.position(name) * (1 if name == "flc_state" else u.rad)
+                for name in ("hwp", "derotator", "flc_state")
+                if instrument == "vampires" or name != "flc_state"
+            }
+            for beam, flux in zip(("right", "left"), made.path(dataset), strict=True):
+                expected = system_mueller(with_beam(chain, beam), made.setup.wavelength, places)
+                np.testing.assert_allclose(flux, expected[..., 0, 0], atol=1e-12)
 
 
-def test_an_effect_of_the_flux_has_the_size_in_the_key():
-    effect = get_effect("detector_nonlinearity")
-    data, chains, key = make_challenge(6, effect=effect.name, snr=40, setup=SMALL)
-    fitted = nominal_model(chains, data).with_effect(effect)
-    ((value, error, *_),) = fitted.sizes(effect.name).values()
-    true = np.mean(key.values[0]["gap_detector_nonlinearity.right"])
-    assert abs(true) > 10 * error[0]
-    assert value[0] == pytest.approx(true, abs=4 * error[0])
+def test_each_kind_of_fault_stands_out_as_asked():
+    for kind in sorted(set(KINDS) - {"none", "absorbed", "frame", "mechanism"}):
+        data, _, case = make_challenge(5, kind=kind, setup=SMALL, snr=20)
+        assert len(case["faults"]) == (2 if kind == "pair" else 1), kind
+        for fault in case["faults"]:
+            assert fault["absorbed"] or fault["snr"] < 21, kind
+        assert [one.name for one in data] == ["polarized", "unpolarized"]
+        assert json.loads(json.dumps(case)) == case
+    for what in ("smear", "ghost", "hysteresis", "wander", "jitter", "fringes"):
+        fault = {"what": what}
+        assert make_challenge(2, kind="mechanism", fault=fault, setup=LEAST)[2]["snr"] > 5, what
+    for what in ("hwp angle", "derotator angle", "exchanged", "one beam"):
+        fault = {"what": what, "frame": 4, "dataset": "polarized"}
+        case = make_challenge(2, kind="frame", fault=fault, setup=LEAST)[2]
+        assert (case["snr"] > 5, case["faults"][0]["frame"]) == (True, 4), what
 
 
-def test_nominal_chains_do_not_hold_the_truth():
-    _, chains, key = make_challenge(7, kind="none", setup=SMALL)
-    for nominal, true in zip(chains, key.chains, strict=True):
-        assert nominal["hwp"].w_sio2.value != true["hwp"].w_sio2.value
-        assert not np.any(nominal["wollaston"].efficiency == true["wollaston"].efficiency)
-    # what both datasets share is the same in both
-    assert key.chains[0]["hwp"].w_sio2.value == key.chains[1]["hwp"].w_sio2.value
+def test_what_the_nominal_model_takes_up_is_absorbed():
+    assert make_challenge(1, kind="absorbed", setup=SMALL)[2]["absorbed"]
+    # its retardance is free at each wavelength
+    fault = DRIFT | {"dependence": "constant"}
+    case = make_challenge(1, setup=SMALL, fault=fault)[2]
+    assert (case["absorbed"], case["snr"], case["faults"][0]["cells"]) == (True, 0.0, {})
 
 
-def test_an_absorbed_effect_leaves_no_gap():
-    data, chains, key = make_challenge(6, kind="absorbed", effect="beam_crosstalk", setup=SMALL)
-    assert key.snr[0] < 0.5
-    model = nominal_model(chains, data)
-    assert model.fit.chi2 < model.problem.n_data + 5 * np.sqrt(2 * model.problem.n_data)
+def test_the_cells_of_the_key_are_what_a_finite_fault_does():
+    made = bench()
+    fault = Fault(made, {"type": "cell", **DRIFT})
+    residual, fit = made.scale(fault, 5)
+    shares = fault.cells(residual, fit)
+    linear = made.shares(residual, fit)
+    assert shares[CELL] == max(shares.values()) == 1
+    assert linear[CELL] == pytest.approx(1, abs=2e-3)
+    # other kinds cannot do it, and a trend of higher order not all of it
+    assert linear.get("in:derotator/rotation/time", 0) < 0.9
+    assert linear.get("in:derotator/retardance_h/time2", 0) < 0.9
 
 
-def test_two_effects_can_be_told_from_each_other():
-    _, _, key = make_challenge(11, kind="pair", snr=30, setup=SMALL)
-    assert len(set(key.effects)) == 2
-    assert not key.accepted[0] & key.accepted[1]
+def test_generators_give_matrices_of_their_kind():
+    for kind, action in ACTIONS.items():
+        matrix = expm(0.1 * action)
+        if kind.startswith(("retardance", "rotation")):
+            np.testing.assert_allclose(matrix @ matrix.T, np.eye(4), atol=1e-12)
+        elif kind.startswith("diattenuation"):
+            np.testing.assert_allclose(matrix, matrix.T)
+            assert matrix[0, 0] > 1
+        else:
+            assert matrix[0, 0] == 1
+            assert np.abs(np.linalg.eigvalsh(matrix)).max() < 1.2
 
 
-def test_a_withheld_effect_is_not_in_the_library():
-    _, _, key = make_challenge(8, kind="withheld", effect="hwp_diattenuation", setup=SMALL)
-    assert key.effects[0] not in key.library
-    shares = key.alternatives[0]
-    assert max(shares.get(name, 0.0) for name in key.library) < 0.3
-
-
-def test_what_is_unlisted_is_explained_by_no_effect():
-    _, _, key = make_challenge(9, kind="unlisted", effect="beam_flicker", setup=SMALL)
-    assert key.effects == ["unlisted_beam_flicker"]
-    assert max(key.alternatives[0].values()) < 0.3
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"kind": "odd"}, "allowed are single"),
-        ({"snr": -1}, "must be finite and positive"),
-        ({"effect": "beam_gian"}, "did you mean 'beam_gain'"),
-        ({"kind": "unlisted", "effect": "odd"}, "there are"),
-        ({"kind": "absorbed", "effect": "mirror_flip"}, "no effect found"),
-        ({"kind": "pair", "snr": 1e-3}, "no two effects found for a challenge of kind pair"),
-    ],
-)
-def test_what_cannot_be_made_is_refused(options, words):
-    with pytest.raises(GapError, match=words):
-        make_challenge(1, setup=SMALL, **options)
-
-
-def test_a_setup_that_is_too_small_is_refused():
+def test_what_cannot_be_made_is_refused():
+    for options, words in (
+        ({"kind": "odd"}, "allowed are none"),
+        ({"snr": np.nan}, "must be finite and positive"),
+        ({"fault": {"place": "in:wollaston"}}, "place = 'in:wollaston'; allowed are source"),
+        ({"kind": "listed", "fault": {"effect": "beam_gian"}}, "did you mean 'beam_gain'"),
+        ({"kind": "listed", "fault": {"effect": "mirror_flip"}}, "no place on the bench"),
+    ):
+        with pytest.raises(GapError, match=words):
+            make_challenge(1, setup=SMALL, **options)
     with pytest.raises(GapError, match="n_derotator = 2"):
         Setup(n_derotator=2)
 
 
-# ---- how it is scored -------------------------------------------------------------------------
+# ---- how an answer is scored ------------------------------------------------------------------
 
 
-def test_aliases_are_accepted_from_their_share():
-    key = Key("single", ["a"], [9.0], [{"b": 0.96, "c": 0.94}], [{}])
-    assert key.accepted == [{"a", "b"}]
+def case(kind="cell", *cells, **fault):
+    cells = cells or ({CELL: 1.0, "after:derotator/retardance_h/time": 0.6, "a/b/step:20": 0.95},)
+    faults = [{"type": kind, "absorbed": False, "cells": one, **fault} for one in cells]
+    return {"kind": kind, "snr": 20.0, "faults": faults}
 
 
-def test_rates_count_only_the_range_asked_for():
-    records = [record(right=True, snr=20), record(right=False, snr=5), record("none", right=True)]
-    result = ChallengeResult(records, {"snr": [3, 30]})
-    assert result.rate("single", least=8)[0] == 1
-    assert result.rate("single")[0] == 0.5
-    assert result.rate("single", below=8)[3] == 1
-    assert result.rate("none", least=8)[3] == 1
-    assert np.isnan(result.rate("pair")[0])
-    assert result.failures == [records[1]]
+def cause(name, probability=0.9, **more):
+    cell = dict(zip(("place", "kind", "dependence"), name.split("/"), strict=True))
+    return {"cell": cell, "probability": probability, **more}
 
 
-def test_the_interval_of_a_rate_holds_it_and_narrows():
-    few, many = (ChallengeResult([record()] * n, {}).rate("single") for n in (3, 300))
-    assert few[1] < many[1] < few[0] == few[2] == 1
+def answer(*causes, verdict="located", **more):
+    return {"verdict": verdict, "causes": list(causes), **more}
 
 
-def test_shrinkage_is_that_over_the_oracle():
-    halfway = record(gap_percent=[2.0, np.sqrt(2.0), np.sqrt(0.4)], pulls=[0.5, -2.0])
-    result = ChallengeResult([halfway], {})
-    assert result.shrinkage_ratio() == pytest.approx(0.5 / 0.9)
-    assert result.summary()["rates"]["coverage of sizes"]["value"] == 0.5
+RIGHT, HALF, WRONG = cause(CELL), cause("after:derotator/retardance_h/time"), cause("a/b/time")
 
 
-def test_a_run_finds_what_is_there(result):
-    assert [r["right"] for r in result.records] == [True] * 3
-    table = result.table
-    assert len(table) == 3
-    named = table["kind"] == "single"
-    assert np.all(table["snr"][named] > 35)
-    assert np.all(table["gap_after"][named] < table["gap_before"][named])
-    assert "recall" in result.words()
-    assert json.loads(json.dumps(result.to_dict(), allow_nan=False))["settings"]["seed"] == 5
+def test_answers_are_right_silent_or_wrong():
+    nothing = {"kind": "none", "snr": 0.0, "faults": []}
+    absorbed = case(absorbed=True)
+    frame = case("frame", frame=7, **{"with": 9})
+    named = [{"frame": 7}]
+    two = case("pair", {CELL: 1.0}, {"a/b/time": 1.0})
+    for key, given, expected in (
+        (nothing, answer(verdict="none"), "right"),
+        (nothing, {}, "silent"),
+        (nothing, answer(verdict="unexplained"), "wrong"),
+        (absorbed, answer(verdict="none"), "right"),
+        (absorbed, answer(RIGHT), "wrong"),
+        (case(), answer(RIGHT), "right"),
+        (case(), answer(verdict="unexplained"), "silent"),
+        (case(), answer(HALF), "silent"),
+        (case(), answer(HALF | {"aliases": [RIGHT]}), "right"),
+        (case(), answer(WRONG), "wrong"),
+        (case(), answer(cause("a/b/time", 0.4)), "silent"),
+        # one of several that is wrong
+        (case(), answer(RIGHT, WRONG), "wrong"),
+        # a step is the same a few frames away
+        (case(), answer(cause("a/b/step:23")), "right"),
+        (case(), answer(cause("a/b/step:40")), "wrong"),
+        (case(effect="beam_gain"), answer({"effect": "beam_gain", "aliases": []}), "right"),
+        (case(effect="beam_gain"), answer({"effect": "x", "aliases": ["beam_gain"]}), "right"),
+        (case(effect="beam_gain"), answer({"effect": "x", "aliases": []}), "wrong"),
+        (two, answer(RIGHT, WRONG), "right"),
+        (two, answer(RIGHT), "silent"),
+        (two, answer(RIGHT, cause("c/d/time")), "wrong"),
+        (frame, answer(verdict="none", frames=named), "right"),
+        (frame, answer(verdict="none", frames=[{"frame": 9}]), "right"),
+        (frame, answer(verdict="none"), "silent"),
+        (frame, answer(RIGHT, frames=named), "wrong"),
+        (case("mechanism"), answer(verdict="unexplained"), "right"),
+        (case("mechanism"), answer(WRONG), "wrong"),
+        (case("detector", {"detector/persistence/previous": 1.0}),
+         answer(cause("detector/persistence/flux")), "right"),
+    ):  # fmt: skip
+        assert score_answer(key, given) == expected, (key, given)
 
 
-def test_the_figure_shows_each_kind_that_was_run(result):
-    axes = result.plot().axes[0]
-    assert axes.get_xlabel() == "signal-to-noise ratio of the weakest effect"
-    labels = axes.get_legend_handles_labels()[1]
-    assert sorted(label.split(",")[0] for label in labels) == ["nothing to be found", "one effect"]
+def test_what_is_no_answer_is_refused():
+    for given in ([], {"causes": [5]}, answer(cause(CELL, 2.0)), answer(cause(CELL, "x"))):
+        with pytest.raises(GapError, match="neither a case nor an answer"):
+            score_answer(case(), given)
+
+
+# ---- cases in files ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cases")
+    make_cases(path, 2, 3, kinds=["cell", "detector"], setup=SMALL)
+    return path
+
+
+def test_cases_in_files_are_scored(folder, tmp_path):
+    key = json.loads((folder / "key.json").read_text())
+    assert list(key) == ["case000", "case001"]
+    for name, one in key.items():
+        assert {path.name for path in (folder / name).iterdir()} == set(one["tables"])
+    (tmp_path / "case001.json").write_text(json.dumps(answer(verdict="unexplained")))
+    result = score_cases(folder, tmp_path)
+    assert [r["verdict"] for r in result.records] == ["missing", "unexplained"]
+    assert result.rate("silent")[0] == 1
+
+
+def test_damaged_files_get_one_clear_line(folder, tmp_path):
+    with pytest.raises(GapError, match="holds no answer to any of the 2 cases"):
+        score_cases(folder, tmp_path)
+    (tmp_path / "case000.json").write_text("{")
+    with pytest.raises(GapError, match=r"case000\.json: is no answer"):
+        score_cases(folder, tmp_path)
+    for content in ("[]", '{"case000": {}}', "\0", '{"case000": {"kind": 1, "faults": [3]}}'):
+        (tmp_path / "key.json").write_text(content)
+        with pytest.raises(GapError, match="is no key of challenges"):
+            score_cases(tmp_path, tmp_path)
+    with pytest.raises(GapError, match="no such file"):
+        score_cases(tmp_path / "none", tmp_path)
+    with pytest.raises(GapError, match="is there already"):
+        make_cases(folder, 1)
+
+
+# ---- what many of them tell -------------------------------------------------------------------
+
+
+def record(index=0, kind="cell", snr=20.0, result="right", claims=()):
+    told = {"index": index, "kind": kind, "snr": snr, "result": result, "verdict": "located"}
+    return told | {"faults": ["a"], "causes": ["b"], "claims": [list(c) for c in claims]}
+
+
+def test_interval_of_wilson_at_95_percent():
+    # Newcombe (1998), Statistics in Medicine 17, 857, table I, method 3
+    for right, n, low, high in (
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ):
+        value, *ends = wilson(right, n, z=stats.norm.ppf(0.975))
+        assert value == right / n
+        assert ends == pytest.approx([low, high], abs=6e-5)
+    assert np.isnan(wilson(0, 0)).all()
+
+
+@pytest.fixture
+def result():
+    rng = np.random.default_rng(1)
+    given = rng.uniform(0, 1, (60, 2))
+    return ChallengeResult(
+        [
+            record(
+                i,
+                ("cell", "none", "frame")[i % 3],
+                (i % 3 != 1) * 10.0 ** (i % 5 / 2),
+                ("right", "silent", "wrong", "right")[i % 4],
+                [(p, bool(rng.uniform() < p)) for p in given[i]],
+            )
+            for i in range(60)
+        ],
+        {"seed": 3},
+    )
+
+
+def test_rates_are_by_kind_and_signal(result):
+    rows = {row["challenges"]: row for row in result.rates}
+    assert list(rows)[:4] == ["all", "cell", "frame", "none"]
+    assert rows["all"]["right"] == 0.5
+    assert rows["all"]["right_low"], rows["all"]["right_high"] == wilson(30, 60)[1:]
+    assert sum(row["n"] for name, row in rows.items() if name.startswith("SNR")) == 40
+    for row in rows.values():
+        assert row["right"] + row["silent"] + row["wrong"] == pytest.approx(1)
+    assert "60 challenges" in result.words()
+    assert json.loads(json.dumps(result.to_dict(), allow_nan=False))["settings"] == {"seed": 3}
+
+
+def test_probabilities_are_held_against_how_often_they_are_right(result):
+    claims = np.array([claim for r in result.records for claim in r["claims"]])
+    table = result.reliability
+    assert table["n"].sum() == 120
+    for row in table:
+        inside = claims[(claims[:, 0] >= row["from"]) & (claims[:, 0] < row["to"])]
+        assert row["probability"] == pytest.approx(inside[:, 0].mean())
+        assert row["right"] == inside[:, 1].mean()
+    axes = result.plot_reliability().axes[0]
+    (points,) = axes.containers
+    np.testing.assert_allclose(points.lines[0].get_xdata(), 100 * table["probability"])
+    # certainty is in the last bin, and nothing at all is a picture too
+    assert ChallengeResult([record(claims=[(1.0, True)])], {}).reliability["to"][0] == 1
+    for figure in (ChallengeResult([], {}).plot_reliability(), ChallengeResult([], {}).plot()):
+        figure.canvas.draw()
+    bars = [bar for ax in result.plot().axes for bar in ax.patches]
+    assert sum(bar.get_width() for bar in bars) == pytest.approx(100 * len(result.rates))
 
 
 # ---- how a run goes on ------------------------------------------------------------------------
 
 
+def told(observations_or_error):
+    """Replace the diagnosis by an answer."""
+
+    def diagnose(chains, observations):
+        if isinstance(observations_or_error, Exception):
+            raise observations_or_error
+        return SimpleNamespace()
+
+    return diagnose
+
+
+def test_a_run_makes_asks_and_scores(monkeypatch):
+    monkeypatch.setattr(challenge, "diagnose", told(None))
+    found = answer(WRONG, seconds=1.0)
+    monkeypatch.setattr("astropolcal.gap.report.to_dict", lambda diagnosis: found)
+    result = run_challenge(2, 5, setup=SMALL, kinds=["none", "cell"])
+    assert [r["result"] for r in result.records] == ["wrong"] * 2
+    assert result.records[0]["claims"] == [[0.9, False]]
+    monkeypatch.setattr(challenge, "diagnose", told(GapError("did not converge")))
+    failed = run_challenge(1, 5, setup=SMALL, kinds=["none"]).records[0]
+    assert (failed["verdict"], failed["error"]) == ("error", "did not converge")
+    assert failed["result"] == "silent"
+
+
 @pytest.mark.slow
-def test_a_run_goes_on_where_it_was_killed(tmp_path, result, monkeypatch):
-    path = tmp_path / "run.jsonl"
-    run_challenge(2, 5, checkpoint=path, **RUN)
+def test_the_diagnosis_keeps_quiet_where_there_is_nothing():
+    small = Setup(n_wavelengths=5, n_derotator=4)
+    assert run_challenge(2, 5, setup=small, kinds=["none"]).rate("right")[0] == 1
+
+
+def test_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):
+    made, said, path = [], [], tmp_path / "run.jsonl"
+    monkeypatch.setattr(challenge, "_run_one", lambda i, s: made.append(i) or record(i))
+    run_challenge(2, 5, checkpoint=path)
     whole = path.read_text()
     path.write_text(whole + '{"index": 2, "ki')
-    made = []
-    from astropolcal.gap import challenge
-
-    original = challenge._run_one
-    monkeypatch.setattr(challenge, "_run_one", lambda i, s: made.append(i) or original(i, s))
-    again = run_challenge(3, 5, checkpoint=path, **RUN)
-    assert made == [2]
+    with ThreadPoolExecutor(2) as pool:
+        progress = lambda *numbers: said.append(numbers)  # noqa: E731
+        result = run_challenge(4, 5, checkpoint=path, client=pool, progress=progress)
+    assert sorted(made) == [0, 1, 2, 3]
+    assert [r["index"] for r in result.records] == [0, 1, 2, 3]
     assert path.read_text().startswith(whole)
-    drop = {"seconds"}
-    for ours, theirs in zip(again.records, result.records, strict=True):
-        assert {k: v for k, v in ours.items() if k not in drop} == {
-            k: v for k, v in theirs.items() if k not in drop
-        }
+    assert said == [(3, 4), (4, 4)]
 
 
-def test_a_checkpoint_of_another_run_is_refused(tmp_path, monkeypatch):
-    from astropolcal.gap import challenge
-
-    monkeypatch.setattr(challenge, "_run_one", lambda i, s: record() | {"index": i})
+def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(challenge, "_run_one", lambda i, s: record(i))
     path = tmp_path / "run.jsonl"
     run_challenge(1, 1, checkpoint=path)
     with pytest.raises(GapError, match="other settings \\(seed\\)"):
         run_challenge(1, 2, checkpoint=path)
-    path.write_text("no json\n")
-    with pytest.raises(GapError, match="is no checkpoint"):
-        run_challenge(1, 1, checkpoint=path)
+    first = path.read_text().splitlines()[0]
+    odd = record(1) | {"claims": [[2.0, True]]}
+    for line in ("no json", "[]", json.dumps(odd), json.dumps(record(1) | {"result": "so so"})):
+        path.write_text(f"{first}\n{line}\n")
+        with pytest.raises(GapError, match="is no checkpoint"):
+            run_challenge(1, 1, checkpoint=path)
 
 
-def test_an_executor_gives_the_same_records(monkeypatch):
-    from astropolcal.gap import challenge
-
-    monkeypatch.setattr(challenge, "_run_one", lambda i, s: record() | {"index": i})
-    with ThreadPoolExecutor(2) as pool:
-        spread = run_challenge(6, 1, client=pool)
-    assert [r["index"] for r in spread.records] == list(range(6))
-
-
-def test_a_diagnosis_that_fails_counts_as_wrong(monkeypatch):
-    from astropolcal.gap import challenge
-
-    def refuse(*args, **kwargs):
-        raise GapError("did not converge")
-
-    monkeypatch.setattr(challenge, "diagnose", refuse)
-    found = run_challenge(1, 5, setup=SMALL, kinds=["none"])
-    assert found.records[0]["verdict"] == "error"
-    assert found.rate("none")[0] == 0
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_a_run_that_makes_no_sense_is_refused():
+    for options, words in (
         ({"n": 0}, "n = 0"),
         ({"n": 1, "seed": -1}, "seed = -1"),
-        ({"n": 1, "kinds": ["odd"]}, "allowed are single"),
+        ({"n": 1, "kinds": ["odd"]}, "allowed are none"),
+        ({"n": 1, "kinds": []}, "allowed are none"),
         ({"n": 1, "snr": (9, 3)}, "the lower first"),
-    ],
-)
-def test_a_run_that_makes_no_sense_is_refused(options, words):
-    with pytest.raises(GapError, match=words):
-        run_challenge(**options)
+    ):
+        with pytest.raises(GapError, match=words):
+            run_challenge(**options)
 
 
 @pytest.mark.slow
 def test_a_cluster_of_dask_gives_the_same_answers():
     distributed = pytest.importorskip("distributed")
-    small = Setup(n_wavelengths=5, n_derotator=4)
-    here = run_challenge(2, seed=3, kinds=("single",), setup=small)
+    options = {"seed": 3, "kinds": ["none"], "setup": SMALL}
+    here = run_challenge(2, **options).records
     with distributed.Client(processes=False, n_workers=1, dashboard_address=None) as client:
-        there = run_challenge(2, seed=3, kinds=("single",), setup=small, client=client)
-    timeless = [
-        [{k: v for k, v in record.items() if k != "seconds"} for record in run.records]
-        for run in (here, there)
-    ]
-    assert timeless[0] == timeless[1]
-
-
-def test_progress_is_told_after_each_challenge(tmp_path):
-    told, options = [], {"kinds": ["none"], "setup": SMALL, "checkpoint": tmp_path / "c.jsonl"}
-    run_challenge(1, **options)
-    run_challenge(2, **options, progress=lambda *numbers: told.append(numbers))
-    assert told == [(2, 2)]
+        there = run_challenge(2, client=client, **options).records
+    for one, two in zip(here, there, strict=True):
+        assert one | {"seconds": 0} == two | {"seconds": 0}

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""The verdict, shares and gaps of a diagnosis; alternatives; what is simulated for challenges."""
+"""The verdict, shares and gaps of a diagnosis; alternatives."""
 
 from types import SimpleNamespace
 
@@ -10,11 +10,10 @@ import pytest
 
 from astropolcal.exceptions import GapError
 from astropolcal.gap import alternatives
-from astropolcal.gap._bench import Key, Setup, _Drawn, _law, _put, _varied
 from astropolcal.gap.alternatives import thinned
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.diagnosis import _conclude, _library
-from astropolcal.gap.effects import EFFECTS, Context, EffectParameter, get_effect
+from astropolcal.gap.effects import EFFECTS, get_effect
 from astropolcal.gap.shrinkage import HeldOut
 
 N_DATA, SIZE = 1010, 10
@@ -216,90 +215,3 @@ def test_without_alternatives_nothing_is_tried():
 def test_chains_and_datasets_go_together():
     with pytest.raises(GapError, match="2 chains for 1 datasets"):
         alternatives.starting_model([data.chain()] * 2, [data.observed()], [], print)
-
-
-# ---- what is simulated for challenges ------------------------------------------------------
-
-
-@pytest.mark.parametrize("key", ["n_wavelengths", "n_derotator"])
-def test_a_setup_needs_three_of_each(key):
-    assert getattr(Setup(**{key: 3}), key) == 3
-    with pytest.raises(GapError, match=f"{key} = 2; allowed are whole numbers from 3 up"):
-        Setup(**{key: 2})
-
-
-def test_wavelengths_of_a_setup_are_even_in_their_logarithm():
-    setup = Setup(n_wavelengths=5)
-    steps = np.diff(np.log(setup.wavelength.value))
-    np.testing.assert_allclose(steps, steps[0])
-    assert set(setup.sources) == {"polarized", "unpolarized"}
-    assert len(setup.frames()) == 8 * 8
-
-
-def test_a_withheld_effect_takes_its_aliases_along():
-    key = Key("withheld", ["beam_gain"], [9.0], [{"background": 0.97, "hwp_tilt": 0.5}], [{}])
-    assert set(EFFECTS) - set(key.library) == {"beam_gain", "background"}
-    assert set(Key("single", *[[]] * 4).library) == set(EFFECTS)
-
-
-def test_truth_differs_from_the_start_and_is_common_to_the_datasets():
-    setup = Setup(n_wavelengths=5)
-    wavelength = setup.wavelength.to_value(u.um)
-    plain = setup.chains()
-    varied = _varied(setup.chains(), wavelength, np.random.default_rng(4))
-    for key in ("w_sio2", "w_mgf2"):
-        values = [getattr(chain["hwp"], key).value for chain in varied]
-        assert values[0] == values[1]
-        assert values[0] != getattr(plain[0]["hwp"], key).value
-    # layers that compensate each other are cut together
-    one, other = (
-        getattr(varied[0]["hwp"], key).value / getattr(plain[0]["hwp"], key).value
-        for key in ("w_sio2", "w_mgf2")
-    )
-    assert one == pytest.approx(other, abs=5e-3)
-    efficiency = varied[0]["wollaston"].efficiency
-    assert np.all(efficiency.value < 1)
-
-
-@pytest.mark.parametrize("n", [1, 8])
-def test_random_laws_have_the_usual_size(n):
-    basis = None if n == 1 else Context(np.linspace(1.2, 2.3, n)).basis(2)
-    parameter = EffectParameter("a.horizontal", 2 * u.deg, 30 * u.deg, basis)
-    rng = np.random.default_rng(3)
-    laws = np.array([np.atleast_1d(_law(parameter, n, rng)) for _ in range(400)])
-    assert laws.shape == (400, n)
-    # a standard deviation between one and a few times the scale
-    assert 0.9 < laws.std() / np.deg2rad(2) < 2.0
-
-
-def test_a_share_that_is_retained_never_exceeds_one():
-    parameter = EffectParameter("a.retained_q", 0.01, 0.5, Context(np.arange(1, 9.0)).basis(2))
-    rng = np.random.default_rng(5)
-    assert all(np.max(_law(parameter, 8, rng)) < 0 for _ in range(50))
-
-
-def test_sizes_are_drawn_about_where_the_effect_is_absent():
-    """Also of an angle that the model holds elsewhere than at zero."""
-    chain = data.chain()
-    chain["calibration_polarizer"].theta.fixed = True
-    bench = SimpleNamespace(
-        chains=[chain],
-        context=Context(data.WAVELENGTH.to_value(u.um)),
-        rng=np.random.default_rng(1),
-    )
-    held = chain["calibration_polarizer"].theta.value
-    drawn = _Drawn(get_effect("polarizer_misalignment"), bench)
-    (value,) = drawn.values(0.0).values()
-    assert np.rad2deg(value) == pytest.approx(held)
-    moved = drawn.chains([chain], drawn.largest)[0]["calibration_polarizer"].theta.value
-    # nine tenths of the limit of five degrees
-    assert abs(moved - held) == pytest.approx(4.5)
-
-
-def test_values_are_put_into_all_chains():
-    chains = [data.chain(), data.chain()]
-    _put(chains, "wollaston.efficiency", 0.9)
-    _put(chains, "calibration_polarizer.theta", np.pi / 4)
-    for chain in chains:
-        np.testing.assert_allclose(chain["wollaston"].efficiency.value, 0.9)
-        assert chain["calibration_polarizer"].theta.value == pytest.approx(45)

@@ -8,8 +8,7 @@ from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
-from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
-from astropolcal.gap.challenge import ChallengeResult
+from astropolcal.exceptions import AstropolcalError
 from astropolcal.scripts import _challenge
 
 SMALL = ["-n", "2", "--kinds", "none", "--wavelengths", "5", "--derotator-angles", "3"]
@@ -29,33 +28,32 @@ def command():
 
 
 def test_it_prints_rates_and_writes_what_is_asked_for(command, tmp_path, capsys):
-    checkpoint, summary, figure = (tmp_path / name for name in ("c.jsonl", "s.json", "f.png"))
-    command(*SMALL, "--checkpoint", checkpoint, "--json", summary, "--figure", figure)
+    names = ("c.jsonl", "s.json", "f.png", "r.png")
+    checkpoint, summary, figure, reliability = (tmp_path / name for name in names)
+    options = ["--checkpoint", checkpoint, "--json", summary, "--figure", figure]
+    command(*SMALL, *options, "--reliability", reliability)
     assert "2 challenges" in capsys.readouterr().out
     content = json.loads(summary.read_text())
-    assert content["summary"]["rates"]["quiet on clean"]["n"] == 2
+    assert content["rates"][0] | {"right": 1.0, "n": 2} == content["rates"][0]
     assert content["settings"]["kinds"] == ["none"]
     assert len(checkpoint.read_text().splitlines()) == 3
-    assert figure.read_bytes().startswith(b"\x89PNG")
+    for picture in (figure, reliability):
+        assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_json_on_stdout_is_nothing_but_json(command, capsys):
-    command(*SMALL, "--json", "-", "-n", "1")
+    command("run", *SMALL, "--json", "-", "-n", "1")
     assert json.loads(capsys.readouterr().out)["settings"]["seed"] == 0
 
 
-def test_wrong_answers_are_listed():
-    wrong = {
-        "index": 4,
-        "kind": "single",
-        "effects": ["beam_gain"],
-        "snr": [12.0],
-        "verdict": "effect",
-        "causes": [["background", "persistence"]],
-        "right": False,
-    }
-    report = _challenge._report(ChallengeResult([wrong], {}))
-    assert "no. 4, single: beam_gain (SNR 12) -> effect background/persistence" in report
+def test_cases_are_made_and_the_answers_of_a_tool_scored(command, tmp_path, capsys):
+    cases, outputs = tmp_path / "cases", tmp_path / "outputs"
+    command("make", cases, *SMALL, "--count", "1")
+    assert "1 case and key.json written" in capsys.readouterr().out
+    outputs.mkdir()
+    (outputs / "case000.json").write_text('{"verdict": "unexplained"}')
+    command("score", cases, outputs)
+    assert "no. 0, wrong: none nothing (SNR 0) -> unexplained" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("text", ["8", "a:b", "1:2:3"])
@@ -69,10 +67,12 @@ def test_a_range_that_is_none_is_refused(command, text, capsys):
     ("options", "words"),
     [
         (["--workers", "0"], "--workers 0"),
-        (["--kinds", "odd"], "allowed are single"),
+        (["--kinds", "odd"], "allowed are none"),
         (["--snr", "9:3"], "the lower first"),
-        (["--json", "/nowhere/x.json"], "there is no folder"),
         (["--derotator-angles", "2"], "n_derotator = 2"),
+        (["-n", "0"], "n = 0"),
+        (["score", "cases"], "challenge score takes 2 folders, 1 given"),
+        (["score", "nowhere", "outputs"], "no such file"),
     ],
 )
 def test_bad_input_is_refused(command, options, words):
@@ -83,45 +83,6 @@ def test_bad_input_is_refused(command, options, words):
 def test_an_unknown_format_of_the_figure_is_refused(command, tmp_path):
     with pytest.raises(AstropolcalError, match="odd"):
         command(*SMALL, "-n", "1", "--figure", tmp_path / "f.odd")
-
-
-# ---- what could not be made, or was stopped ----------------------------------------------------
-
-DARK = {"index": 0, "kind": "single", "verdict": "not made", "error": "too dark"}
-QUIET = {"index": 1, "kind": "none", "verdict": "none", "right": True}
-QUIET |= {"snr": [], "effects": [], "causes": []}
-
-
-@pytest.fixture
-def outcome(monkeypatch):
-    """Function that sets the records of the challenges."""
-
-    def replace(*records):
-        result = ChallengeResult(records, {"snr": [8.0, 300.0]})
-        run_challenge = "astropolcal.gap.challenge.run_challenge"
-        monkeypatch.setattr(run_challenge, lambda *args, **options: result)
-
-    return replace
-
-
-def test_challenges_that_all_could_not_be_made_are_an_error(command, outcome, tmp_path):
-    outcome(DARK)
-    with pytest.raises(GapError, match=r"^0 of 1 challenges could be made: too dark \(1\)$"):
-        command("--json", tmp_path / "c.json")
-    # the records are kept
-    assert json.loads((tmp_path / "c.json").read_text())["challenges"] == [DARK]
-
-
-def test_challenges_of_which_some_could_not_be_made_warn(command, outcome, capsys):
-    outcome(DARK, QUIET)
-    with pytest.warns(AstropolcalWarning, match="1 of 2 challenges could be made"):
-        command()
-    assert "1 challenge, 0 wrong answers" in capsys.readouterr().out
-
-
-def test_without_a_rate_there_is_no_footnote_on_rates():
-    assert "in brackets" in _challenge._report(ChallengeResult([QUIET], {}))
-    assert "in brackets" not in _challenge._report(ChallengeResult([DARK], {}))
 
 
 def test_an_interruption_ends_the_workers_at_once(capsys):

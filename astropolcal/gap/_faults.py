@@ -1,0 +1,250 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The faults of a challenge: of any optic, of the detector, of single frames, and stranger ones."""
+
+import numpy as np
+
+from astropolcal.chain import leaves
+from astropolcal.exceptions import GapError
+from astropolcal.gap._bench import ACTIONS, DETECTOR
+from astropolcal.gap.effects import EFFECTS, Context, get_effect
+from astropolcal.units import canonical_factor
+
+_FRAME_FAULTS = ("hwp angle", "derotator angle", "exchanged", "one beam")
+_MECHANISMS = ("smear", "ghost", "hysteresis", "wander", "jitter", "fringes")
+# the largest size: radian, or a share
+_LARGEST, _LARGEST_SHARE = 0.2, 0.3
+# what the nominal model takes up leaves less than this share of itself
+_TAKEN_UP = 0.02
+
+
+class Fault:
+    """
+    What a simulated calibration has and its nominal model lacks.
+
+    Parameters
+    ----------
+    bench : Bench
+        The instrument.
+    told : dict
+        What the key says of it; what is missing is drawn.
+    """
+
+    def __init__(self, bench, told):
+        self.bench, self.told = bench, dict(told)
+        self.amplitude, self.largest, self.snr = 1e-3, _LARGEST, 0.0
+        getattr(self, f"_draw_{self.told['type']}")(bench.rng)
+
+    def _choose(self, key, among):
+        """Return what the key says, drawn where it says nothing."""
+        among = list(among)
+        value = self.told.setdefault(key, among[self.bench.rng.integers(len(among))])
+        if value not in among:
+            raise GapError(f"{key} = {value!r}; allowed are {', '.join(map(str, among))}")
+        return value
+
+    def _draw_law(self, rng, spread=1.0):
+        """Draw a law in wavelength and a phase; the largest exponent is then the amplitude."""
+        bench = self.bench
+        n = bench.law.shape[1]
+        drawn = [float(x) for x in rng.normal(0, 1, n) / (1 + np.arange(n))]
+        drawn = drawn if spread == 1 else [1.0, *(spread * x for x in drawn[1:])]
+        law = bench.law @ self.told.setdefault("law", drawn)
+        phase = self.told.setdefault("phase", float(rng.uniform(0, 2 * np.pi)))
+        self._shapes = []
+        for d in range(len(bench.clean)):
+            wave = bench.waves(d, self.told["dependence"])
+            wave = wave @ [np.cos(phase), np.sin(phase)] if wave.shape[1] == 2 else wave[:, 0]
+            self._shapes.append(wave[:, None] * law)
+        self._shapes = np.array(self._shapes) / max(np.abs(self._shapes).max(), 1e-12)
+
+    def _draw_cell(self, rng):
+        self._choose("place", self.bench.places)
+        self._choose("kind", ACTIONS)
+        self._choose_dependence(rng)
+        self._draw_law(rng)
+
+    def _choose_dependence(self, rng):
+        if self.told.get("dependence", "").startswith("step:"):
+            return
+        if self._choose("dependence", self.bench.dependences).startswith("step:"):
+            # at any frame but the first and the last
+            self.told["dependence"] = f"step:{rng.integers(4, self.bench.clean[0].n_frames - 4)}"
+
+    def _draw_absorbed(self, rng):
+        if "place" not in self.told:
+            self.told |= self.bench.taken_up(_TAKEN_UP)
+        self.told["type"], self.largest = "cell", 0.05
+        self._draw_cell(rng)
+
+    def _draw_detector(self, rng):
+        self.told["place"], self.largest = "detector", _LARGEST_SHARE
+        if self._choose("kind", ("gain", *DETECTOR)) == "gain":
+            self._choose_dependence(rng)
+            self._draw_law(rng)
+            return
+        # what is added is never negative
+        self.told["dependence"] = "constant"
+        self._draw_law(rng, 0.2)
+        self.told["dependence"] = DETECTOR[self.told["kind"]]
+        if self.told["kind"] == "background_of_one_beam":
+            self._choose("beam", ("right", "left"))
+
+    def _draw_frame(self, rng):
+        sets, what = self.bench.clean, self._choose("what", _FRAME_FAULTS)
+        name = self._choose("dataset", [clean.name for clean in sets])
+        self.place = [clean.name for clean in sets].index(name)
+        n = sets[self.place].n_frames
+        frame = self._choose("frame", range(n))
+        self.told["with"] = None
+        if what == "exchanged":
+            # with one that was taken soon after or before
+            self.told["with"] = (frame + int(rng.integers(1, 6))) % n
+        self.largest, self.sign = _LARGEST_SHARE, rng.choice((-1, 1))
+
+    def _draw_mechanism(self, rng):
+        what = self._choose("what", _MECHANISMS)
+        self.largest = _LARGEST_SHARE
+        self.stage = str(rng.choice(("hwp", "derotator")))
+        if what in ("hysteresis", "wander", "jitter"):
+            self.told["stage"] = self.stage
+            self._angles = [self._wandering(clean, rng) for clean in self.bench.clean]
+        elif what == "ghost":
+            self.told["optic"] = self.stage
+        elif what == "fringes":
+            self.told["place"] = str(rng.choice(self.bench.places[2:]))
+            self.told["kind"] = str(rng.choice(("retardance_h", "diattenuation_h")))
+            phase = 2 * np.pi * rng.uniform(2, 5) * np.linspace(0, 1, len(self.bench.micron))
+            turn = rng.choice((1, 2, 4))
+            angles = [clean.position(self.stage) for clean in self.bench.clean]
+            self._shapes = [np.cos(phase + turn * angle[:, None]) for angle in angles]
+
+    def _wandering(self, clean, rng):
+        """Return errors of an angle through a run, the largest one."""
+        if self.told["what"] == "hysteresis":
+            # each move pulls, and what was pulled goes back slowly
+            angle = clean.position(self.stage)
+            pull, found = np.diff(angle, prepend=angle[:1]), np.zeros(len(angle))
+            for i in range(1, len(angle)):
+                found[i] = 0.8 * found[i - 1] + pull[i]
+        else:
+            found = rng.normal(0, 1, clean.n_frames)
+            found = np.cumsum(found) if self.told["what"] == "wander" else found
+        return found / np.abs(found).max()
+
+    def _draw_listed(self, rng):
+        self.amplitude = 1.0
+        bench, name = self.bench, self.told.get("effect")
+        known = EFFECTS.values() if name is None else [get_effect(name)]
+        fitting = [e for e in known if e.kind != "discrete" and e.applies(bench.chains)]
+        if not fitting:
+            raise GapError(f"effect = {name!r} has no place on the bench")
+        effect = fitting[rng.integers(len(fitting))]
+        self.told["effect"] = effect.name
+        middle = [np.median(o.flux_right + o.flux_left) / 2 for o in bench.clean]
+        context = Context(bench.micron, float(np.median(middle)))
+        self._edit = lambda: effect.edit([chain.copy() for chain in bench.chains], context)
+        edit = self._edit()
+        self._laws = {p.name: _law(p, edit.chains, rng) for p in edit.parameters}
+        self._absent = {p.name: p.canonical_neutral for p in edit.parameters}
+        sizes = [p.canonical_limit / np.abs(self._laws[p.name]).max() for p in edit.parameters]
+        self.largest = 0.9 * min(sizes) if sizes else 1.0
+
+    @property
+    def is_whole(self):
+        """Whether it is there or not, without a size."""
+        return self.told.get("what") == "exchanged"
+
+    def cells(self, residual, fit):
+        """Return the share of its signal that each cell carries; its own is all of it."""
+        own = [self.told.get(key) for key in ("place", "kind", "dependence")]
+        step = own[2] if own[2] and own[2].startswith("step:") else None
+        found = self.bench.shares(residual, fit, step)
+        return {**found, "/".join(own): 1.0} if all(own) else found
+
+    # ---- what it does ---------------------------------------------------------------------------
+
+    def kicks(self, dataset):
+        """Return place, kind and exponents (F, W) of small Mueller matrices."""
+        told = self.told
+        if told["type"] == "cell" or told.get("what") == "fringes":
+            return [(told["place"], told["kind"], self.amplitude * self._shapes[dataset])]
+        return []
+
+    def moves(self, dataset):
+        """Return errors of the angles of stages, radian."""
+        told = self.told
+        if told["type"] == "mechanism" and "stage" in told:
+            return {told["stage"]: self.amplitude * self._angles[dataset]}
+        if told["type"] != "frame" or dataset != self.place or "angle" not in told["what"]:
+            return {}
+        error = np.zeros(self.bench.clean[dataset].n_frames)
+        error[told["frame"]] = self.sign * self.amplitude
+        return {told["what"].split()[0]: error}
+
+    def optics(self, dataset):
+        """Return the optics with an effect of the library, None without."""
+        if self.told["type"] != "listed":
+            return None
+        edit = self._edit()
+        for name, law in self._laws.items():
+            value = self._absent[name] + self.amplitude * law
+            _put(edit.chains, name, value)
+            for target, tie in edit.ties.items():
+                if tie.source == name:
+                    _put(edit.chains, target, tie.factor * value)
+        return self.bench.split(edit.chains[dataset])
+
+    def detected(self, dataset, flux):
+        """Return the fluxes (2, F, W) as the detector gives them."""
+        told, bench = self.told, self.bench
+        if told["type"] == "detector":
+            size = self.amplitude * self._shapes[dataset]
+            if told["kind"] == "gain":
+                return flux * np.stack([1 + size, 1 - size])
+            beams = {"right": (1, 0), "left": (0, 1)}.get(told.get("beam"), (1, 1))
+            added = size * bench.glow(dataset, told["kind"], flux)
+            return flux + np.array(beams)[:, None, None] * added
+        if told["type"] != "frame" or dataset != self.place or "angle" in told["what"]:
+            return flux
+        flux, i, j = flux.copy(), told["frame"], told["with"]
+        if told["what"] == "one beam":
+            flux[0, i] *= 1 + self.sign * self.amplitude
+            return flux
+        seen = flux * bench.bright[dataset]
+        seen[:, [i, j]] = seen[:, [j, i]]
+        return seen / bench.bright[dataset]
+
+
+def _carriers(chains, name):
+    """Return the optics that have a parameter, and its key."""
+    optic, key = name.split(".")
+    return [leaf for chain in chains for leaf in leaves(chain) if leaf.name == optic], key
+
+
+def _law(parameter, chains, rng):
+    """Return a random law, in canonical units and of the parameter's usual size."""
+    found, key = _carriers(chains, parameter.name)
+    n, scale = np.size(getattr(found[0], key).value), parameter.canonical_scale
+    if n == 1:
+        return scale * rng.normal()
+    basis = np.eye(n) if parameter.basis is None else parameter.basis
+    k = basis.shape[1]
+    # an effect that is free at each wavelength is tried where it is sharp
+    if n == k and k > 3:
+        # a resonance anywhere
+        at, width = rng.uniform(0, n), rng.uniform(0.5, 0.3 * n)
+        return scale * rng.normal() / (1 + ((np.arange(n) - at) / width) ** 2)
+    law = basis @ (rng.normal(0, 1, k) / (1 + np.arange(k)))
+    if parameter.is_retained:
+        # no optic gives more polarization than there is
+        law = -(law - law.min() + 0.3 * (np.ptp(law) + 0.1))
+    return scale * law
+
+
+def _put(chains, name, value):
+    found, key = _carriers(chains, name)
+    for leaf in found:
+        parameter = getattr(leaf, key)
+        unit = 1 if parameter.unit is None else parameter.unit
+        factor = 1.0 if parameter.unit is None else canonical_factor(unit)
+        setattr(leaf, key, np.broadcast_to(value / factor, parameter.shape) * unit)
