@@ -93,6 +93,10 @@ class Candidate:
             return replace(self, degree=None)
         return replace(self, context=replace(context, degree=None))
 
+    def cost(self, temper):
+        """Return what its freedom costs, in the logarithm of the evidence."""
+        return 0.5 * self.statistic / temper - (self.tempered(temper).evidence - self.prior)
+
     @cached_property
     def effect(self):
         """The cause as an effect that can be fitted."""
@@ -181,6 +185,34 @@ class Scan:
                 found = _of_cell(self.probes, candidate.cell, degree, self.temper)
             best = max([best, *found], key=lambda one: one.evidence)
         return best
+
+    def named_as(self, candidate, effects):
+        """
+        Return the names of a cell, each with the law for which there is most evidence.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            A cell.
+        effects : sequence of Effect
+            The library.
+
+        Returns
+        -------
+        list of Candidate
+        """
+        chains, own = self.probes.model.trains, set(self.probes.model.added)
+        same = [
+            effect
+            for effect in effects
+            if effect.name not in own and candidate.cell in effect.cells(chains)
+        ]
+        best = {}
+        for degree in (*_DEGREES, *_FREER) if same else ():
+            for one in _named(self.probes, same, self.temper, degree):
+                if one.name not in best or best[one.name].evidence < one.evidence:
+                    best[one.name] = one
+        return list(best.values())
 
     @property
     def best(self):
@@ -362,6 +394,9 @@ def _of_batch(probes, edited, parameters, ties, effects, temper):
             continue
         parts = [(problem.slices[p.name], p.canonical_scale) for p in own]
         rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
+        if not rows.size:
+            # a law less its constant, of no degree, is nothing
+            continue
         size = np.concatenate([np.full(w.stop - w.start, scale) for w, scale in parts])
         square = gram[np.ix_(rows, rows)] * size[:, None] * size
         values, share = (part[0] for part in _spectra(square[None], (target[rows] * size)[None]))

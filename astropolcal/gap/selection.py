@@ -23,11 +23,15 @@ __all__ = ["Group", "Selection", "select"]
 _RETEMPERED = 400
 # fits on the way to the answer need not be carried to the end
 _QUICK = {"steps": 6, "share": 1e-3}
+# causes are looked at beside all the others so many times
+_TURNS = 1
+# log evidence by which a name may be behind its cell, and a rival has to be ahead
+_AS_GOOD, _CLEARLY = 1.0, 3.0
 #: Residuals less probable than this are no noise.
 REMAINDER = 1e-4
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
 ENOUGH = 9.0
-_MOST = 6
+_MOST = 8
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
 _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
@@ -37,7 +41,7 @@ _SAME = 1e-6
 _ALIAS, _MOST_ALIASES = np.exp(-7.0), 40
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
 # needs
-_UNLISTED = (0.0, 0.02, 0.06, 0.4, 0.7, 0.85, 0.9)
+_UNLISTED = (0.0, 0.02, 0.06, 0.4, 0.7, 0.85, 0.9, 0.92, 0.95)
 # above this mean square the residuals are no noise
 _STRUCTURED = 1.5
 # share of the gap that an answer may leave before it is doubtful
@@ -166,12 +170,12 @@ def select(base, library, groups, say, *, cells=True):
     best, left = _search(base, library, first, say, cells)
     if not best.chosen:
         return Selection([], base, first, first, 0.0, [_errors(base, groups)])
-    best = _freed(base, best)
+    best, scans = _exchanged(base, best, library, first, say, cells)
     best = replace(best, model=best.model.polished())
     best, models, history = _checked(base, best, groups, say)
     left = left if best.model is models[-1] and left is not None else None
     unlisted = _unlisted(base, best)
-    found = _grouped(base, best, models, library, first, unlisted, cells)
+    found = _grouped(best, models, scans, unlisted)
     return Selection(found, best.model, first, left, unlisted, history)
 
 
@@ -286,22 +290,65 @@ def _extended(evidence, state, candidate):
     return _State(model, [*state.chosen, candidate], evidence + 0.5 * gained / temper)
 
 
-def _freed(base, best):
-    """Give causes one value a wavelength where the data ask for it."""
-    for i, one in enumerate(best.chosen):
-        loose = one.freed(base.context)
-        chosen = [loose if other is one else other for other in best.chosen]
-        model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
-        more = model.problem.size - best.model.problem.size
-        if more <= 0 or not model.is_physical(loose.name):
-            continue
-        scale = max(1.0, model.mean_square)
-        freedom = max(model.problem.n_data - model.problem.size, 1)
-        gain = (best.model.fit.chi2 - model.fit.chi2) / scale - more * np.log(freedom)
-        if gain > 0:
-            chosen[i] = replace(loose, evidence=one.evidence + gain / 2)
-            best = _State(model, chosen, best.evidence + gain / 2)
-    return best
+def _exchanged(base, best, library, first, say, cells):
+    """
+    Return the set with every cause the best beside all the others, and the scans beside these.
+
+    What was chosen first was chosen while the others were missing: its law in wavelength may be too
+    stiff, another cause may do better, and a name may do as well as the cell that it is.
+    """
+    scans = {}
+    for turn in range(_TURNS if best.chosen else 0):
+        before = best
+        for one in reversed(best.chosen):
+            others = [other for other in best.chosen if other is not one]
+            if turn and others == scans.get(one.name, (None,))[0]:
+                continue
+            say(f"beside all the others: {one.effect.title}")
+            model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
+            found = first if not others else _scanned(model, library, cells)
+            scans[one.name] = (others, found)
+            fresh = _best_beside(found, one, library)
+            if fresh is None or (fresh.name, fresh.degree) == (one.name, one.degree):
+                continue
+            place = best.chosen.index(one)
+            chosen = [*best.chosen[:place], fresh, *best.chosen[place + 1 :]]
+            model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
+            if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
+                scans[fresh.name] = scans.pop(one.name)
+                best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
+        if best is before:
+            break
+    return best, {name: found for name, (_, found) in scans.items()}
+
+
+def _best_beside(found, own, library):
+    """Return the best candidate of a scan; its own again, with a name or another law, if alike."""
+    few = [found.freer(one) for one in _distinct(found.candidates, _FITTED[1])]
+    mine = [found.freer(one) for one in found.candidates if one.name == own.name]
+    names = [
+        name
+        for one in [*few, *mine]
+        if not one.is_named
+        for name in found.named_as(one, library)
+        if name.evidence > one.evidence - _AS_GOOD
+    ]
+    rivals = [*few, *mine]
+    if not rivals:
+        return None
+    best = max(rivals, key=lambda one: one.evidence)
+    if mine and best.evidence < mine[0].evidence + _CLEARLY:
+        best = mine[0]
+    # a name is given where it does as well as its cell
+    as_good = [one for one in names if one.evidence > best.evidence - _AS_GOOD]
+    return max(as_good, key=lambda one: one.evidence, default=best)
+
+
+def _gains(new, fresh, old, one):
+    """Whether a full fit with another cause keeps what the scan promised."""
+    scale = max(1.0, min(new.mean_square, old.mean_square))
+    lost = 0.5 * (new.fit.chi2 - old.fit.chi2) / scale
+    return lost < max(one.cost(scale) - fresh.cost(scale), 0.0) + _CLEARLY
 
 
 def _unlisted(base, best):
@@ -316,19 +363,13 @@ def _unlisted(base, best):
     return 1 - (1 - prior) * np.exp(-share / _LEFT)
 
 
-def _grouped(base, best, models, library, first, unlisted, cells):
+def _grouped(best, models, scans, unlisted):
     """Return the causes with their alias groups and probabilities."""
     found = []
-    for i, one in enumerate(best.chosen):
-        others = [other for other in best.chosen if other is not one]
-        if others:
-            model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
-            beside = _scanned(model, library, cells)
-        else:
-            model, beside = base, first
-        members = _members(one, beside)
+    for one, model in zip(best.chosen, models, strict=True):
+        members = _members(one, scans[one.name])
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
-        found.append(Group(members, float((1 - unlisted) * chance), models[i]))
+        found.append(Group(members, float((1 - unlisted) * chance), model))
     return found
 
 

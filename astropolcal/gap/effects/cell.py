@@ -40,8 +40,8 @@ class CellEffect(Effect):
             cell.name,
             cell.title,
             Where({"in": "inside"}.get(relation, relation), optic or None),
-            cell.kind,
-            cell.dependence,
+            # what only a detector has is put in by itself, see `edit`
+            *((cell.kind, cell.dependence) if cell.kind in GENERATORS else ("gain", "constant")),
             degree,
             category="cell",
             words=cell.place,
