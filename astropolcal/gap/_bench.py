@@ -278,7 +278,7 @@ class Bench:
             move = np.diff(clean.position(rest[0]), prepend=clean.position(rest[0])[:1])
             # what stands has moved last where it moved last
             last = np.maximum.accumulate(np.where(move != 0, np.arange(n), 0))
-            wave = move[last] < 0 if head == "direction" else np.abs(move)
+            wave = move[last] < 0 if head == "direction" else move
         else:
             wave = {
                 "constant": lambda: np.ones(n),

@@ -33,7 +33,14 @@ _TOGETHER = 20
 #: Prior odds of a name against a cell of the table.
 NAMED = 5.0
 # log prior odds of dependences: what changes needs a reason
-_DEPENDENCE = {"constant": 0.0, "step": -5.0, "direction": -1.5, "move": -1.5, "time2": -1.0}
+_DEPENDENCE = {
+    "constant": 0.0,
+    "step": -5.0,
+    "direction": -1.5,
+    "move": -1.5,
+    "time2": -1.0,
+    "dataset": -2.0,
+}
 _OTHER = -0.5
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-9

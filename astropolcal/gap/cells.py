@@ -279,8 +279,7 @@ def dependences(problem, most_steps=_MOST_STEPS):
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
     names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
-    sources = [o.source for o in (d.observations for d in problem.datasets)]
-    if len(set(sources)) < len(sources):
+    if len(problem.datasets) > 1:
         names += [f"dataset:{d.observations.name}" for d in problem.datasets]
     names += [f"step:{n}" for n in _steps(problem, most_steps)]
     found = {}
