@@ -336,8 +336,12 @@ class Probes:
     ----------
     model : Model
         The fitted model.
-    tangent : `~numpy.ndarray`, optional
-        Orthonormal basis of what the model can do already, (n_rows, rank), if known.
+    without : collection of str
+        Names of effects of the model that are taken out, to first order.
+    slopes : dict, optional
+        Derivatives at the places, if they are known.
+    most_steps : int
+        Steps are looked for at so many frames.
 
     Examples
     --------
@@ -354,18 +358,17 @@ class Probes:
     6
     """
 
-    def __init__(self, model, tangent=None, most_steps=_MOST_STEPS):
-        self.model, problem = model, model.problem
-        self.problem = problem
-        coefficients = model.fit.coefficients
-        self.tangent = problem.tangent(coefficients) if tangent is None else tangent
-        residual = problem.residual(coefficients)
-        self.residual = residual - self.tangent @ (self.tangent.T @ residual)
+    def __init__(self, model, without=(), slopes=None, most_steps=_MOST_STEPS):
+        self.model, self.problem = model, model.problem
+        problem, linear = model.problem, model.without(without)
+        self.tangent, self.residual = linear.tangent, linear.residual
+        #: Names of the effects that are in the model.
+        self.own = set(model.added) - set(without)
         #: A function of the frame that is one everywhere, of each dataset.
         self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
         self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
-        self.slopes = self._at_places()
+        self.slopes = self._at_places() if slopes is None else slopes
         parts = list(zip(problem.channels, problem.segments, strict=True))
         #: Tangent and lamp with the frames first, (F, rows of a frame, rank), one a dataset.
         self.by_frame = [_frames_first(self.tangent[rows], c.shape) for c, rows in parts]

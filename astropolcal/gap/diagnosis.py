@@ -289,12 +289,9 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
     causes = [_exchanged(nominal, base, exchanged, total)] if exchanged else []
-    before = base
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
-        explained = (before.fit.chi2 - group.model.fit.chi2) / total
-        causes.append(_cause(group, improved, explained, *errors[i : i + 2]))
-        before = group.model
+        causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
     left_p = improved.p_value
     return Diagnosis(
         verdict=_verdict(causes, nominal, left_p),

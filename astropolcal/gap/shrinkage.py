@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.exceptions import GapError
+from astropolcal.gap.model import Linear
 
 __all__ = ["HeldOut", "foreseen", "frame_groups", "held_out", "left_out_fits"]
 
@@ -226,8 +227,8 @@ def foreseen(model, groups):
 
     Parameters
     ----------
-    model : Model
-        The fitted model.
+    model : Model or Linear
+        The fitted model, or one from which effects were taken.
     groups : tuple
         As `frame_groups` gives them.
 
@@ -236,9 +237,9 @@ def foreseen(model, groups):
     HeldOut
     """
     labels, numbers = groups
-    problem = model.problem
-    tangent = problem.tangent(model.fit.coefficients)
-    residual, sizes = model.residual, [c.shape for c in problem.channels]
+    linear = model if isinstance(model, Linear) else model.without(())
+    problem, tangent, residual = linear.model.problem, linear.tangent, linear.residual
+    sizes = [c.shape for c in problem.channels]
     squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
     for i in range(len(labels)):
         rows, scale = [], []
