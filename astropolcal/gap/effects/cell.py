@@ -1,7 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """A cell of the table of places, kinds and dependences, as an effect that can be fitted."""
 
-from astropolcal.gap.effects.effect import Effect, Where
+from astropolcal.gap.effects.effect import Effect
+from astropolcal.gap.effects.where import Where
 
 __all__ = ["CellEffect"]
 
