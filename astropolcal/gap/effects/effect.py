@@ -326,7 +326,8 @@ class Effect:
                 return scale * (u.rad if unit else 1), limit * (u.rad if unit else 1)
         sizes = limit / 10 if scale is None else scale, limit
         # perturbations are plain numbers, in radian where they are angles
-        return sizes if self.inserted is not None else tuple(_plain(size) for size in sizes)
+        is_plain = self.inserted is None and type(self).put is Effect.put
+        return tuple(_plain(size) for size in sizes) if is_plain else sizes
 
     def law(self, context, chains=()):
         """Return the law of its parameters in wavelength, None for a single number."""
@@ -394,8 +395,10 @@ class Effect:
         one.name, one.mount = label, one.mount or place.mount
         if self.flux is not None:
             one.reference = self.flux * context.flux
-        if (_has_axes(one) and self.where.relation == "inside") or self.where.turned is not None:
-            one.theta = np.rad2deg(place.theta) * u.deg
+        where = self.where
+        inside = where.relation == "inside" and _has_axes(one)
+        if anchor is not None and (inside or where.turned is not None):
+            one.theta = (anchor.theta.value + (where.turned or 0.0)) * u.deg
         for key in one.param_names:
             getattr(one, key).fixed = key not in (*free, *self.equal)
         return one
