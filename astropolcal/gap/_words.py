@@ -456,12 +456,17 @@ def _cause_lines(entry):
 def exposure(entry, causes):
     """Return an exposure in words, and what it is for, causes by their ranks."""
     ranks = {one["name"]: one["rank"] for one in causes}
+    among = {alias["name"]: one["rank"] for one in causes for alias in one["aliases"]}
     known = [f"cause {ranks[name]}" for name in entry["separates"] if name in ranks]
-    if not known:
+    others = [f"cause {among[n]}" for n in entry["separates"] if n in among and n not in ranks]
+    others = list(dict.fromkeys(others))
+    if not known and not others:
         return entry["words"]
-    take, rest = entry["words"].partition(": ")[0], len(entry["separates"]) - len(known)
-    others = f" from {'what it may be' if rest == 1 else f'{rest} others'}" if rest else " apart"
-    return f"{take}: tells {listed(known)}{others} ({entry['gain']:.2g} standard deviations)"
+    for_what = f"tells {listed(known)} " if known else f"tells apart what {listed(others)} may be "
+    for_what += "from what it may be " * bool(known and others)
+    take, gain = entry["words"].partition(": ")[0], entry["gain"]
+    gain = f"{gain:.0f}" if gain >= 10 else f"{gain:.1f}"
+    return f"{take}: {for_what}({gain} standard deviations)"
 
 
 def _numbered(title, texts, before=0):
