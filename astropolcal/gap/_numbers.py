@@ -7,12 +7,11 @@ from functools import cached_property
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration import accuracy_table, calibrate, target_accuracies
+from astropolcal.calibration import calibrate, target_accuracies
 from astropolcal.calibration._directions import ranked
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.gap.problem import OPEN, TOUCHES
-from astropolcal.gap.shrinkage import frame_groups, left_out_fits
 from astropolcal.measurement import Measurement
 from astropolcal.optics import Perturbation
 
@@ -243,64 +242,47 @@ class Doubles:
 
 def accuracies(model, cross_validate=True):
     """
-    Return the accuracies of normalized single differences, ready for JSON.
+    Return what `calibrate` says of a model, with the sizes of its causes held, ready for JSON.
 
-    ``rms_percent`` is the root mean square over all data: of left-out frames, or of
-    the fit where there is no cross-validation; ``double_rms_percent`` that of the double
-    differences, and ``targets`` what the model is good for on sky, both as `calibrate` says it.
+    ``rms_percent`` is the root mean square of the double differences over all data: of left-out
+    frames, or of the fit where there is no cross-validation. Where such a calibration is not
+    possible it is None, and the lists are empty.
     """
-    held_out = _held_out(model) if cross_validate else None
-    measurement = model.problem.measurement
-    residuals = _flat(model, model.fit.coefficients)
-    tables = [
-        accuracy_table(measurement, i, residuals, held_out)
-        for i in range(len(measurement.datasets))
-    ]
-    judged = residuals if held_out is None else held_out
-    return {
-        "observable": "normalized_single_difference",
-        "rms_percent": 100 * float(np.sqrt(np.nanmean(judged**2))),
-        "datasets": [
-            {"name": o.name, "source": o.source}
-            | {f"{key}_percent": _median(table[key].value) for key in ACCURACIES}
-            for o, table in zip(model.observations, tables, strict=True)
-        ],
+    instrument = next((o.instrument for o in model.observations if o.instrument), None)
+    found = {
+        "observable": "normalized_double_difference",
         "wavelength_nm": _number(1e3 * model.problem.wavelength),
-        "rms_percent_per_wavelength": _per_wavelength(measurement, judged),
-    } | _of_calibrate(model, cross_validate)
-
-
-def _flat(model, coefficients):
-    """Return observed minus predicted differences in the order of the data, (n_data,)."""
-    problem = model.problem
-    gaps = problem.differences(coefficients)
-    parts = zip(gaps, problem.channels, problem.datasets, strict=True)
-    return np.concatenate([np.where(c.valid, g[0], np.nan)[d.valid] for g, c, d in parts])
-
-
-def _held_out(model):
-    """Return the differences of every datum predicted by a fit without its group."""
-    labels, numbers = frame_groups(model.observations)
-    problem = model.problem
-    found = np.full(problem.measurement.n_data, np.nan)
-    group = np.concatenate(
-        [n[d.group_of_datum] for n, d in zip(numbers, problem.datasets, strict=True)]
-    )
-    for i, fit in enumerate(left_out_fits(model, labels, numbers)):
-        found[group == i] = _flat(model, fit.coefficients)[group == i]
-    return found
-
-
-def _median(values):
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else None
-
-
-def _per_wavelength(measurement, residuals):
-    """Return the root mean square at each wavelength over all datasets, in percent."""
-    bins = np.concatenate([d.bin_of_datum for d in measurement.datasets])
-    squares = [residuals[bins == b] ** 2 for b in range(len(measurement.wavelength))]
-    return _number([100 * np.sqrt(np.nanmean(s)) if s.size else np.nan for s in squares])
+        "rms_percent": None,
+        "datasets": [],
+        "targets": [],
+    }
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AstropolcalWarning)
+            calibration = with_causes(model, cross_validate=cross_validate, instrument=instrument)
+            targets = target_accuracies(calibration)
+    except AstropolcalError:
+        return found
+    tables = [record.accuracy for record in calibration.datasets]
+    count = np.concatenate([table["n"] for table in tables])
+    gap = np.concatenate([table["s_cv" if cross_validate else "s_res"].value for table in tables])
+    return found | {
+        "rms_percent": float(np.sqrt(np.nansum(count * gap**2) / count.sum())),
+        "datasets": [
+            {"name": record.name, "source": record.source}
+            | {f"{key}_percent": _median(record.accuracy[key].value) for key in ACCURACIES}
+            for record in calibration.datasets
+        ],
+        "targets": [
+            {
+                "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
+                "s_p_percent": _median(table["s_p"].to_value(u.percent)),
+                "s_chi_deg": _median(table["s_chi"].to_value(u.deg)),
+                "words": table.meta["words"],
+            }
+            for table in targets
+        ],
+    }
 
 
 def with_causes(model, **options):
@@ -321,28 +303,6 @@ def with_causes(model, **options):
     )
 
 
-def _of_calibrate(model, cross_validate):
-    """Return what `calibrate` says of a model, with the sizes of its causes held."""
-    instrument = next((o.instrument for o in model.observations if o.instrument), None)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AstropolcalWarning)
-            calibration = with_causes(model, cross_validate=cross_validate, instrument=instrument)
-            targets = target_accuracies(calibration)
-    except AstropolcalError:
-        return {"double_rms_percent": None, "targets": []}
-    tables = [record.accuracy for record in calibration.datasets]
-    count = np.concatenate([table["n"] for table in tables])
-    gap = np.concatenate([table["s_cv" if cross_validate else "s_res"].value for table in tables])
-    return {
-        "double_rms_percent": float(np.sqrt(np.nansum(count * gap**2) / count.sum())),
-        "targets": [
-            {
-                "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
-                "s_p_percent": _median(table["s_p"].to_value(u.percent)),
-                "s_chi_deg": _median(table["s_chi"].to_value(u.deg)),
-                "words": table.meta["words"],
-            }
-            for table in targets
-        ],
-    }
+def _median(values):
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else None

@@ -489,7 +489,7 @@ def _where_lines(title, where):
 def _accuracy_lines(content, keys):
     """Return the accuracies of each dataset and for targets, before and after."""
     heads = "".join(f"{key:^19}" for key in keys).rstrip()
-    rows = ["Accuracy of single differences before -> after, percent, median over wavelengths"]
+    rows = ["Accuracy that calibrate states, before -> after, percent, median over wavelengths"]
     rows.append(f"  {'':<20}{heads}")
     for old, new in _pairs(content, "datasets"):
         cells = (_arrow(old[f"{key}_percent"], new[f"{key}_percent"]) for key in keys)

@@ -92,9 +92,9 @@ def to_dict(diagnosis):
         "exchanged": exchanged,
         "cross_validated": crossed,
         "noise_floor_percent": diagnosis.noise_floor_percent,
-        "gap_before_percent": before["rms_percent"],
-        "gap_after_percent": after["rms_percent"],
-        "shrinkage_percent": _shrinkage(diagnosis, before, after),
+        "gap_before_percent": diagnosis.gap_before_percent,
+        "gap_after_percent": diagnosis.gap_after_percent,
+        "shrinkage_percent": _shrinkage(diagnosis),
         "double_difference": _double(fitted, before, after),
         "gap_p_value": diagnosis.gap_p_value,
         "remainder_p_value": diagnosis.remainder_p_value,
@@ -122,16 +122,15 @@ def _nominal(model):
 
 def _double(fitted, before, after):
     """Return gap and noise of the double differences, None where there are none."""
-    gaps = {"before_percent": before["double_rms_percent"]}
-    gaps["after_percent"] = after["double_rms_percent"]
+    gaps = {"before_percent": before["rms_percent"], "after_percent": after["rms_percent"]}
     if fitted.doubles is None or None in gaps.values():
         return None
     return gaps | {"noise_percent": fitted.doubles.noise_percent}
 
 
-def _shrinkage(diagnosis, before, after):
+def _shrinkage(diagnosis):
     """Return by how much the mean square of the gap is lower, with its 68 % interval."""
-    value = 100 * (1 - (after["rms_percent"] / before["rms_percent"]) ** 2)
+    value = 100 * (1 - (diagnosis.gap_after_percent / diagnosis.gap_before_percent) ** 2)
     found = {"value": value, "low": None, "high": None}
     smooth = all(cause.effect.kind != "discrete" for cause in diagnosis.causes)
     if len(diagnosis.held_out) > 1 and smooth:
@@ -260,16 +259,9 @@ def causes_table(diagnosis):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap import diagnose
+    >>> from types import SimpleNamespace
     >>> from astropolcal.gap.report import causes_table
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> wavelength = [1.2, 1.3, 1.45, 1.6, 1.9, 2.2] * u.um
-    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=wavelength)
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, wavelength, frames, seed=1)
-    >>> len(causes_table(diagnose(chain, data)))
+    >>> len(causes_table(SimpleNamespace(causes=[])))
     0
     """
     causes = diagnosis.causes

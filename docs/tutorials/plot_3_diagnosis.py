@@ -79,8 +79,9 @@ print(summary(diagnosis))
 # How to read it
 # --------------
 #
-# First comes what the model lacks, with its probability; then how large the gap is, on frames that
-# were left out of the fit, in double and in single differences, beside the noise; then what is left.
+# First comes what the model lacks, with its probability; then how large the gap is on frames that
+# were left out of the fit, in double and in single differences beside the noise; then what is
+# left.
 
 causes = causes_table(diagnosis)
 print(causes["rank", "effect", "probability", "explained"])
@@ -93,8 +94,8 @@ figure = plt.figure(figsize=(6.4, 4.6))
 plot_cause_map(diagnosis, figure=figure)
 
 # %%
-# The residuals frame by frame, before and after, with what the causes do. Unequal gains are the same
-# in all frames; what turns with the half-wave plate goes up and down.
+# The residuals frame by frame, before and after, with what the causes do. Unequal gains are the
+# same in all frames; what turns with the half-wave plate goes up and down.
 
 figure = plt.figure(figsize=(9, 6.4))
 plot_gap_frames(diagnosis, figure=figure)

@@ -118,6 +118,9 @@ def test_gap_is_that_of_left_out_frames(found, content):
     assert not fit["cross_validated"]
     assert fit["gap_after_percent"] < fit["gap_before_percent"]
     assert fit["accuracy_before"]["datasets"][0]["s_cv_percent"] is None
+    assert fit["double_difference"]["before_percent"] != pytest.approx(
+        content["double_difference"]["before_percent"]
+    )
 
 
 def test_unequal_gains_cancel_in_double_differences(content):
