@@ -24,8 +24,8 @@ _SAME = 0.5
 _UNLIKELY = 0.05
 # a share of a signal below this is none
 _CANCELS = 0.02
-# degree of polarization of the target that a sentence is about, percent
-_TARGET = 1.0
+# so many targets on sky stand in the summary
+_TARGETS = 2
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 
 
@@ -382,16 +382,17 @@ def _what_is_left(content):
 
 def _on_sky(content):
     """Return what calibrate claims with the nominal and with the improved model."""
-    pairs = [pair for pair in _pairs(content, "targets") if pair[0]["dolp_percent"] == _TARGET]
-    if not pairs or content["verdict"] not in ("named", "located"):
+    targets = [_target(*pair) for pair in _pairs(content, "targets")]
+    if not targets or content["verdict"] not in ("named", "located"):
         return ""
-    old, new = (
-        f"{percent(one['s_p_percent'], 2)} % and {percent(one['s_chi_deg'], 2)} deg"
-        for one in pairs[0]
-    )
+    words = "Errors on sky that calibrate claims, with the nominal -> with the improved model: "
+    return f"{words}{'; '.join(targets[:_TARGETS])}. --save keeps the improved one."
+
+
+def _target(old, new):
     return (
-        f"On sky, calibrate claims to know a target of {_TARGET:g} % to {old} with the nominal "
-        f"model, and to {new} with the improved one, which --save keeps."
+        f"target of {old['dolp_percent']:g} %: {change(old['s_p_percent'], new['s_p_percent'])} %, "
+        f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
     )
 
 
@@ -427,9 +428,10 @@ def _wrapped(lines):
     for line in lines:
         # continued lines begin under the words, not under the bullet, the number or the share
         ends = " " * len(re.match(r"\s*(?:- |\d+\. |\d+ %  )?", line).group())
-        yield from textwrap.wrap(
-            line, _WIDTH, subsequent_indent=ends, break_on_hyphens=False, drop_whitespace=True
-        ) or [""]
+        # a number stays with its unit
+        kept = re.sub(r"(?<=\d) (?=(%|deg)\b|%)", "\N{NO-BREAK SPACE}", line)
+        broken = textwrap.wrap(kept, _WIDTH, subsequent_indent=ends, break_on_hyphens=False)
+        yield from (one.replace("\N{NO-BREAK SPACE}", " ") for one in broken or [""])
 
 
 def _table_lines(causes):
@@ -489,17 +491,13 @@ def _where_lines(title, where):
 def _accuracy_lines(content, keys):
     """Return the accuracies of each dataset and for targets, before and after."""
     heads = "".join(f"{key:^19}" for key in keys).rstrip()
-    rows = ["Accuracy that calibrate states, before -> after, percent, median over wavelengths"]
+    rows = ["Accuracy that calibrate states, before -> after, median over wavelengths (%)"]
     rows.append(f"  {'':<20}{heads}")
     for old, new in _pairs(content, "datasets"):
         cells = (_arrow(old[f"{key}_percent"], new[f"{key}_percent"]) for key in keys)
         rows.append(f"  {shortened(old['name'], 19):<20}{''.join(cells)}".rstrip())
     for old, new in _pairs(content, "targets"):
-        rows.append(
-            f"  on sky, target of {old['dolp_percent']:g} %: s_p "
-            f"{change(old['s_p_percent'], new['s_p_percent'])} %, s_chi "
-            f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
-        )
+        rows.append(f"  on sky, {_target(old, new)}")
     return rows
 
 

@@ -76,7 +76,7 @@ def plot_cause_map(diagnosis, *, figure=None):
     shown = [k for k in _FAMILIES if k != _OTHER or any(k in row for row in rows.values())]
     table = np.array([[row.get(k, (0.0, ""))[0] for k in shown] for row in rows.values()])
     with style():
-        figure = canvas(figure, 6.4, 1.5 + 0.52 * len(rows))
+        figure = canvas(figure, 5.4, 1.6 + 0.5 * len(rows))
         axes = figure.subplots()
         # one hue from white to dark: it is the same for all kinds of colour vision, and in print
         axes.imshow(table, cmap="Blues", vmin=0, vmax=1, aspect="auto")
@@ -87,10 +87,10 @@ def plot_cause_map(diagnosis, *, figure=None):
                     continue
                 look = {"ha": "center", "color": "white" if chance > _DARK else BLACK}
                 axes.text(j, i - 0.16, share(chance), va="center", weight="bold", **look)
-                axes.text(j, i + 0.22, words, va="center", fontsize=8.5, **look)
-        axes.set_xticks(range(len(shown)), labels=[k.replace(" ", "\n") for k in shown])
+                axes.text(j, i + 0.22, words, va="center", fontsize=8, **look)
+        axes.set_xticks(range(len(shown)), labels=shown, rotation=30, ha="left")
         axes.set_yticks(range(len(rows)), labels=[_place_label(place) for place in rows])
-        axes.tick_params(length=0, labelsize=9)
+        axes.tick_params(length=0, labelsize=9.5)
         axes.xaxis.tick_top()
         axes.grid(visible=False)
         for edge in np.arange(0.5, len(rows) - 1):
@@ -158,7 +158,7 @@ def _place_label(place):
     head, _, optic = place.partition(":")
     optic = {"hwp": "half-wave plate"}.get(optic, optic)
     words = {"in": f"in the {optic}", "after": f"behind the {optic}"}
-    return textwrap.fill(words.get(head, place), 18)
+    return textwrap.fill(words.get(head, place), 16)
 
 
 def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):

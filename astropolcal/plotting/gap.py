@@ -165,8 +165,8 @@ def plot_gap_frames(diagnosis, *, figure=None):
     """
     Draw the residuals frame by frame, before and after, with what the causes do.
 
-    Single differences, mean of the middle third of the wavelengths. The line is what the model
-    predicts with the causes in it, less what it predicts without.
+    Single differences, mean of that third of the wavelengths in which the causes do most. The
+    line is what the model predicts with the causes in it, less what it predicts without.
 
     Parameters
     ----------
@@ -202,7 +202,9 @@ def plot_gap_frames(diagnosis, *, figure=None):
         grid = figure.subplots(n, 1, squeeze=False)[:, 0]
         for i, axes in enumerate(grid):
             observations, order = nominal.observations[i], np.argsort(_wavelength(nominal, i))
-            third = order[len(order) // 3 : max(len(order) - len(order) // 3, 1)]
+            thirds = [part for part in np.array_split(order, 3) if part.size]
+            does = [rms(before[i][0][part] - after[i][0][part]) for part in thirds]
+            third = thirds[int(np.nanargmax(does))] if np.nanmax(does) > 0 else thirds[-1]
             old, new = (_mean(gap[i][0][third]) for gap in (before, after))
             x = np.arange(len(old)) + 0.5
             axes.axhline(0, color=GREY, linewidth=0.8)

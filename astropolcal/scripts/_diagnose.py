@@ -44,8 +44,8 @@ _SPECTRUM = (
     "drift and flicker of the lamp; the gap in percent is of the differences alone"
 )
 _FRAMES = (
-    "Residuals of the single differences frame by frame, before and after, at the middle third of "
-    "the wavelengths, with what the causes do"
+    "Residuals of the single differences frame by frame, before and after, in that third of the "
+    "wavelengths in which the causes do most, with what they do"
 )
 
 

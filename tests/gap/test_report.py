@@ -270,7 +270,7 @@ class Page(HTMLParser):
 
     @property
     def text(self):
-        return " ".join(" ".join(self.words).split())
+        return " ".join(" ".join(self.words).replace("\u2011", "-").split())
 
 
 def test_page_is_self_contained_and_complete(found, content, tmp_path):
