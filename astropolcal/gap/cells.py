@@ -285,7 +285,7 @@ def dependences(problem, most_steps=_MOST_STEPS):
     found = {}
     for name in names:
         waves = [_waves(Dependence(name), dataset) for dataset in problem.datasets]
-        if name == "constant" or any(np.ptp(w) > _SAME for w in waves) or name[:7] == "dataset":
+        if name == "constant" or np.ptp(np.concatenate(waves, axis=1), axis=1).max() > _SAME:
             found[name] = waves
     return found
 
@@ -434,7 +434,8 @@ class Probes:
         # light that is added counts as much as the source gives in the frame, in these units
         added = usual * (right + left) / np.maximum(fluxes.sum(axis=0), 1e-9 * usual)
         order = np.argsort(channel.sequence, kind="stable")
-        before = np.zeros_like(fluxes)
+        # the first frame has none before it, and its own counts, as in a chain
+        before = fluxes.copy()
         before[..., order[1:]] = fluxes[..., order[:-1]]
         afterglow = np.divide(before, fluxes, out=np.zeros_like(fluxes), where=fluxes > 0)
         half = (left - right) / 2
