@@ -288,19 +288,43 @@ def _cells(probes, temper):
         else:
             parts = list(zip(single, *reduced.normal(stacked), strict=True))
             parts += [(name, *reduced.pair(waves[name])) for name in several]
+            bent = _bent(probes, place, kind, law_basis(problem.wavelength, degree))
+            if bent is not None:
+                parts = [(n, *bent) if n == "constant" else (n, *own) for n, *own in parts]
         for name, one in _candidates(place, kind, degree, parts, scale, temper):
             if name not in best or best[name].evidence < one.evidence:
                 best[name] = one
     return [one for one in best.values() if one.name not in own]
 
 
+def _bent(probes, place, kind, law):
+    """
+    Return gram and target of a constant cell with its second derivative, None if it has none.
+
+    The derivative vanishes where a parameter is at an extremum, as half a wave is; a change shows
+    in second order then, with one sign only.
+    """
+    bend = probes.bends.get((place, kind))
+    if bend is None:
+        return None
+    gram, target = Reduced(probes, [probes.slopes[place, kind], bend], law).pair(probes.ones)
+    k = law.shape[1]
+    held = gram + np.eye(2 * k) / Cell(place, kind, "constant").scale ** 2
+    size = law @ np.linalg.solve(held, target)[k:]
+    return (gram, target) if size.mean() > 0 else None
+
+
 def _of_cell(probes, cell, degree, temper):
     """Return the candidate of one cell with a law of some degree, in a list."""
-    slopes = probes.slopes[cell.place, cell.kind]
-    reduced = Reduced(probes, slopes, law_basis(probes.problem.wavelength, degree))
-    detector = probes.is_detector(cell.kind)
-    gram, target = reduced.pair(probes.ones if detector else probes.waves[cell.dependence])
-    parts = [(cell.dependence, gram, target)]
+    law = law_basis(probes.problem.wavelength, degree)
+    both = None
+    if cell.dependence == "constant":
+        both = _bent(probes, cell.place, cell.kind, law)
+    if both is None:
+        reduced = Reduced(probes, probes.slopes[cell.place, cell.kind], law)
+        detector = probes.is_detector(cell.kind)
+        both = reduced.pair(probes.ones if detector else probes.waves[cell.dependence])
+    parts = [(cell.dependence, *both)]
     return [one for _, one in _candidates(cell.place, cell.kind, degree, parts, cell.scale, temper)]
 
 
@@ -364,7 +388,12 @@ def _named(probes, effects, temper, degree="default"):
     fitting = [e for e in effects if e.name not in probes.own and not e.absorbed_by]
     fitting = [e for e in fitting if e.name in model.added or e.applies(chains)]
     context = None if degree == "default" else replace(model.context, degree=degree)
+    law = replace(model.context, degree=degree)
     for effect in fitting:
+        bent = _bent_name(probes, effect, law, temper) if effect.name not in model.added else []
+        if bent:
+            found += [replace(one, context=context) for one in bent]
+            continue
         if effect.name in model.added:
             slopes, size = _columns_of(model.problem, model.jacobian, model.added[effect.name])
         else:
@@ -417,6 +446,27 @@ def _columns_of(problem, jacobian, parameters):
     rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
     size = np.concatenate([np.full(w.stop - w.start, p.canonical_scale) for w, p in parts])
     return jacobian[:, rows], size
+
+
+def _bent_name(probes, effect, context, temper):
+    """Return the candidate of an effect whose derivative vanishes, in a list."""
+    model = probes.model
+    cell = effect.cell(model.trains) if probes.bends else None
+    if cell is None or cell.dependence != "constant" or (cell.place, cell.kind) not in probes.bends:
+        return []
+    added = effect.edit(model.held_chains, context).parameters
+    # what is freed, instead of inserted, is no perturbation behind the optic
+    if len(added) != 1 or not added[0].name.startswith(effect.label):
+        return []
+    law = added[0].basis
+    law = np.eye(len(probes.problem.wavelength)) if law is None else law
+    bent = _bent(probes, cell.place, cell.kind, law)
+    if bent is None:
+        return []
+    scale = added[0].canonical_scale
+    (values,), (share,) = _spectra(*(part[None] for part in bent))
+    values = values * scale**2
+    return [_with_name(effect, model, values, share, temper)] if _rank(values, 1.0) else []
 
 
 def _with_name(effect, model, values, share, temper):

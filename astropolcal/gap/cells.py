@@ -38,6 +38,8 @@ _HARMONICS = (1, 2, 4)
 _MOST_STEPS = 64
 # functions of the frame that differ by less are the same
 _SAME = 1e-9
+# size (radian) of a retardance that is tried where its derivative vanishes
+FINITE = 0.1
 #: Usual size of a perturbation (radian, or a share) by kind, the scale of its prior.
 SIZES = {"retardance": 0.1, "rotation": 0.02, "diattenuation": 0.02, "depolarization": 0.05}
 _USUAL = 0.02
@@ -368,6 +370,8 @@ class Probes:
         self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
         self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
+        #: Second derivatives over the size that is tried, where they outdo the first ones.
+        self.bends = {}
         self.slopes = self._at_places() if slopes is None else slopes
         parts = list(zip(problem.channels, problem.segments, strict=True))
         #: Tangent and lamp with the frames first, (F, rows of a frame, rank), one a dataset.
@@ -417,12 +421,31 @@ class Probes:
                         continue
                     slope = np.stack([_bilinear(*part[j], generator) for part in both])
                     found.setdefault((place, kind), {})[i] = slope * channel.valid
+                    if kind.startswith("retardance") and place.startswith("in:"):
+                        # of exp(x G), per size: at a size of FINITE it is half of this
+                        bend = np.stack([_bilinear(*p[j], generator @ generator) for p in both])
+                        bend = FINITE / 2 * bend * channel.valid
+                        self.bends.setdefault((place, kind), {})[i] = bend
             right, left = sweep.fluxes
             gain = np.stack([(one * right - other * left) for one, other in channel.slopes(sweep)])
             found.setdefault(("detector", "gain"), {})[i] = gain * channel.valid
             for kind, slope in self._at_detector(i, channel, sweep):
                 found.setdefault(("detector", kind), {})[i] = slope * channel.valid
+        self.bends = {
+            key: bend
+            for key, bend in self.bends.items()
+            if self._left(bend) > max(self._left(found[key]), 1.0 / FINITE)
+        }
         return found
+
+    def _left(self, slopes):
+        """Return how much of a constant perturbation's derivative the model cannot take up."""
+        white = [
+            channel.whiten(slopes.get(i, np.zeros(channel.shape))).ravel()
+            for i, channel in enumerate(self.problem.channels)
+        ]
+        column = np.concatenate(white)
+        return float(np.linalg.norm(column - self.tangent @ (self.tangent.T @ column)))
 
     def _at_detector(self, i, channel, sweep):
         """Yield what background, nonlinearity, afterglow and crosstalk do to the channels."""
@@ -486,7 +509,8 @@ class Probes:
 
 def _frames_first(basis, shape):
     """Return columns (..., F) x q of a table as (F, rows of a frame, q)."""
-    return np.ascontiguousarray(basis.reshape(-1, shape[-1], basis.shape[1]).swapaxes(0, 1))
+    rows = int(np.prod(shape[:-1]))
+    return np.ascontiguousarray(basis.reshape(rows, shape[-1], basis.shape[1]).swapaxes(0, 1))
 
 
 _PROBE = "gap_probe_"
@@ -513,21 +537,22 @@ class Reduced:
     probes : Probes
         Derivatives.
     slopes : dict of int to `~numpy.ndarray`
-        Of each dataset (2, W, F).
+        Of each dataset (2, W, F), or several in a list.
     law : `~numpy.ndarray`
         Basis of the law in wavelength, shape (W, k).
     """
 
     def __init__(self, probes, slopes, law):
-        problem, k = probes.problem, law.shape[1]
+        problem = probes.problem
+        slopes = slopes if isinstance(slopes, (list, tuple)) else [slopes]
+        k = law.shape[1] * len(slopes)
         self.gram, self.target, self.seen, self.lamps = [], [], [], []
         for i, (dataset, channel, rows) in enumerate(
             zip(problem.datasets, problem.channels, problem.segments, strict=True)
         ):
-            slope = slopes.get(i)
-            if slope is None:
-                slope = np.zeros(channel.shape)
-            columns = law[dataset.bins].T[:, None, :, None] * slope
+            nothing = np.zeros(channel.shape)
+            own = law[dataset.bins].T[:, None, :, None]
+            columns = np.concatenate([own * slope.get(i, nothing) for slope in slopes])
             white = channel.whiten_frames(columns)
             n_frames = channel.shape[2]
             # frames last, then a product of matrices a frame

@@ -12,11 +12,12 @@ from scipy import stats
 from astropolcal.calibration import calibrate
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
+from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
-from astropolcal.optics import Perturbation
+from astropolcal.optics import LinearRetarder, Perturbation
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
@@ -31,6 +32,8 @@ _ABSORBED = 1e-6
 # which the data may leave a size there
 _AT_LIMIT = 1e-6
 _MOST_PRESSED = 0.1
+# a second difference above this share of the first one is tried at finite size
+_BENT = 0.5
 
 
 @dataclass
@@ -158,7 +161,9 @@ class Model:
         Model
         """
         problem, parameters = self.edited(effect, context)
-        fit = problem.fit(problem.start, **settings)
+        starts = _off_extremum(problem, problem.start, parameters)
+        fits = [problem.fit(start, **settings) for start in starts]
+        fit = min(fits, key=lambda one: one.chi2)
         return Model(problem, fit, self.added | {effect.name: parameters})
 
     def with_effects(self, effects, like=None, **settings):
@@ -191,7 +196,17 @@ class Model:
             model = Model(problem, Fit(problem.start, np.inf, False), added)
         if like is not None:
             model = Model(model.problem, like.start_of(model.problem), model.added)
-        return self if model is self else model.polished(**settings)
+        return self if model is self else model._off_extrema().polished(**settings)
+
+    def _off_extrema(self):
+        """Return the model with the effects moved whose derivative vanishes where they start."""
+        start = self.fit.coefficients
+        for parameters in self.added.values():
+            # a finite size may be too large, but a fit gets down from there
+            others = _off_extremum(self.problem, start, parameters)[1:] or [start]
+            start = min(others, key=lambda q: np.sum(self.problem.residual(q) ** 2))
+        moved = start is not self.fit.coefficients
+        return Model(self.problem, Fit(start, np.inf, False), self.added) if moved else self
 
     def without(self, names):
         """
@@ -423,6 +438,37 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
     if not (found.converged and np.isfinite(found.chi2)):
         raise _no_convergence()
     return Model(problem, found)
+
+
+def _off_extremum(problem, start, parameters):
+    """
+    Return starts of a fit, of both signs where the derivative of a retardance vanishes.
+
+    At half a wave it does, and a fit from there would stay.
+    """
+    found = [start]
+    optics = {leaf.name: leaf for d in problem.datasets for leaf in d.propagator.leaves}
+    for parameter in parameters:
+        where = problem.slices.get(parameter.name)
+        if where is None or np.any(start[where]) or not _retards(optics, parameter.name):
+            continue
+        vector = problem.vector(start)
+        vector[problem.free.by_name[parameter.name].slice] = FINITE
+        step = problem.coefficients(vector) - start
+        ends = [start + sign * step for sign in (1, -1)]
+        there, up, down = (problem.residual(q) for q in (start, *ends))
+        bend = np.linalg.norm(up + down - 2 * there)
+        if bend > max(1.0, _BENT * np.linalg.norm(up - down)):
+            found += ends
+    return found
+
+
+def _retards(optics, name):
+    """Return whether a parameter is a constant retardance that was inserted."""
+    optic = optics.get(name.partition(".")[0])
+    if isinstance(optic, Perturbation):
+        return optic.kind.startswith("retardance") and optic.dependence == "constant"
+    return isinstance(optic, LinearRetarder) and name.endswith(".retardance")
 
 
 def _lowest(problem, chains):
