@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from astropolcal.gap.attribution import scan
-from astropolcal.gap.shrinkage import foreseen
+from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = ["Group", "Selection", "select"]
 
@@ -174,7 +174,8 @@ def select(base, library, groups, say, *, cells=True):
     best = replace(best, model=best.model.polished())
     best, steps, history = _checked(base, best, groups, say)
     unlisted = _unlisted(base, best)
-    found = _grouped(best, steps, scans, unlisted)
+    stable = stability(best.model, groups, max(1.0, best.model.mean_square))
+    found = _grouped(best, steps, scans, unlisted, stable)
     return Selection(found, best.model, first, left, unlisted, history)
 
 
@@ -366,14 +367,15 @@ def _unlisted(base, best):
     return 1 - (1 - prior) * np.exp(-share / _LEFT)
 
 
-def _grouped(best, steps, scans, unlisted):
+def _grouped(best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
     found = []
     for one, (before, after) in zip(best.chosen, pairwise(steps), strict=True):
         members = _members(one, scans[one.name])
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
         lowered = max(before.chi2 - after.chi2, 0.0)
-        found.append(Group(members, float((1 - unlisted) * chance), lowered))
+        share = stable.get(one.name, 1.0)
+        found.append(Group(members, float((1 - unlisted) * chance * share), lowered, share))
     return found
 
 
