@@ -2,9 +2,12 @@
 """A cell of the table of places, kinds and dependences, as an effect that can be fitted."""
 
 from astropolcal.gap.effects.effect import Effect
+from astropolcal.gap.effects.library import LIBRARY
 from astropolcal.gap.effects.where import Where
 
 __all__ = ["CellEffect"]
+
+_AS_LISTED = ("inserted", "free", "equal", "flux", "scale", "limit")
 
 
 class CellEffect(Effect):
@@ -30,13 +33,19 @@ class CellEffect(Effect):
 
     def __init__(self, cell, degree=2):
         relation, _, optic = cell.place.partition(":")
+        where = Where({"in": "inside"}.get(relation, relation), optic or None)
+        told = {"kind": cell.kind, "dependence": cell.dependence}
+        # what a detector does with the flux is no perturbation but an optic of the library
+        at = (Where("detector"), (cell.kind,))
+        row = next((effect for effect in LIBRARY if (effect.near or ())[:2] == at), None)
+        if row is not None:
+            where, told = row.where, {key: getattr(row, key) for key in _AS_LISTED}
         super().__init__(
             f"{cell.place}/{cell.kind}/{cell.dependence}",
             cell.title,
-            Where({"in": "inside"}.get(relation, relation), optic or None),
-            cell.kind,
-            cell.dependence,
-            degree,
+            where,
+            degree=degree,
+            **told,
             category="cell",
             words=cell.place,
             shows="what the cell does to the data",
