@@ -271,7 +271,9 @@ class Effect:
         alternative has none.
         """
         every = [self.roles(chain) for chain in chains]
-        roles = next((one for one in every if self.applies_to(one)), next(iter(every), None))
+        # what is in the chains already applies to them no more, and is still what it is
+        there = [one for one in every if self._is_there(one) or self.where.otherwise]
+        roles = next((one for one in there if self.applies_to(one)), next(iter(there), None))
         if roles is None or not (self.kinds or self.near):
             return ()
         where, kinds, text, *_ = (*(self.near or (self.where, self.kinds)), None)
@@ -282,6 +284,9 @@ class Effect:
         texts = (text,) if isinstance(text, str) else text
         cells = [Cell(place, one, text) for text in texts for place in at for one in kinds]
         return tuple(dict.fromkeys(cells))
+
+    def _is_there(self, roles):
+        return self.where.optic is None or self.where.anchor(roles) is not None
 
     def cell(self, chains):
         """Return the main one of `cells`, None where there is none."""

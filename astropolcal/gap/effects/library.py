@@ -108,6 +108,14 @@ def _transmission(name, n, title):
 
 _NO_RETARDER = optics.LinearRetarder(retardance=0 * u.deg)
 _PLATE_EFFECTS = [
+    # a constant is the misalignment of the plate, which the model fits
+    _effect(
+        "hwp_axis_dispersion", "fast axis of the half-wave plate that turns with wavelength",
+        _PLATE, "orientation", optics.EllipticalRetarder(), "circular", _size(1, 20, u.deg),
+        "phase of harmonic 4 of the plate angle, with wavelength, at all derotator angles",
+        "chromatic zero angles of FORS; Bagnulo et al. 2009, doi:10.1086/605654",
+        degree=without_constant, **_ON_PLATE, category="parameter",
+    ),
     _effect(
         "hwp_retardance", "error of the half-wave plate's retardance law",
         _PLATE, "retardance_h", _NO_RETARDER, "retardance", _size(1, 30, u.deg),
@@ -157,14 +165,6 @@ _PLATE_EFFECTS = [
         _size(0.5, 20, u.deg), "harmonics 2, 4, 6 and 8 of the plate angle",
         "Patanchon et al. 2024, doi:10.1088/1475-7516/2024/01/074",
         degree=NUMBER, dependence=harmonic("own", 2), **_ON_PLATE,
-    ),
-    # a constant is the misalignment of the plate, which the model fits
-    _effect(
-        "hwp_axis_dispersion", "fast axis of the half-wave plate that turns with wavelength",
-        _PLATE, "orientation", optics.EllipticalRetarder(), "circular", _size(1, 20, u.deg),
-        "phase of harmonic 4 of the plate angle, with wavelength, at all derotator angles",
-        "chromatic zero angles of FORS; Bagnulo et al. 2009, doi:10.1086/605654",
-        degree=without_constant, **_ON_PLATE, category="parameter",
     ),
     _encoder(
         "hwp_encoder_eccentricity", 1, _PLATE, "half-wave plate", "Millar-Blanchaer et al. 2016",
