@@ -158,7 +158,7 @@ class Fault:
         """Return the share of its signal that each cell carries; its own is all of it."""
         own = [self.told.get(key) for key in ("place", "kind", "dependence")]
         step = own[2] if own[2] and own[2].startswith("step:") else None
-        found = self.bench.shares(residual, fit, step)
+        found = self.bench.shares(residual, fit, step, self.told.get("what") == "fringes")
         return {**found, "/".join(own): 1.0} if all(own) else found
 
     # ---- what it does ---------------------------------------------------------------------------

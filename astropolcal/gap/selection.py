@@ -17,7 +17,7 @@ import numpy as np
 from astropolcal.gap.attribution import scan
 from astropolcal.gap.shrinkage import foreseen, stability
 
-__all__ = ["Group", "Selection", "select"]
+__all__ = ["Group", "Selection", "explained_by_one", "select"]
 
 # the best candidates count where residuals are no noise
 _RETEMPERED = 400
@@ -29,8 +29,10 @@ _TURNS = 1
 _AS_GOOD, _CLEARLY = 1.0, 3.0
 #: Residuals less probable than this are no noise.
 REMAINDER = 1e-4
+# and more probable than this they may be
+_NOISE = 1e-3
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
-ENOUGH = 9.0
+ENOUGH = 12.0
 _MOST = 8
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
@@ -216,6 +218,30 @@ def _growing(best):
     """Yield the model with the first cause, the first two, and so on, to first order."""
     names = [one.name for one in best.chosen]
     return [best.model.without(names[i + 1 :]) for i in range(len(names))]
+
+
+def explained_by_one(model, library, *, cells=True):
+    """
+    Return whether a single cause leaves no more than noise.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    library : sequence of Effect
+        Named effects that are not discrete.
+    cells : bool
+        Whether to ask for cells as well as for names.
+
+    Returns
+    -------
+    bool
+    """
+    found = _scanned(model, library, cells)
+    for one in map(found.freer, _distinct(found.candidates, _WIDTH[0])):
+        if one.evidence > ENOUGH and model.with_effect(*one.recipe, **_QUICK).p_value > _NOISE:
+            return True
+    return False
 
 
 def _scanned(model, library, cells):
