@@ -382,15 +382,19 @@ def _gains(new, fresh, old, one):
 
 
 def _unlisted(base, best):
-    """Return the probability that the gap has a cause that no table has."""
-    count = min(len(best.chosen), len(_UNLISTED) - 1)
-    prior = _UNLISTED[count]
+    """
+    Return the probability that the gap has a cause that no table has.
+
+    A remainder of probability p speaks for it by a Bayes factor of at most -1/(e p ln p) (Sellke,
+    Bayarri & Berger 2001, doi:10.1198/000313001300339950), the more the larger its share is.
+    """
+    prior = _UNLISTED[min(len(best.chosen), len(_UNLISTED) - 1)]
+    p = min(max(best.model.p_value, 1e-300), np.exp(-1))
+    after = prior / (prior - (1 - prior) * np.e * p * np.log(p))
     freedom = best.model.problem.n_data - best.model.problem.size
     excess = max(base.fit.chi2 - freedom, 1.0)
-    if best.model.p_value > REMAINDER:
-        return prior
     share = max(best.model.fit.chi2 - freedom, 0.0) / excess
-    return 1 - (1 - prior) * np.exp(-share / _LEFT)
+    return float(prior + (after - prior) * (1 - np.exp(-share / _LEFT)))
 
 
 def _grouped(best, steps, scans, unlisted, stable):
