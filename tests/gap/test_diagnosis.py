@@ -14,7 +14,6 @@ from astropolcal.exceptions import GapError
 from astropolcal.gap import EFFECTS, alternatives, diagnose
 from astropolcal.gap.alternatives import thinned
 from astropolcal.gap.cells import Cell
-from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 pytestmark = pytest.mark.usefixtures("own_instruments")
@@ -29,7 +28,9 @@ def names(cause):
 
 
 def _one_wavelength():
-    return data.chain(), data.observed().select_bins(np.arange(7) == 3)
+    charis, one = instruments.get("charis"), data.WAVELENGTH[3:4]
+    chain = charis.chain(wavelength=one, derotator="linear")
+    return chain, simulate(chain, one, data.frames(), flux=1e6, seed=1)
 
 
 def _unpolarized():
@@ -56,12 +57,6 @@ def _drifting_lamp():
     return data.chain(), data.observed(lamp=1 + 0.3 * np.linspace(0, 1, 32) ** 2)
 
 
-def _without_errors():
-    table = data.observed().to_table()
-    table.remove_columns(["flux_right_err", "flux_left_err"])
-    return data.chain(), Observations.from_table(table)
-
-
 def _two_runs():
     return [data.chain()] * 2, [data.observed(name="July"), data.observed(seed=2, name="October")]
 
@@ -71,10 +66,10 @@ def _of(name):
     return setup.nominal, setup.observed()
 
 
-CLEAN = [_one_wavelength, _unpolarized, _few_frames, _masked, _drifting_lamp, _without_errors]
+CLEAN = [_one_wavelength, _unpolarized, _few_frames, _masked, _drifting_lamp, _two_runs]
 
 
-@pytest.mark.parametrize("make", [*CLEAN, _two_runs, *set(SETUPS)], ids=str)
+@pytest.mark.parametrize("make", [*CLEAN, *sorted(set(SETUPS) - {"vampires"})])
 def test_clean_data_have_no_gap(make):
     chains, observations = _of(make) if isinstance(make, str) else make()
     found = diagnose(chains, observations, **QUICK)
@@ -128,9 +123,6 @@ def test_what_has_no_name_is_located():
     assert (cause.name, cause.cell, cause.is_named) == (cell.name, cell, False)
     assert cause.before.percent > 3 * cause.after.percent
     assert found.gap_p_value < 1e-9 < found.remainder_p_value
-    # names alone do not close the gap, and are not sure of themselves
-    found = diagnose(setup.nominal, setup.observed(setup.with_cell(cell, 0.05, 0.03)), cells=False)
-    assert all(cause.is_named for cause in found.causes)
 
 
 def test_what_no_cell_explains_stays_unexplained():
@@ -188,7 +180,7 @@ def test_wrong_frames_are_named_and_left_out():
 
 def test_bad_input_is_refused_in_one_line(monkeypatch):
     chain, observed = data.chain(), data.observed()
-    masked = observed.with_mask(np.ones((32, 7), dtype=bool), "all of it")
+    one = data.observed(table=data.frames()[:1])
     short = data.observed(table=half_wave_plate_cycles(derotator=[45] * u.deg))
     two = [data.observed(meta={"instrument": name}) for name in ("CHARIS", "IRDIS")]
     cases = {
@@ -197,7 +189,7 @@ def test_bad_input_is_refused_in_one_line(monkeypatch):
         "2 chains for 1 datasets": ([chain] * 2, [observed], {}),
         "no effects to ask for; give names, or 'all'": (chain, observed, {"effects": []}),
         "no effect 'beam_gian'.*'beam_gain'": (chain, observed, {"effects": ["beam_gian"]}),
-        "": (chain, masked, QUICK),
+        "too few frames to leave out in groups: 1 in the shortest": (chain, one, {}),
     }
     for message, (chains, observations, options) in cases.items():
         with pytest.raises(GapError, match=message) as refused:
