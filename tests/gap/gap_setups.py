@@ -8,7 +8,7 @@ import gap_data
 import numpy as np
 
 from astropolcal import instruments, optics
-from astropolcal.chain import join, leaves
+from astropolcal.chain import join, leaves, stages
 from astropolcal.gap.effects import Context, get_effect
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.instruments import Instrument, SkyLaw
@@ -107,13 +107,38 @@ class Setup:
         if follows:
             table["commanded"], table["hwp"] = table["hwp"], table["hwp_true"]
         options = {"meta": self.meta, "name": "night"} | options
+        # what a cell may follow is known once there are frames
+        extra = [stage for stage in stages(truth) if stage not in table.colnames]
+        if extra:
+            clean = self.observed(self.nominal, noise=False)
+            for stage in extra:
+                table[stage] = clean.position(stage)
         data = simulate(truth, self.wavelength, table, flux=flux, seed=seed, **options)
-        if not follows:
-            return data
         found = data.to_table()
-        found["hwp"] = found["commanded"]
-        found.remove_columns(["commanded", "hwp_true"])
-        return type(data).from_table(found, name="night")
+        if follows:
+            found["hwp"] = found["commanded"]
+            found.remove_columns(["commanded", "hwp_true"])
+        found.remove_columns([stage for stage in extra if stage != "frame"])
+        return type(data).from_table(found, name=data.name)
+
+    def with_detector(self, kind, size, **options):
+        """Simulate a detector that has an error of a kind."""
+        data = self.observed(**options)
+        right, left = data.flux_right, data.flux_left
+        usual = np.median([right, left])
+        if kind == "nonlinearity":
+            changed = [flux * (1 + size * flux / usual) for flux in (right, left)]
+        elif kind == "persistence":
+            changed = [flux + size * np.roll(flux, 1, axis=0) for flux in (right, left)]
+        elif kind == "crosstalk":
+            changed = [right + size * (left - right), left + size * (right - left)]
+        else:
+            both = kind == "background"
+            changed = [right + size * usual, left + both * size * usual]
+        table = data.to_table()
+        for beam, flux in zip(("right", "left"), changed, strict=True):
+            table[f"flux_{beam}"] = flux.ravel() * table[f"flux_{beam}"].unit
+        return type(data).from_table(table, name=data.name)
 
     def with_cell(self, cell, *sizes, flux=3e7):
         """Return the true chain with a cell of a size, and another for its second function."""

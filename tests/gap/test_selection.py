@@ -1,115 +1,107 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Sizes within their limits, and effects that go with others."""
+"""The choice of causes: planted cells are found, with their place and a probability."""
 
 import gap_data as data
 import numpy as np
 import pytest
+from gap_setups import SETUPS
 
-from astropolcal.gap.effects import Context, get_effect
-from astropolcal.gap.model import Model
-from astropolcal.gap.problem import Fit
-from astropolcal.gap.selection import _CLEARLY, _pushes
+from astropolcal.gap.cells import Cell
+from astropolcal.gap.effects import EFFECTS
+from astropolcal.gap.model import nominal_model
+from astropolcal.gap.selection import select
+from astropolcal.gap.shrinkage import frame_groups
 
-DIATTENUATOR = "static_diattenuator"
-
-
-@pytest.fixture(scope="module")
-def strong():
-    """Data with a static diattenuator beyond what the library takes for possible."""
-    true = data.with_effect(DIATTENUATOR, horizontal=0.5)
-    return data.fitted(data.observed(true, flux=1e7))
+pytestmark = pytest.mark.usefixtures("own_instruments")
+SMOOTH = [effect for effect in EFFECTS.values() if effect.kind != "discrete"]
 
 
-def sizes(model, key="horizontal"):
-    return model.sizes(DIATTENUATOR)[f"gap_{DIATTENUATOR}.{key}"][0]
+def chosen(setup, observations, library=(), **options):
+    groups = frame_groups([observations]) if options.pop("left_out", False) else None
+    base = nominal_model([setup.nominal], [observations])
+    return select(base, library, groups, lambda line: None, **options)
 
 
-def test_a_free_size_stays_within_its_limit_and_counts_as_impossible(strong):
-    context = Context(strong.context.wavelength, strong.context.flux, None)
-    model = strong.with_effect(get_effect(DIATTENUATOR), context)
-    assert np.abs(sizes(model)).max() == pytest.approx(0.3)
-    assert not model.is_physical(DIATTENUATOR)
-    assert model.impossible() == {DIATTENUATOR}
+def names(group):
+    return [candidate.name for candidate, _ in group.members]
 
 
-def test_a_possible_size_is_found_as_it_is():
-    true = data.with_effect(DIATTENUATOR, horizontal=0.2)
-    model = data.fitted(data.observed(true, flux=1e7))
-    context = Context(model.context.wavelength, model.context.flux, None)
-    model = model.with_effect(get_effect(DIATTENUATOR), context)
-    np.testing.assert_allclose(sizes(model), 0.2, atol=0.003)
-    assert model.impossible() == set()
+# every kind of place, generator and dependence once
+PLANTED = [
+    ("charis", Cell("in:derotator", "retardance_d", "harmonic:hwp:1"), (0.05, 0.03)),
+    ("charis", Cell("after:hwp", "depolarization_circular", "harmonic:derotator:1"), (0.02, 0.02)),
+    ("cassegrain", Cell("telescope", "diattenuation_h", "step:39"), (0.01,)),
+    ("cassegrain", Cell("detector", "gain", "time2"), (0.01,)),
+    ("cassegrain", Cell("in:hwp", "diattenuation_d", "direction:hwp"), (0.01,)),
+    ("rotating", Cell("in:hwp", "rotation", "direction:hwp"), (0.01,)),
+    ("rotating", Cell("in:rotator", "diattenuation_h", "time"), (0.01,)),
+    ("irdis lamp", Cell("source", "depolarization_linear", "step:30"), (0.01,)),
+    ("irdis star", Cell("in:derotator", "diattenuation_h", "harmonic:derotator:2"), (0.01, 0.0)),
+    ("vampires", Cell("after:relay", "rotation", "harmonic:derotator:4"), (0.01, 0.0)),
+]
 
 
-def test_one_wavelength_at_the_limit_of_many_is_no_reason(strong, monkeypatch):
-    model = strong.with_effect(get_effect(DIATTENUATOR))
-    slot = model.problem.free.by_name[f"gap_{DIATTENUATOR}.horizontal"]
-    values = np.zeros(model.problem.free.size)
-    values[slot.start] = 0.3
-    monkeypatch.setattr(model.problem, "vector", lambda coefficients: values)
-    monkeypatch.setattr("astropolcal.gap.model._MOST_PRESSED", 0.5)
-    assert model.is_physical(DIATTENUATOR)
-    monkeypatch.setattr("astropolcal.gap.model._MOST_PRESSED", 0.1)
-    assert not model.is_physical(DIATTENUATOR)
+@pytest.mark.parametrize(("name", "cell", "sizes"), PLANTED)
+def test_a_planted_cell_is_found_first_and_alone(name, cell, sizes):
+    setup = SETUPS[name]()
+    found = chosen(setup, setup.observed(setup.with_cell(cell, *sizes), seed=7))
+    (group,) = found.groups
+    assert cell.name in names(group)
+    assert group.probability > 0.9
+    assert found.unlisted < 0.1
+    assert found.model.p_value > 1e-3
+    shares = [share for _, share in group.members]
+    assert shares == sorted(shares, reverse=True)
+    assert sum(shares) == pytest.approx(1)
 
 
-def test_a_depolarizer_gains_no_polarization():
-    """What is retained counts from a level that the efficiency takes up: the law stops at one."""
-    name = "anisotropic_depolarizer"
-    model = data.fitted(data.observed(_retaining(np.linspace(1.0, 1.1, 7)), flux=1e8))
-    free = Context(model.context.wavelength, model.context.flux, None)
-    for context in (None, free):
-        added = model.with_effect(get_effect(name), context)
-        slot = added.problem.free.by_name[f"gap_{name}.retained_q"]
-        values = added.problem.vector(added.fit.coefficients)[slot.slice]
-        assert values.max() == pytest.approx(1.0, abs=1e-6)
-        assert added.is_physical(name)
-        assert 0 < added.at_bound(name) < 7
-        assert added.fit.chi2 < 0.02 * model.fit.chi2
+@pytest.mark.parametrize(
+    ("kind", "size"), [("nonlinearity", 0.003), ("background_of_one_beam", 0.003)]
+)
+def test_an_error_of_the_detector_is_found(kind, size):
+    setup = SETUPS["charis"]()
+    found = chosen(setup, setup.with_detector(kind, size, seed=3))
+    assert kind in [candidate.cell.kind for candidate, _ in found.groups[0].members]
+    assert found.groups[0].probability > 0.9
 
 
-def test_bounds_that_no_optic_has_do_not_make_a_size_possible():
-    """An effect of a user may set bounds of its own: the Mueller matrix is not one then."""
-
-    effect = get_effect("anisotropic_depolarizer")
-    optic = effect.inserted.copy()
-    optic.retained_q.bounds = (0, 1.5)
-    problem, parameters = data.clean_model().edited(effect.changed(inserted=optic))
-    for size, possible in ((0.9, True), (1.1, False)):
-        q = problem.start.copy()
-        q[problem.slices[parameters[0].name]] = size, 0.0, 0.0
-        model = Model(problem, Fit(q, 0.0, True), {effect.name: parameters})
-        assert model.is_physical(effect.name) == possible, size
-
-
-def _retaining(share):
-    """Return a chain with a depolarizer, of a low efficiency: there is room for more Q."""
-    true = data.with_effect("anisotropic_depolarizer", retained_q=share)
-    true["gap_anisotropic_depolarizer"].retained_v = share
-    true["wollaston"].efficiency = np.full(len(data.WAVELENGTH), 0.85)
-    return true
+def test_two_planted_causes_are_both_found_and_left_out_frames_agree():
+    setup = SETUPS["charis"]()
+    first = Cell("in:derotator", "retardance_h", "time")
+    second = Cell("in:hwp", "diattenuation_h", "constant")
+    setup.truth = setup.with_cell(first, 0.03)
+    found = chosen(setup, setup.observed(setup.with_cell(second, 0.004), seed=2), left_out=True)
+    assert len(found.groups) == 2
+    for cell in (first, second):
+        assert any(cell.name in names(group) for group in found.groups), cell.name
+    assert all(group.probability > 0.8 for group in found.groups)
+    # each lowers the error of frames that were left out
+    errors = [one.percent for one in found.history]
+    assert errors == sorted(errors, reverse=True)
+    assert found.history[-1].chi2 < 1.5
+    assert all(group.lowered > 0 for group in found.groups)
+    assert found.model is found.groups[-1].model
 
 
-def test_an_effect_without_a_place_is_left_out():
-    model = data.clean_model()
-    assert not get_effect("m3_diattenuation").applies(model.chains)
-    assert model.with_effects([(get_effect("m3_diattenuation"), None)]) is model
+def test_a_name_is_given_where_it_does_as_well_as_its_cell():
+    setup = SETUPS["charis"]()
+    observations = setup.observed(setup.with_effect("beam_gain", imbalance=0.005))
+    (named,) = chosen(setup, observations, SMOOTH).groups
+    assert named.best.name == "beam_gain"
+    assert "detector/gain/constant" in names(named)
+    # without the library it is the cell; without the cells it is the name
+    (cell,) = chosen(setup, observations).groups
+    assert (cell.best.name, cell.best.is_named) == ("detector/gain/constant", False)
+    (alone,) = chosen(setup, observations, SMOOTH, cells=False).groups
+    assert alone.best.name == "beam_gain"
+    assert all(candidate.is_named for candidate, _ in alone.members)
 
 
-class _Model:
-    """What `_pushes` looks at."""
-
-    def __init__(self, chi2, added, impossible):
-        self.fit, self.added = type("Fit", (), {"chi2": chi2}), dict.fromkeys(added)
-        self._impossible = set(impossible)
-
-    def impossible(self):
-        return self._impossible
-
-
-def test_nothing_is_taken_out_of_its_limits_for_little():
-    old = _Model(100.0, ["a"], [])
-    assert _pushes(_Model(99.0, ["a", "b"], ["a"]), old)
-    assert not _pushes(_Model(99.0 * _CLEARLY, ["a", "b"], ["a"]), old)
-    assert not _pushes(_Model(99.0, ["a", "b"], ["b"]), old)
-    assert not _pushes(_Model(99.0, ["a", "b"], ["a"]), _Model(100.0, ["a"], ["a"]))
+def test_a_law_of_any_form_is_one_cause():
+    """A gain at one wavelength alone."""
+    true = data.with_effect("beam_gain")
+    true["gap_beam_gain"].imbalance = np.where(np.arange(len(data.WAVELENGTH)) == 2, 0.02, 0.0)
+    (group,) = chosen(SETUPS["charis"](), data.observed(true, flux=1e7), SMOOTH).groups
+    assert group.best.name == "beam_gain"
+    sizes = group.model.sizes("beam_gain")["gap_beam_gain.imbalance"][0]
+    np.testing.assert_allclose(sizes, true["gap_beam_gain"].imbalance.value, atol=2e-3)

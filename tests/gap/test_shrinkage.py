@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import get_effect
-from astropolcal.gap.shrinkage import HeldOut, frame_groups, held_out, left_out_fits
+from astropolcal.gap.shrinkage import HeldOut, foreseen, frame_groups, held_out, left_out_fits
 
 
 def errors(squares, counts=None, whitened=None):
@@ -169,3 +169,57 @@ def test_pure_noise_is_predicted_to_the_noise():
     noise = 100 * np.sqrt(np.mean(model.problem.channels[0].sigma[0] ** 2))
     assert found.percent == pytest.approx(noise, rel=0.15)
     assert found.chi2 == pytest.approx(1.0, abs=0.2)
+
+
+# ---- foreseen --------------------------------------------------------------------------------
+
+
+class Linear:
+    """A model that is linear in its coefficients, with two groups of three and five frames."""
+
+    def __init__(self, seed, n_waves=4, n_frames=8, size=3):
+        rng = np.random.default_rng(seed)
+        shape = (2, n_waves, n_frames)
+        self.slopes = rng.normal(size=(2 * n_waves * n_frames, size))
+        self.target = rng.normal(size=len(self.slopes))
+        sigma = np.broadcast_to(rng.uniform(0.5, 2, (2, n_waves, 1)), shape)
+        self.channel = SimpleNamespace(shape=shape, valid=rng.random(shape[1:]) < 0.8, sigma=sigma)
+        keep = np.broadcast_to(self.channel.valid, shape).ravel()
+        self.slopes[~keep], self.target[~keep] = 0.0, 0.0
+        self.problem = SimpleNamespace(
+            channels=[self.channel],
+            segments=[slice(0, len(self.slopes))],
+            tangent=lambda q: np.linalg.svd(self.slopes, full_matrices=False)[0],
+        )
+        self.residual, self.fit = self.left(), SimpleNamespace(coefficients=None)
+
+    def left(self, kept=True):
+        """Return the residuals of a fit to some of the rows."""
+        rows = np.broadcast_to(kept, len(self.target))
+        found = np.linalg.lstsq(self.slopes[rows], self.target[rows], rcond=None)[0]
+        return self.target - self.slopes @ found
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_what_is_foreseen_of_a_linear_model_is_what_refits_give(seed):
+    model, number = Linear(seed), np.array([0, 0, 0, 1, 1, 1, 1, 1])
+    found = foreseen(model, (["a", "b"], [number]))
+    for i in range(2):
+        out = np.broadcast_to(number == i, model.channel.shape)
+        gap = model.left(~out.ravel()).reshape(model.channel.shape)
+        assert found.whitened[i] == pytest.approx(np.sum(gap[out] ** 2) / 2)
+        assert found.squares[i] == pytest.approx(
+            np.sum((gap[0] * model.channel.sigma[0])[out[0]] ** 2)
+        )
+        assert found.counts[i] == np.sum(model.channel.valid & (number == i))
+
+
+def test_what_is_foreseen_is_nearly_what_refits_give():
+    true = data.with_effect("beam_gain", imbalance=0.01)
+    for model in (data.fitted(data.observed(true)), data.clean_model()):
+        groups = frame_groups(model.observations)
+        found, expected = foreseen(model, groups), held_out(model, groups)
+        assert found.labels == expected.labels
+        np.testing.assert_array_equal(found.counts, expected.counts)
+        assert found.percent == pytest.approx(expected.percent, rel=0.05)
+        assert found.chi2 == pytest.approx(expected.chi2, rel=0.1)

@@ -1,0 +1,95 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Models with effects added: sizes within their limits, and what has no place."""
+
+import gap_data as data
+import numpy as np
+import pytest
+
+from astropolcal.gap.effects import Context, get_effect
+from astropolcal.gap.model import Model
+from astropolcal.gap.problem import Fit
+
+DIATTENUATOR = "static_diattenuator"
+
+
+@pytest.fixture(scope="module")
+def strong():
+    """Data with a static diattenuator beyond what the library takes for possible."""
+    true = data.with_effect(DIATTENUATOR, horizontal=0.5)
+    return data.fitted(data.observed(true, flux=1e7))
+
+
+def sizes(model, key="horizontal"):
+    return model.sizes(DIATTENUATOR)[f"gap_{DIATTENUATOR}.{key}"][0]
+
+
+def test_a_free_size_stays_within_its_limit_and_counts_as_impossible(strong):
+    context = Context(strong.context.wavelength, strong.context.flux, None)
+    model = strong.with_effect(get_effect(DIATTENUATOR), context)
+    assert np.abs(sizes(model)).max() == pytest.approx(0.3)
+    assert not model.is_physical(DIATTENUATOR)
+    assert model.impossible() == {DIATTENUATOR}
+
+
+def test_a_possible_size_is_found_as_it_is():
+    true = data.with_effect(DIATTENUATOR, horizontal=0.2)
+    model = data.fitted(data.observed(true, flux=1e7))
+    context = Context(model.context.wavelength, model.context.flux, None)
+    model = model.with_effect(get_effect(DIATTENUATOR), context)
+    np.testing.assert_allclose(sizes(model), 0.2, atol=0.003)
+    assert model.impossible() == set()
+
+
+def test_one_wavelength_at_the_limit_of_many_is_no_reason(strong, monkeypatch):
+    model = strong.with_effect(get_effect(DIATTENUATOR))
+    slot = model.problem.free.by_name[f"gap_{DIATTENUATOR}.horizontal"]
+    values = np.zeros(model.problem.free.size)
+    values[slot.start] = 0.3
+    monkeypatch.setattr(model.problem, "vector", lambda coefficients: values)
+    monkeypatch.setattr("astropolcal.gap.model._MOST_PRESSED", 0.5)
+    assert model.is_physical(DIATTENUATOR)
+    monkeypatch.setattr("astropolcal.gap.model._MOST_PRESSED", 0.1)
+    assert not model.is_physical(DIATTENUATOR)
+
+
+def test_a_depolarizer_gains_no_polarization():
+    """What is retained counts from a level that the efficiency takes up: the law stops at one."""
+    name = "anisotropic_depolarizer"
+    model = data.fitted(data.observed(_retaining(np.linspace(1.0, 1.1, 7)), flux=1e8))
+    free = Context(model.context.wavelength, model.context.flux, None)
+    for context in (None, free):
+        added = model.with_effect(get_effect(name), context)
+        slot = added.problem.free.by_name[f"gap_{name}.retained_q"]
+        values = added.problem.vector(added.fit.coefficients)[slot.slice]
+        assert values.max() == pytest.approx(1.0, abs=1e-6)
+        assert added.is_physical(name)
+        assert 0 < added.at_bound(name) < 7
+        assert added.fit.chi2 < 0.02 * model.fit.chi2
+
+
+def test_bounds_that_no_optic_has_do_not_make_a_size_possible():
+    """An effect of a user may set bounds of its own: the Mueller matrix is not one then."""
+
+    effect = get_effect("anisotropic_depolarizer")
+    wide = effect.changed(inserted=effect.inserted.copy())
+    wide.inserted.retained_q.bounds = (0, 1.5)
+    problem, parameters = data.clean_model().edited(wide)
+    for size, possible in ((0.9, True), (1.1, False)):
+        q = problem.start.copy()
+        q[problem.slices[parameters[0].name]] = size, 0.0, 0.0
+        model = Model(problem, Fit(q, 0.0, True), {wide.name: parameters})
+        assert model.is_physical(wide.name) == possible, size
+
+
+def _retaining(share):
+    """Return a chain with a depolarizer, of a low efficiency: there is room for more Q."""
+    true = data.with_effect("anisotropic_depolarizer", retained_q=share)
+    true["gap_anisotropic_depolarizer"].retained_v = share
+    true["wollaston"].efficiency = np.full(len(data.WAVELENGTH), 0.85)
+    return true
+
+
+def test_an_effect_without_a_place_is_left_out():
+    model = data.clean_model()
+    assert not get_effect("m3_diattenuation").applies(model.chains)
+    assert model.with_effects([(get_effect("m3_diattenuation"), None)]) is model
