@@ -20,6 +20,7 @@ from astropolcal.gap._bases import law_basis
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.problem import GapProblem
+from astropolcal.optics.perturbations import split_run
 
 __all__ = ["Candidate", "Scan", "false_discovery", "scan"]
 
@@ -35,6 +36,8 @@ NAMED = 5.0
 # log prior odds of dependences: what changes needs a reason
 _DEPENDENCE = {"constant": 0.0, "step": -5.0, "direction": -1.5, "move": -1.5, "time2": -1.0}
 _OTHER = -0.5
+# and what changes in one of several runs only needs another
+_ALONE = -1.0
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-9
 
@@ -264,19 +267,17 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
 
 def _cells(probes, temper):
     """Return the candidate of every cell, with the better of its laws."""
-    problem, waves = probes.problem, probes.waves
-    single = [name for name, w in waves.items() if len(w[0]) == 1]
-    several = [name for name in waves if name not in single]
-    stacked = [np.concatenate([waves[n][i] for n in single]) for i in range(len(problem.datasets))]
     own, best = set(probes.model.added), {}
     for place, kind, degree, reduced in probes.reduced(_DEGREES):
         scale = Cell(place, kind, "constant").scale
-        if probes.is_detector(kind):
-            # a constant in front of a derivative that follows the flux
-            parts = [(probes.dependence_of(kind), *(x[0] for x in reduced.normal(probes.ones)))]
-        else:
-            parts = list(zip(single, *reduced.normal(stacked), strict=True))
-            parts += [(name, *reduced.pair(waves[name])) for name in several]
+        waves = {
+            name: probes.waves_of(Cell(place, kind, name))
+            for name in probes.dependences_of(place, kind)
+        }
+        single = [name for name, w in waves.items() if len(w[0]) == 1]
+        stacked = [np.concatenate(each) for each in zip(*(waves[n] for n in single), strict=True)]
+        parts = list(zip(single, *reduced.normal(stacked), strict=True))
+        parts += [(name, *reduced.pair(w)) for name, w in waves.items() if len(w[0]) > 1]
         for name, one in _candidates(place, kind, degree, parts, scale, temper):
             if name not in best or best[name].evidence < one.evidence:
                 best[name] = one
@@ -287,8 +288,7 @@ def _of_cell(probes, cell, degree, temper):
     """Return the candidate of one cell with a law of some degree, in a list."""
     slopes = probes.slopes[cell.place, cell.kind]
     reduced = Reduced(probes, slopes, law_basis(probes.problem.wavelength, degree))
-    detector = probes.is_detector(cell.kind)
-    gram, target = reduced.pair(probes.ones if detector else probes.waves[cell.dependence])
+    gram, target = reduced.pair(probes.waves_of(cell))
     parts = [(cell.dependence, gram, target)]
     return [one for _, one in _candidates(cell.place, cell.kind, degree, parts, cell.scale, temper)]
 
@@ -321,7 +321,9 @@ def _candidates(place, kind, degree, parts, scale, temper):
 
 
 def _prior(dependence):
-    return _DEPENDENCE.get(dependence.partition(":")[0], _OTHER)
+    text, run = split_run(dependence)
+    alone = _ALONE if run is not None and text != "dataset" else 0.0
+    return _DEPENDENCE.get(text.partition(":")[0], _OTHER) + alone
 
 
 def _spectra(gram, target):

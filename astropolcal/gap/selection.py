@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from astropolcal.gap.attribution import scan
+from astropolcal.gap.cells import count_runs
 from astropolcal.gap.shrinkage import foreseen
 
 __all__ = ["Group", "Selection", "select"]
@@ -253,20 +254,21 @@ def _search(base, library, first, say, cells):
     """Return the best set of causes, and the scan beside it where it is known."""
     best = _State(base)
     states, known = [best], {best.outline: first}
-    for k in range(_MOST):
+    most_causes = _MOST * count_runs(base.problem)
+    while len(best.chosen) < most_causes:
+        k = len(best.chosen)
         width, most = (part[min(k, len(part) - 1)] for part in (_WIDTH, _FITTED))
-        say(f"looking for cause {k + 1}, at most {_MOST}")
+        say(f"looking for cause {k + 1}, at most {most_causes}")
         grown = {}
         for state in states:
             found = known.get(state.outline)
             if found is None:
                 found = known[state.outline] = _scanned(state.model, library, cells)
-            for one in map(found.freer, _distinct(found.candidates, most)):
-                if one.evidence > ENOUGH:
-                    evidence = state.evidence + one.evidence
-                    outline = state.outline | {one.name}
-                    if outline not in grown or grown[outline][0] < evidence:
-                        grown[outline] = (evidence, state, one)
+            for added in _continuations(found, most):
+                evidence = state.evidence + sum(one.evidence for one in added)
+                outline = state.outline.union(one.name for one in added)
+                if outline not in grown or grown[outline][0] < evidence:
+                    grown[outline] = (evidence, state, added)
         order = sorted(grown.values(), key=lambda item: -item[0])[:most]
         fitted = [state for item in order if (state := _extended(*item)) is not None]
         fitted.sort(key=lambda state: -state.evidence)
@@ -279,15 +281,30 @@ def _search(base, library, first, say, cells):
     return best, known.get(best.outline)
 
 
-def _extended(evidence, state, candidate):
-    """Return a set with one more cause, fitted in full, None where that is impossible."""
-    model = state.model.with_effect(*candidate.recipe, **_QUICK)
-    if not model.is_physical(candidate.name):
+def _continuations(found, most):
+    """Return what may be added to a set: one cause, or one in each of the runs."""
+    few = [found.freer(one) for one in _distinct(found.candidates, most)]
+    few = [one for one in few if one.evidence > ENOUGH]
+    if found.probes is None or len(found.probes.runs) < 2:
+        return [(one,) for one in few]
+    first = {}
+    for one in [*few, *found.candidates]:
+        run = found.probes.run_of(one.cell)
+        if run is not None and run not in first and one.evidence > ENOUGH:
+            first[run] = one if one in few else found.freer(one)
+    # the data of two runs are not the same: their causes can be taken together
+    return [(one,) for one in few] + ([tuple(first.values())] if len(first) > 1 else [])
+
+
+def _extended(evidence, state, added):
+    """Return a set with more causes, fitted in full, None where that is impossible."""
+    model = state.model.with_effects([one.recipe for one in added], **_QUICK)
+    if not all(model.is_physical(one.name) for one in added):
         return None
     # what the full fit gains over the linear promise
-    gained = state.model.fit.chi2 - model.fit.chi2 - candidate.statistic
+    gained = state.model.fit.chi2 - model.fit.chi2 - sum(one.statistic for one in added)
     temper = max(1.0, model.mean_square)
-    return _State(model, [*state.chosen, candidate], evidence + 0.5 * gained / temper)
+    return _State(model, [*state.chosen, *added], evidence + 0.5 * gained / temper)
 
 
 def _exchanged(base, best, library, first, say, cells):
