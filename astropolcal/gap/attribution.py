@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
+from astropolcal.chain import leaves
 from astropolcal.gap._bases import law_basis
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.effects.cell import CellEffect
@@ -188,6 +189,35 @@ class Scan:
                 found = _of_cell(self.probes, candidate.cell, degree, self.temper)
             best = max([best, *found], key=lambda one: one.evidence)
         return best
+
+    def by_run(self, candidate):
+        """
+        Return the evidence for a cause in each of several runs alone.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            A cause that the model of the scan does not have.
+
+        Returns
+        -------
+        dict of str to float
+            Name of the dataset to the logarithm of the Bayes factor; without those that have no
+            place for it, and empty where there is one run only or the cause is in one.
+        """
+        probes = self.probes
+        if probes is None or probes.run_of(candidate.cell) is not None:
+            return {}
+        found = {}
+        for i, run in enumerate(probes.runs):
+            if candidate.is_named:
+                alone = _named_in(probes, candidate.named, i, self.temper)
+            else:
+                cell = candidate.cell.in_run(run)
+                alone = _of_cell(probes, cell, candidate.degree, self.temper)
+            if alone:
+                found[run] = alone[0].evidence - alone[0].prior
+        return found
 
     def named_as(self, candidate, effects):
         """
@@ -375,6 +405,22 @@ def _named(probes, effects, temper, degree="default"):
     if degree == "default":
         return found
     return [replace(one, context=context) for one in found]
+
+
+def _named_in(probes, effect, i, temper):
+    """Return the candidate of a named effect in the chain of one dataset only, in a list."""
+    held = probes.model.held_chains
+    edit = effect.edit(list(held), probes.model.context)
+    chains = [*held[:i], edit.chains[i], *held[i + 1 :]]
+    there = {leaf.name for leaf in leaves(chains[i])}
+    own = [p for p in edit.parameters if p.name.partition(".")[0] in there]
+    names = {p.name for p in own}
+    ties = {
+        name: tie
+        for name, tie in edit.ties.items()
+        if tie.source in names and name.partition(".")[0] in there
+    }
+    return _of_batch(probes, chains, {effect.name: own}, ties, [effect], temper) if own else []
 
 
 def _of_batch(probes, edited, parameters, ties, effects, temper):

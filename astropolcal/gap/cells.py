@@ -11,7 +11,7 @@ light and rows of all places come from one forward and one backward sweep.
 
 from collections import Counter
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import astropy.units as u
@@ -88,6 +88,11 @@ class Cell:
     def run(self):
         """Name of the one dataset in which it is, None where it is in all."""
         return split_run(self.dependence)[1]
+
+    def in_run(self, name):
+        """Return the same in one dataset only."""
+        text = "" if self.dependence in ("constant", "flux", "previous") else f"{self.dependence}/"
+        return replace(self, dependence=f"{text}dataset:{name}")
 
     @property
     def scale(self):

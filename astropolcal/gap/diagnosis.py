@@ -19,6 +19,7 @@ from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.frames import suspect_frames, without_frames
 from astropolcal.gap.model import Model, nominal_model
+from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, select
 from astropolcal.gap.shrinkage import frame_groups
 from astropolcal.words import counted
@@ -58,6 +59,8 @@ class Cause:
         Logarithm of the Bayes factor.
     stability : float or None
         Share of the halves of the wavelengths and of the left-out angles in which it is found.
+    by_dataset : dict of str to float
+        Evidence for it in each of several runs alone.
 
     Examples
     --------
@@ -79,6 +82,7 @@ class Cause:
     physical: bool = True
     evidence: float = 0.0
     stability: float | None = None
+    by_dataset: dict = field(default_factory=dict)
 
     @property
     def name(self):
@@ -186,7 +190,14 @@ def _gap_of_fit(model):
 
 
 def diagnose(
-    calibration, observations, *, effects="all", cells=True, cross_validate=True, progress=None
+    calibration,
+    observations,
+    *,
+    effects="all",
+    cells=True,
+    changes=False,
+    cross_validate=True,
+    progress=None,
 ):
     """
     Diagnose the gap between a model and measurements.
@@ -203,6 +214,9 @@ def diagnose(
     cells : bool
         Whether to ask for every cell of places, kinds and dependences too; without it
         the answer is one of the names, or none.
+    changes : bool
+        Whether to ask what changed between several runs of the same kind of source: causes
+        of one run only come first.
     cross_validate : bool
         Whether to check on left-out frames; without it the gaps are those of
         the fit itself.
@@ -217,7 +231,8 @@ def diagnose(
     ------
     GapError
         If the nominal fit does not converge, there are too few groups of frames
-        to leave out, or an effect is unknown.
+        to leave out, an effect is unknown, the same data are given twice, or changes
+        are asked for where no two datasets have the same source.
 
     Examples
     --------
@@ -240,8 +255,11 @@ def diagnose(
     say = progress or (lambda line: None)
     observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
     library = _library(effects)
-    groups = frame_groups(observations) if cross_validate else None
     _check_instruments(observations)
+    if changes and not cells:
+        raise GapError("what changed between runs is told by cells; ask for them, too")
+    observations = distinct(observations, changes)
+    groups = frame_groups(observations) if cross_validate else None
     say("fitting the nominal model")
     nominal, base, exchanged = starting_model(calibration, observations, library, say)
     say("looking for frames that are not what the table says")
@@ -255,8 +273,10 @@ def diagnose(
     say("looking for causes")
     # what has a place depends on the alternative that was taken; the discrete ones were tried
     smooth = [effect for effect in adapted(library, base.chains) if effect.kind != "discrete"]
-    selection = select(base, smooth, groups, say, cells=cells)
-    return _conclude(nominal, base, exchanged, selection, frames, started)
+    selection = select(base, smooth, groups, say, cells=cells, changes=changes)
+    found = _conclude(nominal, base, exchanged, selection, frames, started)
+    found.settings["changes"] = changes
+    return found
 
 
 def _refitted(model, observations):
@@ -334,6 +354,7 @@ def _cause(group, improved, explained, before=None, after=None):
         physical=improved.is_physical(best.name) if best.name in improved.added else True,
         evidence=float(best.evidence),
         stability=group.stability,
+        by_dataset=group.by_dataset,
     )
 
 

@@ -64,6 +64,8 @@ class Group:
         The model with this cause and all chosen before it.
     stability : float
         Share of the halves of the wavelengths and of left-out angles in which it is found.
+    by_dataset : dict of str to float
+        Evidence for it in each of several runs alone.
 
     Examples
     --------
@@ -77,6 +79,7 @@ class Group:
     probability: float
     model: object = None
     stability: float = 1.0
+    by_dataset: dict = field(default_factory=dict)
 
     @property
     def best(self):
@@ -132,7 +135,7 @@ class _State:
         return frozenset(one.name for one in self.chosen)
 
 
-def select(base, library, groups, say, *, cells=True):
+def select(base, library, groups, say, *, cells=True, changes=False):
     """
     Choose the causes that a model lacks.
 
@@ -148,6 +151,8 @@ def select(base, library, groups, say, *, cells=True):
         Called with a line on what is done next.
     cells : bool
         Whether to ask for cells as well as for names.
+    changes : bool
+        Whether causes of one run only come first.
 
     Returns
     -------
@@ -168,11 +173,19 @@ def select(base, library, groups, say, *, cells=True):
     []
     """
     first = _scanned(base, library, cells)
-    best, left = _search(base, library, first, say, cells)
+    best, left = _search(_State(base), library, first, say, cells, _MOST)
+    runs = count_runs(base.problem)
+    if runs > 1 and cells and best.model.p_value < REMAINDER:
+        best, left = _better_apart(base, best, first, say), None
+        best, left = _search(best, library, first, say, cells, _MOST * runs)
     if not best.chosen:
         return Selection([], base, first, first, 0.0, [_errors(base, groups)])
     best, scans = _exchanged(base, best, library, first, say, cells)
     best = replace(best, model=best.model.polished())
+    if changes:
+        shared = [one for one in best.chosen if first.probes.run_of(one.cell) is None]
+        own = [one for one in best.chosen if one not in shared]
+        best = replace(best, chosen=[*own, *shared])
     best, models, history = _checked(base, best, groups, say)
     left = left if best.model is models[-1] and left is not None else None
     unlisted = _unlisted(base, best)
@@ -250,11 +263,33 @@ def _distinct(candidates, most):
     return found
 
 
-def _search(base, library, first, say, cells):
+def _better_apart(base, best, first, say):
+    """Return the set of the causes that each run needs by itself, if it is better than another."""
+    chosen = []
+    for i, name in enumerate(first.probes.runs):
+        say(f"{name} by itself")
+        alone = base.of_dataset(i)
+        state, _ = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST)
+        chosen += [_in_run(one, name, first.probes) for one in state.chosen]
+    say("all runs together")
+    model = base.with_effects([one.recipe for one in chosen], **_QUICK)
+    temper = max(1.0, min(model.mean_square, best.model.mean_square))
+    gained = 0.5 * (best.model.fit.chi2 - model.fit.chi2) / temper
+    cost = sum(one.cost(temper) for one in chosen) - sum(one.cost(temper) for one in best.chosen)
+    return _State(model, chosen, best.evidence + gained - cost) if gained > cost else best
+
+
+def _in_run(candidate, name, probes):
+    """Return the same cause in one run only."""
+    cell = candidate.cell
+    if probes.run_of(cell) is not None:
+        return candidate
+    return replace(candidate, cell=cell.in_run(name))
+
+
+def _search(best, library, first, say, cells, most_causes):
     """Return the best set of causes, and the scan beside it where it is known."""
-    best = _State(base)
-    states, known = [best], {best.outline: first}
-    most_causes = _MOST * count_runs(base.problem)
+    states, known = [best], {} if best.chosen else {best.outline: first}
     while len(best.chosen) < most_causes:
         k = len(best.chosen)
         width, most = (part[min(k, len(part) - 1)] for part in (_WIDTH, _FITTED))
@@ -386,7 +421,8 @@ def _grouped(best, models, scans, unlisted):
     for one, model in zip(best.chosen, models, strict=True):
         members = _members(one, scans[one.name])
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
-        found.append(Group(members, float((1 - unlisted) * chance), model))
+        alone = scans[one.name].by_run(members[0][0])
+        found.append(Group(members, float((1 - unlisted) * chance), model, by_dataset=alone))
     return found
 
 
