@@ -16,10 +16,12 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
+from astropolcal.chain import leaves
 from astropolcal.gap._bases import law_basis
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.problem import GapProblem
+from astropolcal.optics.perturbations import split_run
 
 __all__ = ["Candidate", "Scan", "false_discovery", "scan"]
 
@@ -42,6 +44,8 @@ _DEPENDENCE = {
     "dataset": -2.0,
 }
 _OTHER = -0.5
+# and what changes in one of several runs only needs another
+_ALONE = -1.0
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-9
 
@@ -193,6 +197,35 @@ class Scan:
             best = max([best, *found], key=lambda one: one.evidence)
         return best
 
+    def by_run(self, candidate):
+        """
+        Return the evidence for a cause in each of several runs alone.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            A cause that the model of the scan does not have.
+
+        Returns
+        -------
+        dict of str to float
+            Name of the dataset to the logarithm of the Bayes factor; without those that have no
+            place for it, and empty where there is one run only or the cause is in one.
+        """
+        probes = self.probes
+        if probes is None or probes.run_of(candidate.cell) is not None:
+            return {}
+        found = {}
+        for i, run in enumerate(probes.runs):
+            if candidate.is_named:
+                alone = _named_in(probes, candidate.named, i, self.temper)
+            else:
+                cell = candidate.cell.in_run(run)
+                alone = _of_cell(probes, cell, candidate.degree, self.temper)
+            if alone:
+                found[run] = alone[0].evidence - alone[0].prior
+        return found
+
     def named_as(self, candidate, effects):
         """
         Return the names of a cell, each with the law for which there is most evidence.
@@ -227,7 +260,7 @@ class Scan:
         return self.candidates[0] if self.candidates else None
 
 
-def scan(model, effects=(), *, cells=True, temper=1.0, without=None, slopes=None):
+def scan(model, effects=(), *, cells=True, temper=1.0, without=None, like=None):
     """
     Return the evidence for all cells and named effects beside a fitted model.
 
@@ -243,8 +276,8 @@ def scan(model, effects=(), *, cells=True, temper=1.0, without=None, slopes=None
         Variance of the residuals about the model with the cause, in units of the noise.
     without : str, optional
         Name of an effect of the model that is taken out, to first order.
-    slopes : dict, optional
-        Derivatives at the places, those of another scan of the same model.
+    like : Probes, optional
+        Those of another scan of the same model, whose derivatives are taken over.
 
     Returns
     -------
@@ -263,7 +296,7 @@ def scan(model, effects=(), *, cells=True, temper=1.0, without=None, slopes=None
     >>> bool(scan(model).best.evidence < 5)
     True
     """
-    probes = Probes(model, () if without is None else (without,), slopes)
+    probes = Probes(model, () if without is None else (without,), like)
     found, levels = [], []
     if cells:
         found = _cells(probes, temper)
@@ -275,22 +308,20 @@ def scan(model, effects=(), *, cells=True, temper=1.0, without=None, slopes=None
 
 def _cells(probes, temper):
     """Return the candidate of every cell, with the better of its laws."""
-    problem, waves = probes.problem, probes.waves
-    single = [name for name, w in waves.items() if len(w[0]) == 1]
-    several = [name for name in waves if name not in single]
-    stacked = [np.concatenate([waves[n][i] for n in single]) for i in range(len(problem.datasets))]
     own, best = probes.own, {}
     for place, kind, degree, reduced in probes.reduced(_DEGREES):
         scale = Cell(place, kind, "constant").scale
-        if probes.is_detector(kind):
-            # a constant in front of a derivative that follows the flux
-            parts = [(probes.dependence_of(kind), *(x[0] for x in reduced.normal(probes.ones)))]
-        else:
-            parts = list(zip(single, *reduced.normal(stacked), strict=True))
-            parts += [(name, *reduced.pair(waves[name])) for name in several]
-            bent = _bent(probes, place, kind, law_basis(problem.wavelength, degree))
-            if bent is not None:
-                parts = [(n, *bent) if n == "constant" else (n, *own) for n, *own in parts]
+        waves = {
+            name: probes.waves_of(Cell(place, kind, name))
+            for name in probes.dependences_of(place, kind)
+        }
+        single = [name for name, w in waves.items() if len(w[0]) == 1]
+        stacked = [np.concatenate(each) for each in zip(*(waves[n] for n in single), strict=True)]
+        parts = list(zip(single, *reduced.normal(stacked), strict=True))
+        parts += [(name, *reduced.pair(w)) for name, w in waves.items() if len(w[0]) > 1]
+        bent = _bent(probes, place, kind, law_basis(probes.problem.wavelength, degree))
+        if bent is not None:
+            parts = [(n, *bent) if n == "constant" else (n, *rest) for n, *rest in parts]
         for name, one in _candidates(place, kind, degree, parts, scale, temper):
             if name not in best or best[name].evidence < one.evidence:
                 best[name] = one
@@ -322,8 +353,7 @@ def _of_cell(probes, cell, degree, temper):
         both = _bent(probes, cell.place, cell.kind, law)
     if both is None:
         reduced = Reduced(probes, probes.slopes[cell.place, cell.kind], law)
-        detector = probes.is_detector(cell.kind)
-        both = reduced.pair(probes.ones if detector else probes.waves[cell.dependence])
+        both = reduced.pair(probes.waves_of(cell))
     parts = [(cell.dependence, *both)]
     return [one for _, one in _candidates(cell.place, cell.kind, degree, parts, cell.scale, temper)]
 
@@ -356,7 +386,9 @@ def _candidates(place, kind, degree, parts, scale, temper):
 
 
 def _prior(dependence):
-    return _DEPENDENCE.get(dependence.partition(":")[0], _OTHER)
+    text, run = split_run(dependence)
+    alone = _ALONE if run is not None and text != "dataset" else 0.0
+    return _DEPENDENCE.get(text.partition(":")[0], _OTHER) + alone
 
 
 def _spectra(gram, target):
@@ -398,16 +430,22 @@ def _named(probes, effects, temper, degree="default"):
             slopes, size = _columns_of(model.problem, model.jacobian, model.added[effect.name])
         else:
             slopes, size = _columns(model, fitting, degree).get(effect.name, (None, None))
-        if size is None or not size.size:
-            continue
-        scaled = slopes * size
-        seen = probes.tangent.T @ scaled
-        gram, target = scaled.T @ scaled - seen.T @ seen, scaled.T @ probes.residual
-        values, share = (part[0] for part in _spectra(gram[None], target[None]))
-        if _rank(values, 1.0):
-            one = _with_name(effect, model, values, share, temper)
-            found.append(replace(one, context=context))
+        one = _of_columns(probes, effect, slopes, size, temper)
+        found += [replace(each, context=context) for each in one]
     return found
+
+
+def _of_columns(probes, effect, slopes, size, temper):
+    """Return the candidate of an effect with these derivatives and usual sizes, in a list."""
+    if size is None or not size.size:
+        return []
+    scaled = slopes * size
+    seen = probes.tangent.T @ scaled
+    gram, target = scaled.T @ scaled - seen.T @ seen, scaled.T @ probes.residual
+    values, share = (part[0] for part in _spectra(gram[None], target[None]))
+    if not _rank(values, 1.0):
+        return []
+    return [_with_name(effect, probes.model, values, share, temper)]
 
 
 def _columns(model, effects, degree):
@@ -446,6 +484,34 @@ def _columns_of(problem, jacobian, parameters):
     rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
     size = np.concatenate([np.full(w.stop - w.start, p.canonical_scale) for w, p in parts])
     return jacobian[:, rows], size
+
+
+def _bent_name(probes, effect, context, temper):
+    """Return the candidate of an effect whose derivative vanishes, in a list."""
+
+
+def _named_in(probes, effect, i, temper):
+    """Return the candidate of a named effect in the chain of one dataset only, in a list."""
+    held = probes.model.held_chains
+    edit = effect.edit(list(held), probes.model.context)
+    chains = [*held[:i], edit.chains[i], *held[i + 1 :]]
+    there = {leaf.name for leaf in leaves(chains[i])}
+    own = [p for p in edit.parameters if p.name.partition(".")[0] in there]
+    names = {p.name for p in own}
+    ties = {
+        name: tie
+        for name, tie in edit.ties.items()
+        if tie.source in names and name.partition(".")[0] in there
+    }
+    if not own:
+        return []
+    laws = {p.name: p.basis for p in own if p.basis is not None}
+    model = probes.model
+    problem = GapProblem(
+        chains, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
+    )
+    jacobian = problem.jacobian(problem.start) if problem.size else None
+    return _of_columns(probes, effect, *_columns_of(problem, jacobian, own), temper)
 
 
 def _bent_name(probes, effect, context, temper):

@@ -9,7 +9,9 @@ light s that arrives at the place, the analyser row a behind it and the generato
 light and rows of all places come from one forward and one backward sweep.
 """
 
-from dataclasses import dataclass
+from collections import Counter
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import astropy.units as u
@@ -20,6 +22,7 @@ from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap._bases import law_basis
 from astropolcal.gap.problem import GapProblem
 from astropolcal.optics import GENERATORS, Dependence
+from astropolcal.optics.perturbations import split_run
 from astropolcal.optics.positions import COORDINATES
 
 __all__ = ["Cell", "Place", "Probes", "dependences", "places"]
@@ -59,7 +62,8 @@ class Cell:
         Key of `~astropolcal.optics.GENERATORS`, or ``"background"``,
         ``"background_of_one_beam"``, ``"nonlinearity"``, ``"persistence"``, ``"crosstalk"``.
     dependence : str
-        As `~astropolcal.optics.Dependence` takes it, or ``"flux"`` and ``"previous"``.
+        As `~astropolcal.optics.Dependence` takes it, or ``"flux"`` and ``"previous"``; in one of
+        several runs only with ``"/dataset:NAME"`` behind it.
 
     Examples
     --------
@@ -81,6 +85,16 @@ class Cell:
     def optic(self):
         """Name of the optic of the place, None where it is none."""
         return self.place.partition(":")[2] or None
+
+    @property
+    def run(self):
+        """Name of the one dataset in which it is, None where it is in all."""
+        return split_run(self.dependence)[1]
+
+    def in_run(self, name):
+        """Return the same in one dataset only."""
+        text = "" if self.dependence in ("constant", "flux", "previous") else f"{self.dependence}/"
+        return replace(self, dependence=f"{text}dataset:{name}")
 
     @property
     def scale(self):
@@ -133,7 +147,12 @@ def _place_words(place):
 
 
 def _when(dependence):
-    parts = dependence.split(":")
+    text, run = split_run(dependence)
+    return _pattern(text) + (f' in "{run}" only' if run is not None else "")
+
+
+def _pattern(text):
+    parts = text.split(":")
     stage = {"hwp": "half-wave plate"}.get(parts[1], parts[1]) if len(parts) > 1 else ""
     times = {"1": "once", "2": "twice", "4": "four times"}
     return {
@@ -146,7 +165,6 @@ def _when(dependence):
         ),
         "direction": lambda: f" that depends on the direction of the last move of the {stage}",
         "move": lambda: f" that grows with the last move of the {stage}",
-        "dataset": lambda: f' in "{dependence.partition(":")[2]}" only',
     }.get(parts[0], lambda: "")()
 
 
@@ -281,9 +299,14 @@ def dependences(problem, most_steps=_MOST_STEPS):
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
     names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
-    if len(problem.datasets) > 1:
-        names += [f"dataset:{d.observations.name}" for d in problem.datasets]
-    names += [f"step:{n}" for n in _steps(problem, most_steps)]
+    runs = [d.observations.name for d in problem.datasets] if count_runs(problem) > 1 else []
+    steps = [f"step:{n}" for n in _steps(problem, most_steps // max(len(runs), 1))]
+    # a frame of one run has nothing to do with that of the same number in another
+    alone = [*names[1:], *steps]
+    every = [d.observations.name for d in problem.datasets]
+    names += [f"dataset:{name}" for name in every] if len(every) > 1 else []
+    names += [] if runs else steps
+    names += [f"{name}/dataset:{run}" for run in runs for name in alone]
     found = {}
     for name in names:
         waves = [_waves(Dependence(name), dataset) for dataset in problem.datasets]
@@ -295,12 +318,27 @@ def dependences(problem, most_steps=_MOST_STEPS):
 _MOVED = ("direction", "move")
 
 
+def count_runs(problem):
+    """
+    Return how many runs of the same kind of source the datasets of a problem are at most.
+
+    Parameters
+    ----------
+    problem : GapProblem
+        Chains and datasets.
+
+    Returns
+    -------
+    int
+    """
+    return max(Counter(d.observations.source for d in problem.datasets).values())
+
+
 def _waves(dependence, dataset):
     """Return the functions of a dependence in the frames of a dataset, (count, F)."""
     observations = dataset.observations
-    if dependence.kind == "dataset":
-        own = dependence.text.partition(":")[2] == observations.name
-        return np.full((1, observations.n_frames), float(own))
+    if dependence.run not in (None, observations.name):
+        return np.zeros((dependence.count, observations.n_frames))
     if dependence.driver is None:
         return np.ones((1, observations.n_frames))
     given = dataset._given.get(dependence.driver)
@@ -340,8 +378,8 @@ class Probes:
         The fitted model.
     without : collection of str
         Names of effects of the model that are taken out, to first order.
-    slopes : dict, optional
-        Derivatives at the places, if they are known.
+    like : Probes, optional
+        Those of the same model, whose derivatives are taken over.
     most_steps : int
         Steps are looked for at so many frames.
 
@@ -360,7 +398,7 @@ class Probes:
     6
     """
 
-    def __init__(self, model, without=(), slopes=None, most_steps=_MOST_STEPS):
+    def __init__(self, model, without=(), like=None, most_steps=_MOST_STEPS):
         self.model, self.problem = model, model.problem
         problem, linear = model.problem, model.without(without)
         self.tangent, self.residual = linear.tangent, linear.residual
@@ -371,8 +409,8 @@ class Probes:
         #: Functions of the frame, see `dependences`.
         self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
         #: Second derivatives over the size that is tried, where they outdo the first ones.
-        self.bends = {}
-        self.slopes = self._at_places() if slopes is None else slopes
+        self.bends = {} if like is None else like.bends
+        self.slopes = self._at_places() if like is None else like.slopes
         parts = list(zip(problem.channels, problem.segments, strict=True))
         #: Tangent and lamp with the frames first, (F, rows of a frame, rank), one a dataset.
         self.by_frame = [_frames_first(self.tangent[rows], c.shape) for c, rows in parts]
@@ -384,8 +422,35 @@ class Probes:
         return [
             Cell(place, kind, dependence)
             for place, kind in self.slopes
-            for dependence in ([_DETECTOR[kind]] if kind in _DETECTOR else self.waves)
+            for dependence in self.dependences_of(place, kind)
         ]
+
+    def dependences_of(self, place, kind):
+        """Return the dependences of a kind at a place."""
+        if kind in _DETECTOR:
+            return [_DETECTOR[kind], *(name for name in self.waves if name[:8] == "dataset:")]
+        if len(self.slopes[place, kind]) > 1:
+            return list(self.waves)
+        # a place in one chain only is in that run anyway
+        return [name for name in self.waves if split_run(name)[1] is None]
+
+    @property
+    def runs(self):
+        """Names of the datasets, of which a cause may be in one only; none for a single run."""
+        names = [d.observations.name for d in self.problem.datasets]
+        return names if count_runs(self.problem) > 1 else []
+
+    def run_of(self, cell):
+        """Return the name of the one dataset that has a cell, None where several have it."""
+        if cell is None or cell.run is not None or not self.runs:
+            return cell and cell.run
+        where = list(self.slopes.get((cell.place, cell.kind), ()))
+        return self.runs[where[0]] if len(where) == 1 else None
+
+    def waves_of(self, cell):
+        """Return the functions of the frame by which the derivative of a cell is multiplied."""
+        # the derivative of what belongs to a detector has its dependence in it
+        return self.waves[cell.dependence] if cell.dependence in self.waves else self.ones
 
     def _at_places(self):
         """Return the derivative of both channels to a constant perturbation, by place and kind."""
@@ -473,16 +538,6 @@ class Probes:
             slopes = [a * one + b * other for a, b in channel.slopes(sweep)]
             yield kind, np.stack(slopes)
 
-    @staticmethod
-    def is_detector(kind):
-        """Whether a kind belongs to a detector, and has one dependence only."""
-        return kind in _DETECTOR
-
-    @staticmethod
-    def dependence_of(kind):
-        """Return the one dependence of a kind that belongs to a detector."""
-        return _DETECTOR[kind]
-
     # ---- normal equations --------------------------------------------------------------------
 
     def reduced(self, degrees=(0, 2)):
@@ -500,11 +555,14 @@ class Probes:
         degree : int or None
         Reduced
         """
-        wavelength = self.problem.wavelength
+        laws = {degree: law_basis(self.problem.wavelength, degree) for degree in degrees}
+        widest = max(laws.values(), key=lambda law: law.shape[1])
         for (place, kind), slopes in self.slopes.items():
-            for degree in degrees:
-                law = law_basis(wavelength, degree)
-                yield place, kind, degree, Reduced(self, slopes, law)
+            whole = Reduced(self, slopes, widest)
+            for degree, law in laws.items():
+                k = law.shape[1]
+                part = np.array_equal(widest[:, :k], law)
+                yield place, kind, degree, whole.first(k) if part else Reduced(self, slopes, law)
 
 
 def _frames_first(basis, shape):
@@ -563,6 +621,17 @@ class Reduced:
             self.seen.append(_by_frame(flat, probes.by_frame[i]))
             # the lamp is taken up as the tangent is: both are directions that data do not tell
             self.lamps.append(_by_frame(white[:, 1], probes.lamp_by_frame[i]))
+
+    def first(self, k):
+        """Return the same for the law of the first columns of the basis."""
+        if k == len(self.target[0]):
+            return self
+        part = copy(self)
+        part.gram = [g[:k, :k] for g in self.gram]
+        part.target = [t[:k] for t in self.target]
+        part.seen = [s[:k] for s in self.seen]
+        part.lamps = [s[:k] for s in self.lamps]
+        return part
 
     def normal(self, waves):
         """

@@ -20,6 +20,7 @@ from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.frames import suspect_frames, without_frames
 from astropolcal.gap.model import Model, nominal_model
 from astropolcal.gap.problem import GapProblem
+from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, explained_by_one, select
 from astropolcal.gap.shrinkage import HeldOut, frame_groups
 from astropolcal.words import counted
@@ -59,6 +60,8 @@ class Cause:
         Logarithm of the Bayes factor.
     stability : float or None
         Share of the halves of the wavelengths and of the left-out angles in which it is found.
+    by_dataset : dict of str to float
+        Evidence for it in each of several runs alone.
 
     Examples
     --------
@@ -80,6 +83,7 @@ class Cause:
     physical: bool = True
     evidence: float = 0.0
     stability: float | None = None
+    by_dataset: dict = field(default_factory=dict)
 
     @property
     def name(self):
@@ -195,6 +199,7 @@ def diagnose(
     *,
     effects="all",
     cells=True,
+    changes=False,
     cross_validate=True,
     nested=False,
     progress=None,
@@ -214,6 +219,9 @@ def diagnose(
     cells : bool
         Whether to ask for every cell of places, kinds and dependences too; without it
         the answer is one of the names, or none.
+    changes : bool
+        Whether to ask what changed between several runs of the same kind of source: causes
+        of one run only come first.
     cross_validate : bool
         Whether to check on left-out frames; without it the gaps are those of
         the fit itself.
@@ -232,7 +240,8 @@ def diagnose(
     ------
     GapError
         If the nominal fit does not converge, there are too few groups of frames
-        to leave out, or an effect is unknown.
+        to leave out, an effect is unknown, the same data are given twice, or changes
+        are asked for where no two datasets have the same source.
 
     Examples
     --------
@@ -255,8 +264,11 @@ def diagnose(
     say = progress or (lambda line: None)
     observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
     library = _library(effects)
-    groups = frame_groups(observations) if cross_validate else None
     _check_instruments(observations)
+    if changes and not cells:
+        raise GapError("what changed between runs is told by cells; ask for them, too")
+    observations = distinct(observations, changes)
+    groups = frame_groups(observations) if cross_validate else None
     say("fitting the nominal model")
     nominal, base, exchanged = starting_model(calibration, observations, library, say)
     say("looking for frames that are not what the table says")
@@ -273,8 +285,9 @@ def diagnose(
         again, groups = _refitted(base, kept), frame_groups(kept) if cross_validate else None
         nominal, base = (again if nominal is base else nominal), again
     say("looking for causes")
-    selection = select(base, smooth, groups, say, cells=cells)
+    selection = select(base, smooth, groups, say, cells=cells, changes=changes)
     found = _conclude(nominal, base, exchanged, selection, frames, started)
+    found.settings["changes"] = changes
     if nested and groups is not None:
         found.nested = _nested(base, smooth, groups, say, cells)
         found.seconds = time.perf_counter() - started
@@ -383,6 +396,7 @@ def _cause(group, improved, explained, before=None, after=None):
         physical=improved.is_physical(best.name) if best.name in improved.added else True,
         evidence=float(best.evidence),
         stability=group.stability,
+        by_dataset=group.by_dataset,
     )
 
 

@@ -4,6 +4,7 @@
 import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
@@ -98,6 +99,25 @@ class Model:
     def context(self):
         """What an effect may know of the data."""
         return Context.of(self.problem.wavelength, self.observations)
+
+    def of_dataset(self, i):
+        """
+        Return the model of one of the datasets by itself, fitted with the same noise.
+
+        Parameters
+        ----------
+        i : int
+            Number of the dataset.
+
+        Returns
+        -------
+        Model
+            Without what was added.
+        """
+        mine = self.problem
+        noise = SimpleNamespace(fluxes=[mine.fluxes[i]], channels=[mine.channels[i]], waves=None)
+        problem = GapProblem([self.trains[i]], [self.observations[i]], ties=mine.ties, like=noise)
+        return Model(problem, problem.fit(problem.start))
 
     def degrees_of_freedom(self, tangent):
         """Return the number of data less that of the directions fitted."""

@@ -17,7 +17,7 @@ from astropolcal import instruments
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
 from astropolcal.files import atomic_path, printable
-from astropolcal.gap import _numbers, _words
+from astropolcal.gap import _numbers, _words, runs
 from astropolcal.gap.planning import few, plan
 from astropolcal.gap.residuals import locate
 from astropolcal.gap.selection import REMAINDER
@@ -83,6 +83,7 @@ def to_dict(diagnosis):
         cause["details"] = _words.details(cause, ranks)
         cause["words"] = _words.cause(cause, ranks)
     noisy = diagnosis.remainder_p_value > REMAINDER
+    changed = runs.changes(diagnosis, causes)
     content = {
         "verdict": diagnosis.verdict,
         "nominal": _nominal(diagnosis.nominal),
@@ -104,13 +105,17 @@ def to_dict(diagnosis):
         "where_left": [] if same or noisy else _where(diagnosis.improved),
         "left_share": 0.0 if noisy else _left_share(diagnosis),
         "causes": causes,
+        "changes": changed,
         "scores": [_score(one) for one in diagnosis.scan.candidates[:_MOST_SCORES]],
         "n_effects": len(diagnosis.scan.candidates),
         "accuracy_before": before,
         "accuracy_after": after,
         "next_observations": _next(diagnosis),
     }
-    return _plain(content | {"sentences": _words.sentences(content)})
+    names = [o.name for o in diagnosis.improved.observations]
+    asked = diagnosis.settings.get("changes", False)
+    words = [*_words.sentences(content), *runs.paragraph(content, names, asked)]
+    return _plain(content | {"sentences": words})
 
 
 def _nominal(model):
@@ -164,6 +169,7 @@ def _cause(diagnosis, i, fitted):
         "left_out_before_percent": before.percent if before else None,
         "left_out_after_percent": after.percent if after else None,
         "stability": cause.stability,
+        "evidence_by_dataset": cause.by_dataset,
         "size": fitted.sizes(cause.name),
         "significance": fitted.significance(cause.name),
         "physical": bool(cause.physical),

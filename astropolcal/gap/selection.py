@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from astropolcal.gap.attribution import scan
+from astropolcal.gap.cells import count_runs
 from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = ["Group", "Selection", "explained_by_one", "select"]
@@ -65,6 +66,8 @@ class Group:
         By how much chi-square is lower with it than with those chosen before it.
     stability : float
         Share of the halves of the wavelengths and of left-out angles in which it is found.
+    by_dataset : dict of str to float
+        Evidence for it in each of several runs alone.
 
     Examples
     --------
@@ -78,6 +81,7 @@ class Group:
     probability: float
     lowered: float = 0.0
     stability: float | None = None
+    by_dataset: dict = field(default_factory=dict)
 
     @property
     def best(self):
@@ -133,7 +137,7 @@ class _State:
         return frozenset(one.name for one in self.chosen)
 
 
-def select(base, library, groups, say, *, cells=True):
+def select(base, library, groups, say, *, cells=True, changes=False):
     """
     Choose the causes that a model lacks.
 
@@ -149,6 +153,8 @@ def select(base, library, groups, say, *, cells=True):
         Called with a line on what is done next.
     cells : bool
         Whether to ask for cells as well as for names.
+    changes : bool
+        Whether causes of one run only come first.
 
     Returns
     -------
@@ -169,11 +175,19 @@ def select(base, library, groups, say, *, cells=True):
     []
     """
     first = _scanned(base, library, cells)
-    best, left = _search(base, library, first, say, cells)
+    best, left = _search(_State(base), library, first, say, cells, _MOST)
+    runs = count_runs(base.problem)
+    if runs > 1 and cells and best.model.p_value < REMAINDER:
+        best, left = _better_apart(base, best, first, say), None
+        best, left = _search(best, library, first, say, cells, _MOST * runs)
     if not best.chosen:
         return Selection([], base, first, first, 0.0, [_errors(base, groups)])
     best, scans = _exchanged(base, best, library, first, say, cells)
     best = replace(best, model=best.model.polished())
+    if changes:
+        shared = [one for one in best.chosen if first.probes.run_of(one.cell) is None]
+        own = [one for one in best.chosen if one not in shared]
+        best = replace(best, chosen=[*own, *shared])
     best, steps, history = _checked(base, best, groups, say)
     unlisted = _unlisted(base, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
@@ -273,24 +287,47 @@ def _distinct(candidates, most):
     return found
 
 
-def _search(base, library, first, say, cells):
+def _better_apart(base, best, first, say):
+    """Return the set of the causes that each run needs by itself, if it is better than another."""
+    chosen = []
+    for i, name in enumerate(first.probes.runs):
+        say(f"{name} by itself")
+        alone = base.of_dataset(i)
+        state, _ = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST)
+        chosen += [_in_run(one, name, first.probes) for one in state.chosen]
+    say("all runs together")
+    model = base.with_effects([one.recipe for one in chosen], **_QUICK)
+    temper = max(1.0, min(model.mean_square, best.model.mean_square))
+    gained = 0.5 * (best.model.fit.chi2 - model.fit.chi2) / temper
+    cost = sum(one.cost(temper) for one in chosen) - sum(one.cost(temper) for one in best.chosen)
+    return _State(model, chosen, best.evidence + gained - cost) if gained > cost else best
+
+
+def _in_run(candidate, name, probes):
+    """Return the same cause in one run only."""
+    cell = candidate.cell
+    if probes.run_of(cell) is not None:
+        return candidate
+    return replace(candidate, cell=cell.in_run(name))
+
+
+def _search(best, library, first, say, cells, most_causes):
     """Return the best set of causes, and the scan beside it where it is known."""
-    best = _State(base)
-    states, known = [best], {best.outline: first}
-    for k in range(_MOST):
+    states, known = [best], {} if best.chosen else {best.outline: first}
+    while len(best.chosen) < most_causes:
+        k = len(best.chosen)
         width, most = (part[min(k, len(part) - 1)] for part in (_WIDTH, _FITTED))
-        say(f"looking for cause {k + 1}, at most {_MOST}")
+        say(f"looking for cause {k + 1}, at most {most_causes}")
         grown = {}
         for state in states:
             found = known.get(state.outline)
             if found is None:
                 found = known[state.outline] = _scanned(state.model, library, cells)
-            for one in map(found.freer, _distinct(found.candidates, most)):
-                if one.evidence > ENOUGH:
-                    evidence = state.evidence + one.evidence
-                    outline = state.outline | {one.name}
-                    if outline not in grown or grown[outline][0] < evidence:
-                        grown[outline] = (evidence, state, one)
+            for added in _continuations(found, most):
+                evidence = state.evidence + sum(one.evidence for one in added)
+                outline = state.outline.union(one.name for one in added)
+                if outline not in grown or grown[outline][0] < evidence:
+                    grown[outline] = (evidence, state, added)
         order = sorted(grown.values(), key=lambda item: -item[0])[:most]
         fitted = [state for item in order if (state := _extended(*item)) is not None]
         fitted.sort(key=lambda state: -state.evidence)
@@ -303,15 +340,30 @@ def _search(base, library, first, say, cells):
     return best, known.get(best.outline)
 
 
-def _extended(evidence, state, candidate):
-    """Return a set with one more cause, fitted in full, None where that is impossible."""
-    model = state.model.with_effect(*candidate.recipe, **_QUICK)
-    if not model.is_physical(candidate.name):
+def _continuations(found, most):
+    """Return what may be added to a set: one cause, or one in each of the runs."""
+    few = [found.freer(one) for one in _distinct(found.candidates, most)]
+    few = [one for one in few if one.evidence > ENOUGH]
+    if found.probes is None or len(found.probes.runs) < 2:
+        return [(one,) for one in few]
+    first = {}
+    for one in [*few, *found.candidates]:
+        run = found.probes.run_of(one.cell)
+        if run is not None and run not in first and one.evidence > ENOUGH:
+            first[run] = one if one in few else found.freer(one)
+    # the data of two runs are not the same: their causes can be taken together
+    return [(one,) for one in few] + ([tuple(first.values())] if len(first) > 1 else [])
+
+
+def _extended(evidence, state, added):
+    """Return a set with more causes, fitted in full, None where that is impossible."""
+    model = state.model.with_effects([one.recipe for one in added], **_QUICK)
+    if not all(model.is_physical(one.name) for one in added):
         return None
     # what the full fit gains over the linear promise
-    gained = state.model.fit.chi2 - model.fit.chi2 - candidate.statistic
+    gained = state.model.fit.chi2 - model.fit.chi2 - sum(one.statistic for one in added)
     temper = max(1.0, model.mean_square)
-    return _State(model, [*state.chosen, candidate], evidence + 0.5 * gained / temper)
+    return _State(model, [*state.chosen, *added], evidence + 0.5 * gained / temper)
 
 
 def _exchanged(base, best, library, first, say, cells):
@@ -321,7 +373,7 @@ def _exchanged(base, best, library, first, say, cells):
     What was chosen first was chosen while the others were missing: its law in wavelength may be too
     stiff, another cause may do better, and a name may do as well as the cell that it is.
     """
-    scans, slopes = {}, None
+    scans, like = {}, None
     for turn in range(_TURNS if best.chosen else 0):
         before = best
         for one in reversed(best.chosen):
@@ -329,8 +381,8 @@ def _exchanged(base, best, library, first, say, cells):
             if turn and others == scans.get(one.name, (None,))[0]:
                 continue
             say(f"beside all the others: {one.effect.title}")
-            found = first if not others else _beside(best.model, one, library, cells, slopes)
-            slopes = slopes or (others and found.probes.slopes)
+            found = first if not others else _beside(best.model, one, library, cells, like)
+            like = like or (found.probes if others else None)
             scans[one.name] = (others, found)
             fresh = _best_beside(found, one, library)
             if fresh is None or (fresh.name, fresh.degree) == (one.name, one.degree):
@@ -339,17 +391,17 @@ def _exchanged(base, best, library, first, say, cells):
             chosen = [*best.chosen[:place], fresh, *best.chosen[place + 1 :]]
             model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
             if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
-                scans[fresh.name], slopes = scans.pop(one.name), None
+                scans[fresh.name], like = scans.pop(one.name), None
                 best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
         if best is before:
             break
     return best, {name: found for name, (_, found) in scans.items()}
 
 
-def _beside(model, one, library, cells, slopes):
+def _beside(model, one, library, cells, like):
     """Return the evidence beside all other causes of a model."""
     temper = max(1.0, model.mean_square)
-    return scan(model, library, cells=cells, temper=temper, without=one.name, slopes=slopes)
+    return scan(model, library, cells=cells, temper=temper, without=one.name, like=like)
 
 
 def _best_beside(found, own, library):
@@ -405,7 +457,9 @@ def _grouped(best, steps, scans, unlisted, stable):
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
         lowered = max(before.chi2 - after.chi2, 0.0)
         share = stable.get(one.name, 1.0)
-        found.append(Group(members, float((1 - unlisted) * chance * share), lowered, share))
+        alone = scans[one.name].by_run(members[0][0])
+        chance = float((1 - unlisted) * chance * share)
+        found.append(Group(members, chance, lowered, share, alone))
     return found
 
 

@@ -32,6 +32,7 @@ examples:
   astropolcal diagnose cal.asdf polarized.ecsv      the model of a calibration
   astropolcal diagnose run.ecsv --derotator linear  a simpler model
   astropolcal diagnose run.ecsv --effects beam_gain,hwp_tilt
+  astropolcal diagnose july.ecsv october.ecsv --changes
   astropolcal diagnose run.ecsv --save better.asdf  calibrate with what is found
 
 Several tables are used together. The effects are listed by --effects help.
@@ -73,6 +74,11 @@ def add_parser(commands):
         default="all",
         metavar="all|NAME,NAME",
         help="which effects to try (default: all; help lists them)",
+    )
+    parser.add_argument(
+        "--changes",
+        action="store_true",
+        help="ask what changed between several runs of the same kind of source",
     )
     _add_output_options(parser)
     parser.set_defaults(run=run)
@@ -122,7 +128,9 @@ def run(arguments):
     _check_page(arguments.report)
     effects = _effects(arguments.effects)
     nominal, datasets, instrument = _nominal(arguments)
-    diagnosis = diagnose(nominal, datasets, effects=effects, progress=progress)
+    diagnosis = diagnose(
+        nominal, datasets, effects=effects, changes=arguments.changes, progress=progress
+    )
     # once: page, JSON and summary say the same
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime

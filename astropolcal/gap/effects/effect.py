@@ -20,6 +20,7 @@ from astropolcal.gap.effects.roles import SEVERAL, Roles
 from astropolcal.gap.effects.where import Where
 from astropolcal.measurement import Tie
 from astropolcal.optics import GENERATORS, Dependence
+from astropolcal.optics.perturbations import split_run
 from astropolcal.words import did_you_mean
 
 __all__ = ["Effect"]
@@ -248,7 +249,7 @@ class Effect:
         place = self.where.find(roles, self.optic)
         if place is None or (self.when is not None and not self.when(roles)):
             return False
-        what, stage, *_ = (*self._dependence(roles).split(":"), "")
+        what, stage, *_ = (*split_run(self._dependence(roles))[0].split(":"), "")
         needed = what in ("harmonic", "direction", "move")
         return not needed or any(o.stage == stage for o in roles.leaves)
 
@@ -257,9 +258,11 @@ class Effect:
 
     def _dependence(self, roles):
         """Return the dependence, with the name of the stage of the effect's own optic."""
-        if ":own" not in self.dependence:
+        text = split_run(self.dependence)[0]
+        if ":own" not in text:
             return self.dependence
-        return self.dependence.replace(":own", f":{self.where.anchor(roles).stage}")
+        stage = f":{self.where.anchor(roles).stage}"
+        return text.replace(":own", stage) + self.dependence.removeprefix(text)
 
     # ---- cells -------------------------------------------------------------------------------
 
@@ -310,8 +313,8 @@ class Effect:
 
     def _in_dataset(self, context, i):
         """Return whether a dataset is that of the dependence, where this names one."""
-        what, _, name = self.dependence.partition(":")
-        return what != "dataset" or context.datasets[i : i + 1] in ((), (name,))
+        name = split_run(self.dependence)[1]
+        return name is None or context.datasets[i : i + 1] in ((), (name,))
 
     def parameters(self, names, chains, context):
         """Return the parameters of these names, with their sizes and laws."""
