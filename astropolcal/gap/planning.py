@@ -43,6 +43,8 @@ _LEAST_SHARE, _MOST_MEMBERS = 0.02, 6
 # of the doubt, the least that an exposure has to take; what a change of the set-up and a frame
 # have to bring
 _CLEARLY, _CHANGE, _FRAME = 0.2, 0.01, 1e-4
+# dependences that a run shows, and not the frames of any other block
+_TIMED = ("time", "time2", "step", "frame")
 # log Bayes factor at which two causes are told apart
 _APART = np.log(10)
 # a dataset is repeated so many times to know its noise
@@ -359,10 +361,15 @@ def _telling_apart(forecast, group, foreseen):
     titles = {effect.name: _titled(effect) for effect, _ in recipes}
     hypotheses, now = forecast.foreseen(names), float(np.sum(weights**2))
     best, value = None, -np.inf
+    # a short block is no run: how far a drift would come in it is not known
+    timed = any(effect.dependence.partition(":")[0] in _TIMED for effect, _ in recipes)
     for exposure, columns in foreseen:
+        if timed and not exposure.what:
+            continue
         factors, sigmas = odds(hypotheses, columns.T @ columns)
         after = expected(weights, factors)
-        worth = after - _CHANGE * exposure.effort - _FRAME * exposure.n_frames
+        clear = np.log10(1 + np.min(sigmas + sigmas.max() * np.eye(len(names))))
+        worth = after + _CHANGE * (clear - exposure.effort) - _FRAME * exposure.n_frames
         if worth > value:
             best, value = (exposure, after, factors, sigmas), worth
     entry = {"question": "cause", "separates": list(names), "gain": 0.0}
@@ -373,19 +380,19 @@ def _telling_apart(forecast, group, foreseen):
         other = [j for j in range(1, len(names)) if min(factors[0, j], factors[j, 0]) > _APART]
         if other and after - now > _CLEARLY * (1 - now):
             gain = min(min(sigmas[0, j], sigmas[j, 0]) for j in other)
-            few = [titles[names[j]] for j in other[:2]]
-            few += [f"{len(other) - 2} more"] * (len(other) > 2)
+            few = listed([titles[names[j]] for j in other], most=2)
+            same = [titles[names[j]] for j in range(1, len(names)) if j not in other]
+            few += f", not from {listed(same, most=2)}," if same else ""
             words = (
-                f"Take {exposure.words}: tells {first} from {listed(few)} at {_sigmas(gain)} "
+                f"Take {exposure.words}: tells {first} from {few} at {_sigmas(gain)} "
                 f"standard deviations; the probability of the true one should rise from "
                 f"{now:.0%} to {_percent(after)}"
             )
             told = [names[0], *(names[j] for j in other)]
             more = {"separates": told, "gain": float(gain), "probability_after": after}
             return entry | more | {"words": words}
-    few = [titles[name] for name in names[1:3]]
-    few += [f"{len(names) - 3} more"] * (len(names) > 3)
-    words = f"No exposure that was tried tells {first} from {listed(few)}: other angles and orders"
+    few = listed([titles[name] for name in names[1:]], most=2)
+    words = f"No exposure that was tried tells {first} from {few}: other angles and orders"
     return entry | {"words": f"{words}, polarizer and lamp do to both the same"}
 
 
