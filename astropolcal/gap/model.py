@@ -33,7 +33,7 @@ _ABSORBED = 1e-6
 _AT_LIMIT = 1e-6
 _MOST_PRESSED = 0.1
 # a second difference above this share of the first one is tried at finite size
-_BENT = 0.5
+_BENT = 1.0
 
 
 @dataclass
