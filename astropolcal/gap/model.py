@@ -24,6 +24,9 @@ __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 _ROUNDS, _MORE = 3, 3
 # a fit whose residuals are less probable than this may sit in a wrong minimum
 _NOISE = 1e-3
+# wavelengths with a mean square above so many medians may sit in a wrong branch; another one has to
+# leave less than this share, and is sought in so many steps
+_CONSPICUOUS, _FAR_LESS, _FEW_STEPS = 3.0, 0.7, 8
 # directions in which a size at its limit does less than this to the data, in units of the
 # noise, are not looked at; nor those of which the model takes up all but this share
 _VISIBLE = 1.0
@@ -350,7 +353,7 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
         return Model(problem, Fit(problem.start, float(residual @ residual), False))
     if like is None:
         problem.settle_noise()
-    found = _lowest(problem, chains)
+    found = _in_branch(problem, _lowest(problem, chains))
     # in turn: the residuals of a better fit tell the noise better
     for _ in range(_ROUNDS - 1 if like is None else 0):
         problem.settle_noise(found.coefficients)
@@ -406,6 +409,91 @@ def _lowest(problem, chains):
         vector[slot.slice] = value if value.size in (1, slot.size) else vector[slot.slice]
     other = problem.fit(np.clip(problem.coefficients(vector), problem.low, problem.high))
     return other if other.converged and other.chi2 < found.chi2 else found
+
+
+def _in_branch(problem, found):
+    """
+    Return the fit with the wavelengths in other branches that are far better there.
+
+    A retardance of the other sign, or a turn from it, may be a minimum of its own, from which a
+    fit does not leave. Wavelengths that fit much worse than the others are started again from what
+    their neighbours say, with all signs.
+    """
+    slots = [s for s in problem.free.slots if s.per_wavelength and s.name not in problem.laws]
+    slots = [slot for slot in slots if slot.size == len(problem.wavelength)]
+    if not slots or stats.chi2.sf(found.chi2, max(problem.n_data - problem.size, 1)) > _NOISE:
+        return found
+    before = _by_wavelength(problem, found.coefficients)
+    bad = before > _CONSPICUOUS * np.median(before)
+    if not bad.any() or np.sum(~bad) < 2:
+        return found
+    live = np.zeros(problem.size, dtype=bool)
+    for slot in slots:
+        live[problem.slices[slot.name]] = bad
+    rows = np.concatenate(
+        [np.broadcast_to(bad[d.bins][:, None], c.shape).ravel() for c, d in _datasets(problem)]
+    )
+    best, least = found.coefficients.copy(), before
+    for start in _branches(problem, slots, found.coefficients, bad):
+        trial = problem.fit(start, rows, ~live, steps=_FEW_STEPS).coefficients
+        after = _by_wavelength(problem, trial)
+        better = bad & (after < least)
+        for slot in slots:
+            where = problem.slices[slot.name]
+            best[where] = np.where(better, trial[where], best[where])
+        least = np.where(better, after, least)
+    # what a wavelength gains has to be more than what a fit may still win by itself
+    if np.all(least > _FAR_LESS * before):
+        return found
+    again = problem.fit(best)
+    return again if again.converged and again.chi2 < found.chi2 else found
+
+
+def _datasets(problem):
+    return zip(problem.channels, problem.datasets, strict=True)
+
+
+def _by_wavelength(problem, coefficients):
+    """Return the mean square of the residuals at each wavelength."""
+    square = problem.residual(coefficients) ** 2
+    total, count = np.zeros((2, len(problem.wavelength)))
+    for (channel, dataset), rows in zip(_datasets(problem), problem.segments, strict=True):
+        total[dataset.bins] += square[rows].reshape(channel.shape).sum(axis=(0, 2))
+        count[dataset.bins] += 2 * channel.valid.sum(axis=1)
+    return total / np.maximum(count, 1)
+
+
+def _branches(problem, slots, coefficients, bad):
+    """Yield starts at which wavelengths are as their neighbours say, with one sign or another."""
+    smooth = {}
+    for slot in slots:
+        values = coefficients[problem.slices[slot.name]]
+        # a retardance is known up to a turn
+        good = np.unwrap(values[~bad]) if slot.unit == u.deg else values[~bad]
+        smooth[slot.name] = np.interp(problem.wavelength, problem.wavelength[~bad], good)
+    angles = [slot.name for slot in slots if slot.unit == u.deg]
+    for flipped in dict.fromkeys([(), tuple(angles), *((name,) for name in angles)]):
+        start = coefficients.copy()
+        for slot in slots:
+            where, value = problem.slices[slot.name], smooth[slot.name]
+            value = -value if slot.name in flipped else value
+            if slot.name in angles:
+                value = _within(value, problem.low[where], problem.high[where])
+            start[where] = np.where(bad, value, start[where])
+        yield np.clip(start, problem.low, problem.high)
+    own = coefficients.copy()
+    for name in angles:
+        where = problem.slices[name]
+        turned = _within(-own[where], problem.low[where], problem.high[where])
+        own[where] = np.where(bad, turned, own[where])
+    yield np.clip(own, problem.low, problem.high)
+
+
+def _within(angle, low, high):
+    """Return an angle, radian, moved by a turn where that brings it within its bounds."""
+    turn = 2 * np.pi
+    angle = np.where((angle < low) & (angle + turn <= high), angle + turn, angle)
+    return np.where((angle > high) & (angle - turn >= low), angle - turn, angle)
 
 
 def _no_convergence():
