@@ -27,6 +27,8 @@ _NOISE = 1e-3
 # wavelengths with a mean square above so many medians may sit in a wrong branch; another one has to
 # leave less than this share, and is sought in so many steps
 _CONSPICUOUS, _FAR_LESS, _FEW_STEPS = 3.0, 0.7, 8
+# square of the bend (radian) that another sign has to be worth
+_OTHER_SIGN = 0.01
 # directions in which a size at its limit does less than this to the data, in units of the
 # noise, are not looked at; nor those of which the model takes up all but this share
 _VISIBLE = 1.0
@@ -417,24 +419,34 @@ def _in_branch(problem, found):
 
     A retardance of the other sign, or a turn from it, may be a minimum of its own, from which a
     fit does not leave. Wavelengths that fit much worse than the others are started again from what
-    their neighbours say, with all signs.
+    their neighbours say, with all signs; where those would have all others bent, everything is
+    fitted from the signs of the smoothest course.
     """
     slots = [s for s in problem.free.slots if s.per_wavelength and s.name not in problem.laws]
     slots = [slot for slot in slots if slot.size == len(problem.wavelength)]
     if not slots or stats.chi2.sf(found.chi2, max(problem.n_data - problem.size, 1)) > _NOISE:
         return found
-    before = _by_wavelength(problem, found.coefficients)
+    for starts in (_mended(problem, slots, found.coefficients), _smoothest(problem, slots, found)):
+        for start in starts:
+            again = problem.fit(start)
+            found = again if again.converged and again.chi2 < found.chi2 else found
+    return found
+
+
+def _mended(problem, slots, coefficients):
+    """Yield the coefficients with the wavelengths that fit worst in a better branch, if any are."""
+    before = _by_wavelength(problem, coefficients)
     bad = before > _CONSPICUOUS * np.median(before)
     if not bad.any() or np.sum(~bad) < 2:
-        return found
+        return
     live = np.zeros(problem.size, dtype=bool)
     for slot in slots:
         live[problem.slices[slot.name]] = bad
     rows = np.concatenate(
         [np.broadcast_to(bad[d.bins][:, None], c.shape).ravel() for c, d in _datasets(problem)]
     )
-    best, least = found.coefficients.copy(), before
-    for start in _branches(problem, slots, found.coefficients, bad):
+    best, least = coefficients.copy(), before
+    for start in _branches(problem, slots, coefficients, bad):
         trial = problem.fit(start, rows, ~live, steps=_FEW_STEPS).coefficients
         after = _by_wavelength(problem, trial)
         better = bad & (after < least)
@@ -443,10 +455,42 @@ def _in_branch(problem, found):
             best[where] = np.where(better, trial[where], best[where])
         least = np.where(better, after, least)
     # what a wavelength gains has to be more than what a fit may still win by itself
-    if np.all(least > _FAR_LESS * before):
-        return found
-    again = problem.fit(best)
-    return again if again.converged and again.chi2 < found.chi2 else found
+    if np.any(least < _FAR_LESS * before):
+        yield best
+
+
+def _smoothest(problem, slots, found):
+    """Yield the coefficients with the signs of retardances that make their courses smoothest."""
+    start = found.coefficients.copy()
+    for slot in slots:
+        where = problem.slices[slot.name]
+        if slot.unit == u.deg and slot.size > 2:
+            start[where] = _smooth(
+                problem.wavelength, start[where], problem.low[where], problem.high[where]
+            )
+    if not np.array_equal(start, found.coefficients):
+        yield start
+
+
+def _smooth(wavelength, values, low, high):
+    """Return values with the signs and turns with which their course is least bent."""
+    turn = 2 * np.pi
+    choices = np.array([s * values + k * turn for s in (1, -1) for k in (0, -1, 1)])
+    # what is out of the bounds is no choice; its own value is always one, and preferred
+    cost = np.where((choices >= low) & (choices <= high), _OTHER_SIGN, np.inf)
+    cost[0] = 0.0
+    total, back = cost[:, :1] + cost[:, 1], []
+    for i in range(2, len(values)):
+        first, second, third = choices[:, i - 2], choices[:, i - 1], choices[:, i]
+        share = (wavelength[i] - wavelength[i - 1]) / (wavelength[i - 1] - wavelength[i - 2])
+        straight = second[None] + share * (second[None] - first[:, None])
+        bends = total[:, :, None] + (third - straight[:, :, None]) ** 2 + cost[:, i]
+        back.append(bends.argmin(axis=0))
+        total = bends.min(axis=0)
+    path = list(np.unravel_index(total.argmin(), total.shape))
+    for step in reversed(back):
+        path.insert(0, int(step[path[0], path[1]]))
+    return choices[path, np.arange(len(values))]
 
 
 def _datasets(problem):
