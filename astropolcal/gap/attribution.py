@@ -33,7 +33,14 @@ _TOGETHER = 20
 #: Prior odds of a name against a cell of the table.
 NAMED = 5.0
 # log prior odds of dependences: what changes needs a reason
-_DEPENDENCE = {"constant": 0.0, "step": -5.0, "direction": -1.5, "move": -1.5, "time2": -1.0}
+_DEPENDENCE = {
+    "constant": 0.0,
+    "step": -5.0,
+    "direction": -1.5,
+    "move": -1.5,
+    "time2": -1.0,
+    "dataset": -2.0,
+}
 _OTHER = -0.5
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-9
@@ -201,7 +208,7 @@ class Scan:
         -------
         list of Candidate
         """
-        chains, own = self.probes.model.trains, set(self.probes.model.added)
+        chains, own = self.probes.model.trains, self.probes.own
         same = [
             effect
             for effect in effects
@@ -220,7 +227,7 @@ class Scan:
         return self.candidates[0] if self.candidates else None
 
 
-def scan(model, effects=(), *, cells=True, temper=1.0):
+def scan(model, effects=(), *, cells=True, temper=1.0, without=None, slopes=None):
     """
     Return the evidence for all cells and named effects beside a fitted model.
 
@@ -234,6 +241,10 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
         Whether to ask for the cells as well.
     temper : float
         Variance of the residuals about the model with the cause, in units of the noise.
+    without : str, optional
+        Name of an effect of the model that is taken out, to first order.
+    slopes : dict, optional
+        Derivatives at the places, those of another scan of the same model.
 
     Returns
     -------
@@ -252,7 +263,7 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
     >>> bool(scan(model).best.evidence < 5)
     True
     """
-    probes = Probes(model)
+    probes = Probes(model, () if without is None else (without,), slopes)
     found, levels = [], []
     if cells:
         found = _cells(probes, temper)
@@ -268,7 +279,7 @@ def _cells(probes, temper):
     single = [name for name, w in waves.items() if len(w[0]) == 1]
     several = [name for name in waves if name not in single]
     stacked = [np.concatenate([waves[n][i] for n in single]) for i in range(len(problem.datasets))]
-    own, best = set(probes.model.added), {}
+    own, best = probes.own, {}
     for place, kind, degree, reduced in probes.reduced(_DEGREES):
         scale = Cell(place, kind, "constant").scale
         if probes.is_detector(kind):
@@ -371,18 +382,39 @@ def _rank(values, scale):
 
 
 def _named(probes, effects, temper, degree="default"):
-    """Return the candidates of named effects, all of them at zero in the same chains."""
+    """Return the candidates of named effects."""
     model, found = probes.model, []
-    context = replace(model.context, degree=degree)
     chains = model.trains
-    waiting = [
-        effect
-        for effect in effects
-        if effect.name not in model.added and not effect.absorbed_by and effect.applies(chains)
-    ]
-    found += [one for effect in waiting for one in _bent_name(probes, effect, context, temper)]
-    bent = {one.named.name for one in found}
-    waiting = [effect for effect in waiting if effect.name not in bent]
+    fitting = [e for e in effects if e.name not in probes.own and not e.absorbed_by]
+    fitting = [e for e in fitting if e.name in model.added or e.applies(chains)]
+    context = None if degree == "default" else replace(model.context, degree=degree)
+    law = replace(model.context, degree=degree)
+    for effect in fitting:
+        bent = _bent_name(probes, effect, law, temper) if effect.name not in model.added else []
+        if bent:
+            found += [replace(one, context=context) for one in bent]
+            continue
+        if effect.name in model.added:
+            slopes, size = _columns_of(model.problem, model.jacobian, model.added[effect.name])
+        else:
+            slopes, size = _columns(model, fitting, degree).get(effect.name, (None, None))
+        if size is None or not size.size:
+            continue
+        scaled = slopes * size
+        seen = probes.tangent.T @ scaled
+        gram, target = scaled.T @ scaled - seen.T @ seen, scaled.T @ probes.residual
+        values, share = (part[0] for part in _spectra(gram[None], target[None]))
+        if _rank(values, 1.0):
+            one = _with_name(effect, model, values, share, temper)
+            found.append(replace(one, context=context))
+    return found
+
+
+def _columns(model, effects, degree):
+    """Return derivatives and usual sizes of named effects, all at zero in the same chains."""
+    known = model.__dict__.setdefault("_named_columns", {})
+    waiting = [e for e in effects if (e.name, degree) not in known and e.name not in model.added]
+    context = replace(model.context, degree=degree)
     while waiting:
         edited, parameters, ties, later = list(model.held_chains), {}, {}, []
         for effect in waiting:
@@ -395,11 +427,25 @@ def _named(probes, effects, temper, degree="default"):
                 continue
             edited, parameters[effect.name] = edit.chains, edit.parameters
             ties |= {name: tie for name, tie in edit.ties.items() if tie.source in names}
-        found += _of_batch(probes, edited, parameters, ties, waiting, temper)
+        laws = {p.name: p.basis for own in parameters.values() for p in own if p.basis is not None}
+        problem = GapProblem(
+            edited, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
+        )
+        jacobian = problem.jacobian(problem.start) if problem.size else None
+        for name, own in parameters.items():
+            known[name, degree] = _columns_of(problem, jacobian, own)
         waiting = later
-    if degree == "default":
-        return found
-    return [replace(one, context=context) for one in found]
+    return {name: found for (name, law), found in known.items() if law == degree}
+
+
+def _columns_of(problem, jacobian, parameters):
+    """Return the derivatives to parameters, and their usual sizes."""
+    parts = [(problem.slices[p.name], p) for p in parameters if p.name in problem.slices]
+    if jacobian is None or not parts:
+        return None, np.empty(0)
+    rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
+    size = np.concatenate([np.full(w.stop - w.start, p.canonical_scale) for w, p in parts])
+    return jacobian[:, rows], size
 
 
 def _bent_name(probes, effect, context, temper):
@@ -421,36 +467,6 @@ def _bent_name(probes, effect, context, temper):
     (values,), (share,) = _spectra(*(part[None] for part in bent))
     values = values * scale**2
     return [_with_name(effect, model, values, share, temper)] if _rank(values, 1.0) else []
-
-
-def _of_batch(probes, edited, parameters, ties, effects, temper):
-    """Return the candidates of effects that are in the same chains."""
-    laws = {p.name: p.basis for own in parameters.values() for p in own if p.basis is not None}
-    model = probes.model
-    problem = GapProblem(
-        edited, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
-    )
-    if not problem.size:
-        return []
-    slopes = problem.jacobian(problem.start)
-    seen = probes.tangent.T @ slopes
-    gram, target = slopes.T @ slopes - seen.T @ seen, slopes.T @ probes.residual
-    found = []
-    for effect in effects:
-        own = [p for p in parameters.get(effect.name, ()) if p.name in problem.slices]
-        if not own:
-            continue
-        parts = [(problem.slices[p.name], p.canonical_scale) for p in own]
-        rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
-        if not rows.size:
-            # a law less its constant, of no degree, is nothing
-            continue
-        size = np.concatenate([np.full(w.stop - w.start, scale) for w, scale in parts])
-        square = gram[np.ix_(rows, rows)] * size[:, None] * size
-        values, share = (part[0] for part in _spectra(square[None], (target[rows] * size)[None]))
-        if _rank(values, 1.0):
-            found.append(_with_name(effect, model, values, share, temper))
-    return found
 
 
 def _with_name(effect, model, values, share, temper):

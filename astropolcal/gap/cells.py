@@ -281,14 +281,13 @@ def dependences(problem, most_steps=_MOST_STEPS):
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
     names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
-    sources = [o.source for o in (d.observations for d in problem.datasets)]
-    if len(set(sources)) < len(sources):
+    if len(problem.datasets) > 1:
         names += [f"dataset:{d.observations.name}" for d in problem.datasets]
     names += [f"step:{n}" for n in _steps(problem, most_steps)]
     found = {}
     for name in names:
         waves = [_waves(Dependence(name), dataset) for dataset in problem.datasets]
-        if name == "constant" or any(np.ptp(w) > _SAME for w in waves) or name[:7] == "dataset":
+        if name == "constant" or np.ptp(np.concatenate(waves, axis=1), axis=1).max() > _SAME:
             found[name] = waves
     return found
 
@@ -339,8 +338,12 @@ class Probes:
     ----------
     model : Model
         The fitted model.
-    tangent : `~numpy.ndarray`, optional
-        Orthonormal basis of what the model can do already, (n_rows, rank), if known.
+    without : collection of str
+        Names of effects of the model that are taken out, to first order.
+    slopes : dict, optional
+        Derivatives at the places, if they are known.
+    most_steps : int
+        Steps are looked for at so many frames.
 
     Examples
     --------
@@ -357,20 +360,19 @@ class Probes:
     6
     """
 
-    def __init__(self, model, tangent=None, most_steps=_MOST_STEPS):
-        self.model, problem = model, model.problem
-        self.problem = problem
-        coefficients = model.fit.coefficients
-        self.tangent = problem.tangent(coefficients) if tangent is None else tangent
-        residual = problem.residual(coefficients)
-        self.residual = residual - self.tangent @ (self.tangent.T @ residual)
+    def __init__(self, model, without=(), slopes=None, most_steps=_MOST_STEPS):
+        self.model, self.problem = model, model.problem
+        problem, linear = model.problem, model.without(without)
+        self.tangent, self.residual = linear.tangent, linear.residual
+        #: Names of the effects that are in the model.
+        self.own = set(model.added) - set(without)
         #: A function of the frame that is one everywhere, of each dataset.
         self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
         self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
         #: Second derivatives over the size that is tried, where they outdo the first ones.
         self.bends = {}
-        self.slopes = self._at_places()
+        self.slopes = self._at_places() if slopes is None else slopes
         parts = list(zip(problem.channels, problem.segments, strict=True))
         #: Tangent and lamp with the frames first, (F, rows of a frame, rank), one a dataset.
         self.by_frame = [_frames_first(self.tangent[rows], c.shape) for c, rows in parts]
@@ -460,7 +462,8 @@ class Probes:
         # light that is added counts as much as the source gives in the frame, in these units
         added = usual * (right + left) / np.maximum(fluxes.sum(axis=0), 1e-9 * usual)
         order = np.argsort(channel.sequence, kind="stable")
-        before = np.zeros_like(fluxes)
+        # the first frame has none before it, and its own counts, as in a chain
+        before = fluxes.copy()
         before[..., order[1:]] = fluxes[..., order[:-1]]
         afterglow = np.divide(before, fluxes, out=np.zeros_like(fluxes), where=fluxes > 0)
         half = (left - right) / 2

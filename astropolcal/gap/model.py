@@ -14,7 +14,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context
-from astropolcal.gap.problem import Fit, GapProblem, as_mounted
+from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
 from astropolcal.optics import LinearRetarder, Perturbation
@@ -213,6 +213,45 @@ class Model:
         moved = start is not self.fit.coefficients
         return Model(self.problem, Fit(start, np.inf, False), self.added) if moved else self
 
+    def without(self, names):
+        """
+        Return the model without some of its effects, to first order.
+
+        Parameters
+        ----------
+        names : collection of str
+            Names of added effects.
+
+        Returns
+        -------
+        Linear
+        """
+        problem, q = self.problem, self.fit.coefficients
+        kept, jacobian = np.ones(problem.size, dtype=bool), self.jacobian
+        residual = self.residual
+        absent = problem.coefficients(problem._absent())
+        for parameter in (p for name in names for p in self.added[name]):
+            where = problem.slices.get(parameter.name)
+            if where is not None:
+                kept[where] = False
+                residual = residual + jacobian[:, where] @ (q - absent)[where]
+        # what is known beforehand is one more row of data for each of these parameters
+        known = np.flatnonzero(kept & (problem.tight > 0))
+        table, target = jacobian, residual
+        if known.size:
+            rows = np.zeros((known.size, problem.size))
+            rows[np.arange(known.size), known] = problem.tight[known]
+            table = np.concatenate([jacobian, rows])
+            target = np.concatenate([residual, -(q - problem.centre)[known] * problem.tight[known]])
+        tangent = problem.tangent(q, table, kept)
+        left = target - tangent @ (tangent.T @ target)
+        return Linear(self, tangent[: problem.n_rows], left[: problem.n_rows])
+
+    @cached_property
+    def jacobian(self):
+        """Derivative of the rows to the coefficients, (n_rows, n_coefficients)."""
+        return self.problem.jacobian(self.fit.coefficients)
+
     def start_of(self, problem):
         """Return a start for another problem: this solution where the two share parameters."""
         mine, theirs = self.problem, problem.vector(problem.start)
@@ -302,6 +341,44 @@ class Model:
     def impossible(self):
         """Return the names of the effects whose fitted values are out of their limits."""
         return {name for name in self.added if not self.is_physical(name)}
+
+
+@dataclass
+class Linear:
+    """
+    A fitted model in which effects may be absent, to first order.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    tangent : `~numpy.ndarray`
+        Orthonormal basis of what it can do without these effects, (n_rows, rank).
+    residual : `~numpy.ndarray`
+        What it leaves then, whitened, (n_rows,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.gap.model import Linear
+    >>> Linear(None, np.zeros((2, 0)), np.array([3.0, 4.0])).chi2
+    25.0
+    """
+
+    model: Model
+    tangent: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def chi2(self):
+        """Sum of squares of the residuals."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def mean_square(self):
+        """Mean square of the residuals: 1 where noise is all that is left."""
+        freedom = self.model.problem.n_data - self.tangent.shape[1]
+        return self.chi2 / max(freedom, 1)
 
 
 def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):
@@ -589,7 +666,6 @@ def nominal_calibration(chains, observations):
     >>> nominal_calibration([chain], [simulate(chain, charis.wavelength, frames, seed=1)]).converged
     True
     """
-    chains = [as_mounted(chain) for chain in chains]
     measurement = Measurement(chains, observations)
     if not measurement.free.size:
         return _AsGiven(measurement)

@@ -15,9 +15,9 @@ from itertools import pairwise
 import numpy as np
 
 from astropolcal.gap.attribution import scan
-from astropolcal.gap.shrinkage import foreseen
+from astropolcal.gap.shrinkage import foreseen, stability
 
-__all__ = ["Group", "Selection", "select"]
+__all__ = ["Group", "Selection", "explained_by_one", "select"]
 
 # the best candidates count where residuals are no noise
 _RETEMPERED = 400
@@ -29,8 +29,10 @@ _TURNS = 1
 _AS_GOOD, _CLEARLY = 1.0, 3.0
 #: Residuals less probable than this are no noise.
 REMAINDER = 1e-4
+# and more probable than this they may be
+_NOISE = 1e-3
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
-ENOUGH = 9.0
+ENOUGH = 12.0
 _MOST = 8
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
@@ -41,7 +43,7 @@ _SAME = 1e-6
 _ALIAS, _MOST_ALIASES = np.exp(-7.0), 40
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
 # needs
-_UNLISTED = (0.0, 0.02, 0.06, 0.4, 0.7, 0.85, 0.9, 0.92, 0.95)
+_UNLISTED = (0.0, 0.02, 0.08, 0.55, 0.75, 0.88, 0.92, 0.95, 0.97)
 # above this mean square the residuals are no noise
 _STRUCTURED = 1.5
 # share of the gap that an answer may leave before it is doubtful
@@ -59,8 +61,8 @@ class Group:
         Candidates and their probabilities among each other, best first.
     probability : float
         That one of the members is a cause of the gap.
-    model : Model
-        The model with this cause and all chosen before it.
+    lowered : float
+        By how much chi-square is lower with it than with those chosen before it.
     stability : float
         Share of the halves of the wavelengths and of left-out angles in which it is found.
 
@@ -74,8 +76,8 @@ class Group:
 
     members: list
     probability: float
-    model: object = None
-    stability: float = 1.0
+    lowered: float = 0.0
+    stability: float | None = None
 
     @property
     def best(self):
@@ -172,10 +174,10 @@ def select(base, library, groups, say, *, cells=True):
         return Selection([], base, first, first, 0.0, [_errors(base, groups)])
     best, scans = _exchanged(base, best, library, first, say, cells)
     best = replace(best, model=best.model.polished())
-    best, models, history = _checked(base, best, groups, say)
-    left = left if best.model is models[-1] and left is not None else None
+    best, steps, history = _checked(base, best, groups, say)
     unlisted = _unlisted(base, best)
-    found = _grouped(best, models, scans, unlisted)
+    stable = stability(best.model, groups, max(1.0, best.model.mean_square))
+    found = _grouped(best, steps, scans, unlisted, stable)
     return Selection(found, best.model, first, left, unlisted, history)
 
 
@@ -187,19 +189,19 @@ def _checked(base, best, groups, say):
     """
     Return the set without causes that left-out frames speak against.
 
-    With it, the models with one cause more each, and their errors on left-out frames.
+    With it, what is left with one cause more each, and the errors on left-out frames.
     """
     while True:
         say("left-out frames")
-        models = _growing(base, best)
-        history = [_errors(model, groups) for model in (base, *models)]
+        steps = [base.without(()), *_growing(best)]
+        history = [_errors(step, groups) for step in steps]
         worse = [
             i
             for i, (before, after) in enumerate(pairwise(history))
-            if before is not None and _worsens(after, before, models[i].mean_square)
+            if before is not None and _worsens(after, before, steps[i + 1].mean_square)
         ]
         if not worse:
-            return best, models, history
+            return best, steps, history
         chosen = [one for i, one in enumerate(best.chosen) if i != worse[-1]]
         model = base.with_effects([o.recipe for o in chosen], like=best.model)
         best = _State(model, chosen, best.evidence - best.chosen[worse[-1]].evidence)
@@ -212,12 +214,34 @@ def _worsens(after, before, scatter):
     return better < (-2.0 if scatter < _STRUCTURED else 0.0)
 
 
-def _growing(base, best):
-    """Return the models with the first cause, the first two, and so on."""
-    recipes = [one.recipe for one in best.chosen]
-    ends = range(1, len(recipes))
-    models = [base.with_effects(recipes[:i], like=best.model, **_QUICK) for i in ends]
-    return [*models, best.model] if recipes else []
+def _growing(best):
+    """Yield the model with the first cause, the first two, and so on, to first order."""
+    names = [one.name for one in best.chosen]
+    return [best.model.without(names[i + 1 :]) for i in range(len(names))]
+
+
+def explained_by_one(model, library, *, cells=True):
+    """
+    Return whether a single cause leaves no more than noise.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    library : sequence of Effect
+        Named effects that are not discrete.
+    cells : bool
+        Whether to ask for cells as well as for names.
+
+    Returns
+    -------
+    bool
+    """
+    found = _scanned(model, library, cells)
+    for one in map(found.freer, _distinct(found.candidates, _WIDTH[0])):
+        if one.evidence > ENOUGH and model.with_effect(*one.recipe, **_QUICK).p_value > _NOISE:
+            return True
+    return False
 
 
 def _scanned(model, library, cells):
@@ -297,7 +321,7 @@ def _exchanged(base, best, library, first, say, cells):
     What was chosen first was chosen while the others were missing: its law in wavelength may be too
     stiff, another cause may do better, and a name may do as well as the cell that it is.
     """
-    scans = {}
+    scans, slopes = {}, None
     for turn in range(_TURNS if best.chosen else 0):
         before = best
         for one in reversed(best.chosen):
@@ -305,8 +329,8 @@ def _exchanged(base, best, library, first, say, cells):
             if turn and others == scans.get(one.name, (None,))[0]:
                 continue
             say(f"beside all the others: {one.effect.title}")
-            model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
-            found = first if not others else _scanned(model, library, cells)
+            found = first if not others else _beside(best.model, one, library, cells, slopes)
+            slopes = slopes or (others and found.probes.slopes)
             scans[one.name] = (others, found)
             fresh = _best_beside(found, one, library)
             if fresh is None or (fresh.name, fresh.degree) == (one.name, one.degree):
@@ -315,11 +339,17 @@ def _exchanged(base, best, library, first, say, cells):
             chosen = [*best.chosen[:place], fresh, *best.chosen[place + 1 :]]
             model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
             if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
-                scans[fresh.name] = scans.pop(one.name)
+                scans[fresh.name], slopes = scans.pop(one.name), None
                 best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
         if best is before:
             break
     return best, {name: found for name, (_, found) in scans.items()}
+
+
+def _beside(model, one, library, cells, slopes):
+    """Return the evidence beside all other causes of a model."""
+    temper = max(1.0, model.mean_square)
+    return scan(model, library, cells=cells, temper=temper, without=one.name, slopes=slopes)
 
 
 def _best_beside(found, own, library):
@@ -363,13 +393,15 @@ def _unlisted(base, best):
     return 1 - (1 - prior) * np.exp(-share / _LEFT)
 
 
-def _grouped(best, models, scans, unlisted):
+def _grouped(best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
     found = []
-    for one, model in zip(best.chosen, models, strict=True):
+    for one, (before, after) in zip(best.chosen, pairwise(steps), strict=True):
         members = _members(one, scans[one.name])
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
-        found.append(Group(members, float((1 - unlisted) * chance), model))
+        lowered = max(before.chi2 - after.chi2, 0.0)
+        share = stable.get(one.name, 1.0)
+        found.append(Group(members, float((1 - unlisted) * chance * share), lowered, share))
     return found
 
 
