@@ -17,7 +17,7 @@ from astropolcal.gap.effects import Context
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
-from astropolcal.optics import LinearRetarder, Perturbation
+from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
@@ -37,6 +37,8 @@ _ABSORBED = 1e-6
 # which the data may leave a size there
 _AT_LIMIT = 1e-6
 _MOST_PRESSED = 0.1
+# share by which optics may seem to measure more polarization than there is
+_MORE_LIGHT = 1e-3
 # a second difference above this share of the first one is tried at finite size
 _BENT = 1.0
 
@@ -323,7 +325,33 @@ class Model:
             for leaf in self._carriers(name)
             if not isinstance(leaf, Perturbation)
         ]
-        return all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
+        possible = all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
+        return possible and self._keeps_polarization(name)
+
+    def _keeps_polarization(self, name):
+        """
+        Return whether no beam would be negative for some light in front of an effect.
+
+        What makes polarization larger may be a change of an optic that makes it smaller, or of one
+        behind it, but all optics together never measure more than there is.
+        """
+        vector, own = None, {p.name.partition(".")[0] for p in self.added[name]}
+        for dataset in self.problem.datasets:
+            optics = dataset.propagator.leaves
+            found = [i for i, leaf in enumerate(optics) if leaf.name in own and _depolarizes(leaf)]
+            if not found:
+                continue
+            vector = self.problem.vector(self.fit.coefficients) if vector is None else vector
+            sweep = dataset.forward(vector)
+            # rotators, which stand between an optic and what turns with it, change no length
+            front = [i for i in range(found[0]) if not isinstance(optics[i], Rotator)][-1:]
+            one, none = np.ones(sweep.fluxes[0].shape), np.zeros(sweep.fluxes[0].shape)
+            for weights in ((one, none), (none, one)):
+                for row, _ in sweep.crossings(front, weights).values():
+                    polarized = np.linalg.norm(row[..., 1:], axis=-1)
+                    if np.any(polarized > row[..., 0] * (1 + _MORE_LIGHT)):
+                        return False
+        return True
 
     def _carriers(self, name):
         """Return the optics that have the parameters of an effect, or some that follow these."""
@@ -379,6 +407,10 @@ class Linear:
         """Mean square of the residuals: 1 where noise is all that is left."""
         freedom = self.model.problem.n_data - self.tangent.shape[1]
         return self.chi2 / max(freedom, 1)
+
+
+def _depolarizes(leaf):
+    return isinstance(leaf, Perturbation) and leaf.kind.startswith("depolarization")
 
 
 def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):

@@ -5,10 +5,12 @@ import astropy.units as u
 import numpy as np
 import pytest
 from gap_data import WAVELENGTH as DATA_WAVELENGTH
-from gap_data import chain, observed
+from gap_data import chain, clean_model, observed
 
 from astropolcal import instruments, optics
 from astropolcal.gap import diagnose
+from astropolcal.gap.cells import Cell
+from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -80,3 +82,21 @@ def test_a_wavelength_in_the_wrong_branch_is_brought_back(kind, bins):
     found = getattr(model.chains[0]["derotator"], key).value
     expected = getattr(true["derotator"], key).value
     np.testing.assert_allclose(np.cos(np.deg2rad(found - expected)), 1, atol=1e-2)
+
+
+@pytest.mark.parametrize("place", ["source", "in:derotator", "after:derotator"])
+@pytest.mark.parametrize(
+    ("kind", "size", "possible"),
+    [
+        ("depolarization_linear", 0.05, True),
+        # the prism's efficiency of 0.985 has room for less depolarization, but not for that much
+        ("depolarization_linear", -0.01, True),
+        ("depolarization_linear", -0.05, False),
+        ("diattenuation_h", -0.05, True),
+    ],
+)
+def test_no_size_makes_more_polarization_than_there_is(place, kind, size, possible):
+    cell = CellEffect(Cell(place, kind, "constant"), 0)
+    model = clean_model().with_effect(cell, steps=0)
+    model.fit.coefficients[model.problem.slices[model.added[cell.name][0].name]] = size
+    assert model.is_physical(cell.name) is possible
