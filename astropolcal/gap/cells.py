@@ -499,17 +499,22 @@ class Probes:
         self.bends = {
             key: bend
             for key, bend in self.bends.items()
-            if self._left(bend) > max(self._left(found[key]), 1.0 / FINITE)
+            # what is seen in first order, be it taken up by the model, has its second one there
+            if self._left(bend) > max(np.linalg.norm(self._white(found[key])), 1.0 / FINITE)
         }
         return found
 
-    def _left(self, slopes):
-        """Return how much of a constant perturbation's derivative the model cannot take up."""
-        white = [
+    def _white(self, slopes):
+        """Return the whitened derivative of the data to a constant perturbation, (n_rows,)."""
+        parts = [
             channel.whiten(slopes.get(i, np.zeros(channel.shape))).ravel()
             for i, channel in enumerate(self.problem.channels)
         ]
-        column = np.concatenate(white)
+        return np.concatenate(parts)
+
+    def _left(self, slopes):
+        """Return how much of it the model cannot take up."""
+        column = self._white(slopes)
         return float(np.linalg.norm(column - self.tangent @ (self.tangent.T @ column)))
 
     def _at_detector(self, i, channel, sweep):

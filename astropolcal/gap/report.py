@@ -18,7 +18,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
 from astropolcal.files import atomic_path, printable
 from astropolcal.gap import _numbers, _words, runs
-from astropolcal.gap.planning import few, plan
+from astropolcal.gap.planning import plan
 from astropolcal.gap.residuals import locate
 from astropolcal.gap.selection import REMAINDER
 
@@ -30,8 +30,6 @@ _DPI = 130
 # pixels of a page to an inch
 _CSS = 96
 _MOST_SCORES = 8
-# aliases that exposures are sought to tell apart
-_MOST_RIVALS = 3
 
 
 # ---- for machines ------------------------------------------------------------------------
@@ -216,21 +214,8 @@ def _left_share(diagnosis):
 
 
 def _next(diagnosis):
-    """Return the exposures that tell the aliases of each cause apart, or fix what is open."""
-    model, found = diagnosis.nominal, []
-    smooth = [cause for cause in diagnosis.causes if cause.effect.kind != "discrete"]
-    if len(smooth) < len(diagnosis.causes):
-        # the fit goes on from chains in which an optic was exchanged
-        return plan(diagnosis.improved)
-    # each alias group at the model without it, but with all that was found before
-    for i, cause in enumerate(smooth):
-        last = i + 1 == len(smooth)
-        fresh = diagnosis.improved if last else model.with_effect(cause.effect)
-        if cause.aliases:
-            rivals = [one.effect for one, _ in cause.aliases[:_MOST_RIVALS]]
-            found += plan(model, [cause.effect, *rivals], members={cause.name: fresh})
-        model = fresh
-    return few(found) or plan(diagnosis.improved)
+    """Return the exposures that answer what is open."""
+    return plan(diagnosis)
 
 
 def _plain(value):
