@@ -257,6 +257,8 @@ def accuracies(model, cross_validate=True):
             warnings.simplefilter("ignore", AstropolcalWarning)
             calibration = with_causes(model, cross_validate=cross_validate, instrument=instrument)
             targets = target_accuracies(calibration)
+            if not all(np.isfinite(table["s_p"]).all() for table in targets):
+                targets = target_accuracies(calibration, open_directions="ignore")
     except AstropolcalError:
         return found
     tables = [record.accuracy for record in calibration.datasets]

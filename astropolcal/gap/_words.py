@@ -21,7 +21,7 @@ _WHERE, _SUMMARY = 5, 24
 # an alias at another place is the same thing if it is this probable against the best
 _SAME = 0.5
 # of causes less probable than this the table is enough
-_UNLIKELY = 0.05
+_UNLIKELY = 0.1
 # a share of a signal below this is none
 _CANCELS = 0.02
 # so many targets on sky stand in the summary
@@ -109,24 +109,25 @@ def sizes(entry):
 def labels(entry):
     """Return what the parameters of a cause are called."""
     keys = [name.split(".") for name in entry["size"]]
-    if entry["cell"] and not entry["effect"]:
-        return [_of_cell(entry["cell"]["dependence"], key) for _, key in keys]
     single = len({key for _, key in keys}) == len(keys)
-    return [(key if single else f"{key} of {o}").replace("_", " ") for o, key in keys]
+    known = _of_cell(entry["cell"]) if entry["cell"] else {}
+    words = [known.get(key) or (key if single else f"{key} of {optic}") for optic, key in keys]
+    return [one.replace("_", " ") for one in words]
 
 
-def _of_cell(dependence, key):
-    wave = {"amplitude": "cosine", "quadrature": "sine"}.get(key)
-    if wave is None:
-        return key.replace("_", " ")
-    return {
+def _of_cell(cell):
+    """Return what the sizes of a perturbation are."""
+    kind = cell["dependence"].partition(":")[0]
+    if kind == "harmonic":
+        return {"amplitude": "amplitude of the cosine", "quadrature": "amplitude of the sine"}
+    words = {
         "time": "change in half of the run",
         "time2": "bend",
         "step": "step",
         "direction": "change after moves backwards",
         "move": "change with a move of one radian",
-        "harmonic": f"amplitude of the {wave}",
-    }.get(dependence.partition(":")[0], "size")
+    }
+    return {"amplitude": words.get(kind, "size")}
 
 
 def _size(value, std, unit, limit):
@@ -385,8 +386,12 @@ def _on_sky(content):
     targets = [_target(*pair) for pair in _pairs(content, "targets")]
     if not targets or content["verdict"] not in ("named", "located"):
         return ""
-    words = "Errors on sky that calibrate claims, with the nominal -> with the improved model: "
-    return f"{words}{'; '.join(targets[:_TARGETS])}. --save keeps the improved one."
+    open_too = "as if" in content["accuracy_before"]["targets"][0]["words"]
+    known = " if what the data leave open were known" if open_too else ""
+    return (
+        "Errors on sky that calibrate claims, with the nominal -> with the improved model"
+        f"{known}: {'; '.join(targets[:_TARGETS])}. --save keeps the improved one."
+    )
 
 
 def _target(old, new):
