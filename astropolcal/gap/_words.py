@@ -383,21 +383,18 @@ def _what_is_left(content):
 
 def _on_sky(content):
     """Return what calibrate claims with the nominal and with the improved model."""
-    targets = [_target(*pair) for pair in _pairs(content, "targets")]
-    if not targets or content["verdict"] not in ("named", "located"):
+    before, after = (content[f"accuracy_{when}"]["targets"] for when in ("before", "after"))
+    if not before or not after or content["verdict"] not in ("named", "located"):
         return ""
-    open_too = "as if" in content["accuracy_before"]["targets"][0]["words"]
-    known = " if what the data leave open were known" if open_too else ""
-    return (
-        "Errors on sky that calibrate claims, with the nominal -> with the improved model"
-        f"{known}: {'; '.join(targets[:_TARGETS])}. --save keeps the improved one."
-    )
-
-
-def _target(old, new):
-    return (
+    targets = [
         f"target of {old['dolp_percent']:g} %: {change(old['s_p_percent'], new['s_p_percent'])} %, "
         f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
+        for old, new in zip(before[:_TARGETS], after[:_TARGETS], strict=True)
+    ]
+    known = " if what the data leave open were known" if "as if" in before[0]["words"] else ""
+    return (
+        "Errors on sky that calibrate claims, with the nominal -> with the improved model"
+        f"{known}: {'; '.join(targets)}. --save keeps the improved one."
     )
 
 
@@ -500,8 +497,3 @@ def worth_reading(where):
 def _where_lines(title, where):
     lines = [f"{share(one['share']):>6}  {where_words(one)}" for one in worth_reading(where)]
     return [title, *lines] if lines else []
-
-
-def _pairs(content, key):
-    # a model that cannot be calibrated has no targets
-    return zip(content["accuracy_before"][key], content["accuracy_after"][key], strict=False)
