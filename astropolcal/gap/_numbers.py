@@ -133,17 +133,13 @@ class Fitted:
 
     def trades(self, name):
         """
-        Return the other parameters that move with the least certain direction of an effect.
+        Return the other parameters that can be exchanged for a part of an effect.
 
         At most three names, the strongest first.
         """
-        rows = self._rows(name)
-        error = np.sqrt(np.diag(self.covariance))
+        rows, error = self._rows(name), np.sqrt(np.diag(self.covariance))
         error = np.where(error > 0, error, 1.0)
-        correlation = self.covariance / np.outer(error, error)
-        weakest = np.linalg.eigh(self.covariance[np.ix_(rows, rows)])[1][:, -1] * error[rows]
-        strength = np.abs(correlation[:, rows] @ weakest)
-        strength /= np.sqrt(weakest @ correlation[np.ix_(rows, rows)] @ weakest) or 1.0
+        strength = np.abs(self.covariance / np.outer(error, error))[rows].max(axis=0)
         if self.is_open[rows].any():
             # what the data leave open altogether is worse than what they know badly
             touching = self.null[np.abs(self.null[:, rows]).max(axis=1) > TOUCHES]
@@ -261,6 +257,8 @@ def accuracies(model, cross_validate=True):
             warnings.simplefilter("ignore", AstropolcalWarning)
             calibration = with_causes(model, cross_validate=cross_validate, instrument=instrument)
             targets = target_accuracies(calibration)
+            if not all(np.isfinite(table["s_p"]).all() for table in targets):
+                targets = target_accuracies(calibration, open_directions="ignore")
     except AstropolcalError:
         return found
     tables = [record.accuracy for record in calibration.datasets]

@@ -16,12 +16,12 @@ _TINY, _CONSPICUOUS = 1e-6, 0.01
 _WIDTH = 80
 # so many causes are named in a sentence, in a title, and in place of another
 _NAMED, _IN_TITLE, _ALIASES = 3, 2, 4
-# so many lines say where the gap lies, so many exposures stand in the summary
-_WHERE, _NEXT = 5, 2
+# so many lines say where the gap lies, and so many has the summary
+_WHERE, _SUMMARY = 5, 24
 # an alias at another place is the same thing if it is this probable against the best
 _SAME = 0.5
 # of causes less probable than this the table is enough
-_UNLIKELY = 0.05
+_UNLIKELY = 0.1
 # a share of a signal below this is none
 _CANCELS = 0.02
 # so many targets on sky stand in the summary
@@ -109,24 +109,25 @@ def sizes(entry):
 def labels(entry):
     """Return what the parameters of a cause are called."""
     keys = [name.split(".") for name in entry["size"]]
-    if entry["cell"] and not entry["effect"]:
-        return [_of_cell(entry["cell"]["dependence"], key) for _, key in keys]
     single = len({key for _, key in keys}) == len(keys)
-    return [(key if single else f"{key} of {o}").replace("_", " ") for o, key in keys]
+    known = _of_cell(entry["cell"]) if entry["cell"] else {}
+    words = [known.get(key) or (key if single else f"{key} of {optic}") for optic, key in keys]
+    return [one.replace("_", " ") for one in words]
 
 
-def _of_cell(dependence, key):
-    wave = {"amplitude": "cosine", "quadrature": "sine"}.get(key)
-    if wave is None:
-        return key.replace("_", " ")
-    return {
+def _of_cell(cell):
+    """Return what the sizes of a perturbation are."""
+    kind = cell["dependence"].partition(":")[0]
+    if kind == "harmonic":
+        return {"amplitude": "amplitude of the cosine", "quadrature": "amplitude of the sine"}
+    words = {
         "time": "change in half of the run",
         "time2": "bend",
         "step": "step",
         "direction": "change after moves backwards",
         "move": "change with a move of one radian",
-        "harmonic": f"amplitude of the {wave}",
-    }.get(dependence.partition(":")[0], "size")
+    }
+    return {"amplitude": words.get(kind, "size")}
 
 
 def _size(value, std, unit, limit):
@@ -382,45 +383,51 @@ def _what_is_left(content):
 
 def _on_sky(content):
     """Return what calibrate claims with the nominal and with the improved model."""
-    targets = [_target(*pair) for pair in _pairs(content, "targets")]
-    if not targets or content["verdict"] not in ("named", "located"):
+    before, after = (content[f"accuracy_{when}"]["targets"] for when in ("before", "after"))
+    if not before or not after or content["verdict"] not in ("named", "located"):
         return ""
-    words = "Errors on sky that calibrate claims, with the nominal -> with the improved model: "
-    return f"{words}{'; '.join(targets[:_TARGETS])}. --save keeps the improved one."
-
-
-def _target(old, new):
-    return (
+    targets = [
         f"target of {old['dolp_percent']:g} %: {change(old['s_p_percent'], new['s_p_percent'])} %, "
         f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
+        for old, new in zip(before[:_TARGETS], after[:_TARGETS], strict=True)
+    ]
+    known = " if what the data leave open were known" if "as if" in before[0]["words"] else ""
+    return (
+        "Errors on sky that calibrate claims, with the nominal -> with the improved model"
+        f"{known}: {'; '.join(targets)}. --save keeps the improved one."
     )
 
 
 # ---- for the terminal ------------------------------------------------------------------------
 
 
-def text(content, accuracies, frames=(), written=()):
+def text(content, frames=(), written=()):
     """
     Return a report as text of at most 80 columns, the summary first.
 
     ``frames`` are lines on those not used, ``written`` the files that were.
     """
     causes = content["causes"]
-    likely = [one for one in causes if one["probability"] >= _UNLIKELY]
     following = [exposure(entry, causes) for entry in content["next_observations"]]
+    files = [f"Written: {', '.join(map(str, written))}"] if written else []
+    # as much as the summary has room for
+    for rows, take in ((len(causes), 2), (len(causes), 1), (3, 1)):
+        table, first = _table_lines(causes, rows), _numbered("Observe next", following[:take])
+        summary = _joined([content["sentences"], table, first, files])
+        if summary.count("\n") < _SUMMARY:
+            break
     parts = [
-        content["sentences"],
-        _table_lines(causes),
-        _numbered("Observe next", following[:_NEXT]),
-        [f"{'' if i else 'Written:':<8} {path}" for i, path in enumerate(written)],
-        *(_cause_lines(one) for one in likely),
-        _numbered("Or observe", following[_NEXT:], _NEXT),
+        *(_cause_lines(one) for one in causes if one["probability"] >= _UNLIKELY),
+        _numbered("Or observe", following[take:], take),
         _where_lines("Of the gap of the nominal model", content["where"]),
         _where_lines("Of what is left", content["where_left"]),
-        _accuracy_lines(content, accuracies),
         [f"Nominal model: {content['nominal']}"],
         list(frames),
     ]
+    return f"{summary}\n\n{_joined(parts)}"
+
+
+def _joined(parts):
     return "\n\n".join("\n".join(_wrapped(part)) for part in parts if part)
 
 
@@ -430,21 +437,25 @@ def _wrapped(lines):
         ends = " " * len(re.match(r"\s*(?:- |\d+\. |\d+ %  )?", line).group())
         # a number stays with its unit
         kept = re.sub(r"(?<=\d) (?=(%|deg)\b|%)", "\N{NO-BREAK SPACE}", line)
-        broken = textwrap.wrap(kept, _WIDTH, subsequent_indent=ends, break_on_hyphens=False)
+        # and the name of a file stays whole
+        whole = {"break_on_hyphens": False, "break_long_words": False}
+        broken = textwrap.wrap(kept, _WIDTH, subsequent_indent=ends, **whole)
         yield from (one.replace("\N{NO-BREAK SPACE}", " ") for one in broken or [""])
 
 
-def _table_lines(causes):
+def _table_lines(causes, most):
     """Return a line a cause: rank, probability, what it explains, what double differences see."""
     if not causes:
         return []
+    more = [f"and {len(causes) - most} more"] if len(causes) > most else []
     rows = [("", "probability", "explains", "in double diff.", "cause")]
-    for entry in causes:
+    for entry in causes[:most]:
         shares = (entry[key] for key in ("probability", "explained", "double_difference_share"))
         rows.append((str(entry["rank"]), *map(short_share, shares), entry["name"]))
     *widths, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
     room = _WIDTH - sum(widths) - 2 * len(widths)
-    return ["  ".join([*map(str.rjust, row, widths), shortened(row[-1], room)]) for row in rows]
+    lines = ["  ".join([*map(str.rjust, r, widths), shortened(r[-1], room)]) for r in rows]
+    return lines + more
 
 
 def _cause_lines(entry):
@@ -486,25 +497,3 @@ def worth_reading(where):
 def _where_lines(title, where):
     lines = [f"{share(one['share']):>6}  {where_words(one)}" for one in worth_reading(where)]
     return [title, *lines] if lines else []
-
-
-def _accuracy_lines(content, keys):
-    """Return the accuracies of each dataset and for targets, before and after."""
-    heads = "".join(f"{key:^19}" for key in keys).rstrip()
-    rows = ["Accuracy that calibrate states, before -> after, median over wavelengths (%)"]
-    rows.append(f"  {'':<20}{heads}")
-    for old, new in _pairs(content, "datasets"):
-        cells = (_arrow(old[f"{key}_percent"], new[f"{key}_percent"]) for key in keys)
-        rows.append(f"  {shortened(old['name'], 19):<20}{''.join(cells)}".rstrip())
-    for old, new in _pairs(content, "targets"):
-        rows.append(f"  on sky, {_target(old, new)}")
-    return rows
-
-
-def _pairs(content, key):
-    # a model that cannot be calibrated has no targets
-    return zip(content["accuracy_before"][key], content["accuracy_after"][key], strict=False)
-
-
-def _arrow(old, new):
-    return f"{percent(old):>7} -> {percent(new):<8}"

@@ -294,9 +294,9 @@ def summary(diagnosis, content=None, written=()):
     Returns
     -------
     str
-        The summary: a few sentences, a table of the causes, what to observe next, and
-        what was written. Below it each cause with its sizes, where the gap lies, and the
-        accuracies before and after.
+        The summary, of at most 24 lines: a few sentences, a table of the causes, what to
+        observe next, and what was written. Below it each cause with its sizes, and where the
+        gap lies.
 
     Examples
     --------
@@ -313,7 +313,7 @@ def summary(diagnosis, content=None, written=()):
     The model agrees with the measurements: it lacks nothing that these data show.
     """
     content = to_dict(diagnosis) if content is None else content
-    return _words.text(content, _numbers.ACCURACIES, _about_frames(diagnosis), written)
+    return _words.text(content, _about_frames(diagnosis), written)
 
 
 # ---- a page ------------------------------------------------------------------------------------

@@ -203,7 +203,7 @@ def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
     >>> truth = chain | BeamGain(imbalance=0.02, name="flat")
     >>> frames = half_wave_plate_cycles(derotator=[45, 70, 95, 120] * u.deg)
     >>> data = simulate(truth, wavelength, frames, seed=1)
-    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cells=False)
     >>> plot_effect_sizes(diagnosis, "beam_gain").axes[0].get_ylabel()[:9]
     'imbalance'
     """
@@ -269,10 +269,8 @@ def _absent(model, effect, name, size):
 def _label(diagnosis, effect, name, unit):
     """Return what a size is, and its unit."""
     cause = next(one for one in diagnosis.causes if one.name == effect)
-    cell = cause.cell.to_dict() if cause.cell else None
-    entry = {"size": diagnosis.improved.added[effect], "effect": cause.effect, "cell": cell}
-    names = [p.name for p in entry["size"]]
-    entry = {"size": names, "effect": effect if cause.is_named else None, "cell": cell}
+    names = [p.name for p in diagnosis.improved.added[effect]]
+    entry = {"size": names, "cell": cause.cell.to_dict() if cause.cell else None}
     words = dict(zip(names, labels(entry), strict=True))[name]
     return f"{textwrap.fill(words, _LABEL)} ({unit})"
 
@@ -285,7 +283,8 @@ _DRIVERS = {"sequence": "share of the run", "frame": "frame"}
 def _curve(diagnosis, effect):
     """Return the dependence of a cause that is a cell and changes from frame to frame."""
     cause = next(one for one in diagnosis.causes if one.name == effect)
-    if cause.cell is None or cause.is_named or cause.cell.kind not in GENERATORS:
+    keys = [p.name.partition(".")[2] for p in diagnosis.improved.added.get(effect) or ()]
+    if cause.cell is None or cause.cell.kind not in GENERATORS or keys[:1] != ["amplitude"]:
         return None
     dependence = Dependence(cause.cell.dependence)
     return dependence if dependence.driver else None

@@ -61,8 +61,9 @@ else:
 # Ask
 # ---
 #
-# ``diagnose`` asks for every small error that an optic may have, and for the effects of the library
-# that have a name. A few names are enough here, so that the page builds quickly.
+# ``diagnose`` asks for every small error that an optic may have, its cells of place, kind and
+# dependence, and for the effects of the library that have a name. A few names are enough here, so
+# that the page builds quickly.
 
 effects = [
     "beam_gain",
@@ -72,7 +73,7 @@ effects = [
     "derotator_diattenuation",
     "static_diattenuator",
 ]
-diagnosis = diagnose(chains, data, effects=effects)
+diagnosis = diagnose(chains, data, effects=effects, cells=False)
 print(summary(diagnosis))
 
 # %%
