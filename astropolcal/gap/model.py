@@ -345,10 +345,9 @@ class Model:
             for leaf in self._carriers(name)
             if not isinstance(leaf, Perturbation)
         ]
-        possible = all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
-        return possible and self._keeps_polarization(name)
+        return all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
 
-    def _keeps_polarization(self, name):
+    def keeps_polarization(self, name):
         """
         Return whether no beam would be negative for some light in front of an effect.
 
