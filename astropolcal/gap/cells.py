@@ -484,7 +484,10 @@ class Probes:
 
 def _frames_first(basis, shape):
     """Return columns (..., F) x q of a table as (F, rows of a frame, q)."""
-    return np.ascontiguousarray(basis.reshape(-1, shape[-1], basis.shape[1]).swapaxes(0, 1))
+    # no -1: of a model without free parameters there are no columns
+    rows, rank = basis.shape
+    table = basis.reshape(rows // shape[-1], shape[-1], rank)
+    return np.ascontiguousarray(table.swapaxes(0, 1))
 
 
 _PROBE = "gap_probe_"
