@@ -8,12 +8,15 @@ import gap_data as data
 import numpy as np
 import pytest
 from gap_setups import SETUPS
+from sky_data import held
+from star_data import WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments
 from astropolcal.exceptions import GapError
 from astropolcal.gap import EFFECTS, alternatives, diagnose
 from astropolcal.gap.alternatives import thinned
 from astropolcal.gap.cells import Cell
+from astropolcal.instruments.telescope import published_mirror
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 pytestmark = pytest.mark.usefixtures("own_instruments")
@@ -173,6 +176,23 @@ def test_wrong_frames_are_named_and_left_out():
         mask = model.observations[0].mask
         assert mask[5].all()
         assert mask.sum() == 7
+
+
+# ---- on sky ------------------------------------------------------------------------------------
+
+
+def test_a_star_tells_what_a_chain_without_free_parameters_lacks():
+    chain = star_chain()
+    chain["m3"].diattenuation = published_mirror().diattenuation(WAVELENGTH)
+    found = diagnose(held(chain), observe_star(chain, seed=4))
+    assert (found.verdict, found.causes) == ("none", [])
+    star = observe_star(chain, seed=3, parallactic=(-60, 60))
+    found = diagnose(held(chain, without=["m3"]), star)
+    assert found.verdict == "named"
+    assert found.causes[0].name == "m3_diattenuation"
+    measured = found.chains[0]["gap_m3_diattenuation"].diattenuation.value
+    np.testing.assert_allclose(measured, chain["m3"].diattenuation.value, atol=3e-4)
+    assert found.gap_after_percent < 0.2 * found.gap_before_percent
 
 
 # ---- bad input ---------------------------------------------------------------------------------
