@@ -278,7 +278,7 @@ class Bench:
             move = np.diff(clean.position(rest[0]), prepend=clean.position(rest[0])[:1])
             # what stands has moved last where it moved last
             last = np.maximum.accumulate(np.where(move != 0, np.arange(n), 0))
-            wave = move[last] < 0 if head == "direction" else np.abs(move)
+            wave = move[last] < 0 if head == "direction" else move
         else:
             wave = {
                 "constant": lambda: np.ones(n),
@@ -294,11 +294,11 @@ class Bench:
         return [self._exposed(dataset, faults) for dataset in range(len(self.clean))]
 
     def _exposed(self, dataset, faults):
-        positions, kicks, optics, spread, ghosts = {}, [], None, 0.0, []
+        positions, kicks, chains, spread, ghosts = {}, [], self.chains, 0.0, []
         for fault in faults:
             what = fault.told.get("what")
             kicks += fault.kicks(dataset)
-            optics = fault.optics(dataset) or optics
+            chains = fault.edited(chains)
             for stage, moved in fault.moves(dataset).items():
                 clean = self.clean[dataset].position(stage)
                 positions[stage] = positions.get(stage, clean) + moved
@@ -306,6 +306,7 @@ class Bench:
                 spread = fault.amplitude * self.waves(dataset, "move:hwp")[:, 0]
             elif what == "ghost":
                 ghosts.append(fault)
+        optics = None if chains is self.chains else self.split(chains[dataset])
         still = positions.get("hwp", self.clean[dataset].position("hwp"))
         nodes = (-1, -0.5, 0, 0.5, 1) if np.any(spread) else (0,)
         flux = np.mean(
@@ -383,7 +384,8 @@ class Bench:
                 self._known[leaf.name] = leaf.canonical_values()
                 for i, key in enumerate(leaf.param_names):
                     parameter = getattr(leaf, key)
-                    if parameter.fixed:
+                    # what is known beforehand stays as it is known
+                    if parameter.fixed or parameter.prior is not None:
                         continue
                     value = np.atleast_1d(self._known[leaf.name][i])
                     self._free.append((leaf.name, i, np.shape(self._known[leaf.name][i])))
@@ -440,8 +442,9 @@ class Bench:
         )
         return -fit.fun, fit
 
-    def _cells(self, vector, own=None):
+    def _cells(self, vector, own=None, law=None):
         """Yield name and whitened columns of each cell of places, kinds and dependences."""
+        law = self.law if law is None else law
         values, n_sets = self._values(vector), range(len(self.clean))
         flux = [self.path(d, values=values) for d in n_sets]
         names = dict.fromkeys([*self.dependences, *([own] if own else [])])
@@ -455,10 +458,10 @@ class Bench:
                     for row, light, turn in ends
                 ]
                 for name, wave in waves.items():
-                    yield f"{place}/{kind}/{name}", self._columns(flux, slopes, wave)
+                    yield f"{place}/{kind}/{name}", self._columns(flux, slopes, wave, law)
         gain = [f * np.array([1, -1])[:, None, None] for f in flux]
         for name, wave in waves.items():
-            yield f"detector/gain/{name}", self._columns(flux, gain, wave)
+            yield f"detector/gain/{name}", self._columns(flux, gain, wave, law)
         still = waves["constant"]
         for kind, name in DETECTOR.items():
             slopes = [self.glow(d, kind, flux[d]) for d in n_sets]
@@ -466,7 +469,7 @@ class Bench:
                 f"detector/{kind}/{name}",
                 np.concatenate(
                     [
-                        self._columns(flux, [s * on[:, None, None] for s in slopes], still)
+                        self._columns(flux, [s * on[:, None, None] for s in slopes], still, law)
                         for on in (np.eye(2) if kind != "background" else np.ones((1, 2)))
                     ]
                 ),
@@ -499,23 +502,27 @@ class Bench:
             return np.concatenate([0 * seen[:, :1], seen[:, :-1]], axis=1) / bright
         return np.broadcast_to(usual / bright, flux.shape)
 
-    def _columns(self, flux, slopes, waves):
+    def _columns(self, flux, slopes, waves, law):
         """Return the whitened columns of slopes (2, F, W) times waves and laws."""
         found = []
         for f, s, wave in zip(flux, slopes, waves, strict=True):
             total = f.sum(axis=0)
             both = np.stack([2 * (f[1] * s[0] - f[0] * s[1]) / total**2, s.sum(axis=0) / total])
-            each = np.einsum("fk,wl,cfw->klcfw", wave, self.law, both)
+            each = np.einsum("fk,wl,cfw->klcfw", wave, law, both)
             found.append(each.reshape(-1, *both.shape))
         return self._whiten(found)
 
-    def shares(self, residual, fit, own=None):
-        """Return the share of a residual that each cell, or one's own, carries beside the model."""
+    def shares(self, residual, fit, own=None, sharp=False):
+        """
+        Return the share of a residual that each cell, or one's own, carries beside the model.
+
+        With smooth laws in wavelength or, where it is sharp, any.
+        """
         kept = fit.active_mask == 0
         taken = np.linalg.qr(fit.jac[:, kept])[0]
         signal = residual - taken @ (taken.T @ residual)
         found = {}
-        for name, columns in self._cells(fit.x, own):
+        for name, columns in self._cells(fit.x, own, np.eye(len(self.micron)) if sharp else None):
             length = np.linalg.norm(columns, axis=1)
             columns = (columns[length > 0] / length[length > 0, None]).T
             left, size, _ = np.linalg.svd(
@@ -582,7 +589,8 @@ def _varied(chains, law, rng):
     known = {}
     for leaf in (leaf for chain in chains for leaf in leaves(chain)):
         for key in leaf.param_names:
-            if not getattr(leaf, key).fixed:
+            # a mounting that is known within its error is where it should be
+            if not getattr(leaf, key).fixed and getattr(leaf, key).prior is None:
                 name = f"{leaf.name}.{key}"
                 if name not in known:
                     known[name] = _vary(leaf, key, law, rng, known)

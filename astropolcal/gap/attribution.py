@@ -16,10 +16,12 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
+from astropolcal.chain import leaves
 from astropolcal.gap._bases import law_basis
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.problem import GapProblem
+from astropolcal.optics.perturbations import split_run
 
 __all__ = ["Candidate", "Scan", "false_discovery", "scan"]
 
@@ -33,8 +35,17 @@ _TOGETHER = 20
 #: Prior odds of a name against a cell of the table.
 NAMED = 5.0
 # log prior odds of dependences: what changes needs a reason
-_DEPENDENCE = {"constant": 0.0, "step": -5.0, "direction": -1.5, "move": -1.5, "time2": -1.0}
+_DEPENDENCE = {
+    "constant": 0.0,
+    "step": -5.0,
+    "direction": -1.5,
+    "move": -1.5,
+    "time2": -1.0,
+    "dataset": -2.0,
+}
 _OTHER = -0.5
+# and what changes in one of several runs only needs another
+_ALONE = -1.0
 # a direction of which model and lamp leave less than this is theirs
 _ABSORBED = 1e-9
 
@@ -186,6 +197,35 @@ class Scan:
             best = max([best, *found], key=lambda one: one.evidence)
         return best
 
+    def by_run(self, candidate):
+        """
+        Return the evidence for a cause in each of several runs alone.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            A cause that the model of the scan does not have.
+
+        Returns
+        -------
+        dict of str to float
+            Name of the dataset to the logarithm of the Bayes factor; without those that have no
+            place for it, and empty where there is one run only or the cause is in one.
+        """
+        probes = self.probes
+        if probes is None or probes.run_of(candidate.cell) is not None:
+            return {}
+        found = {}
+        for i, run in enumerate(probes.runs):
+            if candidate.is_named:
+                alone = _named_in(probes, candidate.named, i, self.temper)
+            else:
+                cell = candidate.cell.in_run(run)
+                alone = _of_cell(probes, cell, candidate.degree, self.temper)
+            if alone:
+                found[run] = alone[0].evidence - alone[0].prior
+        return found
+
     def named_as(self, candidate, effects):
         """
         Return the names of a cell, each with the law for which there is most evidence.
@@ -201,7 +241,7 @@ class Scan:
         -------
         list of Candidate
         """
-        chains, own = self.probes.model.trains, set(self.probes.model.added)
+        chains, own = self.probes.model.trains, self.probes.own
         same = [
             effect
             for effect in effects
@@ -220,7 +260,7 @@ class Scan:
         return self.candidates[0] if self.candidates else None
 
 
-def scan(model, effects=(), *, cells=True, temper=1.0):
+def scan(model, effects=(), *, cells=True, temper=1.0, without=None, like=None):
     """
     Return the evidence for all cells and named effects beside a fitted model.
 
@@ -234,6 +274,10 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
         Whether to ask for the cells as well.
     temper : float
         Variance of the residuals about the model with the cause, in units of the noise.
+    without : str, optional
+        Name of an effect of the model that is taken out, to first order.
+    like : Probes, optional
+        Those of another scan of the same model, whose derivatives are taken over.
 
     Returns
     -------
@@ -252,7 +296,7 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
     >>> bool(scan(model).best.evidence < 5)
     True
     """
-    probes = Probes(model)
+    probes = Probes(model, () if without is None else (without,), like)
     found, levels = [], []
     if cells:
         found = _cells(probes, temper)
@@ -264,32 +308,53 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
 
 def _cells(probes, temper):
     """Return the candidate of every cell, with the better of its laws."""
-    problem, waves = probes.problem, probes.waves
-    single = [name for name, w in waves.items() if len(w[0]) == 1]
-    several = [name for name in waves if name not in single]
-    stacked = [np.concatenate([waves[n][i] for n in single]) for i in range(len(problem.datasets))]
-    own, best = set(probes.model.added), {}
+    own, best = probes.own, {}
     for place, kind, degree, reduced in probes.reduced(_DEGREES):
         scale = Cell(place, kind, "constant").scale
-        if probes.is_detector(kind):
-            # a constant in front of a derivative that follows the flux
-            parts = [(probes.dependence_of(kind), *(x[0] for x in reduced.normal(probes.ones)))]
-        else:
-            parts = list(zip(single, *reduced.normal(stacked), strict=True))
-            parts += [(name, *reduced.pair(waves[name])) for name in several]
+        waves = {
+            name: probes.waves_of(Cell(place, kind, name))
+            for name in probes.dependences_of(place, kind)
+        }
+        single = [name for name, w in waves.items() if len(w[0]) == 1]
+        stacked = [np.concatenate(each) for each in zip(*(waves[n] for n in single), strict=True)]
+        parts = list(zip(single, *reduced.normal(stacked), strict=True))
+        parts += [(name, *reduced.pair(w)) for name, w in waves.items() if len(w[0]) > 1]
+        bent = _bent(probes, place, kind, law_basis(probes.problem.wavelength, degree))
+        if bent is not None:
+            parts = [(n, *bent) if n == "constant" else (n, *rest) for n, *rest in parts]
         for name, one in _candidates(place, kind, degree, parts, scale, temper):
             if name not in best or best[name].evidence < one.evidence:
                 best[name] = one
     return [one for one in best.values() if one.name not in own]
 
 
+def _bent(probes, place, kind, law):
+    """
+    Return gram and target of a constant cell with its second derivative, None if it has none.
+
+    The derivative vanishes where a parameter is at an extremum, as half a wave is; a change shows
+    in second order then, with one sign only.
+    """
+    bend = probes.bends.get((place, kind))
+    if bend is None:
+        return None
+    gram, target = Reduced(probes, [probes.slopes[place, kind], bend], law).pair(probes.ones)
+    k = law.shape[1]
+    held = gram + np.eye(2 * k) / Cell(place, kind, "constant").scale ** 2
+    size = law @ np.linalg.solve(held, target)[k:]
+    return (gram, target) if size.mean() > 0 else None
+
+
 def _of_cell(probes, cell, degree, temper):
     """Return the candidate of one cell with a law of some degree, in a list."""
-    slopes = probes.slopes[cell.place, cell.kind]
-    reduced = Reduced(probes, slopes, law_basis(probes.problem.wavelength, degree))
-    detector = probes.is_detector(cell.kind)
-    gram, target = reduced.pair(probes.ones if detector else probes.waves[cell.dependence])
-    parts = [(cell.dependence, gram, target)]
+    law = law_basis(probes.problem.wavelength, degree)
+    both = None
+    if cell.dependence == "constant":
+        both = _bent(probes, cell.place, cell.kind, law)
+    if both is None:
+        reduced = Reduced(probes, probes.slopes[cell.place, cell.kind], law)
+        both = reduced.pair(probes.waves_of(cell))
+    parts = [(cell.dependence, *both)]
     return [one for _, one in _candidates(cell.place, cell.kind, degree, parts, cell.scale, temper)]
 
 
@@ -321,7 +386,9 @@ def _candidates(place, kind, degree, parts, scale, temper):
 
 
 def _prior(dependence):
-    return _DEPENDENCE.get(dependence.partition(":")[0], _OTHER)
+    text, run = split_run(dependence)
+    alone = _ALONE if run is not None and text != "dataset" else 0.0
+    return _DEPENDENCE.get(text.partition(":")[0], _OTHER) + alone
 
 
 def _spectra(gram, target):
@@ -347,15 +414,45 @@ def _rank(values, scale):
 
 
 def _named(probes, effects, temper, degree="default"):
-    """Return the candidates of named effects, all of them at zero in the same chains."""
+    """Return the candidates of named effects."""
     model, found = probes.model, []
-    context = replace(model.context, degree=degree)
     chains = model.trains
-    waiting = [
-        effect
-        for effect in effects
-        if effect.name not in model.added and not effect.absorbed_by and effect.applies(chains)
-    ]
+    fitting = [e for e in effects if e.name not in probes.own and not e.absorbed_by]
+    fitting = [e for e in fitting if e.name in model.added or e.applies(chains)]
+    context = None if degree == "default" else replace(model.context, degree=degree)
+    law = replace(model.context, degree=degree)
+    for effect in fitting:
+        bent = _bent_name(probes, effect, law, temper) if effect.name not in model.added else []
+        if bent:
+            found += [replace(one, context=context) for one in bent]
+            continue
+        if effect.name in model.added:
+            slopes, size = _columns_of(model.problem, model.jacobian, model.added[effect.name])
+        else:
+            slopes, size = _columns(model, fitting, degree).get(effect.name, (None, None))
+        one = _of_columns(probes, effect, slopes, size, temper)
+        found += [replace(each, context=context) for each in one]
+    return found
+
+
+def _of_columns(probes, effect, slopes, size, temper):
+    """Return the candidate of an effect with these derivatives and usual sizes, in a list."""
+    if size is None or not size.size:
+        return []
+    scaled = slopes * size
+    seen = probes.tangent.T @ scaled
+    gram, target = scaled.T @ scaled - seen.T @ seen, scaled.T @ probes.residual
+    values, share = (part[0] for part in _spectra(gram[None], target[None]))
+    if not _rank(values, 1.0):
+        return []
+    return [_with_name(effect, probes.model, values, share, temper)]
+
+
+def _columns(model, effects, degree):
+    """Return derivatives and usual sizes of named effects, all at zero in the same chains."""
+    known = model.__dict__.setdefault("_named_columns", {})
+    waiting = [e for e in effects if (e.name, degree) not in known and e.name not in model.added]
+    context = replace(model.context, degree=degree)
     while waiting:
         edited, parameters, ties, later = list(model.held_chains), {}, {}, []
         for effect in waiting:
@@ -368,41 +465,74 @@ def _named(probes, effects, temper, degree="default"):
                 continue
             edited, parameters[effect.name] = edit.chains, edit.parameters
             ties |= {name: tie for name, tie in edit.ties.items() if tie.source in names}
-        found += _of_batch(probes, edited, parameters, ties, waiting, temper)
+        laws = {p.name: p.basis for own in parameters.values() for p in own if p.basis is not None}
+        problem = GapProblem(
+            edited, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
+        )
+        jacobian = problem.jacobian(problem.start) if problem.size else None
+        for name, own in parameters.items():
+            known[name, degree] = _columns_of(problem, jacobian, own)
         waiting = later
-    if degree == "default":
-        return found
-    return [replace(one, context=context) for one in found]
+    return {name: found for (name, law), found in known.items() if law == degree}
 
 
-def _of_batch(probes, edited, parameters, ties, effects, temper):
-    """Return the candidates of effects that are in the same chains."""
-    laws = {p.name: p.basis for own in parameters.values() for p in own if p.basis is not None}
+def _columns_of(problem, jacobian, parameters):
+    """Return the derivatives to parameters, and their usual sizes."""
+    parts = [(problem.slices[p.name], p) for p in parameters if p.name in problem.slices]
+    if jacobian is None or not parts:
+        return None, np.empty(0)
+    rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
+    size = np.concatenate([np.full(w.stop - w.start, p.canonical_scale) for w, p in parts])
+    return jacobian[:, rows], size
+
+
+def _bent_name(probes, effect, context, temper):
+    """Return the candidate of an effect whose derivative vanishes, in a list."""
+
+
+def _named_in(probes, effect, i, temper):
+    """Return the candidate of a named effect in the chain of one dataset only, in a list."""
+    held = probes.model.held_chains
+    edit = effect.edit(list(held), probes.model.context)
+    chains = [*held[:i], edit.chains[i], *held[i + 1 :]]
+    there = {leaf.name for leaf in leaves(chains[i])}
+    own = [p for p in edit.parameters if p.name.partition(".")[0] in there]
+    names = {p.name for p in own}
+    ties = {
+        name: tie
+        for name, tie in edit.ties.items()
+        if tie.source in names and name.partition(".")[0] in there
+    }
+    if not own:
+        return []
+    laws = {p.name: p.basis for p in own if p.basis is not None}
     model = probes.model
     problem = GapProblem(
-        edited, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
+        chains, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
     )
-    if not problem.size:
+    jacobian = problem.jacobian(problem.start) if problem.size else None
+    return _of_columns(probes, effect, *_columns_of(problem, jacobian, own), temper)
+
+
+def _bent_name(probes, effect, context, temper):
+    """Return the candidate of an effect whose derivative vanishes, in a list."""
+    model = probes.model
+    cell = effect.cell(model.trains) if probes.bends else None
+    if cell is None or cell.dependence != "constant" or (cell.place, cell.kind) not in probes.bends:
         return []
-    slopes = problem.jacobian(problem.start)
-    seen = probes.tangent.T @ slopes
-    gram, target = slopes.T @ slopes - seen.T @ seen, slopes.T @ probes.residual
-    found = []
-    for effect in effects:
-        own = [p for p in parameters.get(effect.name, ()) if p.name in problem.slices]
-        if not own:
-            continue
-        parts = [(problem.slices[p.name], p.canonical_scale) for p in own]
-        rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
-        if not rows.size:
-            # a law less its constant, of no degree, is nothing
-            continue
-        size = np.concatenate([np.full(w.stop - w.start, scale) for w, scale in parts])
-        square = gram[np.ix_(rows, rows)] * size[:, None] * size
-        values, share = (part[0] for part in _spectra(square[None], (target[rows] * size)[None]))
-        if _rank(values, 1.0):
-            found.append(_with_name(effect, model, values, share, temper))
-    return found
+    added = effect.edit(model.held_chains, context).parameters
+    # what is freed, instead of inserted, is no perturbation behind the optic
+    if len(added) != 1 or not added[0].name.startswith(effect.label):
+        return []
+    law = added[0].basis
+    law = np.eye(len(probes.problem.wavelength)) if law is None else law
+    bent = _bent(probes, cell.place, cell.kind, law)
+    if bent is None:
+        return []
+    scale = added[0].canonical_scale
+    (values,), (share,) = _spectra(*(part[None] for part in bent))
+    values = values * scale**2
+    return [_with_name(effect, model, values, share, temper)] if _rank(values, 1.0) else []
 
 
 def _with_name(effect, model, values, share, temper):

@@ -9,7 +9,9 @@ light s that arrives at the place, the analyser row a behind it and the generato
 light and rows of all places come from one forward and one backward sweep.
 """
 
-from dataclasses import dataclass
+from collections import Counter
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import astropy.units as u
@@ -20,6 +22,7 @@ from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap._bases import law_basis
 from astropolcal.gap.problem import GapProblem
 from astropolcal.optics import GENERATORS, Dependence
+from astropolcal.optics.perturbations import split_run
 from astropolcal.optics.positions import COORDINATES
 
 __all__ = ["Cell", "Place", "Probes", "dependences", "places"]
@@ -38,6 +41,8 @@ _HARMONICS = (1, 2, 4)
 _MOST_STEPS = 64
 # functions of the frame that differ by less are the same
 _SAME = 1e-9
+# size (radian) of a retardance that is tried where its derivative vanishes
+FINITE = 0.1
 #: Usual size of a perturbation (radian, or a share) by kind, the scale of its prior.
 SIZES = {"retardance": 0.1, "rotation": 0.02, "diattenuation": 0.02, "depolarization": 0.05}
 _USUAL = 0.02
@@ -57,7 +62,8 @@ class Cell:
         Key of `~astropolcal.optics.GENERATORS`, or ``"background"``,
         ``"background_of_one_beam"``, ``"nonlinearity"``, ``"persistence"``, ``"crosstalk"``.
     dependence : str
-        As `~astropolcal.optics.Dependence` takes it, or ``"flux"`` and ``"previous"``.
+        As `~astropolcal.optics.Dependence` takes it, or ``"flux"`` and ``"previous"``; in one of
+        several runs only with ``"/dataset:NAME"`` behind it.
 
     Examples
     --------
@@ -79,6 +85,16 @@ class Cell:
     def optic(self):
         """Name of the optic of the place, None where it is none."""
         return self.place.partition(":")[2] or None
+
+    @property
+    def run(self):
+        """Name of the one dataset in which it is, None where it is in all."""
+        return split_run(self.dependence)[1]
+
+    def in_run(self, name):
+        """Return the same in one dataset only."""
+        text = "" if self.dependence in ("constant", "flux", "previous") else f"{self.dependence}/"
+        return replace(self, dependence=f"{text}dataset:{name}")
 
     @property
     def scale(self):
@@ -131,7 +147,12 @@ def _place_words(place):
 
 
 def _when(dependence):
-    parts = dependence.split(":")
+    text, run = split_run(dependence)
+    return _pattern(text) + (f' in "{run}" only' if run is not None else "")
+
+
+def _pattern(text):
+    parts = text.split(":")
     stage = {"hwp": "half-wave plate"}.get(parts[1], parts[1]) if len(parts) > 1 else ""
     times = {"1": "once", "2": "twice", "4": "four times"}
     return {
@@ -144,7 +165,6 @@ def _when(dependence):
         ),
         "direction": lambda: f" that depends on the direction of the last move of the {stage}",
         "move": lambda: f" that grows with the last move of the {stage}",
-        "dataset": lambda: f' in "{dependence.partition(":")[2]}" only',
     }.get(parts[0], lambda: "")()
 
 
@@ -279,10 +299,14 @@ def dependences(problem, most_steps=_MOST_STEPS):
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
     names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
-    sources = [o.source for o in (d.observations for d in problem.datasets)]
-    if len(set(sources)) < len(sources):
-        names += [f"dataset:{d.observations.name}" for d in problem.datasets]
-    names += [f"step:{n}" for n in _steps(problem, most_steps)]
+    runs = [d.observations.name for d in problem.datasets] if count_runs(problem) > 1 else []
+    steps = [f"step:{n}" for n in _steps(problem, most_steps // max(len(runs), 1))]
+    # a frame of one run has nothing to do with that of the same number in another
+    alone = [*names[1:], *steps]
+    every = [d.observations.name for d in problem.datasets]
+    names += [f"dataset:{name}" for name in every] if len(every) > 1 else []
+    names += [] if runs else steps
+    names += [f"{name}/dataset:{run}" for run in runs for name in alone]
     found = {}
     for name in names:
         waves = [_waves(Dependence(name), dataset) for dataset in problem.datasets]
@@ -294,12 +318,27 @@ def dependences(problem, most_steps=_MOST_STEPS):
 _MOVED = ("direction", "move")
 
 
+def count_runs(problem):
+    """
+    Return how many runs of the same kind of source the datasets of a problem are at most.
+
+    Parameters
+    ----------
+    problem : GapProblem
+        Chains and datasets.
+
+    Returns
+    -------
+    int
+    """
+    return max(Counter(d.observations.source for d in problem.datasets).values())
+
+
 def _waves(dependence, dataset):
     """Return the functions of a dependence in the frames of a dataset, (count, F)."""
     observations = dataset.observations
-    if dependence.kind == "dataset":
-        own = dependence.text.partition(":")[2] == observations.name
-        return np.full((1, observations.n_frames), float(own))
+    if dependence.run not in (None, observations.name):
+        return np.zeros((dependence.count, observations.n_frames))
     if dependence.driver is None:
         return np.ones((1, observations.n_frames))
     given = dataset._given.get(dependence.driver)
@@ -337,8 +376,12 @@ class Probes:
     ----------
     model : Model
         The fitted model.
-    tangent : `~numpy.ndarray`, optional
-        Orthonormal basis of what the model can do already, (n_rows, rank), if known.
+    without : collection of str
+        Names of effects of the model that are taken out, to first order.
+    like : Probes, optional
+        Those of the same model, whose derivatives are taken over.
+    most_steps : int
+        Steps are looked for at so many frames.
 
     Examples
     --------
@@ -355,18 +398,19 @@ class Probes:
     6
     """
 
-    def __init__(self, model, tangent=None, most_steps=_MOST_STEPS):
-        self.model, problem = model, model.problem
-        self.problem = problem
-        coefficients = model.fit.coefficients
-        self.tangent = problem.tangent(coefficients) if tangent is None else tangent
-        residual = problem.residual(coefficients)
-        self.residual = residual - self.tangent @ (self.tangent.T @ residual)
+    def __init__(self, model, without=(), like=None, most_steps=_MOST_STEPS):
+        self.model, self.problem = model, model.problem
+        problem, linear = model.problem, model.without(without)
+        self.tangent, self.residual = linear.tangent, linear.residual
+        #: Names of the effects that are in the model.
+        self.own = set(model.added) - set(without)
         #: A function of the frame that is one everywhere, of each dataset.
         self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
         self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
-        self.slopes = self._at_places()
+        #: Second derivatives over the size that is tried, where they outdo the first ones.
+        self.bends = {} if like is None else like.bends
+        self.slopes = self._at_places() if like is None else like.slopes
         parts = list(zip(problem.channels, problem.segments, strict=True))
         #: Tangent and lamp with the frames first, (F, rows of a frame, rank), one a dataset.
         self.by_frame = [_frames_first(self.tangent[rows], c.shape) for c, rows in parts]
@@ -378,8 +422,35 @@ class Probes:
         return [
             Cell(place, kind, dependence)
             for place, kind in self.slopes
-            for dependence in ([_DETECTOR[kind]] if kind in _DETECTOR else self.waves)
+            for dependence in self.dependences_of(place, kind)
         ]
+
+    def dependences_of(self, place, kind):
+        """Return the dependences of a kind at a place."""
+        if kind in _DETECTOR:
+            return [_DETECTOR[kind], *(name for name in self.waves if name[:8] == "dataset:")]
+        if len(self.slopes[place, kind]) > 1:
+            return list(self.waves)
+        # a place in one chain only is in that run anyway
+        return [name for name in self.waves if split_run(name)[1] is None]
+
+    @property
+    def runs(self):
+        """Names of the datasets, of which a cause may be in one only; none for a single run."""
+        names = [d.observations.name for d in self.problem.datasets]
+        return names if count_runs(self.problem) > 1 else []
+
+    def run_of(self, cell):
+        """Return the name of the one dataset that has a cell, None where several have it."""
+        if cell is None or cell.run is not None or not self.runs:
+            return cell and cell.run
+        where = list(self.slopes.get((cell.place, cell.kind), ()))
+        return self.runs[where[0]] if len(where) == 1 else None
+
+    def waves_of(self, cell):
+        """Return the functions of the frame by which the derivative of a cell is multiplied."""
+        # the derivative of what belongs to a detector has its dependence in it
+        return self.waves[cell.dependence] if cell.dependence in self.waves else self.ones
 
     def _at_places(self):
         """Return the derivative of both channels to a constant perturbation, by place and kind."""
@@ -415,12 +486,36 @@ class Probes:
                         continue
                     slope = np.stack([_bilinear(*part[j], generator) for part in both])
                     found.setdefault((place, kind), {})[i] = slope * channel.valid
+                    if kind.startswith("retardance") and place.startswith("in:"):
+                        # of exp(x G), per size: at a size of FINITE it is half of this
+                        bend = np.stack([_bilinear(*p[j], generator @ generator) for p in both])
+                        bend = FINITE / 2 * bend * channel.valid
+                        self.bends.setdefault((place, kind), {})[i] = bend
             right, left = sweep.fluxes
             gain = np.stack([(one * right - other * left) for one, other in channel.slopes(sweep)])
             found.setdefault(("detector", "gain"), {})[i] = gain * channel.valid
             for kind, slope in self._at_detector(i, channel, sweep):
                 found.setdefault(("detector", kind), {})[i] = slope * channel.valid
+        self.bends = {
+            key: bend
+            for key, bend in self.bends.items()
+            # what is seen in first order, be it taken up by the model, has its second one there
+            if self._left(bend) > max(np.linalg.norm(self._white(found[key])), 1.0 / FINITE)
+        }
         return found
+
+    def _white(self, slopes):
+        """Return the whitened derivative of the data to a constant perturbation, (n_rows,)."""
+        parts = [
+            channel.whiten(slopes.get(i, np.zeros(channel.shape))).ravel()
+            for i, channel in enumerate(self.problem.channels)
+        ]
+        return np.concatenate(parts)
+
+    def _left(self, slopes):
+        """Return how much of it the model cannot take up."""
+        column = self._white(slopes)
+        return float(np.linalg.norm(column - self.tangent @ (self.tangent.T @ column)))
 
     def _at_detector(self, i, channel, sweep):
         """Yield what background, nonlinearity, afterglow and crosstalk do to the channels."""
@@ -448,16 +543,6 @@ class Probes:
             slopes = [a * one + b * other for a, b in channel.slopes(sweep)]
             yield kind, np.stack(slopes)
 
-    @staticmethod
-    def is_detector(kind):
-        """Whether a kind belongs to a detector, and has one dependence only."""
-        return kind in _DETECTOR
-
-    @staticmethod
-    def dependence_of(kind):
-        """Return the one dependence of a kind that belongs to a detector."""
-        return _DETECTOR[kind]
-
     # ---- normal equations --------------------------------------------------------------------
 
     def reduced(self, degrees=(0, 2)):
@@ -475,19 +560,20 @@ class Probes:
         degree : int or None
         Reduced
         """
-        wavelength = self.problem.wavelength
+        laws = {degree: law_basis(self.problem.wavelength, degree) for degree in degrees}
+        widest = max(laws.values(), key=lambda law: law.shape[1])
         for (place, kind), slopes in self.slopes.items():
-            for degree in degrees:
-                law = law_basis(wavelength, degree)
-                yield place, kind, degree, Reduced(self, slopes, law)
+            whole = Reduced(self, slopes, widest)
+            for degree, law in laws.items():
+                k = law.shape[1]
+                part = np.array_equal(widest[:, :k], law)
+                yield place, kind, degree, whole.first(k) if part else Reduced(self, slopes, law)
 
 
 def _frames_first(basis, shape):
     """Return columns (..., F) x q of a table as (F, rows of a frame, q)."""
-    # no -1: of a model without free parameters there are no columns
-    rows, rank = basis.shape
-    table = basis.reshape(rows // shape[-1], shape[-1], rank)
-    return np.ascontiguousarray(table.swapaxes(0, 1))
+    rows = int(np.prod(shape[:-1]))
+    return np.ascontiguousarray(basis.reshape(rows, shape[-1], basis.shape[1]).swapaxes(0, 1))
 
 
 _PROBE = "gap_probe_"
@@ -514,21 +600,22 @@ class Reduced:
     probes : Probes
         Derivatives.
     slopes : dict of int to `~numpy.ndarray`
-        Of each dataset (2, W, F).
+        Of each dataset (2, W, F), or several in a list.
     law : `~numpy.ndarray`
         Basis of the law in wavelength, shape (W, k).
     """
 
     def __init__(self, probes, slopes, law):
-        problem, k = probes.problem, law.shape[1]
+        problem = probes.problem
+        slopes = slopes if isinstance(slopes, (list, tuple)) else [slopes]
+        k = law.shape[1] * len(slopes)
         self.gram, self.target, self.seen, self.lamps = [], [], [], []
         for i, (dataset, channel, rows) in enumerate(
             zip(problem.datasets, problem.channels, problem.segments, strict=True)
         ):
-            slope = slopes.get(i)
-            if slope is None:
-                slope = np.zeros(channel.shape)
-            columns = law[dataset.bins].T[:, None, :, None] * slope
+            nothing = np.zeros(channel.shape)
+            own = law[dataset.bins].T[:, None, :, None]
+            columns = np.concatenate([own * slope.get(i, nothing) for slope in slopes])
             white = channel.whiten_frames(columns)
             n_frames = channel.shape[2]
             # frames last, then a product of matrices a frame
@@ -539,6 +626,17 @@ class Reduced:
             self.seen.append(_by_frame(flat, probes.by_frame[i]))
             # the lamp is taken up as the tangent is: both are directions that data do not tell
             self.lamps.append(_by_frame(white[:, 1], probes.lamp_by_frame[i]))
+
+    def first(self, k):
+        """Return the same for the law of the first columns of the basis."""
+        if k == len(self.target[0]):
+            return self
+        part = copy(self)
+        part.gram = [g[:k, :k] for g in self.gram]
+        part.target = [t[:k] for t in self.target]
+        part.seen = [s[:k] for s in self.seen]
+        part.lamps = [s[:k] for s in self.lamps]
+        return part
 
     def normal(self, waves):
         """

@@ -19,8 +19,10 @@ from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.frames import suspect_frames, without_frames
 from astropolcal.gap.model import Model, nominal_model
-from astropolcal.gap.selection import REMAINDER, select
-from astropolcal.gap.shrinkage import frame_groups
+from astropolcal.gap.problem import GapProblem
+from astropolcal.gap.runs import distinct
+from astropolcal.gap.selection import REMAINDER, explained_by_one, select
+from astropolcal.gap.shrinkage import HeldOut, frame_groups
 from astropolcal.words import counted
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
@@ -58,6 +60,8 @@ class Cause:
         Logarithm of the Bayes factor.
     stability : float or None
         Share of the halves of the wavelengths and of the left-out angles in which it is found.
+    by_dataset : dict of str to float
+        Evidence for it in each of several runs alone.
 
     Examples
     --------
@@ -79,6 +83,7 @@ class Cause:
     physical: bool = True
     evidence: float = 0.0
     stability: float | None = None
+    by_dataset: dict = field(default_factory=dict)
 
     @property
     def name(self):
@@ -119,6 +124,8 @@ class Diagnosis:
         Frames that are not what the table says.
     settings : dict
         How it was asked.
+    nested : HeldOut or None
+        Errors on groups of frames that took no part in the choice of the causes.
 
     Examples
     --------
@@ -145,6 +152,7 @@ class Diagnosis:
     seconds: float = 0.0
     frames: list = field(default_factory=list)
     settings: dict = field(default_factory=dict)
+    nested: object = None
 
     @property
     def noise_floor_percent(self):
@@ -186,7 +194,15 @@ def _gap_of_fit(model):
 
 
 def diagnose(
-    calibration, observations, *, effects="all", cells=True, cross_validate=True, progress=None
+    calibration,
+    observations,
+    *,
+    effects="all",
+    cells=True,
+    changes=False,
+    cross_validate=True,
+    nested=False,
+    progress=None,
 ):
     """
     Diagnose the gap between a model and measurements.
@@ -203,9 +219,16 @@ def diagnose(
     cells : bool
         Whether to ask for every cell of places, kinds and dependences too; without it
         the answer is one of the names, or none.
+    changes : bool
+        Whether to ask what changed between several runs of the same kind of source: causes
+        of one run only come first.
     cross_validate : bool
         Whether to check on left-out frames; without it the gaps are those of
         the fit itself.
+    nested : bool
+        Whether to choose the causes anew without each group of frames, and predict that with
+        them: the one measure of the shrinkage in which the choice has no part. It takes as many
+        times the time as there are groups.
     progress : callable, optional
         Called with a line on what is done next.
 
@@ -217,7 +240,8 @@ def diagnose(
     ------
     GapError
         If the nominal fit does not converge, there are too few groups of frames
-        to leave out, or an effect is unknown.
+        to leave out, an effect is unknown, the same data are given twice, or changes
+        are asked for where no two datasets have the same source.
 
     Examples
     --------
@@ -240,23 +264,64 @@ def diagnose(
     say = progress or (lambda line: None)
     observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
     library = _library(effects)
-    groups = frame_groups(observations) if cross_validate else None
     _check_instruments(observations)
+    if changes and not cells:
+        raise GapError("what changed between runs is told by cells; ask for them, too")
+    observations = distinct(observations, changes)
+    groups = frame_groups(observations) if cross_validate else None
     say("fitting the nominal model")
     nominal, base, exchanged = starting_model(calibration, observations, library, say)
     say("looking for frames that are not what the table says")
     frames = suspect_frames(base)
     wrong = [fault for fault in frames if fault.what != "lamp"]
-    if wrong:
+    # what has a place depends on the alternative that was taken; the discrete ones were tried.
+    # What depends on the last move of a stage shows in a few frames too, and is one cause
+    smooth = [effect for effect in adapted(library, base.chains) if effect.kind != "discrete"]
+    if len(wrong) > 1 and explained_by_one(base, smooth, cells=cells):
+        frames = [fault for fault in frames if fault.what == "lamp"]
+    elif wrong:
         say(f"without {counted(len(wrong), 'frame')}: fitting the nominal model again")
         kept = without_frames(observations, wrong)
         again, groups = _refitted(base, kept), frame_groups(kept) if cross_validate else None
         nominal, base = (again if nominal is base else nominal), again
     say("looking for causes")
-    # what has a place depends on the alternative that was taken; the discrete ones were tried
-    smooth = [effect for effect in adapted(library, base.chains) if effect.kind != "discrete"]
-    selection = select(base, smooth, groups, say, cells=cells)
-    return _conclude(nominal, base, exchanged, selection, frames, started)
+    selection = select(base, smooth, groups, say, cells=cells, changes=changes)
+    found = _conclude(nominal, base, exchanged, selection, frames, started)
+    found.settings["changes"] = changes
+    if nested and groups is not None:
+        found.nested = _nested(base, smooth, groups, say, cells)
+        found.seconds = time.perf_counter() - started
+    return found
+
+
+def _nested(base, smooth, groups, say, cells):
+    """Return the errors on frames of groups that took no part in the choice of the causes."""
+    labels, numbers = groups
+    squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
+    problem = base.problem
+    for k, label in enumerate(labels):
+        say(f"without {label}, {k + 1} of {len(labels)}")
+        seen = [number == k for number in numbers]
+        kept = [
+            o.with_mask(here, f"left out: {label}")
+            for o, here in zip(base.observations, seen, strict=True)
+        ]
+        fold = Model(GapProblem(base.chains, kept), base.fit, base.added)
+        fold.problem.settle_noise(fold.problem.start)
+        fold = Model(fold.problem, fold.problem.fit(base.fit.coefficients), base.added)
+        chosen = select(fold, smooth, None, lambda line: None, cells=cells)
+        recipes = [(group.best.effect, group.best.context) for group in chosen.groups]
+        whole = base.with_effects(recipes, like=chosen.model, steps=0)
+        start = chosen.model.start_of(whole.problem)
+        gaps = whole.problem.differences(start.coefficients)
+        for channel, gap, here in zip(problem.channels, gaps, seen, strict=True):
+            mine = channel.valid & here
+            squares[k] += np.sum(gap[0][mine] ** 2)
+            whitened[k] += np.sum(channel.whiten(gap)[:, mine] ** 2) / 2
+            counts[k] += mine.sum()
+    keep = counts > 0
+    labels = [label for label, there in zip(labels, keep, strict=True) if there]
+    return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
 
 
 def _refitted(model, observations):
@@ -289,12 +354,9 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
     causes = [_exchanged(nominal, base, exchanged, total)] if exchanged else []
-    before = base
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
-        explained = (before.fit.chi2 - group.model.fit.chi2) / total
-        causes.append(_cause(group, improved, explained, *errors[i : i + 2]))
-        before = group.model
+        causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
     left_p = improved.p_value
     return Diagnosis(
         verdict=_verdict(causes, nominal, left_p),
@@ -334,6 +396,7 @@ def _cause(group, improved, explained, before=None, after=None):
         physical=improved.is_physical(best.name) if best.name in improved.added else True,
         evidence=float(best.evidence),
         stability=group.stability,
+        by_dataset=group.by_dataset,
     )
 
 

@@ -4,6 +4,7 @@
 import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
@@ -12,17 +13,23 @@ from scipy import stats
 from astropolcal.calibration import calibrate
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
+from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context
-from astropolcal.gap.problem import Fit, GapProblem, as_mounted
+from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
-from astropolcal.optics import Perturbation
+from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
 _ROUNDS, _MORE = 3, 3
 # a fit whose residuals are less probable than this may sit in a wrong minimum
 _NOISE = 1e-3
+# wavelengths with a mean square above so many medians may sit in a wrong branch; another one has to
+# leave less than this share, and is sought in so many steps
+_CONSPICUOUS, _FAR_LESS, _FEW_STEPS = 3.0, 0.7, 8
+# square of the bend (radian) that another sign has to be worth
+_OTHER_SIGN = 0.01
 # directions in which a size at its limit does less than this to the data, in units of the
 # noise, are not looked at; nor those of which the model takes up all but this share
 _VISIBLE = 1.0
@@ -31,6 +38,10 @@ _ABSORBED = 1e-6
 # which the data may leave a size there
 _AT_LIMIT = 1e-6
 _MOST_PRESSED = 0.1
+# share by which optics may seem to measure more polarization than there is
+_MORE_LIGHT = 1e-3
+# a second difference above this share of the first one is tried at finite size
+_BENT = 1.0
 
 
 @dataclass
@@ -96,6 +107,25 @@ class Model:
         """What an effect may know of the data."""
         return Context.of(self.problem.wavelength, self.observations)
 
+    def of_dataset(self, i):
+        """
+        Return the model of one of the datasets by itself, fitted with the same noise.
+
+        Parameters
+        ----------
+        i : int
+            Number of the dataset.
+
+        Returns
+        -------
+        Model
+            Without what was added.
+        """
+        mine = self.problem
+        noise = SimpleNamespace(fluxes=[mine.fluxes[i]], channels=[mine.channels[i]], waves=None)
+        problem = GapProblem([self.trains[i]], [self.observations[i]], ties=mine.ties, like=noise)
+        return Model(problem, problem.fit(problem.start))
+
     def degrees_of_freedom(self, tangent):
         """Return the number of data less that of the directions fitted."""
         return self.problem.n_data - tangent.shape[1]
@@ -158,7 +188,9 @@ class Model:
         Model
         """
         problem, parameters = self.edited(effect, context)
-        fit = problem.fit(problem.start, **settings)
+        starts = _off_extremum(problem, problem.start, parameters)
+        fits = [problem.fit(start, **settings) for start in starts]
+        fit = min(fits, key=lambda one: one.chi2)
         return Model(problem, fit, self.added | {effect.name: parameters})
 
     def with_effects(self, effects, like=None, **settings):
@@ -191,7 +223,56 @@ class Model:
             model = Model(problem, Fit(problem.start, np.inf, False), added)
         if like is not None:
             model = Model(model.problem, like.start_of(model.problem), model.added)
-        return self if model is self else model.polished(**settings)
+        return self if model is self else model._off_extrema().polished(**settings)
+
+    def _off_extrema(self):
+        """Return the model with the effects moved whose derivative vanishes where they start."""
+        start = self.fit.coefficients
+        for parameters in self.added.values():
+            # a finite size may be too large, but a fit gets down from there
+            others = _off_extremum(self.problem, start, parameters)[1:] or [start]
+            start = min(others, key=lambda q: np.sum(self.problem.residual(q) ** 2))
+        moved = start is not self.fit.coefficients
+        return Model(self.problem, Fit(start, np.inf, False), self.added) if moved else self
+
+    def without(self, names):
+        """
+        Return the model without some of its effects, to first order.
+
+        Parameters
+        ----------
+        names : collection of str
+            Names of added effects.
+
+        Returns
+        -------
+        Linear
+        """
+        problem, q = self.problem, self.fit.coefficients
+        kept, jacobian = np.ones(problem.size, dtype=bool), self.jacobian
+        residual = self.residual
+        absent = problem.coefficients(problem._absent())
+        for parameter in (p for name in names for p in self.added[name]):
+            where = problem.slices.get(parameter.name)
+            if where is not None:
+                kept[where] = False
+                residual = residual + jacobian[:, where] @ (q - absent)[where]
+        # what is known beforehand is one more row of data for each of these parameters
+        known = np.flatnonzero(kept & (problem.tight > 0))
+        table, target = jacobian, residual
+        if known.size:
+            rows = np.zeros((known.size, problem.size))
+            rows[np.arange(known.size), known] = problem.tight[known]
+            table = np.concatenate([jacobian, rows])
+            target = np.concatenate([residual, -(q - problem.centre)[known] * problem.tight[known]])
+        tangent = problem.tangent(q, table, kept)
+        left = target - tangent @ (tangent.T @ target)
+        return Linear(self, tangent[: problem.n_rows], left[: problem.n_rows])
+
+    @cached_property
+    def jacobian(self):
+        """Derivative of the rows to the coefficients, (n_rows, n_coefficients)."""
+        return self.problem.jacobian(self.fit.coefficients)
 
     def start_of(self, problem):
         """Return a start for another problem: this solution where the two share parameters."""
@@ -264,7 +345,33 @@ class Model:
             for leaf in self._carriers(name)
             if not isinstance(leaf, Perturbation)
         ]
-        return all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
+        possible = all(np.isfinite(m).all() and is_physical(m, _AT_LIMIT).all() for m in matrices)
+        return possible and self._keeps_polarization(name)
+
+    def _keeps_polarization(self, name):
+        """
+        Return whether no beam would be negative for some light in front of an effect.
+
+        What makes polarization larger may be a change of an optic that makes it smaller, or of one
+        behind it, but all optics together never measure more than there is.
+        """
+        vector, own = None, {p.name.partition(".")[0] for p in self.added[name]}
+        for dataset in self.problem.datasets:
+            optics = dataset.propagator.leaves
+            found = [i for i, leaf in enumerate(optics) if leaf.name in own and _depolarizes(leaf)]
+            if not found:
+                continue
+            vector = self.problem.vector(self.fit.coefficients) if vector is None else vector
+            sweep = dataset.forward(vector)
+            # rotators, which stand between an optic and what turns with it, change no length
+            front = [i for i in range(found[0]) if not isinstance(optics[i], Rotator)][-1:]
+            one, none = np.ones(sweep.fluxes[0].shape), np.zeros(sweep.fluxes[0].shape)
+            for weights in ((one, none), (none, one)):
+                for row, _ in sweep.crossings(front, weights).values():
+                    polarized = np.linalg.norm(row[..., 1:], axis=-1)
+                    if np.any(polarized > row[..., 0] * (1 + _MORE_LIGHT)):
+                        return False
+        return True
 
     def _carriers(self, name):
         """Return the optics that have the parameters of an effect, or some that follow these."""
@@ -282,6 +389,48 @@ class Model:
     def impossible(self):
         """Return the names of the effects whose fitted values are out of their limits."""
         return {name for name in self.added if not self.is_physical(name)}
+
+
+@dataclass
+class Linear:
+    """
+    A fitted model in which effects may be absent, to first order.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    tangent : `~numpy.ndarray`
+        Orthonormal basis of what it can do without these effects, (n_rows, rank).
+    residual : `~numpy.ndarray`
+        What it leaves then, whitened, (n_rows,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.gap.model import Linear
+    >>> Linear(None, np.zeros((2, 0)), np.array([3.0, 4.0])).chi2
+    25.0
+    """
+
+    model: Model
+    tangent: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def chi2(self):
+        """Sum of squares of the residuals."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def mean_square(self):
+        """Mean square of the residuals: 1 where noise is all that is left."""
+        freedom = self.model.problem.n_data - self.tangent.shape[1]
+        return self.chi2 / max(freedom, 1)
+
+
+def _depolarizes(leaf):
+    return isinstance(leaf, Perturbation) and leaf.kind.startswith("depolarization")
 
 
 def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):
@@ -335,7 +484,7 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
         return Model(problem, Fit(problem.start, float(residual @ residual), False))
     if like is None:
         problem.settle_noise()
-    found = _lowest(problem, chains)
+    found = _in_branch(problem, _lowest(problem, chains))
     # in turn: the residuals of a better fit tell the noise better
     for _ in range(_ROUNDS - 1 if like is None else 0):
         problem.settle_noise(found.coefficients)
@@ -346,6 +495,37 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
     if not (found.converged and np.isfinite(found.chi2)):
         raise _no_convergence()
     return Model(problem, found)
+
+
+def _off_extremum(problem, start, parameters):
+    """
+    Return starts of a fit, of both signs where the derivative of a retardance vanishes.
+
+    At half a wave it does, and a fit from there would stay.
+    """
+    found = [start]
+    optics = {leaf.name: leaf for d in problem.datasets for leaf in d.propagator.leaves}
+    for parameter in parameters:
+        where = problem.slices.get(parameter.name)
+        if where is None or np.any(start[where]) or not _retards(optics, parameter.name):
+            continue
+        vector = problem.vector(start)
+        vector[problem.free.by_name[parameter.name].slice] = FINITE
+        step = problem.coefficients(vector) - start
+        ends = [start + sign * step for sign in (1, -1)]
+        there, up, down = (problem.residual(q) for q in (start, *ends))
+        bend = np.linalg.norm(up + down - 2 * there)
+        if bend > max(1.0, _BENT * np.linalg.norm(up - down)):
+            found += ends
+    return found
+
+
+def _retards(optics, name):
+    """Return whether a parameter is a constant retardance that was inserted."""
+    optic = optics.get(name.partition(".")[0])
+    if isinstance(optic, Perturbation):
+        return optic.kind.startswith("retardance") and optic.dependence == "constant"
+    return isinstance(optic, LinearRetarder) and name.endswith(".retardance")
 
 
 def _lowest(problem, chains):
@@ -360,6 +540,133 @@ def _lowest(problem, chains):
         vector[slot.slice] = value if value.size in (1, slot.size) else vector[slot.slice]
     other = problem.fit(np.clip(problem.coefficients(vector), problem.low, problem.high))
     return other if other.converged and other.chi2 < found.chi2 else found
+
+
+def _in_branch(problem, found):
+    """
+    Return the fit with the wavelengths in other branches that are far better there.
+
+    A retardance of the other sign, or a turn from it, may be a minimum of its own, from which a
+    fit does not leave. Wavelengths that fit much worse than the others are started again from what
+    their neighbours say, with all signs; where those would have all others bent, everything is
+    fitted from the signs of the smoothest course.
+    """
+    slots = [s for s in problem.free.slots if s.per_wavelength and s.name not in problem.laws]
+    slots = [slot for slot in slots if slot.size == len(problem.wavelength)]
+    if not slots or stats.chi2.sf(found.chi2, max(problem.n_data - problem.size, 1)) > _NOISE:
+        return found
+    for starts in (_mended(problem, slots, found.coefficients), _smoothest(problem, slots, found)):
+        for start in starts:
+            again = problem.fit(start)
+            found = again if again.converged and again.chi2 < found.chi2 else found
+    return found
+
+
+def _mended(problem, slots, coefficients):
+    """Yield the coefficients with the wavelengths that fit worst in a better branch, if any are."""
+    before = _by_wavelength(problem, coefficients)
+    bad = before > _CONSPICUOUS * np.median(before)
+    if not bad.any() or np.sum(~bad) < 2:
+        return
+    live = np.zeros(problem.size, dtype=bool)
+    for slot in slots:
+        live[problem.slices[slot.name]] = bad
+    rows = np.concatenate(
+        [np.broadcast_to(bad[d.bins][:, None], c.shape).ravel() for c, d in _datasets(problem)]
+    )
+    best, least = coefficients.copy(), before
+    for start in _branches(problem, slots, coefficients, bad):
+        trial = problem.fit(start, rows, ~live, steps=_FEW_STEPS).coefficients
+        after = _by_wavelength(problem, trial)
+        better = bad & (after < least)
+        for slot in slots:
+            where = problem.slices[slot.name]
+            best[where] = np.where(better, trial[where], best[where])
+        least = np.where(better, after, least)
+    # what a wavelength gains has to be more than what a fit may still win by itself
+    if np.any(least < _FAR_LESS * before):
+        yield best
+
+
+def _smoothest(problem, slots, found):
+    """Yield the coefficients with the signs of retardances that make their courses smoothest."""
+    start = found.coefficients.copy()
+    for slot in slots:
+        where = problem.slices[slot.name]
+        if slot.unit == u.deg and slot.size > 2:
+            start[where] = _smooth(
+                problem.wavelength, start[where], problem.low[where], problem.high[where]
+            )
+    if not np.array_equal(start, found.coefficients):
+        yield start
+
+
+def _smooth(wavelength, values, low, high):
+    """Return values with the signs and turns with which their course is least bent."""
+    turn = 2 * np.pi
+    choices = np.array([s * values + k * turn for s in (1, -1) for k in (0, -1, 1)])
+    # what is out of the bounds is no choice; its own value is always one, and preferred
+    cost = np.where((choices >= low) & (choices <= high), _OTHER_SIGN, np.inf)
+    cost[0] = 0.0
+    total, back = cost[:, :1] + cost[:, 1], []
+    for i in range(2, len(values)):
+        first, second, third = choices[:, i - 2], choices[:, i - 1], choices[:, i]
+        share = (wavelength[i] - wavelength[i - 1]) / (wavelength[i - 1] - wavelength[i - 2])
+        straight = second[None] + share * (second[None] - first[:, None])
+        bends = total[:, :, None] + (third - straight[:, :, None]) ** 2 + cost[:, i]
+        back.append(bends.argmin(axis=0))
+        total = bends.min(axis=0)
+    path = list(np.unravel_index(total.argmin(), total.shape))
+    for step in reversed(back):
+        path.insert(0, int(step[path[0], path[1]]))
+    return choices[path, np.arange(len(values))]
+
+
+def _datasets(problem):
+    return zip(problem.channels, problem.datasets, strict=True)
+
+
+def _by_wavelength(problem, coefficients):
+    """Return the mean square of the residuals at each wavelength."""
+    square = problem.residual(coefficients) ** 2
+    total, count = np.zeros((2, len(problem.wavelength)))
+    for (channel, dataset), rows in zip(_datasets(problem), problem.segments, strict=True):
+        total[dataset.bins] += square[rows].reshape(channel.shape).sum(axis=(0, 2))
+        count[dataset.bins] += 2 * channel.valid.sum(axis=1)
+    return total / np.maximum(count, 1)
+
+
+def _branches(problem, slots, coefficients, bad):
+    """Yield starts at which wavelengths are as their neighbours say, with one sign or another."""
+    smooth = {}
+    for slot in slots:
+        values = coefficients[problem.slices[slot.name]]
+        # a retardance is known up to a turn
+        good = np.unwrap(values[~bad]) if slot.unit == u.deg else values[~bad]
+        smooth[slot.name] = np.interp(problem.wavelength, problem.wavelength[~bad], good)
+    angles = [slot.name for slot in slots if slot.unit == u.deg]
+    for flipped in dict.fromkeys([(), tuple(angles), *((name,) for name in angles)]):
+        start = coefficients.copy()
+        for slot in slots:
+            where, value = problem.slices[slot.name], smooth[slot.name]
+            value = -value if slot.name in flipped else value
+            if slot.name in angles:
+                value = _within(value, problem.low[where], problem.high[where])
+            start[where] = np.where(bad, value, start[where])
+        yield np.clip(start, problem.low, problem.high)
+    own = coefficients.copy()
+    for name in angles:
+        where = problem.slices[name]
+        turned = _within(-own[where], problem.low[where], problem.high[where])
+        own[where] = np.where(bad, turned, own[where])
+    yield np.clip(own, problem.low, problem.high)
+
+
+def _within(angle, low, high):
+    """Return an angle, radian, moved by a turn where that brings it within its bounds."""
+    turn = 2 * np.pi
+    angle = np.where((angle < low) & (angle + turn <= high), angle + turn, angle)
+    return np.where((angle > high) & (angle - turn >= low), angle - turn, angle)
 
 
 def _no_convergence():
@@ -411,7 +718,6 @@ def nominal_calibration(chains, observations):
     >>> nominal_calibration([chain], [simulate(chain, charis.wavelength, frames, seed=1)]).converged
     True
     """
-    chains = [as_mounted(chain) for chain in chains]
     measurement = Measurement(chains, observations)
     if not measurement.free.size:
         return _AsGiven(measurement)

@@ -15,9 +15,10 @@ from itertools import pairwise
 import numpy as np
 
 from astropolcal.gap.attribution import scan
-from astropolcal.gap.shrinkage import foreseen
+from astropolcal.gap.cells import count_runs
+from astropolcal.gap.shrinkage import foreseen, stability
 
-__all__ = ["Group", "Selection", "select"]
+__all__ = ["Group", "Selection", "explained_by_one", "select"]
 
 # the best candidates count where residuals are no noise
 _RETEMPERED = 400
@@ -29,8 +30,10 @@ _TURNS = 1
 _AS_GOOD, _CLEARLY = 1.0, 3.0
 #: Residuals less probable than this are no noise.
 REMAINDER = 1e-4
+# and more probable than this they may be
+_NOISE = 1e-3
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
-ENOUGH = 9.0
+ENOUGH = 12.0
 _MOST = 8
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
@@ -41,7 +44,7 @@ _SAME = 1e-6
 _ALIAS, _MOST_ALIASES = np.exp(-7.0), 40
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
 # needs
-_UNLISTED = (0.0, 0.02, 0.06, 0.4, 0.7, 0.85, 0.9, 0.92, 0.95)
+_UNLISTED = (0.0, 0.02, 0.08, 0.55, 0.75, 0.88, 0.92, 0.95, 0.97)
 # above this mean square the residuals are no noise
 _STRUCTURED = 1.5
 # share of the gap that an answer may leave before it is doubtful
@@ -59,10 +62,12 @@ class Group:
         Candidates and their probabilities among each other, best first.
     probability : float
         That one of the members is a cause of the gap.
-    model : Model
-        The model with this cause and all chosen before it.
+    lowered : float
+        By how much chi-square is lower with it than with those chosen before it.
     stability : float
         Share of the halves of the wavelengths and of left-out angles in which it is found.
+    by_dataset : dict of str to float
+        Evidence for it in each of several runs alone.
 
     Examples
     --------
@@ -74,8 +79,9 @@ class Group:
 
     members: list
     probability: float
-    model: object = None
-    stability: float = 1.0
+    lowered: float = 0.0
+    stability: float | None = None
+    by_dataset: dict = field(default_factory=dict)
 
     @property
     def best(self):
@@ -131,7 +137,7 @@ class _State:
         return frozenset(one.name for one in self.chosen)
 
 
-def select(base, library, groups, say, *, cells=True):
+def select(base, library, groups, say, *, cells=True, changes=False):
     """
     Choose the causes that a model lacks.
 
@@ -147,6 +153,8 @@ def select(base, library, groups, say, *, cells=True):
         Called with a line on what is done next.
     cells : bool
         Whether to ask for cells as well as for names.
+    changes : bool
+        Whether causes of one run only come first.
 
     Returns
     -------
@@ -167,15 +175,23 @@ def select(base, library, groups, say, *, cells=True):
     []
     """
     first = _scanned(base, library, cells)
-    best, left = _search(base, library, first, say, cells)
+    best, left = _search(_State(base), library, first, say, cells, _MOST)
+    runs = count_runs(base.problem)
+    if runs > 1 and cells and best.model.p_value < REMAINDER:
+        best, left = _better_apart(base, best, first, say), None
+        best, left = _search(best, library, first, say, cells, _MOST * runs)
     if not best.chosen:
         return Selection([], base, first, first, 0.0, [_errors(base, groups)])
     best, scans = _exchanged(base, best, library, first, say, cells)
     best = replace(best, model=best.model.polished())
-    best, models, history = _checked(base, best, groups, say)
-    left = left if best.model is models[-1] and left is not None else None
+    if changes:
+        shared = [one for one in best.chosen if first.probes.run_of(one.cell) is None]
+        own = [one for one in best.chosen if one not in shared]
+        best = replace(best, chosen=[*own, *shared])
+    best, steps, history = _checked(base, best, groups, say)
     unlisted = _unlisted(base, best)
-    found = _grouped(best, models, scans, unlisted)
+    stable = stability(best.model, groups, max(1.0, best.model.mean_square))
+    found = _grouped(best, steps, scans, unlisted, stable)
     return Selection(found, best.model, first, left, unlisted, history)
 
 
@@ -187,19 +203,19 @@ def _checked(base, best, groups, say):
     """
     Return the set without causes that left-out frames speak against.
 
-    With it, the models with one cause more each, and their errors on left-out frames.
+    With it, what is left with one cause more each, and the errors on left-out frames.
     """
     while True:
         say("left-out frames")
-        models = _growing(base, best)
-        history = [_errors(model, groups) for model in (base, *models)]
+        steps = [base.without(()), *_growing(best)]
+        history = [_errors(step, groups) for step in steps]
         worse = [
             i
             for i, (before, after) in enumerate(pairwise(history))
-            if before is not None and _worsens(after, before, models[i].mean_square)
+            if before is not None and _worsens(after, before, steps[i + 1].mean_square)
         ]
         if not worse:
-            return best, models, history
+            return best, steps, history
         chosen = [one for i, one in enumerate(best.chosen) if i != worse[-1]]
         model = base.with_effects([o.recipe for o in chosen], like=best.model)
         best = _State(model, chosen, best.evidence - best.chosen[worse[-1]].evidence)
@@ -212,12 +228,34 @@ def _worsens(after, before, scatter):
     return better < (-2.0 if scatter < _STRUCTURED else 0.0)
 
 
-def _growing(base, best):
-    """Return the models with the first cause, the first two, and so on."""
-    recipes = [one.recipe for one in best.chosen]
-    ends = range(1, len(recipes))
-    models = [base.with_effects(recipes[:i], like=best.model, **_QUICK) for i in ends]
-    return [*models, best.model] if recipes else []
+def _growing(best):
+    """Yield the model with the first cause, the first two, and so on, to first order."""
+    names = [one.name for one in best.chosen]
+    return [best.model.without(names[i + 1 :]) for i in range(len(names))]
+
+
+def explained_by_one(model, library, *, cells=True):
+    """
+    Return whether a single cause leaves no more than noise.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    library : sequence of Effect
+        Named effects that are not discrete.
+    cells : bool
+        Whether to ask for cells as well as for names.
+
+    Returns
+    -------
+    bool
+    """
+    found = _scanned(model, library, cells)
+    for one in map(found.freer, _distinct(found.candidates, _WIDTH[0])):
+        if one.evidence > ENOUGH and model.with_effect(*one.recipe, **_QUICK).p_value > _NOISE:
+            return True
+    return False
 
 
 def _scanned(model, library, cells):
@@ -249,24 +287,47 @@ def _distinct(candidates, most):
     return found
 
 
-def _search(base, library, first, say, cells):
+def _better_apart(base, best, first, say):
+    """Return the set of the causes that each run needs by itself, if it is better than another."""
+    chosen = []
+    for i, name in enumerate(first.probes.runs):
+        say(f"{name} by itself")
+        alone = base.of_dataset(i)
+        state, _ = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST)
+        chosen += [_in_run(one, name, first.probes) for one in state.chosen]
+    say("all runs together")
+    model = base.with_effects([one.recipe for one in chosen], **_QUICK)
+    temper = max(1.0, min(model.mean_square, best.model.mean_square))
+    gained = 0.5 * (best.model.fit.chi2 - model.fit.chi2) / temper
+    cost = sum(one.cost(temper) for one in chosen) - sum(one.cost(temper) for one in best.chosen)
+    return _State(model, chosen, best.evidence + gained - cost) if gained > cost else best
+
+
+def _in_run(candidate, name, probes):
+    """Return the same cause in one run only."""
+    cell = candidate.cell
+    if probes.run_of(cell) is not None:
+        return candidate
+    return replace(candidate, cell=cell.in_run(name))
+
+
+def _search(best, library, first, say, cells, most_causes):
     """Return the best set of causes, and the scan beside it where it is known."""
-    best = _State(base)
-    states, known = [best], {best.outline: first}
-    for k in range(_MOST):
+    states, known = [best], {} if best.chosen else {best.outline: first}
+    while len(best.chosen) < most_causes:
+        k = len(best.chosen)
         width, most = (part[min(k, len(part) - 1)] for part in (_WIDTH, _FITTED))
-        say(f"looking for cause {k + 1}, at most {_MOST}")
+        say(f"looking for cause {k + 1}, at most {most_causes}")
         grown = {}
         for state in states:
             found = known.get(state.outline)
             if found is None:
                 found = known[state.outline] = _scanned(state.model, library, cells)
-            for one in map(found.freer, _distinct(found.candidates, most)):
-                if one.evidence > ENOUGH:
-                    evidence = state.evidence + one.evidence
-                    outline = state.outline | {one.name}
-                    if outline not in grown or grown[outline][0] < evidence:
-                        grown[outline] = (evidence, state, one)
+            for added in _continuations(found, most):
+                evidence = state.evidence + sum(one.evidence for one in added)
+                outline = state.outline.union(one.name for one in added)
+                if outline not in grown or grown[outline][0] < evidence:
+                    grown[outline] = (evidence, state, added)
         order = sorted(grown.values(), key=lambda item: -item[0])[:most]
         fitted = [state for item in order if (state := _extended(*item)) is not None]
         fitted.sort(key=lambda state: -state.evidence)
@@ -279,15 +340,30 @@ def _search(base, library, first, say, cells):
     return best, known.get(best.outline)
 
 
-def _extended(evidence, state, candidate):
-    """Return a set with one more cause, fitted in full, None where that is impossible."""
-    model = state.model.with_effect(*candidate.recipe, **_QUICK)
-    if not model.is_physical(candidate.name):
+def _continuations(found, most):
+    """Return what may be added to a set: one cause, or one in each of the runs."""
+    few = [found.freer(one) for one in _distinct(found.candidates, most)]
+    few = [one for one in few if one.evidence > ENOUGH]
+    if found.probes is None or len(found.probes.runs) < 2:
+        return [(one,) for one in few]
+    first = {}
+    for one in [*few, *found.candidates]:
+        run = found.probes.run_of(one.cell)
+        if run is not None and run not in first and one.evidence > ENOUGH:
+            first[run] = one if one in few else found.freer(one)
+    # the data of two runs are not the same: their causes can be taken together
+    return [(one,) for one in few] + ([tuple(first.values())] if len(first) > 1 else [])
+
+
+def _extended(evidence, state, added):
+    """Return a set with more causes, fitted in full, None where that is impossible."""
+    model = state.model.with_effects([one.recipe for one in added], **_QUICK)
+    if not all(model.is_physical(one.name) for one in added):
         return None
     # what the full fit gains over the linear promise
-    gained = state.model.fit.chi2 - model.fit.chi2 - candidate.statistic
+    gained = state.model.fit.chi2 - model.fit.chi2 - sum(one.statistic for one in added)
     temper = max(1.0, model.mean_square)
-    return _State(model, [*state.chosen, candidate], evidence + 0.5 * gained / temper)
+    return _State(model, [*state.chosen, *added], evidence + 0.5 * gained / temper)
 
 
 def _exchanged(base, best, library, first, say, cells):
@@ -297,7 +373,7 @@ def _exchanged(base, best, library, first, say, cells):
     What was chosen first was chosen while the others were missing: its law in wavelength may be too
     stiff, another cause may do better, and a name may do as well as the cell that it is.
     """
-    scans = {}
+    scans, like = {}, None
     for turn in range(_TURNS if best.chosen else 0):
         before = best
         for one in reversed(best.chosen):
@@ -305,8 +381,8 @@ def _exchanged(base, best, library, first, say, cells):
             if turn and others == scans.get(one.name, (None,))[0]:
                 continue
             say(f"beside all the others: {one.effect.title}")
-            model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
-            found = first if not others else _scanned(model, library, cells)
+            found = first if not others else _beside(best.model, one, library, cells, like)
+            like = like or (found.probes if others else None)
             scans[one.name] = (others, found)
             fresh = _best_beside(found, one, library)
             if fresh is None or (fresh.name, fresh.degree) == (one.name, one.degree):
@@ -315,11 +391,17 @@ def _exchanged(base, best, library, first, say, cells):
             chosen = [*best.chosen[:place], fresh, *best.chosen[place + 1 :]]
             model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
             if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
-                scans[fresh.name] = scans.pop(one.name)
+                scans[fresh.name], like = scans.pop(one.name), None
                 best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
         if best is before:
             break
     return best, {name: found for name, (_, found) in scans.items()}
+
+
+def _beside(model, one, library, cells, like):
+    """Return the evidence beside all other causes of a model."""
+    temper = max(1.0, model.mean_square)
+    return scan(model, library, cells=cells, temper=temper, without=one.name, like=like)
 
 
 def _best_beside(found, own, library):
@@ -352,24 +434,32 @@ def _gains(new, fresh, old, one):
 
 
 def _unlisted(base, best):
-    """Return the probability that the gap has a cause that no table has."""
-    count = min(len(best.chosen), len(_UNLISTED) - 1)
-    prior = _UNLISTED[count]
+    """
+    Return the probability that the gap has a cause that no table has.
+
+    A remainder of probability p speaks for it by a Bayes factor of at most -1/(e p ln p) (Sellke,
+    Bayarri & Berger 2001, doi:10.1198/000313001300339950), the more the larger its share is.
+    """
+    prior = _UNLISTED[min(len(best.chosen), len(_UNLISTED) - 1)]
+    p = min(max(best.model.p_value, 1e-300), np.exp(-1))
+    after = prior / (prior - (1 - prior) * np.e * p * np.log(p))
     freedom = best.model.problem.n_data - best.model.problem.size
     excess = max(base.fit.chi2 - freedom, 1.0)
-    if best.model.p_value > REMAINDER:
-        return prior
     share = max(best.model.fit.chi2 - freedom, 0.0) / excess
-    return 1 - (1 - prior) * np.exp(-share / _LEFT)
+    return float(prior + (after - prior) * (1 - np.exp(-share / _LEFT)))
 
 
-def _grouped(best, models, scans, unlisted):
+def _grouped(best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
     found = []
-    for one, model in zip(best.chosen, models, strict=True):
+    for one, (before, after) in zip(best.chosen, pairwise(steps), strict=True):
         members = _members(one, scans[one.name])
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
-        found.append(Group(members, float((1 - unlisted) * chance), model))
+        lowered = max(before.chi2 - after.chi2, 0.0)
+        share = stable.get(one.name, 1.0)
+        alone = scans[one.name].by_run(members[0][0])
+        chance = float((1 - unlisted) * chance * share)
+        found.append(Group(members, chance, lowered, share, alone))
     return found
 
 

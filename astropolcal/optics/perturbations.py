@@ -62,7 +62,8 @@ class Dependence:
         ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``,
         cosine and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last
         move of the stage was backwards; ``"move:STAGE"``, how far it was moved, in radian;
-        ``"dataset:NAME"``, in one dataset only.
+        ``"dataset:NAME"``, in one dataset only. With ``"/dataset:NAME"`` behind it, any of the
+        others is in that dataset only.
 
     Raises
     ------
@@ -85,13 +86,19 @@ class Dependence:
         if not isinstance(self.text, str) or not _FORMS.fullmatch(self.text):
             raise ParameterError(
                 f"dependence = {self.text!r}; allowed are constant, time, time2, step:FRAME, "
-                "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE and dataset:NAME"
+                "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE and dataset:NAME, each "
+                "also with /dataset:NAME behind it"
             )
 
     @property
     def parts(self):
-        """The words of the text between its colons."""
-        return self.text.split(":")
+        """The words of the text between its colons, without a dataset behind it."""
+        return split_run(self.text)[0].split(":")
+
+    @property
+    def run(self):
+        """Name of the one dataset in which it is, None where it is in all."""
+        return split_run(self.text)[1]
 
     @property
     def kind(self):
@@ -146,8 +153,27 @@ class Dependence:
 
 
 _FORMS = re.compile(
-    r"constant|time2?|(step|frame):\d+|harmonic:\w+:[1-9]\d?|(direction|move):\w+|dataset:.+"
+    r"(constant|time2?|(step|frame):\d+|harmonic:\w+:[1-9]\d?|(direction|move):\w+)"
+    r"(/dataset:.+)?|dataset:.+",
+    re.DOTALL,
 )
+_DATASET = "dataset:"
+
+
+def split_run(text):
+    """
+    Return a dependence without its dataset, and the name of that, None where it has none.
+
+    Examples
+    --------
+    >>> from astropolcal.optics.perturbations import split_run
+    >>> split_run("time/dataset:July"), split_run("dataset:July"), split_run("time")
+    (('time', 'July'), ('dataset', 'July'), ('time', None))
+    """
+    if text.startswith(_DATASET):
+        return "dataset", text.removeprefix(_DATASET)
+    head, _, name = text.partition(f"/{_DATASET}")
+    return head, name or None
 
 
 class Perturbation(_BeamOptic, FrameOptic):

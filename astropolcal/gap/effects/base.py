@@ -226,4 +226,7 @@ def _tracking_law(observations):
 
 def label_of(name):
     """Return the name of an optic that an effect adds."""
-    return "gap_" + re.sub(r"\W", "_", name)
+    head, sign, run = name.partition("dataset:")
+    # datasets whose names differ in a space only have optics of their own
+    run = re.sub(r"\W", lambda m: "_" if m.group() == "-" else f"_{ord(m.group()):x}_", run)
+    return "gap_" + re.sub(r"\W", "_", head + sign) + run

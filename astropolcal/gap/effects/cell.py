@@ -4,7 +4,8 @@
 from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap.effects._detector_cells import detector_optic
 from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
-from astropolcal.gap.effects.effect import Effect, Where
+from astropolcal.gap.effects.effect import Effect
+from astropolcal.gap.effects.where import Where
 from astropolcal.optics import GENERATORS
 
 __all__ = ["CellEffect"]
@@ -36,12 +37,13 @@ class CellEffect(Effect):
 
     def __init__(self, cell, degree=2):
         relation, _, optic = cell.place.partition(":")
+        everywhere = "constant" if cell.run is None else f"dataset:{cell.run}"
         super().__init__(
             cell.name,
             cell.title,
             Where({"in": "inside"}.get(relation, relation), optic or None),
             # what only a detector has is put in by itself, see `edit`
-            *((cell.kind, cell.dependence) if cell.kind in GENERATORS else ("gain", "constant")),
+            *((cell.kind, cell.dependence) if cell.kind in GENERATORS else ("gain", everywhere)),
             degree,
             category="cell",
             words=cell.place,
@@ -58,8 +60,11 @@ class CellEffect(Effect):
         """Return the chains with the perturbation at zero; see `Effect.edit`."""
         if self._cell.kind in GENERATORS:
             return super().edit(chains, context)
-        edited, label = [], label_of(self.name)
-        for chain in chains:
+        edited, ties, label = [], {}, label_of(self.name)
+        for i, chain in enumerate(chains):
+            if not self._in_dataset(context, i):
+                edited.append(chain)
+                continue
             optic, side, key, ties = detector_optic(self._cell.kind, label, context)
             split = next(o.name for o in leaves(chain) if o.splits_light)
             edited.append(insert_optic(chain, optic, **{side: split}))

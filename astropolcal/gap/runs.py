@@ -1,0 +1,271 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+What changed between several runs of the same kind of source.
+
+A cause in one of the runs only is a change; what all have is none, and is asked for in each run by
+itself.
+"""
+
+import copy
+from itertools import combinations
+
+import numpy as np
+
+from astropolcal.chain import leaves
+from astropolcal.exceptions import GapError
+from astropolcal.gap._words import listed
+from astropolcal.gap.cells import Cell, count_runs
+from astropolcal.optics.perturbations import split_run
+
+__all__ = ["changes", "distinct", "paragraph"]
+
+# kinds whose sizes are angles, in radian
+_ANGLES = ("retardance", "rotation")
+# so many changes are told in the summary
+_MOST = 4
+_LIKELY = 0.5
+
+
+def distinct(observations, changes=False):
+    """
+    Return the datasets with names of their own.
+
+    Parameters
+    ----------
+    observations : sequence of Observations
+        The datasets.
+    changes : bool
+        Whether changes between runs are asked for.
+
+    Returns
+    -------
+    list of Observations
+        Copies with another name of those whose name is that of one before them.
+
+    Raises
+    ------
+    GapError
+        If two hold the same data, or changes are asked for and there is one run of each source.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.runs import distinct
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis, frames = instruments.get("charis"), half_wave_plate_cycles()
+    >>> pair = [simulate(charis.chain(), charis.wavelength, frames, seed=i) for i in (1, 2)]
+    >>> [one.name for one in distinct(pair)]
+    ['simulated', 'simulated (2)']
+    """
+    observations = list(observations)
+    for one, other in combinations(observations, 2):
+        if one is other or (
+            one.n_frames == other.n_frames and one.content_hash == other.content_hash
+        ):
+            names = dict.fromkeys((one.name, other.name))
+            raise GapError(f"the same data are given twice: {' and '.join(names)}")
+    sources = [o.source for o in observations]
+    if changes and len(set(sources)) == len(sources):
+        raise GapError(
+            "what changed can be told between runs of the same kind of source only; given: "
+            + ", ".join(f"{o.name} ({o.source or 'no source stated'})" for o in observations)
+        )
+    names, found = set(), []
+    for one in observations:
+        count, name = 1, one.name
+        while name in names:
+            count += 1
+            name = f"{one.name} ({count})"
+        names.add(name)
+        if name != one.name:
+            one = copy.copy(one)
+            one.name = name
+        found.append(one)
+    return found
+
+
+# ---- what changed ------------------------------------------------------------------------------
+
+
+def changes(diagnosis, causes):
+    """
+    Return the causes that are in one of several runs only.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+    causes : list of dict
+        Its causes, as `~astropolcal.gap.report.to_dict` gives them.
+
+    Returns
+    -------
+    list of dict
+        Keys ``cell``, ``dataset``, ``size`` (parameter to values, errors, unit and limit),
+        ``probability``, ``brought_by`` (optics that only this run has, in front of the place) and
+        ``words``; the most probable first, and among these the most significant.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> from astropolcal.gap.runs import changes
+    >>> changes(SimpleNamespace(improved=None), [])
+    []
+    """
+    if not causes or count_runs(diagnosis.improved.problem) < 2:
+        return []
+    names, chains = _runs(diagnosis)
+    wavelength = 1e3 * diagnosis.improved.problem.wavelength
+    found = []
+    for cause in causes:
+        cell = cause["cell"] and Cell(**cause["cell"])
+        run = cell and _run_of(cell, names, chains)
+        if run is not None:
+            brought = _brought(cell, run, names, chains)
+            entry = {
+                "cell": cause["cell"],
+                "dataset": run,
+                "size": cause["size"],
+                "probability": cause["probability"],
+                "significance": cause["significance"],
+                "brought_by": brought,
+            }
+            entry["words"] = _sentence(cell, entry, names, wavelength)
+            found.append(entry)
+    return sorted(found, key=lambda e: (-round(e["probability"], 2), -(e["significance"] or 0)))
+
+
+def _runs(diagnosis):
+    """Return names and chains of the datasets."""
+    model = diagnosis.improved
+    return [o.name for o in model.observations], [leaves(chain) for chain in model.chains]
+
+
+def _run_of(cell, names, chains):
+    """Return the name of the one dataset that has a cell, None where several have it."""
+    if cell.run is not None or cell.optic is None:
+        return cell.run
+    there = [
+        name
+        for name, chain in zip(names, chains, strict=True)
+        if cell.optic in [optic.name for optic in chain]
+    ]
+    return there[0] if len(there) == 1 else None
+
+
+def _brought(cell, run, names, chains):
+    """Return the optics that only a run has, at or in front of the place of a cell."""
+    mine = [optic.name for optic in chains[names.index(run)] if not _is_added(optic)]
+    others = {o.name for n, c in zip(names, chains, strict=True) if n != run for o in c}
+    own = [name for name in mine if name not in others]
+    head, _, optic = cell.place.partition(":")
+    if head == "detector":
+        end = len(mine)
+    elif optic in mine:
+        # what stands right in front of an optic is told from that by nothing
+        end = mine.index(optic) + 1 + (head == "after")
+    else:
+        return []
+    return [name for name in own if mine.index(name) < end]
+
+
+def _is_added(optic):
+    return (optic.name or "").startswith("gap_")
+
+
+# ---- in words ----------------------------------------------------------------------------------
+
+
+def paragraph(content, names, asked=False):
+    """
+    Return what is to be said of the changes between runs, in a few sentences.
+
+    Parameters
+    ----------
+    content : dict
+        What `~astropolcal.gap.report.to_dict` collects, with its ``changes`` and ``causes``.
+    names : list of str
+        Names of the runs.
+    asked : bool
+        Whether changes were asked for; if not, nothing is said where there are none.
+
+    Returns
+    -------
+    list of str
+
+    Examples
+    --------
+    >>> from astropolcal.gap.runs import paragraph
+    >>> paragraph({"changes": [], "causes": [], "verdict": "none"}, ["July", "October"], asked=True)
+    ['Nothing changed between "July" and "October" that the data can tell.']
+    """
+    found = content["changes"]
+    if not found:
+        quoted = [f'"{name}"' for name in names]
+        words = [f"Nothing changed between {listed(quoted)} that the data can tell."]
+        return words if asked else []
+    words = [one["words"] for one in found[:_MOST]]
+    if len(found) > _MOST:
+        words.append(f"{len(found) - _MOST} smaller changes are listed below.")
+    if min(one["probability"] for one in found) < _LIKELY:
+        words.append(
+            "These changes help to describe the runs, but what is left says that they need not be "
+            "the true ones."
+        )
+    brought = [one for one in found if one["brought_by"]]
+    if brought:
+        optics = dict.fromkeys(name for one in brought for name in one["brought_by"])
+        many = f"{len(brought)} of the changes are" if len(brought) > 1 else "One change is"
+        words.append(
+            f"{many} at or behind what only one run has ({listed(list(optics))}): that may have "
+            "brought them."
+        )
+    return words
+
+
+def _sentence(cell, entry, names, wavelength):
+    """Return one change in words."""
+    plain = Cell(cell.place, cell.kind, split_run(cell.dependence)[0])
+    constant = plain.dependence in ("dataset", "constant")
+    title = Cell(cell.place, cell.kind, "constant").title if constant else plain.title
+    size = _size(cell, entry["size"], wavelength)
+    chance = f"probability {100 * entry['probability']:.0f} %"
+    run = entry["dataset"]
+    if constant and len(names) == 2 and size is not None:
+        # of the second against the first, whichever of the two has it
+        sign = 1 if run == names[1] else -1
+        value, error, unit, where = size
+        return (
+            f'Between "{names[0]}" and "{names[1]}" the {title} changed by '
+            f"{_number(sign * value, error)} {unit}{where} ({chance})."
+        )
+    told = ""
+    if size is not None:
+        value, error, unit, where = size
+        told = f", by {_number(value, error)} {unit}{where}"
+    if constant:
+        return f'In "{run}" the {title} differs from that of the other runs{told} ({chance}).'
+    return f'In "{run}" only there is {title}{told} ({chance}).'
+
+
+def _number(value, error):
+    digits = max(0, 1 - int(np.floor(np.log10(error)))) if error > 0 else 3
+    return f"{value:.{min(digits, 6)}f} +- {error:.{min(digits, 6)}f}"
+
+
+def _size(cell, parameters, wavelength):
+    """Return value, error, unit and where of the clearest size of a cause, None if it is open."""
+    angle = cell.kind.partition("_")[0] in _ANGLES
+    factor, unit = (np.rad2deg(1.0), "deg") if angle else (100.0, "%")
+    best = None
+    for one in parameters.values():
+        values = np.array(np.ravel(one["value"]), dtype=float)
+        errors = np.array(np.ravel(one["std"]), dtype=float)
+        clear = np.where(errors > 0, np.abs(values) / errors, np.nan)
+        if np.isnan(clear).all():
+            continue
+        i = int(np.nanargmax(clear))
+        if best is None or clear[i] > best[0]:
+            where = f" at {wavelength[i]:.0f} nm" if values.size == len(wavelength) > 1 else ""
+            best = (clear[i], factor * values[i], factor * errors[i], unit, where)
+    return best and best[1:]

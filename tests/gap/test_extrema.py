@@ -1,0 +1,102 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What a model holds, or has at a bound or in a wrong branch, hides nothing."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from gap_data import WAVELENGTH as DATA_WAVELENGTH
+from gap_data import chain, clean_model, observed
+
+from astropolcal import instruments, optics
+from astropolcal.gap import diagnose
+from astropolcal.gap.cells import Cell
+from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.model import nominal_model
+from astropolcal.simulation import half_wave_plate_cycles, simulate
+
+WAVELENGTH = [1.2, 1.4, 1.6, 1.8, 2.0, 2.2] * u.um
+TURN = half_wave_plate_cycles(np.arange(16) * 11.25 * u.deg, [0] * u.deg)
+
+
+def plate_chain(retardance=180.0, free=False):
+    """Return polarizer, plate and Wollaston prism, all held but the polarizer's angle."""
+    polarizer = optics.LinearPolarizer(theta=20 * u.deg, name="polarizer")
+    polarizer.theta.bounds = (10, 30)
+    plate = optics.LinearRetarder(retardance=retardance * u.deg, mount="hwp", name="hwp")
+    prism = optics.WollastonPrism(name="wollaston")
+    for optic in (polarizer, plate, prism):
+        for key in optic.param_names:
+            getattr(optic, key).fixed = True
+    polarizer.theta.fixed = not free
+    return polarizer | plate | prism
+
+
+@pytest.mark.parametrize(("true", "free"), [(176.0, False), (176.0, True), (184.0, True)])
+def test_half_a_wave_hides_nothing(true, free):
+    data = simulate(plate_chain(true), WAVELENGTH, TURN, flux=1e6, seed=1, name="turn")
+    found = diagnose(plate_chain(free=free), data)
+    (cause,) = found.causes
+    assert cause.name == "hwp_retardance" or cause.cell.name == "in:hwp/retardance_h/constant"
+    ((size, _, unit, _),) = found.improved.sizes(cause.name).values()
+    # data do not tell which side of half a wave it is
+    degrees = np.abs(size[0]) if unit == u.deg else np.rad2deg(np.abs(size[0]))
+    assert degrees == pytest.approx(4.0, abs=0.3)
+    assert found.remainder_p_value > 1e-3
+
+
+def test_half_a_wave_that_is_one_is_no_cause():
+    data = simulate(plate_chain(), WAVELENGTH, TURN, flux=1e6, seed=2, name="turn")
+    assert diagnose(plate_chain(free=True), data).causes == []
+
+
+def test_a_parameter_beyond_its_bound_is_named():
+    true, narrow = chain(), chain()
+    true["hwp"].theta = 2 * u.deg
+    narrow["hwp"].theta.bounds = (-0.5, 0.5)
+    narrow["calibration_polarizer"].theta.fixed = narrow["derotator"].theta.fixed = True
+    found = diagnose(narrow, observed(true), cells=False)
+    assert found.verdict == "named"
+    assert found.causes[0].name == "hwp_angle_bound"
+
+
+class Given:
+    """A calibration that has converged to some values."""
+
+    converged = True
+
+    def __init__(self, *chains):
+        self.chains = list(chains)
+
+
+@pytest.mark.parametrize("bins", [(3,), (2, 3), (0,)])
+@pytest.mark.parametrize("kind", ["linear", "elliptical"])
+def test_a_wavelength_in_the_wrong_branch_is_brought_back(kind, bins):
+    true = instruments.get("charis").chain(wavelength=DATA_WAVELENGTH, derotator=kind)
+    wrong = true.copy()
+    key = "retardance" if kind == "linear" else "horizontal"
+    values = getattr(wrong["derotator"], key).value.copy()
+    values[list(bins)] *= -1
+    setattr(wrong["derotator"], key, values * u.deg)
+    model = nominal_model([wrong], [observed(true)], calibration=Given(wrong))
+    assert model.mean_square < 1.3
+    found = getattr(model.chains[0]["derotator"], key).value
+    expected = getattr(true["derotator"], key).value
+    np.testing.assert_allclose(np.cos(np.deg2rad(found - expected)), 1, atol=1e-2)
+
+
+@pytest.mark.parametrize("place", ["source", "in:derotator", "after:derotator"])
+@pytest.mark.parametrize(
+    ("kind", "size", "possible"),
+    [
+        ("depolarization_linear", 0.05, True),
+        # the prism's efficiency of 0.985 has room for less depolarization, but not for that much
+        ("depolarization_linear", -0.01, True),
+        ("depolarization_linear", -0.05, False),
+        ("diattenuation_h", -0.05, True),
+    ],
+)
+def test_no_size_makes_more_polarization_than_there_is(place, kind, size, possible):
+    cell = CellEffect(Cell(place, kind, "constant"), 0)
+    model = clean_model().with_effect(cell, steps=0)
+    model.fit.coefficients[model.problem.slices[model.added[cell.name][0].name]] = size
+    assert model.is_physical(cell.name) is possible

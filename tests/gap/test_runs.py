@@ -1,0 +1,313 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Several runs of the same kind of source in one diagnosis, and what changed between them."""
+
+import json
+from functools import cache
+
+import astropy.units as u
+import gap_data as data
+import numpy as np
+import pytest
+
+from astropolcal.chain import join, leaves
+from astropolcal.exceptions import GapError, ParameterError
+from astropolcal.gap import diagnose
+from astropolcal.gap.cells import Cell, Probes, dependences
+from astropolcal.gap.effects import Context
+from astropolcal.gap.effects.base import label_of
+from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.report import summary, to_dict
+from astropolcal.gap.runs import changes, distinct, paragraph
+from astropolcal.optics import Dependence, LinearRetarder, Perturbation
+from astropolcal.scripts.main import main
+
+JULY, OCTOBER = "July: 15", "October 5"
+
+
+def with_cell(*cells):
+    """Return the usual chain with cells of certain sizes, each (place, kind, dependence, size)."""
+    chains = [data.chain()]
+    for *cell, size in cells:
+        edit = CellEffect(Cell(*cell)).edit(chains, Context(data.WAVELENGTH.to_value(u.um)))
+        chains = edit.chains
+        for parameter in edit.parameters:
+            optic, key = parameter.name.split(".")
+            one = next(leaf for leaf in leaves(chains[0]) if leaf.name == optic)
+            target = getattr(one, key)
+            target.value = np.full(np.shape(target.value), size)
+    return join(leaves(chains[0]))
+
+
+def pair(first=(), second=(), names=(JULY, OCTOBER)):
+    return [
+        data.observed(with_cell(*cells), seed=seed, name=name)
+        for seed, (cells, name) in enumerate(zip((first, second), names, strict=True), 3)
+    ]
+
+
+GAIN = ("detector", "gain", "constant", 0.01)
+BEHIND = ("after:derotator", "retardance_d", "constant", 0.05)
+
+
+@cache
+def changed():
+    """A gain in both runs, and a retarder behind the derotator in the second."""
+    return diagnose(data.chain(), pair([GAIN], [GAIN, BEHIND]), changes=True)
+
+
+@cache
+def changed_content():
+    return to_dict(changed())
+
+
+# ---- what changed ------------------------------------------------------------------------------
+
+
+def test_a_change_is_found_with_its_run_cell_and_size():
+    content = changed_content()
+    first, *others = content["changes"]
+    assert not others
+    assert {key: first["cell"][key] for key in ("place", "kind")} == {
+        "place": "after:derotator",
+        "kind": "retardance_d",
+    }
+    assert first["dataset"] in (JULY, OCTOBER)
+    assert first["cell"]["dependence"] == f"dataset:{first['dataset']}"
+    assert first["probability"] > 0.9
+    (size,) = first["size"].values()
+    sign = 1 if first["dataset"] == OCTOBER else -1
+    np.testing.assert_allclose(sign * np.array(size["value"]), 0.05, atol=0.01)
+    assert first["brought_by"] == []
+    assert first["words"].startswith(
+        f'Between "{JULY}" and "{OCTOBER}" the retardance at 45 deg to the axes behind the derotator '
+        "changed by 2."
+    )
+    assert first["words"] in content["sentences"]
+    json.dumps(content)
+
+
+def test_changes_come_first_and_the_shared_cause_after():
+    first, *others = changed().causes
+    assert first.cell.run in (JULY, OCTOBER)
+    assert {"beam_gain", "detector/gain/constant"} & {cause.name for cause in others}
+    assert all(cause.cell.run is None for cause in others)
+    assert "2.9" in summary(changed()) or "2.8" in summary(changed())
+
+
+def test_each_run_by_itself_asks_for_the_shared_cause():
+    shared = next(c for c in changed_content()["causes"] if "gain" in c["name"])
+    assert set(shared["evidence_by_dataset"]) == {JULY, OCTOBER}
+    assert min(shared["evidence_by_dataset"].values()) > 20
+    own = next(c for c in changed_content()["causes"] if "retardance" in c["name"])
+    assert own["evidence_by_dataset"] == {}
+
+
+def test_what_both_runs_lack_is_no_change():
+    found = diagnose(data.chain(), pair([GAIN], [GAIN]))
+    assert [cause.name for cause in found.causes] == ["beam_gain"]
+    content = to_dict(found)
+    assert content["changes"] == []
+    assert not any("changed" in line for line in content["sentences"])
+
+
+def test_nothing_changed_is_said_where_it_was_asked():
+    found = diagnose(data.chain(), pair(), changes=True)
+    assert found.verdict == "none"
+    line = f'Nothing changed between "{JULY}" and "{OCTOBER}" that the data can tell.'
+    assert to_dict(found)["sentences"][-1] == line
+    assert "Nothing changed between" in summary(found)
+
+
+def test_one_of_three_runs_differs():
+    runs = [*pair(names=("a", "b")), data.observed(with_cell(BEHIND), seed=9, name="c")]
+    content = to_dict(diagnose(data.chain(), runs, changes=True))
+    (one,) = content["changes"]
+    assert one["dataset"] == "c"
+    assert one["cell"] == {
+        "place": "after:derotator",
+        "kind": "retardance_d",
+        "dependence": "dataset:c",
+    }
+    assert (
+        'In "c" the retardance at 45 deg to the axes behind the derotator differs' in one["words"]
+    )
+
+
+def test_a_gain_of_one_run_that_drifts():
+    drift = ("detector", "gain", "harmonic:derotator:1", 0.01)
+    found = diagnose(data.chain(), pair([], [drift]), changes=True)
+    content = to_dict(found)
+    assert {one["dataset"] for one in content["changes"]} == {OCTOBER}
+    one = content["changes"][0]["cell"]
+    assert (one["place"], one["kind"]) == ("detector", "gain")
+    assert one["dependence"].endswith(f"/dataset:{OCTOBER}")
+    assert found.remainder_p_value > 1e-4
+
+
+def test_what_an_optic_of_one_run_brought():
+    parts = list(leaves(data.chain()))
+    dichroic = LinearRetarder(name="dichroic", fixed={"retardance": True})
+    nominal = [data.chain(), join([*parts[:-1], dichroic, parts[-1]])]
+    true = nominal[1].copy()
+    true["dichroic"].retardance, true["dichroic"].theta = 4 * u.deg, 45 * u.deg
+    runs = [data.observed(name="out"), data.observed(true, seed=4, name="in")]
+    content = to_dict(diagnose(nominal, runs, changes=True))
+    one = content["changes"][0]
+    assert one["brought_by"] == ["dichroic"]
+    assert one["cell"]["kind"] == "retardance_d"
+    assert "only one run has (dichroic)" in content["sentences"][-1]
+
+
+# ---- parts -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["July", "with space", "a:b", "a/dataset:b", "x/y:own"])
+def test_a_dependence_in_one_run(name):
+    assert Dependence(f"dataset:{name}").run == name
+    both = Dependence(f"harmonic:hwp:2/dataset:{name.replace('/dataset', '')}")
+    assert (both.kind, both.driver, both.count) == ("harmonic", "hwp", 2)
+    assert both.run == name.replace("/dataset", "")
+    with pytest.raises(ParameterError, match="also with /dataset:NAME"):
+        Dependence(f"sometimes/dataset:{name}")
+
+
+def test_labels_of_runs_are_told_apart():
+    names = [f"in:hwp/rotation/dataset:{name}" for name in ("a b", "a:b", "a_b", "a.b")]
+    labels = [label_of(name) for name in names]
+    assert len(set(labels)) == len(labels)
+    assert all(label.isidentifier() for label in labels)
+
+
+def test_cells_of_runs_are_put_into_their_chains_only():
+    chains = [data.chain(), data.chain()]
+    context = Context(data.WAVELENGTH.to_value(u.um), datasets=(JULY, OCTOBER))
+    for kind in ("rotation", "gain", "background", "persistence"):
+        place = "detector" if kind != "rotation" else "in:hwp"
+        edit = CellEffect(Cell(place, kind, f"dataset:{OCTOBER}")).edit(chains, context)
+        added = [sum(o.name.startswith("gap_") for o in leaves(c)) for c in edit.chains]
+        assert added[0] == 0 < added[1]
+        assert len(edit.parameters) == 1
+
+
+def test_probes_have_every_dependence_in_each_run():
+    model = data.fitted(pair())
+    waves = dependences(model.problem, 4)
+    assert f"dataset:{JULY}" in waves
+    assert f"time/dataset:{OCTOBER}" in waves
+    assert not any(name.startswith("step") and "dataset" not in name for name in waves)
+    np.testing.assert_array_equal(waves[f"time/dataset:{OCTOBER}"][0], 0)
+    assert np.ptp(waves[f"time/dataset:{OCTOBER}"][1]) == pytest.approx(2)
+    probes = Probes(model, most_steps=0)
+    assert Cell("detector", "background", f"dataset:{JULY}") in probes.cells
+    assert probes.run_of(Cell("in:hwp", "rotation", f"dataset:{JULY}")) == JULY
+    assert probes.run_of(Cell("in:hwp", "rotation", "time")) is None
+
+
+def test_one_run_has_no_cells_of_its_own():
+    waves = dependences(data.clean_model().problem, 4)
+    assert not any("dataset:" in name for name in waves)
+
+
+def test_the_derivative_of_a_cell_in_one_run_is_that_of_its_optic():
+    model = data.fitted(pair())
+    probes = Probes(model, most_steps=0)
+    cell = Cell("in:derotator", "retardance_h", f"time/dataset:{OCTOBER}")
+    problem, parameters = model.edited(CellEffect(cell, 0))
+    where = problem.slices[parameters[0].name]
+    slope = problem.jacobian(problem.start)[:, where][:, 0]
+    cut = problem.segments[0].stop
+    np.testing.assert_array_equal(slope[:cut], 0)
+    wave = probes.waves_of(cell)[1]
+    white = problem.channels[1].whiten(probes.slopes[cell.place, cell.kind][1] * wave[0])
+    np.testing.assert_allclose(slope[cut:], white.ravel(), atol=1e-6 * np.abs(slope).max())
+
+
+def test_a_perturbation_keeps_its_run():
+    one = Perturbation(kind="rotation", dependence=f"time/dataset:{JULY}", name="x")
+    assert one.copy().dependence == f"time/dataset:{JULY}"
+    assert one.mount == "sequence"
+
+
+def test_words_of_a_change_that_is_doubtful():
+    found = {"words": "A.", "probability": 0.1, "brought_by": ["dichroic"]}
+    words = paragraph({"changes": [found] * 6}, [JULY, OCTOBER])
+    assert words[:4] == ["A."] * 4
+    assert words[4] == "2 smaller changes are listed below."
+    assert "need not be the true ones" in words[5]
+    assert words[6].startswith("6 of the changes are at or behind what only one run has")
+
+
+def test_a_single_run_has_no_changes():
+    content = to_dict(diagnose(data.chain(), data.observed()))
+    assert content["changes"] == []
+    assert changes(diagnose(data.chain(), data.observed()), [{}]) == []
+
+
+# ---- bad input ---------------------------------------------------------------------------------
+
+
+def test_one_run_has_nothing_to_compare():
+    with pytest.raises(
+        GapError, match=r"same kind of source only; given: lamp \(no source stated\)"
+    ):
+        diagnose(data.chain(), data.observed(), changes=True)
+
+
+def test_the_same_data_twice():
+    run = data.observed()
+    again = data.observed(name="copy")
+    with pytest.raises(GapError, match="the same data are given twice: lamp and copy"):
+        diagnose(data.chain(), [run, again])
+
+
+def test_runs_of_different_instruments():
+    runs = pair()
+    runs[0].meta["instrument"] = "CHARIS"
+    runs[1].meta["instrument"] = "IRDIS"
+    with pytest.raises(GapError, match="datasets are of different instruments: CHARIS, IRDIS"):
+        diagnose(data.chain(), runs, changes=True)
+
+
+def test_changes_need_cells():
+    with pytest.raises(GapError, match="told by cells"):
+        diagnose(data.chain(), pair(), changes=True, cells=False)
+
+
+def test_runs_of_one_name_get_names_of_their_own():
+    runs = distinct(pair(names=("a", "a")))
+    assert [run.name for run in runs] == ["a", "a (2)"]
+
+
+# ---- command line ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tables(tmp_path):
+    meta = {"instrument": "CHARIS", "source": "polarized", "yjh50_dichroic": "out",
+            "nasmyth_beam_switcher": "not installed"}  # fmt: skip
+    true = (with_cell(GAIN), with_cell(GAIN, BEHIND))
+    found = []
+    for seed, (chain, name) in enumerate(zip(true, ("july", "october"), strict=True), 3):
+        found.append(tmp_path / f"{name}.ecsv")
+        data.observed(chain, seed=seed, meta=meta).write(found[-1])
+    return found
+
+
+def test_changes_on_the_command_line(tables, tmp_path, capsys):
+    out = tmp_path / "out.json"
+    options = ["--derotator", "linear", "--changes", "-q", "--json", str(out)]
+    assert main(["diagnose", *map(str, tables), *options]) == 0
+    (one,) = json.loads(out.read_text())["changes"]
+    assert one["dataset"] in ("july", "october")
+    assert one["cell"]["place"] == "after:derotator"
+
+
+@pytest.mark.parametrize(
+    ("which", "words"),
+    [([0], "july (polarized)"), ([0, 0], "holds the same frames as")],
+)
+def test_bad_input_on_the_command_line(tables, capsys, which, words):
+    files = [str(tables[i]) for i in which]
+    assert main(["diagnose", *files, "--changes", "-q"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert words in line
