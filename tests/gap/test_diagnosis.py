@@ -244,8 +244,8 @@ def test_a_sign_may_be_wrong_where_double_differences_are_far_off():
     ]
     for observed, residual, sigma, wrong in cases:
         part = SimpleNamespace(observed=np.full(20, observed), sigma=np.full(20, sigma))
-        signs = np.resize([1.0, -1.0], 20)
-        measurement = SimpleNamespace(datasets=[part], residuals=lambda r=residual: r * signs)
+        left = residual * np.resize([1.0, -1.0], 20)
+        measurement = SimpleNamespace(datasets=[part], residuals=lambda left=left: left)
         given = SimpleNamespace(measurement=measurement)
         assert alternatives._may_be_wrong(given) == wrong, (observed, residual, sigma)
 

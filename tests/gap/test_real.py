@@ -106,7 +106,10 @@ def test_star_misses_flat_field_and_mirror(shared_data):
     outside = leaves(CHARIS.chain(*CHARIS.setup(star)))[:4]
     chain = held(join([*outside, *leaves(inside)[start:]]), without=["m3"])
     found = diagnose(*thinned([chain], [star], 8), cells=False)
-    assert [cause.name for cause in found.causes][:2] == ["beam_gain", "m3_diattenuation"]
+    gain, mirror, *_ = named(found)
+    # of a star that is hardly polarized, a diattenuator in front of the prism is a gain
+    assert gain & {"beam_gain", "static_diattenuator"}
+    assert "m3_diattenuation" in mirror
     measured = found.chains[0]["gap_m3_diattenuation"].diattenuation.value
     wavelength = found.nominal.observations[0].wavelength.to(u.um)
     published = published_mirror().diattenuation(wavelength)
