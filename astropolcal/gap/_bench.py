@@ -278,7 +278,7 @@ class Bench:
             move = np.diff(clean.position(rest[0]), prepend=clean.position(rest[0])[:1])
             # what stands has moved last where it moved last
             last = np.maximum.accumulate(np.where(move != 0, np.arange(n), 0))
-            wave = move[last] < 0 if head == "direction" else np.abs(move)
+            wave = move[last] < 0 if head == "direction" else move
         else:
             wave = {
                 "constant": lambda: np.ones(n),
@@ -294,11 +294,11 @@ class Bench:
         return [self._exposed(dataset, faults) for dataset in range(len(self.clean))]
 
     def _exposed(self, dataset, faults):
-        positions, kicks, optics, spread, ghosts = {}, [], None, 0.0, []
+        positions, kicks, chains, spread, ghosts = {}, [], self.chains, 0.0, []
         for fault in faults:
             what = fault.told.get("what")
             kicks += fault.kicks(dataset)
-            optics = fault.optics(dataset) or optics
+            chains = fault.edited(chains)
             for stage, moved in fault.moves(dataset).items():
                 clean = self.clean[dataset].position(stage)
                 positions[stage] = positions.get(stage, clean) + moved
@@ -306,6 +306,7 @@ class Bench:
                 spread = fault.amplitude * self.waves(dataset, "move:hwp")[:, 0]
             elif what == "ghost":
                 ghosts.append(fault)
+        optics = None if chains is self.chains else self.split(chains[dataset])
         still = positions.get("hwp", self.clean[dataset].position("hwp"))
         nodes = (-1, -0.5, 0, 0.5, 1) if np.any(spread) else (0,)
         flux = np.mean(

@@ -142,8 +142,8 @@ class Fault:
         self.told["effect"] = effect.name
         middle = [np.median(o.flux_right + o.flux_left) / 2 for o in bench.clean]
         context = Context(bench.micron, float(np.median(middle)))
-        self._edit = lambda: effect.edit([chain.copy() for chain in bench.chains], context)
-        edit = self._edit()
+        self._edit = lambda chains: effect.edit([chain.copy() for chain in chains], context)
+        edit = self._edit(bench.chains)
         self._laws = {p.name: _law(p, edit.chains, rng) for p in edit.parameters}
         self._absent = {p.name: p.canonical_neutral for p in edit.parameters}
         sizes = [p.canonical_limit / np.abs(self._laws[p.name]).max() for p in edit.parameters]
@@ -181,18 +181,18 @@ class Fault:
         error[told["frame"]] = self.sign * self.amplitude
         return {told["what"].split()[0]: error}
 
-    def optics(self, dataset):
-        """Return the optics with an effect of the library, None without."""
+    def edited(self, chains):
+        """Return chains with an effect of the library in them, the same without one."""
         if self.told["type"] != "listed":
-            return None
-        edit = self._edit()
+            return chains
+        edit = self._edit(chains)
         for name, law in self._laws.items():
             value = self._absent[name] + self.amplitude * law
             _put(edit.chains, name, value)
             for target, tie in edit.ties.items():
                 if tie.source == name:
                     _put(edit.chains, target, tie.factor * value)
-        return self.bench.split(edit.chains[dataset])
+        return edit.chains
 
     def detected(self, dataset, flux):
         """Return the fluxes (2, F, W) as the detector gives them."""

@@ -1,20 +1,27 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Numbers of a report: sizes of effects per wavelength, and accuracies of a model."""
+"""Numbers of a report: sizes of causes, what they do to the data, accuracies of a model."""
 
+import warnings
 from functools import cached_property
-from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration import accuracy_table, paper_accuracies
+from astropolcal.calibration import calibrate, target_accuracies
 from astropolcal.calibration._directions import ranked
+from astropolcal.chain import leaves
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.gap.problem import OPEN, TOUCHES
-from astropolcal.gap.shrinkage import frame_groups, left_out_fits
+from astropolcal.measurement import Measurement
+from astropolcal.optics import Perturbation
 
 ACCURACIES = ("s_res", "s_mean", "s_cv")
 # parameters correlated more than this with what is uncertain are named
 _STRONG, _MOST_TRADES = 0.5, 3
+# perturbations that are angles
+_ANGLES = ("retardance", "rotation")
+# directions below this share of the largest take nothing up
+_TINY = 1e-9
 
 
 # ---- sizes ---------------------------------------------------------------------------------
@@ -46,18 +53,54 @@ class Fitted:
     def _size(self, parameter):
         slot = self.problem.free.by_name[parameter.name]
         where = self.problem.slices[parameter.name]
+        unit, factor = self.unit_of(parameter.name)
         block = parameter.basis if slot.per_wavelength else None
         block = np.eye(where.stop - where.start) if block is None else block
-        value = block @ self.model.fit.coefficients[where] / slot.factor
+        value = block @ self.model.fit.coefficients[where] / factor
         std = np.sqrt(np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block))
         # one open coefficient leaves every value of a law open
-        std = np.where(self.is_open[where].any(), np.nan, std / slot.factor)
-        return {
-            "value": _number(value),
-            "std": _number(std),
-            "unit": str(slot.unit or ""),
-            "limit": float(u.Quantity(parameter.limit).to_value(slot.unit or u.one)),
-        }
+        std = np.where(self.is_open[where].any(), np.nan, std / factor)
+        limit = parameter.canonical_limit / factor
+        return {"value": _number(value), "std": _number(std), "unit": unit, "limit": float(limit)}
+
+    def unit_of(self, name):
+        """Return the unit of a parameter in words, and how much of it is canonical."""
+        slot, optic = self.problem.free.by_name[name], name.partition(".")[0]
+        chains = self.model.chains
+        carrier = next((o for c in chains for o in leaves(c) if o.name == optic), None)
+        if isinstance(carrier, Perturbation) and carrier.kind.startswith(_ANGLES):
+            return "deg", np.deg2rad(1.0)
+        return str(slot.unit or ""), slot.factor
+
+    def double_share(self, name):
+        """
+        Return the share of what a cause does that is left in double differences, or None.
+
+        To first order, and less what the rest of the model takes up.
+        """
+        doubles = self.doubles
+        if not self.model.added.get(name) or doubles is None:
+            return None
+        problem, full = self.problem, self.model.fit.coefficients
+        rows, without = self._rows(name), full.copy()
+        without[rows] = np.concatenate([self._absent(p) for p in self.model.added[name]])
+        others = np.setdiff1d(np.arange(problem.size), rows)
+        lost = problem.residual(without) - problem.residual(full)
+        slopes = problem.jacobian(full)[:, others]
+        without[others] += np.linalg.lstsq(slopes, lost, rcond=_TINY)[0]
+        pairs = zip(problem.differences(without), problem.differences(full), strict=True)
+        single = doubles.in_pairs([one[0] - other[0] for one, other in pairs])
+        double = doubles.residuals(without) - doubles.residuals(full)
+        # of two frames of opposite signs the double difference is as large as each
+        return float(np.clip(np.sum(double**2) / max(np.sum(single**2), 1e-300), 0, 1))
+
+    @cached_property
+    def doubles(self):
+        """The double differences of the model, None where frames form no pairs."""
+        try:
+            return Doubles(self.model)
+        except ObservationError:
+            return None
 
     def significance(self, name):
         """Return the size of an effect as a whole in units of its error, or None."""
@@ -154,87 +197,112 @@ def _number(values):
     return plain[0] if len(plain) == 1 else plain
 
 
+# ---- double differences ---------------------------------------------------------------------
+
+
+class Doubles:
+    """
+    Normalized double differences of a model.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    """
+
+    def __init__(self, model):
+        self.problem = model.problem
+        self.measurement = Measurement(
+            model.chains,
+            model.observations,
+            observable="normalized_double_difference",
+            ties=model.problem.ties,
+        )
+
+    def residuals(self, coefficients):
+        """Return observed minus predicted, (n_data,)."""
+        residuals = self.measurement.residuals(self.problem.vector(coefficients))
+        return residuals[: self.measurement.n_data]
+
+    def in_pairs(self, singles):
+        """Return the root mean square of values (W, F) over the frames of each, (n_data,)."""
+        parts = zip(self.measurement.datasets, singles, strict=True)
+        squares = [np.mean(one[:, d.frames] ** 2, axis=-1)[d.valid] for d, one in parts]
+        return np.sqrt(np.concatenate(squares))
+
+    @property
+    def noise_percent(self):
+        """Their noise, by that of the single differences, in percent."""
+        sigma = self.in_pairs([c.sigma[0] for c in self.problem.channels])
+        return 100 * float(np.sqrt(np.mean(sigma**2) / 2))
+
+
 # ---- accuracies -----------------------------------------------------------------------------
 
 
 def accuracies(model, cross_validate=True):
     """
-    Return the accuracies of normalized single differences, ready for JSON.
+    Return what `calibrate` says of a model, with the sizes of its causes held, ready for JSON.
 
-    ``rms_percent`` is the root mean square over all data: of left-out frames, or of
-    the fit where there is no cross-validation.
+    ``rms_percent`` is the root mean square of the double differences over all data: of left-out
+    frames, or of the fit where there is no cross-validation. Where such a calibration is not
+    possible it is None, and the lists are empty.
     """
-    held_out = _held_out(model) if cross_validate else None
-    measurement = model.problem.measurement
-    residuals = _flat(model, model.fit.coefficients)
-    tables = [
-        accuracy_table(measurement, i, residuals, held_out)
-        for i in range(len(measurement.datasets))
-    ]
-    judged = residuals if held_out is None else held_out
-    return {
-        "observable": "normalized_single_difference",
-        "rms_percent": 100 * float(np.sqrt(np.nanmean(judged**2))),
-        "datasets": [
-            {"name": o.name, "source": o.source}
-            | {f"{key}_percent": _median(table[key].value) for key in ACCURACIES}
-            for o, table in zip(model.observations, tables, strict=True)
-        ],
+    instrument = next((o.instrument for o in model.observations if o.instrument), None)
+    found = {
+        "observable": "normalized_double_difference",
         "wavelength_nm": _number(1e3 * model.problem.wavelength),
-        "rms_percent_per_wavelength": _per_wavelength(measurement, judged),
-        "targets": _targets(model, tables, "s_mean") + _targets(model, tables, "s_cv"),
+        "rms_percent": None,
+        "datasets": [],
+        "targets": [],
+    }
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AstropolcalWarning)
+            calibration = with_causes(model, cross_validate=cross_validate, instrument=instrument)
+            targets = target_accuracies(calibration)
+    except AstropolcalError:
+        return found
+    tables = [record.accuracy for record in calibration.datasets]
+    count = np.concatenate([table["n"] for table in tables])
+    gap = np.concatenate([table["s_cv" if cross_validate else "s_res"].value for table in tables])
+    return found | {
+        "rms_percent": float(np.sqrt(np.nansum(count * gap**2) / count.sum())),
+        "datasets": [
+            {"name": record.name, "source": record.source}
+            | {f"{key}_percent": _median(record.accuracy[key].value) for key in ACCURACIES}
+            for record in calibration.datasets
+        ],
+        "targets": [
+            {
+                "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
+                "s_p_percent": _median(table["s_p"].to_value(u.percent)),
+                "s_chi_deg": _median(table["s_chi"].to_value(u.deg)),
+                "words": table.meta["words"],
+            }
+            for table in targets
+        ],
     }
 
 
-def _flat(model, coefficients):
-    """Return observed minus predicted differences in the order of the data, (n_data,)."""
-    problem = model.problem
-    gaps = problem.differences(coefficients)
-    parts = zip(gaps, problem.channels, problem.datasets, strict=True)
-    return np.concatenate([np.where(c.valid, g[0], np.nan)[d.valid] for g, c, d in parts])
+def with_causes(model, **options):
+    """
+    Calibrate the chains of a model, the sizes of its causes held.
 
-
-def _held_out(model):
-    """Return the differences of every datum predicted by a fit without its group."""
-    labels, numbers = frame_groups(model.observations)
-    problem = model.problem
-    found = np.full(problem.measurement.n_data, np.nan)
-    group = np.concatenate(
-        [n[d.group_of_datum] for n, d in zip(numbers, problem.datasets, strict=True)]
+    Their sizes are what was found: fitting them again, to double differences, could move them.
+    """
+    held = {p.name for parameters in model.added.values() for p in parameters}
+    ties = model.problem.ties
+    held |= {name for name, tie in ties.items() if tie.source in held}
+    return calibrate(
+        model.chains,
+        model.observations,
+        fix=dict.fromkeys(sorted(held)) or None,
+        ties={name: tie for name, tie in ties.items() if name not in held},
+        **options,
     )
-    for i, fit in enumerate(left_out_fits(model, labels, numbers)):
-        found[group == i] = _flat(model, fit.coefficients)[group == i]
-    return found
 
 
 def _median(values):
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else None
-
-
-def _per_wavelength(measurement, residuals):
-    """Return the root mean square at each wavelength over all datasets, in percent."""
-    bins = np.concatenate([d.bin_of_datum for d in measurement.datasets])
-    squares = [residuals[bins == b] ** 2 for b in range(len(measurement.wavelength))]
-    return _number([100 * np.sqrt(np.nanmean(s)) if s.size else np.nan for s in squares])
-
-
-def _targets(model, tables, column):
-    """Return s_p and s_chi, median over the wavelengths, at the worst angle."""
-    records = [
-        SimpleNamespace(source=o.source, accuracy=table)
-        for o, table in zip(model.observations, tables, strict=True)
-    ]
-    like = SimpleNamespace(
-        wavelength=model.problem.wavelength * u.um, datasets=records, chains=model.chains
-    )
-    return [
-        {
-            "dolp_percent": float(u.Quantity(t.meta["dolp"]).to_value(u.percent)),
-            "column": column,
-            "s_p_percent": _median(t["s_p"].value),
-            "s_chi_deg": _median(t["s_chi"].value),
-            "missing": t.meta["missing"],
-        }
-        for t in paper_accuracies(like, column=column)
-    ]

@@ -6,18 +6,26 @@ import textwrap
 
 import numpy as np
 
+from astropolcal.gap.cells import Cell, _kind_words, _place_words, _when
+
 # a size is determined if the data narrow it to this share of its physical limit
 _DETERMINED = 0.1
-_TINY = 1e-99
-# below this the residuals are more than noise
-_REMAINDER = 1e-4
-# above this the sum of squares alone is not conspicuous
-_CONSPICUOUS = 0.01
+# smaller probabilities than this are no doubt; above the second the sum of squares alone is not
+# conspicuous
+_TINY, _CONSPICUOUS = 1e-6, 0.01
 _WIDTH = 80
-# the longest name of an effect in a table
-_LONGEST = 26
-# so many effects are named in a sentence, and in a title
-_NAMED, _IN_TITLE = 3, 2
+# so many causes are named in a sentence, in a title, and in place of another
+_NAMED, _IN_TITLE, _ALIASES = 3, 2, 4
+# so many lines say where the gap lies, so many exposures stand in the summary
+_WHERE, _NEXT = 5, 2
+# an alias at another place is the same thing if it is this probable against the best
+_SAME = 0.5
+# of causes less probable than this the table is enough
+_UNLIKELY = 0.05
+# a share of a signal below this is none
+_CANCELS = 0.02
+# so many targets on sky stand in the summary
+_TARGETS = 2
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 
 
@@ -40,12 +48,12 @@ def percent(value, digits=3):
 
 def p(value):
     """Return a probability as short text."""
-    return f"< {_TINY:g}" if value < _TINY else f"{value:.2g}"
+    return f"< {_TINY:.0e}".replace("e-0", "e-") if value < _TINY else f"{value:.2g}"
 
 
-def p_is(value):
-    """Return a probability with its letter: ``p = 0.3``."""
-    return f"p {p(value)}" if value < _TINY else f"p = {p(value)}"
+def doubt(value):
+    """Return how sure it is that noise alone does not do it."""
+    return "beyond doubt" if value < _TINY else f"(p = {p(value)})"
 
 
 def share(value):
@@ -54,8 +62,8 @@ def share(value):
 
 
 def short_share(value):
-    """Return a share as percent, for a column of a table."""
-    return share(value).replace("less than", "<")
+    """Return a share as percent, for a column of a table; a dash if there is none."""
+    return "-" if value is None else share(value).replace("less than", "<")
 
 
 def change(old, new, digits=2):
@@ -92,30 +100,52 @@ def shortened(name, width):
 # ---- sizes -----------------------------------------------------------------------------------
 
 
-def sizes(parameters):
-    """Return a line a parameter: its size, its error, and how much the data tell of it."""
-    return [f"{name}: {_size(**entry)}" for name, entry in parameters.items()]
+def sizes(entry):
+    """Return a line a parameter of a cause: its size, its error, how much the data tell of it."""
+    pairs = zip(labels(entry), entry["size"].values(), strict=True)
+    return [f"{label}: {_size(**size)}" for label, size in pairs]
+
+
+def labels(entry):
+    """Return what the parameters of a cause are called."""
+    keys = [name.split(".") for name in entry["size"]]
+    if entry["cell"] and not entry["effect"]:
+        return [_of_cell(entry["cell"]["dependence"], key) for _, key in keys]
+    single = len({key for _, key in keys}) == len(keys)
+    return [(key if single else f"{key} of {o}").replace("_", " ") for o, key in keys]
+
+
+def _of_cell(dependence, key):
+    wave = {"amplitude": "cosine", "quadrature": "sine"}.get(key)
+    if wave is None:
+        return key.replace("_", " ")
+    return {
+        "time": "change in half of the run",
+        "time2": "bend",
+        "step": "step",
+        "direction": "change after moves backwards",
+        "move": "change with a move of one radian",
+        "harmonic": f"amplitude of the {wave}",
+    }.get(dependence.partition(":")[0], "size")
 
 
 def _size(value, std, unit, limit):
-    ends = f" {unit}" if unit else ""
     several = isinstance(value, list)
     pairs = list(zip(value, std, strict=True)) if several else [(value, std)]
     good = [(v, s) for v, s in pairs if is_determined(s, limit)]
     if not good:
         return "not determined by these data" + (" at any wavelength" if several else "")
-    values, errors = np.array(good).T
-    digits = _digits(np.median(errors))
-    if not several:
-        return f"{value:.{digits}f} +- {std:.{digits}f}{ends}"
+    # shares are given in percent
+    values, errors = np.array(good).T * (1 if unit else 100)
+    ends, digits = f" {unit or '%'}", _digits(np.median(errors))
     middle, low, high = (f"{f(values):.{digits}f}" for f in (np.median, np.min, np.max))
     least, most = (percent(f(errors), 2) for f in (np.min, np.max))
-    text = f"median {middle}, from {low} to {high}{ends}; errors {least} to {most}{ends}"
+    text = f"{low} to {high}{ends}, median {middle}, errors {least} to {most}{ends}"
     if low == high and least == most:
-        text = f"{middle} +- {errors[0]:.{digits}f}{ends} at every wavelength"
-    if len(good) < len(value):
-        text += f"; determined at {len(good)} of {len(value)} wavelengths"
-    return text
+        text = f"{middle} +- {errors[0]:.{digits}f}{ends}"
+        text += " at every wavelength" if several else ""
+    known = f"; determined at {len(good)} of {len(pairs)} wavelengths"
+    return text + known if len(good) < len(pairs) else text
 
 
 def is_determined(std, limit):
@@ -137,216 +167,256 @@ def has_sizes(entry):
     ]
 
 
-# ---- a cause ---------------------------------------------------------------------------------
+# ---- what a cause is, and what else it may be ----------------------------------------------------
+
+
+def _outline(one):
+    """Return kind and dependence of a cell, the name of what has one."""
+    cell = None if one["effect"] else one["cell"]
+    return (cell["kind"], cell["dependence"]) if cell else one["name"]
+
+
+def _title(group):
+    """Return the title of cells of one outline, with all their places."""
+    if len(group) == 1:
+        return group[0]["title"]
+    cell = Cell(**group[0]["cell"])
+    return f"{_kind_words(cell)} {_places(group)}{_when(cell.dependence)}"
+
+
+def _places(group, of="of"):
+    words = [
+        "at the source" if place == "source" else re.sub("^of ", f"{of} ", _place_words(place))
+        for place in (one["cell"]["place"] for one in group)
+    ]
+    return listed(words, "or")
+
+
+def _alike(entry):
+    """Return a cause, and those of its aliases that are the same thing at another place."""
+    least = _SAME * entry["share"]
+    same = [a for a in entry["aliases"] if _outline(a) == _outline(entry)]
+    return [entry, *(a for a in same if a["probability"] >= least)]
+
+
+def title(entry):
+    """Return the title of a cause, with all places at which it may as well be."""
+    return _title(_alike(entry))
+
+
+def own_share(entry):
+    """Return how probable a cause is among its aliases, at whichever of its places."""
+    return entry["share"] + sum(one["probability"] for one in _alike(entry)[1:])
+
+
+def others(entry, ranks):
+    """Return titles and probabilities of what else a cause may be, those of one kind as one."""
+    groups, same = {}, _alike(entry)[1:]
+    for one in entry["aliases"]:
+        if one not in same and one["name"] not in ranks:
+            groups.setdefault(_outline(one), []).append(one)
+    found = [(_title(g), sum(one["probability"] for one in g)) for g in groups.values()]
+    return [f"{words} ({share(chance)})" for words, chance in sorted(found, key=lambda x: -x[1])]
 
 
 def cause(entry, ranks):
     """Return what is to be said of one cause, in a few sentences."""
-    title = entry["title"][0].upper() + entry["title"][1:]
-    parts = [f"{title} ({entry['place']})."]
-    parts.append(f"It explains {share(entry['explained'])} of what exceeds the noise.")
-    if None not in (entry["left_out_before_percent"], entry["left_out_after_percent"]):
-        parts.append(
-            f"Left-out frames: {percent(entry['left_out_before_percent'])} % without it, "
-            f"{percent(entry['left_out_after_percent'])} % with it."
-        )
-    parts.append(f"Its probability is {share(entry['probability'])}.")
-    return " ".join([*parts, *details(entry, ranks)])
+    return " ".join([_found(entry), *details(entry, ranks)])
+
+
+def _found(entry):
+    chance = share(entry["probability"])
+    if own_share(entry) < _SAME:
+        first = f"{title(entry)} ({share(own_share(entry))})"
+        several = listed([first, *others(entry, {})], "or", _NAMED)
+        return f"The model lacks one of several things ({chance}): {several}."
+    if entry["effect"] or not entry["cell"]:
+        return f"The model lacks one effect: {entry['title']} ({chance})."
+    cell, places = Cell(**entry["cell"]), _places(_alike(entry), "in")
+    begin = "The detector shows" if cell.place == "detector" else f"Something {places} causes"
+    words = f"{_kind_words(cell)}{_when(cell.dependence)}"
+    return f"{begin} {words} ({chance}); no name is known for it."
 
 
 def details(entry, ranks):
     """
-    Return what a table does not say of a cause, a list of sentences.
+    Return what is to be said of a cause beside its title, a list of sentences.
 
     ``ranks`` gives the rank of every cause by its name: an alias may be a cause too.
     """
-    return [*_of_aliases(entry, ranks), *_of_size(entry)]
-
-
-def open_aliases(entry, ranks):
-    """Return the titles of the aliases of a cause that are no causes themselves."""
-    return [one["title"] for one in entry["aliases"] if one["name"] not in ranks]
-
-
-def _of_aliases(entry, ranks):
-    found, others = [], open_aliases(entry, ranks)
-    if others:
-        found.append(f"These data cannot tell it from: {'; '.join(others)}.")
+    texts = [_explains(entry)]
+    if alternatives := others(entry, ranks):
+        texts.append(
+            f"These data hardly tell it ({share(own_share(entry))}) from "
+            f"{listed(alternatives, 'or', _ALIASES)}."
+        )
     both = [f"cause {ranks[a['name']]}" for a in entry["aliases"] if a["name"] in ranks]
     if both:
-        found.append(
+        texts.append(
             f"It resembles {listed(both)}: the data ask for both, "
             "but how much belongs to which is uncertain."
         )
-    return found
+    return texts + _of_size(entry)
+
+
+def _explains(entry):
+    text = f"It explains {share(entry['explained'])} of what exceeds the noise"
+    errors = (entry["left_out_before_percent"], entry["left_out_after_percent"])
+    text += "" if None in errors else f" (left-out frames: {change(*errors, 3)} %)"
+    kept = entry["double_difference_share"]
+    if kept is None:
+        return f"{text}."
+    return text + (
+        "; it cancels in the double differences."
+        if kept < _CANCELS
+        else f"; {share(kept)} of its signal is in the double differences."
+    )
 
 
 def _of_size(entry):
     if entry["kind"] == "discrete":
         return ["It is an alternative to the model and has no size."]
-    found, strength = [], entry["significance"]
+    texts, strength = [], entry["significance"]
     if strength is not None:
-        found.append(f"Its size as a whole is {strength:.0f} standard errors from zero.")
-    found.append(
-        f"The size is physically possible{_at_bound(entry)}."
-        if entry["physical"]
-        else "The size is physically impossible: it stands for something that the library lacks."
-    )
-    known = has_sizes(entry)
+        texts.append(f"Its size as a whole is {strength:.0f} standard errors from zero.")
+    if not entry["physical"]:
+        texts.append("The size is physically impossible: it stands for something else.")
+    elif entry["at_bound"]:
+        n = np.sum([np.size(one["value"]) for one in entry["size"].values()])
+        texts.append(f"The size is at a bound of the optic at {entry['at_bound']} of {n} values.")
+    known, rest = has_sizes(entry), entry["trades_with"]
     if not all(known):
-        others = entry.get("trades_with")
-        found.append(
-            f"The data need the effect but do not tell {'all of ' if any(known) else ''}its size: "
-            f"a part of it {_exchanged(others) if others else 'hardly changes them'}."
+        texts.append(
+            f"The data need it but do not tell {'all of ' if any(known) else ''}its size: a part "
+            + (f"can be exchanged for changes of {listed(rest)}." if rest else "hardly shows.")
         )
-    return found
+    return texts
 
 
-def _at_bound(entry):
-    """Return at how many of its values a size is at a bound of the optic, in words."""
-    n = np.sum([np.size(one["value"]) for one in entry["size"].values()])
-    at = entry.get("at_bound")
-    if not at:
-        return ""
-    return f": at a bound of the optic{'' if n == 1 else f' at {at} of {n} values'}"
-
-
-def _exchanged(others):
-    return f"can be exchanged for changes of {listed(others)}"
-
-
-# ---- three sentences -------------------------------------------------------------------------
+# ---- the summary -------------------------------------------------------------------------------
 
 
 def sentences(content):
-    """Return the three sentences: how large the gap is, what causes it, what is left."""
-    return [_how_large(content), _what(content), _what_is_left(content)]
+    """Return frames to distrust, what causes the gap, how large it is, and what is left."""
+    parts = (_frames, _what, _how_large, _what_is_left, _on_sky)
+    return [words for words in (part(content) for part in parts) if words]
 
 
-def _of_frames(content):
-    return "frames left out of the fit" if content["cross_validated"] else "the frames of the fit"
-
-
-def _of_differences(frames):
-    # calibrate gives double differences, which hide a part of the gap
-    return f"the single differences of {frames}"
-
-
-def _how_large(content):
-    frames = "the frames" if content["exchanged"] else _of_frames(content)
-    chance = p_is(content["gap_p_value"])
-    before, noise = (percent(content[f"{key}_percent"]) for key in ("gap_before", "noise_floor"))
-    if content["verdict"] == "none":
-        return (
-            f"The model agrees with the measurements: it predicts {_of_differences(frames)} to "
-            f"{before} % of polarization, and the noise is {noise} % (residuals as large "
-            f"by noise alone: {chance})."
-        )
-    real = f"the gap is real (residuals as large by noise alone: {chance})"
-    # a pattern can be certain where the sum of squares is not conspicuous
-    if content["gap_p_value"] > _CONSPICUOUS:
-        real = f"the residuals are no larger than noise ({chance}), but their pattern is not one"
-    return (
-        f"The model misses {_of_differences(frames)} by {before} % of polarization where the "
-        f"noise is {noise} %; "
-        f"{real}."
-    )
+def _frames(content):
+    faults = [fault["words"].rstrip(".") for fault in content["frames"]]
+    return f"Some frames are not what their table says: {'; '.join(faults)}." if faults else ""
 
 
 def _what(content):
-    causes = content["causes"]
-    if content["verdict"] == "none":
-        return _nothing(content)
-    if not causes:
-        return (
-            f"None of the {content['n_effects']} effects that were tried explains it: "
-            "the cause is not in the library."
-        )
-    explained = share(sum(entry["explained"] for entry in causes))
+    causes, verdict = content["causes"], content["verdict"]
+    if verdict == "none":
+        return "The model agrees with the measurements: it lacks nothing that these data show."
     # in the order of what they explain, not of when they were found
     largest = sorted(causes, key=lambda entry: -entry["explained"])
-    named = listed([entry["title"] for entry in largest], most=_NAMED)
-    if content["verdict"] == "unexplained":
-        return (
-            f"The effects that help ({named}) explain only "
-            f"{explained} of what exceeds the noise: the cause is not in the library."
-        )
-    ends = f"{explained} of what exceeds the noise"
-    if len(causes) > 1:
-        return f"The model lacks {len(causes)} effects, which explain {ends}: {named}" + (
-            f"{_doubt(causes)}."
-        )
-    if causes[0]["aliases"]:
-        group = [causes[0]["title"], *(one["title"] for one in causes[0]["aliases"])]
-        several = listed(group, "or", _NAMED)
-        return (
-            "The model lacks one of these, which the data cannot tell apart: "
-            f"{several}, which explains {ends}."
-        )
-    return f"The model lacks one effect: {causes[0]['title']}, which explains {ends}."
+    if verdict == "unexplained":
+        return _unknown(content, largest)
+    if len(causes) == 1:
+        return _found(causes[0])
+    nameless = "" if verdict == "named" else ", not all of which have a name"
+    names = [f"{title(entry)} ({share(entry['probability'])})" for entry in largest]
+    return f"The model lacks {len(causes)} things{nameless}: {listed(names, most=_NAMED)}."
 
 
-def _doubt(causes):
-    """Return how many of several causes may as well be other effects."""
-    names = {entry["name"] for entry in causes}
-    several = sum(bool(open_aliases(entry, names)) for entry in causes)
-    if not several:
-        return ""
-    one = "one of them may as well be another effect"
-    many = f"{several} of them may as well be other effects"
-    return f" ({one if several == 1 else many}, as listed)"
+def _unknown(content, causes):
+    where = content["where_left"] or content["where"]
+    text = "I do not know what the model lacks: "
+    if causes:
+        text += f"what helps most, {title(causes[0])} ({share(causes[0]['probability'])}), "
+        text += "needs others beside it." if len(causes) > 1 else "is not probable enough."
+    else:
+        text += f"none of the {content['n_effects']} causes that were tried explains the gap."
+    of = "what is left" if content["where_left"] else "the gap"
+    return f"{text} {where_words(where[0], of)}." if where else text
 
 
-def _clearest(content):
-    if not content["where"]:
-        return ""
-    first = content["where"][0]
-    return f"; the clearest part of it is {first['detail']} ({share(first['share'])} of the gap)"
+def where_words(entry, of=None):
+    """Return a sentence on where a part of the gap lies; without ``of`` its end."""
+    verb = "follows" if entry["kind"] == "pattern" else "lies in"
+    whole = f"{share(entry['share'])} of {of} " if of else ""
+    return f"{whole}{verb} {entry['detail']}"
 
 
-def _nothing(content):
-    if not content["scores"]:
-        return "There was no cause to try that the model does not contain."
-    return f"None of the {content['n_effects']} causes that were tried is needed."
+def _how_large(content):
+    them = "it" if len(content["causes"]) == 1 else "them"
+
+    def gaps(before, after, noise):
+        more = f", with {them} by {percent(after)} %" if content["causes"] else ""
+        return f"{percent(before)} %{more} (noise {percent(noise)} %)"
+
+    keys, double = ("before_percent", "after_percent"), content["double_difference"]
+    text = "In single differences the model is off by "
+    if double:
+        text = "In double differences, which calibrate fits, the model is off by "
+        text += f"{gaps(*(double[key] for key in keys), double['noise_percent'])}; "
+        text += "in single differences by "
+    text += gaps(*(content[f"gap_{key}"] for key in keys), content["noise_floor_percent"])
+    frames = "frames left out of the fit" if content["cross_validated"] else "the frames of the fit"
+    text += f": percent of polarization, {'the frames' if content['exchanged'] else frames}."
+    if content["verdict"] == "none":
+        return text
+    chance = content["gap_p_value"]
+    # a pattern can be certain where the sum of squares is not conspicuous
+    if chance > _CONSPICUOUS:
+        return f"{text} The residuals are no larger than noise {doubt(chance)}, but have a pattern."
+    return f"{text} The gap is real {doubt(chance)}."
 
 
 def _what_is_left(content):
-    verdict, causes = content["verdict"], content["causes"]
-    if verdict == "none":
-        return (
-            "An effect below the noise, or one that the parameters of the model take up "
-            "entirely, would not show."
-        )
-    if not causes:
-        return (
-            f"Nothing should be added to the model before its cause is known{_clearest(content)}."
-        )
-    shrunk, left = content["shrinkage_percent"], content["remainder_p_value"]
-    details = [] if shrunk["value"] is None else [f"mean square lower by {shrunk['value']:.0f} %"]
-    if shrunk["low"] is not None:
-        details.append(f"68 % interval {shrunk['low']:.0f} to {shrunk['high']:.0f} %")
-    rest = "is noise" if left > _REMAINDER else "is more than noise and unexplained"
-    # such a size stands for an effect that the library does not have
-    strange = [entry["title"] for entry in causes if not entry["physical"]]
-    doubt = f"; physically impossible is the size of {listed(strange)}" if strange else ""
+    if content["verdict"] == "none":
+        return "What is below the noise, or what the parameters take up entirely, does not show."
+    if not content["causes"]:
+        return "Nothing should be added to the model before its cause is known."
+    where, part = content["where_left"], content["left_share"]
+    text = f"What is left, {share(part)} of the gap, is more than" if part else "What is left is"
+    text += f" noise {doubt(content['remainder_p_value'])}"
+    if where and content["verdict"] != "unexplained":
+        text += f": {where_words(where[0], 'it')}"
+    strange = [entry["title"] for entry in content["causes"] if not entry["physical"]]
+    return text + (f"; physically impossible is the size of {listed(strange)}." if strange else ".")
+
+
+def _on_sky(content):
+    """Return what calibrate claims with the nominal and with the improved model."""
+    targets = [_target(*pair) for pair in _pairs(content, "targets")]
+    if not targets or content["verdict"] not in ("named", "located"):
+        return ""
+    words = "Errors on sky that calibrate claims, with the nominal -> with the improved model: "
+    return f"{words}{'; '.join(targets[:_TARGETS])}. --save keeps the improved one."
+
+
+def _target(old, new):
     return (
-        f"With {'it' if len(causes) == 1 else 'them'} the model predicts {_of_frames(content)} to "
-        f"{percent(content['gap_after_percent'])} %{' (' if details else ''}{', '.join(details)}"
-        f"{')' if details else ''}, and what remains {rest} ({p_is(left)}){doubt}."
+        f"target of {old['dolp_percent']:g} %: {change(old['s_p_percent'], new['s_p_percent'])} %, "
+        f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
     )
 
 
 # ---- for the terminal ------------------------------------------------------------------------
 
 
-def text(content, accuracies, frames=()):
-    """Return a report as text of at most 80 columns; ``frames`` are lines on those not used."""
+def text(content, accuracies, frames=(), written=()):
+    """
+    Return a report as text of at most 80 columns, the summary first.
+
+    ``frames`` are lines on those not used, ``written`` the files that were.
+    """
+    causes = content["causes"]
+    likely = [one for one in causes if one["probability"] >= _UNLIKELY]
+    following = [exposure(entry, causes) for entry in content["next_observations"]]
     parts = [
         content["sentences"],
-        _table_lines(content),
-        *(_cause_lines(cause, called(content)) for cause in content["causes"]),
-        _numbered("What to observe next", [e["words"] for e in content["next_observations"]]),
-        _where_lines(content["where"]),
+        _table_lines(causes),
+        _numbered("Observe next", following[:_NEXT]),
+        [f"{'' if i else 'Written:':<8} {path}" for i, path in enumerate(written)],
+        *(_cause_lines(one) for one in likely),
+        _numbered("Or observe", following[_NEXT:], _NEXT),
+        _where_lines("Of the gap of the nominal model", content["where"]),
+        _where_lines("Of what is left", content["where_left"]),
         _accuracy_lines(content, accuracies),
         [f"Nominal model: {content['nominal']}"],
         list(frames),
@@ -357,90 +427,83 @@ def text(content, accuracies, frames=()):
 def _wrapped(lines):
     for line in lines:
         # continued lines begin under the words, not under the bullet, the number or the share
-        indent = len(re.match(r"\s*(?:- |\d+\. |\d+ %  )?", line).group())
-        ends = " " * indent
-        yield from textwrap.wrap(
-            line, _WIDTH, subsequent_indent=ends, break_on_hyphens=False, drop_whitespace=True
-        ) or [""]
+        ends = " " * len(re.match(r"\s*(?:- |\d+\. |\d+ %  )?", line).group())
+        # a number stays with its unit
+        kept = re.sub(r"(?<=\d) (?=(%|deg)\b|%)", "\N{NO-BREAK SPACE}", line)
+        broken = textwrap.wrap(kept, _WIDTH, subsequent_indent=ends, break_on_hyphens=False)
+        yield from (one.replace("\N{NO-BREAK SPACE}", " ") for one in broken or [""])
 
 
-def called(content):
-    """Return what the causes are called: they are none where they leave the gap unexplained."""
-    return "Effect" if content["verdict"] == "unexplained" else "Cause"
-
-
-def _table_lines(content):
-    """Return a line a cause: rank, name, place, share, errors on left-out frames."""
-    causes = content["causes"]
+def _table_lines(causes):
+    """Return a line a cause: rank, probability, what it explains, what double differences see."""
     if not causes:
         return []
-    rows = [("effect", "place", "explains", "left-out (%)")]
+    rows = [("", "probability", "explains", "in double diff.", "cause")]
     for entry in causes:
-        errors = (entry["left_out_before_percent"], entry["left_out_after_percent"])
-        told = "-" if errors == (None, None) else " -> ".join(map(percent, errors))
-        rows.append((entry["name"], entry["place"], short_share(entry["explained"]), told))
-    # the place has what the other columns leave of the width
-    a, _, c, d = (max(map(len, column)) for column in zip(*rows, strict=True))
-    a = min(a, _LONGEST)
-    b = _WIDTH - a - c - d - 6
-    lines = [
-        f"{i or '':>2} {shortened(one, a):<{a}} {shortened(two, b):<{b}} {three:>{c}} {four:>{d}}"
-        for i, (one, two, three, four) in enumerate(rows)
-    ]
-    title = "Causes" if called(content) == "Cause" else "Effects that help"
-    return [f"{title}; prediction errors on left-out frames without -> with each", *lines]
+        shares = (entry[key] for key in ("probability", "explained", "double_difference_share"))
+        rows.append((str(entry["rank"]), *map(short_share, shares), entry["name"]))
+    *widths, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
+    room = _WIDTH - sum(widths) - 2 * len(widths)
+    return ["  ".join([*map(str.rjust, row, widths), shortened(row[-1], room)]) for row in rows]
 
 
-def _cause_lines(entry, called):
-    lines = [f"  Probability {share(entry['probability'])}."]
-    lines += [f"  {sentence}" for sentence in entry["details"]]
+def _cause_lines(entry):
     return [
-        f"{called} {entry['rank']}: {entry['title']} ({entry['name']})",
-        *lines,
-        *(f"  - {line}" for line in sizes(entry["size"])),
+        f"Cause {entry['rank']}: {title(entry)} ({share(entry['probability'])})",
+        *(f"  {sentence}" for sentence in entry["details"]),
+        *(f"  - {line}" for line in sizes(entry)),
     ]
 
 
-def _numbered(title, texts):
-    lines = [f"{i:>3}. {words}" for i, words in enumerate(texts, 1)]
+def exposure(entry, causes):
+    """Return an exposure in words, and what it is for, causes by their ranks."""
+    ranks = {one["name"]: one["rank"] for one in causes}
+    among = {alias["name"]: one["rank"] for one in causes for alias in one["aliases"]}
+    known = [f"cause {ranks[name]}" for name in entry["separates"] if name in ranks]
+    others = [f"cause {among[n]}" for n in entry["separates"] if n in among and n not in ranks]
+    others = list(dict.fromkeys(others))
+    if not known and not others:
+        return entry["words"]
+    for_what = f"tells {listed(known)} " if known else f"tells apart what {listed(others)} may be "
+    for_what += "from what it may be " * bool(known and others)
+    take, gain = entry["words"].partition(": ")[0], entry["gain"]
+    gain = f"{gain:.0f}" if gain >= 10 else f"{gain:.1f}"
+    return f"{take}: {for_what}({gain} standard deviations)"
+
+
+def _numbered(title, texts, before=0):
+    lines = [f"{i:>3}. {words}" for i, words in enumerate(texts, before + 1)]
     return [title, *lines] if lines else []
 
 
-def _where_lines(where):
-    lines = [
-        f"{share(e['share']):>6}  {e['detail']}"
-        + ("" if e["p_value"] < _TINY else f" ({p_is(e['p_value'])})")
-        for e in where
-    ]
-    # the patterns are taken in one after the other, the places are the same gap seen again
-    title = (
-        "Where the gap of the nominal model lies, share of the excess over the noise "
-        f"(p < {_TINY:g} where no p is given). Patterns come first: each has the share that those "
-        "before it have left. Places overlap with them and with one another: the shares of both "
-        "lists together do not add up"
-    )
+def worth_reading(where):
+    """Return the first patterns, and the first places, of where a gap lies."""
+    patterns = [one for one in where if one["kind"] == "pattern"]
+    places = [one for one in where if one["kind"] != "pattern"]
+    return (patterns[: max(_WHERE - len(places), (_WHERE + 1) // 2)] + places)[:_WHERE]
+
+
+def _where_lines(title, where):
+    lines = [f"{share(one['share']):>6}  {where_words(one)}" for one in worth_reading(where)]
     return [title, *lines] if lines else []
 
 
 def _accuracy_lines(content, keys):
     """Return the accuracies of each dataset and for targets, before and after."""
     heads = "".join(f"{key:^19}" for key in keys).rstrip()
-    rows = ["Accuracy of single differences before -> after, percent, median over wavelengths"]
+    rows = ["Accuracy that calibrate states, before -> after, median over wavelengths (%)"]
     rows.append(f"  {'':<20}{heads}")
     for old, new in _pairs(content, "datasets"):
         cells = (_arrow(old[f"{key}_percent"], new[f"{key}_percent"]) for key in keys)
         rows.append(f"  {shortened(old['name'], 19):<20}{''.join(cells)}".rstrip())
     for old, new in _pairs(content, "targets"):
-        rows.append(
-            f"  target of {old['dolp_percent']:g} % by {old['column']}: s_p "
-            f"{change(old['s_p_percent'], new['s_p_percent'])} %, s_chi "
-            f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
-        )
+        rows.append(f"  on sky, {_target(old, new)}")
     return rows
 
 
 def _pairs(content, key):
-    return zip(content["accuracy_before"][key], content["accuracy_after"][key], strict=True)
+    # a model that cannot be calibrated has no targets
+    return zip(content["accuracy_before"][key], content["accuracy_after"][key], strict=False)
 
 
 def _arrow(old, new):

@@ -16,7 +16,6 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
-from astropolcal.chain import leaves
 from astropolcal.gap._bases import law_basis
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.effects.cell import CellEffect
@@ -35,7 +34,14 @@ _TOGETHER = 20
 #: Prior odds of a name against a cell of the table.
 NAMED = 5.0
 # log prior odds of dependences: what changes needs a reason
-_DEPENDENCE = {"constant": 0.0, "step": -5.0, "direction": -1.5, "move": -1.5, "time2": -1.0}
+_DEPENDENCE = {
+    "constant": 0.0,
+    "step": -5.0,
+    "direction": -1.5,
+    "move": -1.5,
+    "time2": -1.0,
+    "dataset": -2.0,
+}
 _OTHER = -0.5
 # and what changes in one of several runs only needs another
 _ALONE = -1.0
@@ -211,7 +217,7 @@ class Scan:
         found = {}
         for i, run in enumerate(probes.runs):
             if candidate.is_named:
-                alone = _named_in(probes, candidate.named, i, self.temper)
+                alone = _named_in(probes, candidate.named, i, self.temper, candidate.context)
             else:
                 cell = candidate.cell.in_run(run)
                 alone = _of_cell(probes, cell, candidate.degree, self.temper)
@@ -234,7 +240,7 @@ class Scan:
         -------
         list of Candidate
         """
-        chains, own = self.probes.model.trains, set(self.probes.model.added)
+        chains, own = self.probes.model.trains, self.probes.own
         same = [
             effect
             for effect in effects
@@ -253,7 +259,7 @@ class Scan:
         return self.candidates[0] if self.candidates else None
 
 
-def scan(model, effects=(), *, cells=True, temper=1.0):
+def scan(model, effects=(), *, cells=True, temper=1.0, without=None, slopes=None):
     """
     Return the evidence for all cells and named effects beside a fitted model.
 
@@ -267,6 +273,10 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
         Whether to ask for the cells as well.
     temper : float
         Variance of the residuals about the model with the cause, in units of the noise.
+    without : str, optional
+        Name of an effect of the model that is taken out, to first order.
+    slopes : dict, optional
+        Derivatives at the places, those of another scan of the same model.
 
     Returns
     -------
@@ -285,7 +295,7 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
     >>> bool(scan(model).best.evidence < 5)
     True
     """
-    probes = Probes(model)
+    probes = Probes(model, () if without is None else (without,), slopes)
     found, levels = [], []
     if cells:
         found = _cells(probes, temper)
@@ -297,7 +307,7 @@ def scan(model, effects=(), *, cells=True, temper=1.0):
 
 def _cells(probes, temper):
     """Return the candidate of every cell, with the better of its laws."""
-    own, best = set(probes.model.added), {}
+    own, best = probes.own, {}
     for place, kind, degree, reduced in probes.reduced(_DEGREES):
         scale = Cell(place, kind, "constant").scale
         waves = {
@@ -308,18 +318,42 @@ def _cells(probes, temper):
         stacked = [np.concatenate(each) for each in zip(*(waves[n] for n in single), strict=True)]
         parts = list(zip(single, *reduced.normal(stacked), strict=True))
         parts += [(name, *reduced.pair(w)) for name, w in waves.items() if len(w[0]) > 1]
+        bent = _bent(probes, place, kind, law_basis(probes.problem.wavelength, degree))
+        if bent is not None:
+            parts = [(n, *bent) if n == "constant" else (n, *own) for n, *own in parts]
         for name, one in _candidates(place, kind, degree, parts, scale, temper):
             if name not in best or best[name].evidence < one.evidence:
                 best[name] = one
     return [one for one in best.values() if one.name not in own]
 
 
+def _bent(probes, place, kind, law):
+    """
+    Return gram and target of a constant cell with its second derivative, None if it has none.
+
+    The derivative vanishes where a parameter is at an extremum, as half a wave is; a change shows
+    in second order then, with one sign only.
+    """
+    bend = probes.bends.get((place, kind))
+    if bend is None:
+        return None
+    gram, target = Reduced(probes, [probes.slopes[place, kind], bend], law).pair(probes.ones)
+    k = law.shape[1]
+    held = gram + np.eye(2 * k) / Cell(place, kind, "constant").scale ** 2
+    size = law @ np.linalg.solve(held, target)[k:]
+    return (gram, target) if size.mean() > 0 else None
+
+
 def _of_cell(probes, cell, degree, temper):
     """Return the candidate of one cell with a law of some degree, in a list."""
-    slopes = probes.slopes[cell.place, cell.kind]
-    reduced = Reduced(probes, slopes, law_basis(probes.problem.wavelength, degree))
-    gram, target = reduced.pair(probes.waves_of(cell))
-    parts = [(cell.dependence, gram, target)]
+    law = law_basis(probes.problem.wavelength, degree)
+    both = None
+    if cell.dependence == "constant":
+        both = _bent(probes, cell.place, cell.kind, law)
+    if both is None:
+        reduced = Reduced(probes, probes.slopes[cell.place, cell.kind], law)
+        both = reduced.pair(probes.waves_of(cell))
+    parts = [(cell.dependence, *both)]
     return [one for _, one in _candidates(cell.place, cell.kind, degree, parts, cell.scale, temper)]
 
 
@@ -379,15 +413,33 @@ def _rank(values, scale):
 
 
 def _named(probes, effects, temper, degree="default"):
-    """Return the candidates of named effects, all of them at zero in the same chains."""
+    """Return the candidates of named effects."""
     model, found = probes.model, []
-    context = replace(model.context, degree=degree)
     chains = model.trains
-    waiting = [
-        effect
-        for effect in effects
-        if effect.name not in model.added and not effect.absorbed_by and effect.applies(chains)
-    ]
+    fitting = [e for e in effects if e.name not in probes.own and not e.absorbed_by]
+    fitting = [e for e in fitting if e.name in model.added or e.applies(chains)]
+    context = None if degree == "default" else replace(model.context, degree=degree)
+    law = replace(model.context, degree=degree)
+    for effect in fitting:
+        bent = _bent_name(probes, effect, law, temper) if effect.name not in model.added else []
+        if bent:
+            found += [replace(one, context=context) for one in bent]
+            continue
+        slopes, size = _slopes_of(probes, effect, fitting, degree)
+        if size is None or not size.size:
+            continue
+        found += [
+            replace(one, context=context)
+            for one in _of_columns(probes, effect, slopes * size, temper)
+        ]
+    return found
+
+
+def _columns(model, effects, degree):
+    """Return derivatives and usual sizes of named effects, all at zero in the same chains."""
+    known = model.__dict__.setdefault("_named_columns", {})
+    waiting = [e for e in effects if (e.name, degree) not in known and e.name not in model.added]
+    context = replace(model.context, degree=degree)
     while waiting:
         edited, parameters, ties, later = list(model.held_chains), {}, {}, []
         for effect in waiting:
@@ -400,57 +452,74 @@ def _named(probes, effects, temper, degree="default"):
                 continue
             edited, parameters[effect.name] = edit.chains, edit.parameters
             ties |= {name: tie for name, tie in edit.ties.items() if tie.source in names}
-        found += _of_batch(probes, edited, parameters, ties, waiting, temper)
+        laws = {p.name: p.basis for own in parameters.values() for p in own if p.basis is not None}
+        problem = GapProblem(
+            edited, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
+        )
+        jacobian = problem.jacobian(problem.start) if problem.size else None
+        for name, own in parameters.items():
+            known[name, degree] = _columns_of(problem, jacobian, own)
         waiting = later
-    if degree == "default":
-        return found
-    return [replace(one, context=context) for one in found]
+    return {name: found for (name, law), found in known.items() if law == degree}
 
 
-def _named_in(probes, effect, i, temper):
-    """Return the candidate of a named effect in the chain of one dataset only, in a list."""
-    held = probes.model.held_chains
-    edit = effect.edit(list(held), probes.model.context)
-    chains = [*held[:i], edit.chains[i], *held[i + 1 :]]
-    there = {leaf.name for leaf in leaves(chains[i])}
-    own = [p for p in edit.parameters if p.name.partition(".")[0] in there]
-    names = {p.name for p in own}
-    ties = {
-        name: tie
-        for name, tie in edit.ties.items()
-        if tie.source in names and name.partition(".")[0] in there
-    }
-    return _of_batch(probes, chains, {effect.name: own}, ties, [effect], temper) if own else []
-
-
-def _of_batch(probes, edited, parameters, ties, effects, temper):
-    """Return the candidates of effects that are in the same chains."""
-    laws = {p.name: p.basis for own in parameters.values() for p in own if p.basis is not None}
-    model = probes.model
-    problem = GapProblem(
-        edited, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
-    )
-    if not problem.size:
+def _named_in(probes, effect, i, temper, context):
+    """Return the candidate of a named effect in one dataset only, in a list."""
+    degree = "default" if context is None else context.degree
+    slopes, size = _slopes_of(probes, effect, [effect], degree)
+    if size is None or not size.size:
         return []
-    slopes = problem.jacobian(problem.start)
-    seen = probes.tangent.T @ slopes
-    gram, target = slopes.T @ slopes - seen.T @ seen, slopes.T @ probes.residual
-    found = []
-    for effect in effects:
-        own = [p for p in parameters.get(effect.name, ()) if p.name in problem.slices]
-        if not own:
-            continue
-        parts = [(problem.slices[p.name], p.canonical_scale) for p in own]
-        rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
-        if not rows.size:
-            # a law less its constant, of no degree, is nothing
-            continue
-        size = np.concatenate([np.full(w.stop - w.start, scale) for w, scale in parts])
-        square = gram[np.ix_(rows, rows)] * size[:, None] * size
-        values, share = (part[0] for part in _spectra(square[None], (target[rows] * size)[None]))
-        if _rank(values, 1.0):
-            found.append(_with_name(effect, model, values, share, temper))
-    return found
+    rows = probes.problem.segments[i]
+    alone = np.zeros_like(slopes)
+    alone[rows] = slopes[rows]
+    return _of_columns(probes, effect, alone * size, temper)
+
+
+def _slopes_of(probes, effect, effects, degree):
+    """Return the derivatives to the parameters of an effect, and their usual sizes."""
+    model = probes.model
+    if effect.name in model.added:
+        return _columns_of(model.problem, model.jacobian, model.added[effect.name])
+    return _columns(model, effects, degree).get(effect.name, (None, None))
+
+
+def _of_columns(probes, effect, scaled, temper):
+    """Return the candidate of an effect with these derivatives, of unit size, in a list."""
+    seen = probes.tangent.T @ scaled
+    gram, target = scaled.T @ scaled - seen.T @ seen, scaled.T @ probes.residual
+    values, share = (part[0] for part in _spectra(gram[None], target[None]))
+    return [_with_name(effect, probes.model, values, share, temper)] if _rank(values, 1.0) else []
+
+
+def _columns_of(problem, jacobian, parameters):
+    """Return the derivatives to parameters, and their usual sizes."""
+    parts = [(problem.slices[p.name], p) for p in parameters if p.name in problem.slices]
+    if jacobian is None or not parts:
+        return None, np.empty(0)
+    rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
+    size = np.concatenate([np.full(w.stop - w.start, p.canonical_scale) for w, p in parts])
+    return jacobian[:, rows], size
+
+
+def _bent_name(probes, effect, context, temper):
+    """Return the candidate of an effect whose derivative vanishes, in a list."""
+    model = probes.model
+    cell = effect.cell(model.trains) if probes.bends else None
+    if cell is None or cell.dependence != "constant" or (cell.place, cell.kind) not in probes.bends:
+        return []
+    added = effect.edit(model.held_chains, context).parameters
+    # what is freed, instead of inserted, is no perturbation behind the optic
+    if len(added) != 1 or not added[0].name.startswith(effect.label):
+        return []
+    law = added[0].basis
+    law = np.eye(len(probes.problem.wavelength)) if law is None else law
+    bent = _bent(probes, cell.place, cell.kind, law)
+    if bent is None:
+        return []
+    scale = added[0].canonical_scale
+    (values,), (share,) = _spectra(*(part[None] for part in bent))
+    values = values * scale**2
+    return [_with_name(effect, model, values, share, temper)] if _rank(values, 1.0) else []
 
 
 def _with_name(effect, model, values, share, temper):

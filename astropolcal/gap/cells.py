@@ -41,6 +41,8 @@ _HARMONICS = (1, 2, 4)
 _MOST_STEPS = 64
 # functions of the frame that differ by less are the same
 _SAME = 1e-9
+# size (radian) of a retardance that is tried where its derivative vanishes
+FINITE = 0.1
 #: Usual size of a perturbation (radian, or a share) by kind, the scale of its prior.
 SIZES = {"retardance": 0.1, "rotation": 0.02, "diattenuation": 0.02, "depolarization": 0.05}
 _USUAL = 0.02
@@ -282,7 +284,7 @@ def dependences(problem, most_steps=_MOST_STEPS):
     >>> from astropolcal.gap.cells import dependences
     >>> from astropolcal.gap.model import nominal_model
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = instruments.get("charis").chain(derotator="linear")
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> model = nominal_model([chain], [simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)])
     >>> list(dependences(model.problem, 0))[:4]
@@ -297,16 +299,19 @@ def dependences(problem, most_steps=_MOST_STEPS):
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
     names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
-    runs = [d.observations.name for d in problem.datasets] if count_runs(problem) > 1 else []
+    several = [d.observations.name for d in problem.datasets]
+    runs = several if count_runs(problem) > 1 else []
     steps = [f"step:{n}" for n in _steps(problem, most_steps // max(len(runs), 1))]
     # a frame of one run has nothing to do with that of the same number in another
     alone = [*names[1:], *steps]
-    names += [f"dataset:{run}" for run in runs] or steps
+    if len(several) > 1:
+        names += [f"dataset:{name}" for name in several]
+    names += [] if runs else steps
     names += [f"{name}/dataset:{run}" for run in runs for name in alone]
     found = {}
     for name in names:
         waves = [_waves(Dependence(name), dataset) for dataset in problem.datasets]
-        if name == "constant" or any(np.ptp(w) > _SAME for w in waves) or name[:7] == "dataset":
+        if name == "constant" or np.ptp(np.concatenate(waves, axis=1), axis=1).max() > _SAME:
             found[name] = waves
     return found
 
@@ -372,8 +377,12 @@ class Probes:
     ----------
     model : Model
         The fitted model.
-    tangent : `~numpy.ndarray`, optional
-        Orthonormal basis of what the model can do already, (n_rows, rank), if known.
+    without : collection of str
+        Names of effects of the model that are taken out, to first order.
+    slopes : dict, optional
+        Derivatives at the places, if they are known.
+    most_steps : int
+        Steps are looked for at so many frames.
 
     Examples
     --------
@@ -390,18 +399,19 @@ class Probes:
     6
     """
 
-    def __init__(self, model, tangent=None, most_steps=_MOST_STEPS):
-        self.model, problem = model, model.problem
-        self.problem = problem
-        coefficients = model.fit.coefficients
-        self.tangent = problem.tangent(coefficients) if tangent is None else tangent
-        residual = problem.residual(coefficients)
-        self.residual = residual - self.tangent @ (self.tangent.T @ residual)
+    def __init__(self, model, without=(), slopes=None, most_steps=_MOST_STEPS):
+        self.model, self.problem = model, model.problem
+        problem, linear = model.problem, model.without(without)
+        self.tangent, self.residual = linear.tangent, linear.residual
+        #: Names of the effects that are in the model.
+        self.own = set(model.added) - set(without)
         #: A function of the frame that is one everywhere, of each dataset.
         self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
         self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
-        self.slopes = self._at_places()
+        #: Second derivatives over the size that is tried, where they outdo the first ones.
+        self.bends = {}
+        self.slopes = self._at_places() if slopes is None else slopes
         parts = list(zip(problem.channels, problem.segments, strict=True))
         #: Tangent and lamp with the frames first, (F, rows of a frame, rank), one a dataset.
         self.by_frame = [_frames_first(self.tangent[rows], c.shape) for c, rows in parts]
@@ -477,12 +487,31 @@ class Probes:
                         continue
                     slope = np.stack([_bilinear(*part[j], generator) for part in both])
                     found.setdefault((place, kind), {})[i] = slope * channel.valid
+                    if kind.startswith("retardance") and place.startswith("in:"):
+                        # of exp(x G), per size: at a size of FINITE it is half of this
+                        bend = np.stack([_bilinear(*p[j], generator @ generator) for p in both])
+                        bend = FINITE / 2 * bend * channel.valid
+                        self.bends.setdefault((place, kind), {})[i] = bend
             right, left = sweep.fluxes
             gain = np.stack([(one * right - other * left) for one, other in channel.slopes(sweep)])
             found.setdefault(("detector", "gain"), {})[i] = gain * channel.valid
             for kind, slope in self._at_detector(i, channel, sweep):
                 found.setdefault(("detector", kind), {})[i] = slope * channel.valid
+        self.bends = {
+            key: bend
+            for key, bend in self.bends.items()
+            if self._left(bend) > max(self._left(found[key]), 1.0 / FINITE)
+        }
         return found
+
+    def _left(self, slopes):
+        """Return how much of a constant perturbation's derivative the model cannot take up."""
+        white = [
+            channel.whiten(slopes.get(i, np.zeros(channel.shape))).ravel()
+            for i, channel in enumerate(self.problem.channels)
+        ]
+        column = np.concatenate(white)
+        return float(np.linalg.norm(column - self.tangent @ (self.tangent.T @ column)))
 
     def _at_detector(self, i, channel, sweep):
         """Yield what background, nonlinearity, afterglow and crosstalk do to the channels."""
@@ -494,7 +523,8 @@ class Probes:
         # light that is added counts as much as the source gives in the frame, in these units
         added = usual * (right + left) / np.maximum(fluxes.sum(axis=0), 1e-9 * usual)
         order = np.argsort(channel.sequence, kind="stable")
-        before = np.zeros_like(fluxes)
+        # the first frame has none before it, and its own counts, as in a chain
+        before = fluxes.copy()
         before[..., order[1:]] = fluxes[..., order[:-1]]
         afterglow = np.divide(before, fluxes, out=np.zeros_like(fluxes), where=fluxes > 0)
         half = (left - right) / 2
@@ -538,7 +568,8 @@ class Probes:
 
 def _frames_first(basis, shape):
     """Return columns (..., F) x q of a table as (F, rows of a frame, q)."""
-    return np.ascontiguousarray(basis.reshape(-1, shape[-1], basis.shape[1]).swapaxes(0, 1))
+    rows = int(np.prod(shape[:-1]))
+    return np.ascontiguousarray(basis.reshape(rows, shape[-1], basis.shape[1]).swapaxes(0, 1))
 
 
 _PROBE = "gap_probe_"
@@ -565,21 +596,22 @@ class Reduced:
     probes : Probes
         Derivatives.
     slopes : dict of int to `~numpy.ndarray`
-        Of each dataset (2, W, F).
+        Of each dataset (2, W, F), or several in a list.
     law : `~numpy.ndarray`
         Basis of the law in wavelength, shape (W, k).
     """
 
     def __init__(self, probes, slopes, law):
-        problem, k = probes.problem, law.shape[1]
+        problem = probes.problem
+        slopes = slopes if isinstance(slopes, (list, tuple)) else [slopes]
+        k = law.shape[1] * len(slopes)
         self.gram, self.target, self.seen, self.lamps = [], [], [], []
         for i, (dataset, channel, rows) in enumerate(
             zip(problem.datasets, problem.channels, problem.segments, strict=True)
         ):
-            slope = slopes.get(i)
-            if slope is None:
-                slope = np.zeros(channel.shape)
-            columns = law[dataset.bins].T[:, None, :, None] * slope
+            nothing = np.zeros(channel.shape)
+            own = law[dataset.bins].T[:, None, :, None]
+            columns = np.concatenate([own * slope.get(i, nothing) for slope in slopes])
             white = channel.whiten_frames(columns)
             n_frames = channel.shape[2]
             # frames last, then a product of matrices a frame

@@ -19,9 +19,10 @@ from astropolcal.gap.effects import EFFECTS, adapted, get_effect
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.frames import suspect_frames, without_frames
 from astropolcal.gap.model import Model, nominal_model
+from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, select
-from astropolcal.gap.shrinkage import frame_groups
+from astropolcal.gap.shrinkage import HeldOut, frame_groups
 from astropolcal.words import counted
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]
@@ -123,6 +124,8 @@ class Diagnosis:
         Frames that are not what the table says.
     settings : dict
         How it was asked.
+    nested : HeldOut or None
+        Errors on groups of frames that took no part in the choice of the causes.
 
     Examples
     --------
@@ -149,6 +152,7 @@ class Diagnosis:
     seconds: float = 0.0
     frames: list = field(default_factory=list)
     settings: dict = field(default_factory=dict)
+    nested: object = None
 
     @property
     def noise_floor_percent(self):
@@ -197,6 +201,7 @@ def diagnose(
     cells=True,
     changes=False,
     cross_validate=True,
+    nested=False,
     progress=None,
 ):
     """
@@ -220,6 +225,10 @@ def diagnose(
     cross_validate : bool
         Whether to check on left-out frames; without it the gaps are those of
         the fit itself.
+    nested : bool
+        Whether to choose the causes anew without each group of frames, and predict that with
+        them: the one measure of the shrinkage in which the choice has no part. It takes as many
+        times the time as there are groups.
     progress : callable, optional
         Called with a line on what is done next.
 
@@ -276,7 +285,40 @@ def diagnose(
     selection = select(base, smooth, groups, say, cells=cells, changes=changes)
     found = _conclude(nominal, base, exchanged, selection, frames, started)
     found.settings["changes"] = changes
+    if nested and groups is not None:
+        found.nested = _nested(base, smooth, groups, say, cells)
+        found.seconds = time.perf_counter() - started
     return found
+
+
+def _nested(base, smooth, groups, say, cells):
+    """Return the errors on frames of groups that took no part in the choice of the causes."""
+    labels, numbers = groups
+    squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
+    problem = base.problem
+    for k, label in enumerate(labels):
+        say(f"without {label}, {k + 1} of {len(labels)}")
+        seen = [number == k for number in numbers]
+        kept = [
+            o.with_mask(here, f"left out: {label}")
+            for o, here in zip(base.observations, seen, strict=True)
+        ]
+        fold = Model(GapProblem(base.chains, kept), base.fit, base.added)
+        fold.problem.settle_noise(fold.problem.start)
+        fold = Model(fold.problem, fold.problem.fit(base.fit.coefficients), base.added)
+        chosen = select(fold, smooth, None, lambda line: None, cells=cells)
+        recipes = [(group.best.effect, group.best.context) for group in chosen.groups]
+        whole = base.with_effects(recipes, like=chosen.model, steps=0)
+        start = chosen.model.start_of(whole.problem)
+        gaps = whole.problem.differences(start.coefficients)
+        for channel, gap, here in zip(problem.channels, gaps, seen, strict=True):
+            mine = channel.valid & here
+            squares[k] += np.sum(gap[0][mine] ** 2)
+            whitened[k] += np.sum(channel.whiten(gap)[:, mine] ** 2) / 2
+            counts[k] += mine.sum()
+    keep = counts > 0
+    labels = [label for label, there in zip(labels, keep, strict=True) if there]
+    return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
 
 
 def _refitted(model, observations):
@@ -309,12 +351,9 @@ def _conclude(nominal, base, exchanged, selection, frames, started):
     # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
     causes = [_exchanged(nominal, base, exchanged, total)] if exchanged else []
-    before = base
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
-        explained = (before.fit.chi2 - group.model.fit.chi2) / total
-        causes.append(_cause(group, improved, explained, *errors[i : i + 2]))
-        before = group.model
+        causes.append(_cause(group, improved, group.lowered / total, *errors[i : i + 2]))
     left_p = improved.p_value
     return Diagnosis(
         verdict=_verdict(causes, nominal, left_p),

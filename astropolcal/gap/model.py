@@ -13,11 +13,12 @@ from scipy import stats
 from astropolcal.calibration import calibrate
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
+from astropolcal.gap.cells import FINITE
 from astropolcal.gap.effects import Context
-from astropolcal.gap.problem import Fit, GapProblem, as_mounted
+from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
-from astropolcal.optics import Perturbation
+from astropolcal.optics import LinearRetarder, Perturbation
 
 __all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
 
@@ -32,6 +33,8 @@ _ABSORBED = 1e-6
 # which the data may leave a size there
 _AT_LIMIT = 1e-6
 _MOST_PRESSED = 0.1
+# a second difference above this share of the first one is tried at finite size
+_BENT = 0.5
 
 
 @dataclass
@@ -178,7 +181,9 @@ class Model:
         Model
         """
         problem, parameters = self.edited(effect, context)
-        fit = problem.fit(problem.start, **settings)
+        starts = _off_extremum(problem, problem.start, parameters)
+        fits = [problem.fit(start, **settings) for start in starts]
+        fit = min(fits, key=lambda one: one.chi2)
         return Model(problem, fit, self.added | {effect.name: parameters})
 
     def with_effects(self, effects, like=None, **settings):
@@ -211,7 +216,56 @@ class Model:
             model = Model(problem, Fit(problem.start, np.inf, False), added)
         if like is not None:
             model = Model(model.problem, like.start_of(model.problem), model.added)
-        return self if model is self else model.polished(**settings)
+        return self if model is self else model._off_extrema().polished(**settings)
+
+    def _off_extrema(self):
+        """Return the model with the effects moved whose derivative vanishes where they start."""
+        start = self.fit.coefficients
+        for parameters in self.added.values():
+            # a finite size may be too large, but a fit gets down from there
+            others = _off_extremum(self.problem, start, parameters)[1:] or [start]
+            start = min(others, key=lambda q: np.sum(self.problem.residual(q) ** 2))
+        moved = start is not self.fit.coefficients
+        return Model(self.problem, Fit(start, np.inf, False), self.added) if moved else self
+
+    def without(self, names):
+        """
+        Return the model without some of its effects, to first order.
+
+        Parameters
+        ----------
+        names : collection of str
+            Names of added effects.
+
+        Returns
+        -------
+        Linear
+        """
+        problem, q = self.problem, self.fit.coefficients
+        kept, jacobian = np.ones(problem.size, dtype=bool), self.jacobian
+        residual = self.residual
+        absent = problem.coefficients(problem._absent())
+        for parameter in (p for name in names for p in self.added[name]):
+            where = problem.slices.get(parameter.name)
+            if where is not None:
+                kept[where] = False
+                residual = residual + jacobian[:, where] @ (q - absent)[where]
+        # what is known beforehand is one more row of data for each of these parameters
+        known = np.flatnonzero(kept & (problem.tight > 0))
+        table, target = jacobian, residual
+        if known.size:
+            rows = np.zeros((known.size, problem.size))
+            rows[np.arange(known.size), known] = problem.tight[known]
+            table = np.concatenate([jacobian, rows])
+            target = np.concatenate([residual, -(q - problem.centre)[known] * problem.tight[known]])
+        tangent = problem.tangent(q, table, kept)
+        left = target - tangent @ (tangent.T @ target)
+        return Linear(self, tangent[: problem.n_rows], left[: problem.n_rows])
+
+    @cached_property
+    def jacobian(self):
+        """Derivative of the rows to the coefficients, (n_rows, n_coefficients)."""
+        return self.problem.jacobian(self.fit.coefficients)
 
     def start_of(self, problem):
         """Return a start for another problem: this solution where the two share parameters."""
@@ -304,6 +358,44 @@ class Model:
         return {name for name in self.added if not self.is_physical(name)}
 
 
+@dataclass
+class Linear:
+    """
+    A fitted model in which effects may be absent, to first order.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    tangent : `~numpy.ndarray`
+        Orthonormal basis of what it can do without these effects, (n_rows, rank).
+    residual : `~numpy.ndarray`
+        What it leaves then, whitened, (n_rows,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.gap.model import Linear
+    >>> Linear(None, np.zeros((2, 0)), np.array([3.0, 4.0])).chi2
+    25.0
+    """
+
+    model: Model
+    tangent: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def chi2(self):
+        """Sum of squares of the residuals."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def mean_square(self):
+        """Mean square of the residuals: 1 where noise is all that is left."""
+        freedom = self.model.problem.n_data - self.tangent.shape[1]
+        return self.chi2 / max(freedom, 1)
+
+
 def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):
     """
     Fit the nominal chains in both channels.
@@ -366,6 +458,37 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
     if not (found.converged and np.isfinite(found.chi2)):
         raise _no_convergence()
     return Model(problem, found)
+
+
+def _off_extremum(problem, start, parameters):
+    """
+    Return starts of a fit, of both signs where the derivative of a retardance vanishes.
+
+    At half a wave it does, and a fit from there would stay.
+    """
+    found = [start]
+    optics = {leaf.name: leaf for d in problem.datasets for leaf in d.propagator.leaves}
+    for parameter in parameters:
+        where = problem.slices.get(parameter.name)
+        if where is None or np.any(start[where]) or not _retards(optics, parameter.name):
+            continue
+        vector = problem.vector(start)
+        vector[problem.free.by_name[parameter.name].slice] = FINITE
+        step = problem.coefficients(vector) - start
+        ends = [start + sign * step for sign in (1, -1)]
+        there, up, down = (problem.residual(q) for q in (start, *ends))
+        bend = np.linalg.norm(up + down - 2 * there)
+        if bend > max(1.0, _BENT * np.linalg.norm(up - down)):
+            found += ends
+    return found
+
+
+def _retards(optics, name):
+    """Return whether a parameter is a constant retardance that was inserted."""
+    optic = optics.get(name.partition(".")[0])
+    if isinstance(optic, Perturbation):
+        return optic.kind.startswith("retardance") and optic.dependence == "constant"
+    return isinstance(optic, LinearRetarder) and name.endswith(".retardance")
 
 
 def _lowest(problem, chains):
@@ -431,7 +554,6 @@ def nominal_calibration(chains, observations):
     >>> nominal_calibration([chain], [simulate(chain, charis.wavelength, frames, seed=1)]).converged
     True
     """
-    chains = [as_mounted(chain) for chain in chains]
     measurement = Measurement(chains, observations)
     if not measurement.free.size:
         return _AsGiven(measurement)

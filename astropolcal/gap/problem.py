@@ -16,7 +16,6 @@ from astropolcal.chain import Train, leaves
 from astropolcal.gap._bases import law_basis, orthonormal
 from astropolcal.gap._noise import expected_fluxes, noise, settings
 from astropolcal.gap.channels import Channels
-from astropolcal.instruments.telescope import as_exact
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
 from astropolcal.optics import StarSource
@@ -42,43 +41,28 @@ _AT_WALL = 1e-7
 _GUESSES, _ROUNDING = 10, 1e-13
 
 
-def as_mounted(chain):
-    """
-    Return a chain in which what is mounted as well as it can be stands at its nominal angle.
-
-    Where a model lacks something, the fit turns a mirror to make up for it; a diagnosis asks for
-    that angle as for any other cause.
-
-    Parameters
-    ----------
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        The chain; it is not changed.
-
-    Returns
-    -------
-    Optic or `~astropy.modeling.CompoundModel`
-        The same, or a copy.
-    """
-    if not any(_is_mounted(leaf) for leaf in leaves(chain)):
-        return chain
-    chain = chain.copy()
-    for leaf in leaves(chain):
-        if _is_mounted(leaf):
-            leaf.theta.value = float(leaf.theta.prior.mean())
-            leaf.theta.fixed, leaf.theta.prior = True, None
-    return chain
-
-
-def _is_mounted(leaf):
-    return leaf.theta.prior is not None and leaf.mount is None and not isinstance(leaf, StarSource)
-
-
 def _exact(chain):
-    """Return the optics of a chain, copies of them where what is known beforehand is held."""
-    chain = as_mounted(chain)
+    """Return the optics of a chain, copies where a standard star is held as it is known."""
     found = leaves(chain)
-    known = any(leaf.theta.prior is not None or isinstance(leaf, StarSource) for leaf in found)
-    return Train(leaves(as_exact(chain.copy()))) if known else Train(found)
+    if not any(isinstance(leaf, StarSource) for leaf in found):
+        return Train(found)
+    found = [leaf.copy() if isinstance(leaf, StarSource) else leaf for leaf in found]
+    for leaf in found:
+        for key in leaf.param_names if isinstance(leaf, StarSource) else ():
+            parameter = getattr(leaf, key)
+            if parameter.prior is not None:
+                parameter.fixed, parameter.prior = True, None
+    return Train(found)
+
+
+def _mounted(chains):
+    """Return mean and standard deviation, radian, of the angles of what is mounted with care."""
+    found = {}
+    for leaf in (leaf for chain in chains for leaf in chain):
+        prior = leaf.theta.prior
+        if prior is not None and leaf.mount is None and not leaf.theta.fixed:
+            found[f"{leaf.name}.theta"] = np.deg2rad(prior.mean()), np.deg2rad(prior.std())
+    return found
 
 
 class GapProblem:
@@ -142,6 +126,9 @@ class GapProblem:
         self.neutral, self.limits = dict(neutral or {}), dict(limits or {})
         # what the model holds is held; an effect is what frees it
         chains, observations = [_exact(chain) for chain in chains], list(observations)
+        for name, (middle, spread) in _mounted(chains).items():
+            self.neutral.setdefault(name, middle)
+            self.priors.setdefault(name, spread)
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
         #: Functions of the frame on which a cause may depend, once they are known.
         self.waves = None if like is None else like.waves
@@ -399,18 +386,21 @@ class GapProblem:
 
     # ---- what follows from a fit --------------------------------------------------------
 
-    def tangent(self, coefficients):
+    def tangent(self, coefficients, jacobian=None, kept=True):
         """
         Return an orthonormal basis of the derivatives, shape (n_rows, rank).
 
-        A coefficient, or a value of a law, at its bound cannot take anything up and is left out.
+        A coefficient, or a value of a law, at its bound cannot take anything up and is left out,
+        as are those that are not kept.
         """
-        return orthonormal(self.open_slopes(coefficients))
+        return orthonormal(self.open_slopes(coefficients, jacobian, kept))
 
-    def open_slopes(self, coefficients):
+    def open_slopes(self, coefficients, jacobian=None, kept=True):
         """Return the derivatives in the directions that no bound closes, shape (n_rows, k)."""
         inside = (coefficients > self.low + _AT_BOUND) & (coefficients < self.high - _AT_BOUND)
-        slopes, (rows, ends) = self.jacobian(coefficients)[:, inside], self._walls
+        inside &= kept
+        jacobian = self.jacobian(coefficients) if jacobian is None else jacobian
+        slopes, (rows, ends) = jacobian[:, inside], self._walls
         held = rows[rows @ coefficients > ends - _AT_WALL][:, inside]
         return slopes @ null_space(held) if len(held) else slopes
 

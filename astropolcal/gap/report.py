@@ -20,9 +20,12 @@ from astropolcal.files import atomic_path, printable
 from astropolcal.gap import _numbers, _words, runs
 from astropolcal.gap.planning import few, plan
 from astropolcal.gap.residuals import locate
+from astropolcal.gap.selection import REMAINDER
 
 __all__ = ["causes_table", "summary", "to_dict", "write_html"]
 
+#: Caption of the figure that stands with the causes, see `~astropolcal.plotting.plot_cause_map`.
+MAP = "Where in the chain the causes are, and of which kind"
 _DPI = 130
 # pixels of a page to an inch
 _CSS = 96
@@ -80,6 +83,7 @@ def to_dict(diagnosis):
         cause["details"] = _words.details(cause, ranks)
         cause["words"] = _words.cause(cause, ranks)
     changed = runs.changes(diagnosis, causes)
+    noisy = diagnosis.remainder_p_value > REMAINDER
     content = {
         "verdict": diagnosis.verdict,
         "nominal": _nominal(diagnosis.nominal),
@@ -89,15 +93,17 @@ def to_dict(diagnosis):
         "exchanged": exchanged,
         "cross_validated": crossed,
         "noise_floor_percent": diagnosis.noise_floor_percent,
-        "gap_before_percent": before["rms_percent"],
-        "gap_after_percent": after["rms_percent"],
-        "shrinkage_percent": _shrinkage(diagnosis, before, after),
+        "gap_before_percent": diagnosis.gap_before_percent,
+        "gap_after_percent": diagnosis.gap_after_percent,
+        "shrinkage_percent": _shrinkage(diagnosis),
+        "double_difference": _double(fitted, before, after),
         "gap_p_value": diagnosis.gap_p_value,
         "remainder_p_value": diagnosis.remainder_p_value,
         "unlisted_probability": diagnosis.settings.get("unlisted"),
         "frames": [fault.to_dict() for fault in diagnosis.frames],
         "where": _where(diagnosis.nominal),
-        "where_left": [] if same else _where(diagnosis.improved),
+        "where_left": [] if same or noisy else _where(diagnosis.improved),
+        "left_share": 0.0 if noisy else _left_share(diagnosis),
         "causes": causes,
         "changes": changed,
         "scores": [_score(one) for one in diagnosis.scan.candidates[:_MOST_SCORES]],
@@ -119,9 +125,17 @@ def _nominal(model):
     return f"{'; '.join(chains)}. Free: {free}"
 
 
-def _shrinkage(diagnosis, before, after):
+def _double(fitted, before, after):
+    """Return gap and noise of the double differences, None where there are none."""
+    gaps = {"before_percent": before["rms_percent"], "after_percent": after["rms_percent"]}
+    if fitted.doubles is None or None in gaps.values():
+        return None
+    return gaps | {"noise_percent": fitted.doubles.noise_percent}
+
+
+def _shrinkage(diagnosis):
     """Return by how much the mean square of the gap is lower, with its 68 % interval."""
-    value = 100 * (1 - (after["rms_percent"] / before["rms_percent"]) ** 2)
+    value = 100 * (1 - (diagnosis.gap_after_percent / diagnosis.gap_before_percent) ** 2)
     found = {"value": value, "low": None, "high": None}
     smooth = all(cause.effect.kind != "discrete" for cause in diagnosis.causes)
     if len(diagnosis.held_out) > 1 and smooth:
@@ -150,6 +164,7 @@ def _cause(diagnosis, i, fitted):
         "aliases": [_alias(one, chance) for one, chance in cause.aliases],
         "p_value": cause.p_value,
         "explained": cause.explained,
+        "double_difference_share": fitted.double_share(cause.name),
         "evidence": cause.evidence,
         "left_out_before_percent": before.percent if before else None,
         "left_out_after_percent": after.percent if after else None,
@@ -188,8 +203,16 @@ def _score(one):
 
 
 def _where(model):
-    """Return where the gap of a model lies."""
-    return list(locate(model).entries)
+    """Return where the gap of a model lies: what it follows, then where it is large."""
+    found = locate(model)
+    kinds = map(str, found.told["kind"])
+    return [e | {"kind": kind} for e, kind in zip(found.entries, kinds, strict=True)]
+
+
+def _left_share(diagnosis):
+    """Return the share of the excess over the noise that the improved model leaves."""
+    old, new = (m.fit.chi2 - m.problem.n_data for m in (diagnosis.nominal, diagnosis.improved))
+    return float(np.clip(new / old, 0, 1)) if old > 0 else 1.0
 
 
 def _next(diagnosis):
@@ -242,16 +265,9 @@ def causes_table(diagnosis):
 
     Examples
     --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap import diagnose
+    >>> from types import SimpleNamespace
     >>> from astropolcal.gap.report import causes_table
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> wavelength = [1.2, 1.3, 1.45, 1.6, 1.9, 2.2] * u.um
-    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=wavelength)
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, wavelength, frames, seed=1)
-    >>> len(causes_table(diagnose(chain, data)))
+    >>> len(causes_table(SimpleNamespace(causes=[])))
     0
     """
     causes = diagnosis.causes
@@ -277,7 +293,7 @@ def causes_table(diagnosis):
 # ---- for the terminal ------------------------------------------------------------------------
 
 
-def summary(diagnosis, content=None):
+def summary(diagnosis, content=None, written=()):
     """
     Return a diagnosis as text of at most 80 columns.
 
@@ -287,13 +303,15 @@ def summary(diagnosis, content=None):
         The diagnosis.
     content : dict, optional
         What `to_dict` returned for it, if it is known already.
+    written : sequence of path-like
+        Files that were written.
 
     Returns
     -------
     str
-        Three sentences, and below them a table of the causes, each with its
-        sizes, what to observe next, where the gap lies, and the accuracies before
-        and after.
+        The summary: a few sentences, a table of the causes, what to observe next, and
+        what was written. Below it each cause with its sizes, where the gap lies, and the
+        accuracies before and after.
 
     Examples
     --------
@@ -307,10 +325,10 @@ def summary(diagnosis, content=None):
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> data = simulate(chain, wavelength, frames, seed=1)
     >>> print(summary(diagnose(chain, data)).splitlines()[0])
-    The model agrees with the measurements: it predicts the single differences of
+    The model agrees with the measurements: it lacks nothing that these data show.
     """
     content = to_dict(diagnosis) if content is None else content
-    return _words.text(content, _numbers.ACCURACIES, _about_frames(diagnosis))
+    return _words.text(content, _numbers.ACCURACIES, _about_frames(diagnosis), written)
 
 
 # ---- a page ------------------------------------------------------------------------------------
@@ -354,6 +372,8 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None, content=None
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    from astropolcal.version import version
+
     environment = Environment(
         loader=PackageLoader("astropolcal.gap", "templates"),
         autoescape=True,
@@ -361,18 +381,23 @@ def write_html(diagnosis, path, *, figures=None, size_figures=None, content=None
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for name in ("number", "percent", "p", "short_share", "in_title", "shortened"):
-        environment.filters[name] = getattr(_words, name)
+    names = ("number", "percent", "p", "short_share", "in_title", "shortened", "worth_reading")
+    environment.filters |= {name: getattr(_words, name) for name in names}
+    environment.filters |= {"title_of": _words.title, "zip": zip}
+    images = _images(figures)
     page = environment.get_template("report.html").render(
         content=to_dict(diagnosis) if content is None else content,
         datasets=_about(diagnosis),
         frames=_about_frames(diagnosis),
-        figures=_images(figures),
+        figures={name: image for name, image in images.items() if name != MAP},
+        map_figure={MAP: images[MAP]} if MAP in images else {},
         size_figures=_images(size_figures),
         sizes=_words.sizes,
         is_determined=_words.is_determined,
+        exposure=_words.exposure,
+        where_words=_words.where_words,
         accuracies=_numbers.ACCURACIES,
-        version=_version(),
+        version=version,
     )
     with atomic_path(path, error=GapError) as temporary:
         temporary.write_text(printable(page), encoding="utf-8")
@@ -439,9 +464,3 @@ def _image(figure):
     width, height = (round(_CSS * inches) for inches in figure.get_size_inches())
     source = "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
     return {"source": source, "width": width, "height": height}
-
-
-def _version():
-    from astropolcal.version import version
-
-    return version

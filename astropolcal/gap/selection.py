@@ -16,7 +16,7 @@ import numpy as np
 
 from astropolcal.gap.attribution import scan
 from astropolcal.gap.cells import count_runs
-from astropolcal.gap.shrinkage import foreseen
+from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = ["Group", "Selection", "select"]
 
@@ -33,6 +33,8 @@ REMAINDER = 1e-4
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
 ENOUGH = 9.0
 _MOST = 8
+# of several runs each by itself, and all together for each of them
+_MOST_ALONE, _MOST_TOGETHER = 6, 10
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
 _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
@@ -42,7 +44,7 @@ _SAME = 1e-6
 _ALIAS, _MOST_ALIASES = np.exp(-7.0), 40
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
 # needs
-_UNLISTED = (0.0, 0.02, 0.06, 0.4, 0.7, 0.85, 0.9, 0.92, 0.95)
+_UNLISTED = (0.0, 0.02, 0.08, 0.55, 0.75, 0.88, 0.92, 0.95, 0.97)
 # above this mean square the residuals are no noise
 _STRUCTURED = 1.5
 # share of the gap that an answer may leave before it is doubtful
@@ -60,8 +62,8 @@ class Group:
         Candidates and their probabilities among each other, best first.
     probability : float
         That one of the members is a cause of the gap.
-    model : Model
-        The model with this cause and all chosen before it.
+    lowered : float
+        By how much chi-square is lower with it than with those chosen before it.
     stability : float
         Share of the halves of the wavelengths and of left-out angles in which it is found.
     by_dataset : dict of str to float
@@ -77,8 +79,8 @@ class Group:
 
     members: list
     probability: float
-    model: object = None
-    stability: float = 1.0
+    lowered: float = 0.0
+    stability: float | None = None
     by_dataset: dict = field(default_factory=dict)
 
     @property
@@ -173,11 +175,12 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     []
     """
     first = _scanned(base, library, cells)
-    best, left = _search(_State(base), library, first, say, cells, _MOST)
     runs = count_runs(base.problem)
-    if runs > 1 and cells and best.model.p_value < REMAINDER:
-        best, left = _better_apart(base, best, first, say), None
-        best, left = _search(best, library, first, say, cells, _MOST * runs)
+    most = _MOST if runs < 2 or not cells else _MOST // 2
+    best, left = _search(_State(base), library, first, say, cells, most)
+    if runs > 1 and len(best.chosen) >= most and best.model.p_value < REMAINDER:
+        best = _apart(base, first, say)
+        best, left = _search(best, [], first, say, cells, _MOST_TOGETHER * runs)
     if not best.chosen:
         return Selection([], base, first, first, 0.0, [_errors(base, groups)])
     best, scans = _exchanged(base, best, library, first, say, cells)
@@ -186,10 +189,10 @@ def select(base, library, groups, say, *, cells=True, changes=False):
         shared = [one for one in best.chosen if first.probes.run_of(one.cell) is None]
         own = [one for one in best.chosen if one not in shared]
         best = replace(best, chosen=[*own, *shared])
-    best, models, history = _checked(base, best, groups, say)
-    left = left if best.model is models[-1] and left is not None else None
+    best, steps, history = _checked(base, best, groups, say)
     unlisted = _unlisted(base, best)
-    found = _grouped(best, models, scans, unlisted)
+    stable = stability(best.model, groups, max(1.0, best.model.mean_square))
+    found = _grouped(best, steps, scans, unlisted, stable)
     return Selection(found, best.model, first, left, unlisted, history)
 
 
@@ -201,22 +204,32 @@ def _checked(base, best, groups, say):
     """
     Return the set without causes that left-out frames speak against.
 
-    With it, the models with one cause more each, and their errors on left-out frames.
+    With it, what is left with one cause more each, and the errors on left-out frames.
     """
     while True:
         say("left-out frames")
-        models = _growing(base, best)
-        history = [_errors(model, groups) for model in (base, *models)]
-        worse = [
-            i
-            for i, (before, after) in enumerate(pairwise(history))
-            if before is not None and _worsens(after, before, models[i].mean_square)
-        ]
+        steps = [base.without(()), *_growing(best)]
+        history = [_errors(step, groups) for step in steps]
+        worse = _worse(best, steps, history, groups)
         if not worse:
-            return best, models, history
-        chosen = [one for i, one in enumerate(best.chosen) if i != worse[-1]]
+            return best, steps, history
+        chosen = [one for i, one in enumerate(best.chosen) if i not in worse]
         model = base.with_effects([o.recipe for o in chosen], like=best.model)
-        best = _State(model, chosen, best.evidence - best.chosen[worse[-1]].evidence)
+        best = _State(model, chosen, best.evidence - sum(best.chosen[i].evidence for i in worse))
+
+
+def _worse(best, steps, history, groups):
+    """Return the numbers of the causes that left-out frames speak against."""
+    if groups is None:
+        return []
+    if len(best.chosen) <= _MOST:
+        pairs = zip(pairwise(history), steps[1:], strict=True)
+        found = [i for i, ((a, b), step) in enumerate(pairs) if _worsens(b, a, step.mean_square)]
+        return found[-1:]
+    # of many, the first may need the last: each is taken out of the whole set
+    scatter, whole = best.model.mean_square, history[-1]
+    without = (foreseen(best.model.without([one.name]), groups) for one in best.chosen)
+    return [i for i, other in enumerate(without) if _worsens(whole, other, scatter)]
 
 
 def _worsens(after, before, scatter):
@@ -226,12 +239,10 @@ def _worsens(after, before, scatter):
     return better < (-2.0 if scatter < _STRUCTURED else 0.0)
 
 
-def _growing(base, best):
-    """Return the models with the first cause, the first two, and so on."""
-    recipes = [one.recipe for one in best.chosen]
-    ends = range(1, len(recipes))
-    models = [base.with_effects(recipes[:i], like=best.model, **_QUICK) for i in ends]
-    return [*models, best.model] if recipes else []
+def _growing(best):
+    """Yield the model with the first cause, the first two, and so on, to first order."""
+    names = [one.name for one in best.chosen]
+    return [best.model.without(names[i + 1 :]) for i in range(len(names))]
 
 
 def _scanned(model, library, cells):
@@ -263,20 +274,19 @@ def _distinct(candidates, most):
     return found
 
 
-def _better_apart(base, best, first, say):
-    """Return the set of the causes that each run needs by itself, if it is better than another."""
+def _apart(base, first, say):
+    """Return the set of the causes that each run needs by itself."""
     chosen = []
     for i, name in enumerate(first.probes.runs):
         say(f"{name} by itself")
         alone = base.of_dataset(i)
-        state, _ = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST)
+        state, _ = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST_ALONE)
         chosen += [_in_run(one, name, first.probes) for one in state.chosen]
     say("all runs together")
     model = base.with_effects([one.recipe for one in chosen], **_QUICK)
-    temper = max(1.0, min(model.mean_square, best.model.mean_square))
-    gained = 0.5 * (best.model.fit.chi2 - model.fit.chi2) / temper
-    cost = sum(one.cost(temper) for one in chosen) - sum(one.cost(temper) for one in best.chosen)
-    return _State(model, chosen, best.evidence + gained - cost) if gained > cost else best
+    temper = max(1.0, model.mean_square)
+    gained = 0.5 * (base.fit.chi2 - model.fit.chi2) / temper
+    return _State(model, chosen, gained - sum(one.cost(temper) for one in chosen))
 
 
 def _in_run(candidate, name, probes):
@@ -349,7 +359,7 @@ def _exchanged(base, best, library, first, say, cells):
     What was chosen first was chosen while the others were missing: its law in wavelength may be too
     stiff, another cause may do better, and a name may do as well as the cell that it is.
     """
-    scans = {}
+    scans, slopes = {}, None
     for turn in range(_TURNS if best.chosen else 0):
         before = best
         for one in reversed(best.chosen):
@@ -357,9 +367,12 @@ def _exchanged(base, best, library, first, say, cells):
             if turn and others == scans.get(one.name, (None,))[0]:
                 continue
             say(f"beside all the others: {one.effect.title}")
-            model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
-            found = first if not others else _scanned(model, library, cells)
+            found = first if not others else _beside(best.model, one, library, cells, slopes)
+            slopes = slopes or (others and found.probes.slopes)
             scans[one.name] = (others, found)
+            if len(best.chosen) > _MOST:
+                # so many that none is sure: what each can be told from is all that is asked
+                continue
             fresh = _best_beside(found, one, library)
             if fresh is None or (fresh.name, fresh.degree) == (one.name, one.degree):
                 continue
@@ -367,11 +380,17 @@ def _exchanged(base, best, library, first, say, cells):
             chosen = [*best.chosen[:place], fresh, *best.chosen[place + 1 :]]
             model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
             if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
-                scans[fresh.name] = scans.pop(one.name)
+                scans[fresh.name], slopes = scans.pop(one.name), None
                 best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
         if best is before:
             break
     return best, {name: found for name, (_, found) in scans.items()}
+
+
+def _beside(model, one, library, cells, slopes):
+    """Return the evidence beside all other causes of a model."""
+    temper = max(1.0, model.mean_square)
+    return scan(model, library, cells=cells, temper=temper, without=one.name, slopes=slopes)
 
 
 def _best_beside(found, own, library):
@@ -415,14 +434,17 @@ def _unlisted(base, best):
     return 1 - (1 - prior) * np.exp(-share / _LEFT)
 
 
-def _grouped(best, models, scans, unlisted):
+def _grouped(best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
     found = []
-    for one, model in zip(best.chosen, models, strict=True):
+    for one, (before, after) in zip(best.chosen, pairwise(steps), strict=True):
         members = _members(one, scans[one.name])
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
+        lowered = max(before.chi2 - after.chi2, 0.0)
+        share = stable.get(one.name, 1.0)
+        chance *= float((1 - unlisted) * share)
         alone = scans[one.name].by_run(members[0][0])
-        found.append(Group(members, float((1 - unlisted) * chance), model, by_dataset=alone))
+        found.append(Group(members, chance, lowered, share, alone))
     return found
 
 

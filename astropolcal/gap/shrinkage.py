@@ -13,13 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.exceptions import GapError
+from astropolcal.gap.model import Linear
 
-__all__ = ["HeldOut", "foreseen", "frame_groups", "held_out", "left_out_fits"]
+__all__ = ["HeldOut", "foreseen", "frame_groups", "held_out", "left_out_fits", "stability"]
 
 # degree; angles that differ by less are one group
 _SAME_ANGLE = 0.5
 # next to the solution of all frames the fit to most of them takes few steps
 _STEPS, _SHARE = 8, 1e-5
+# singular values below this share of the largest belong to directions that are open
+_OPEN = 1e-9
 # a direction that a group determines by more than this share is its own
 _MOST_LEVER = 0.99
 
@@ -226,8 +229,8 @@ def foreseen(model, groups):
 
     Parameters
     ----------
-    model : Model
-        The fitted model.
+    model : Model or Linear
+        The fitted model, or one from which effects were taken.
     groups : tuple
         As `frame_groups` gives them.
 
@@ -236,9 +239,9 @@ def foreseen(model, groups):
     HeldOut
     """
     labels, numbers = groups
-    problem = model.problem
-    tangent = problem.tangent(model.fit.coefficients)
-    residual, sizes = model.residual, [c.shape for c in problem.channels]
+    linear = model if isinstance(model, Linear) else model.without(())
+    problem, tangent, residual = linear.model.problem, linear.tangent, linear.residual
+    sizes = [c.shape for c in problem.channels]
     squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
     for i in range(len(labels)):
         rows, scale = [], []
@@ -265,6 +268,68 @@ def foreseen(model, groups):
     keep = counts > 0
     labels = [label for label, here in zip(labels, keep, strict=True) if here]
     return HeldOut(labels, squares[keep], whitened[keep], counts[keep])
+
+
+def stability(model, groups, temper):
+    """
+    Return in which share of parts of the data each effect of a model is still asked for.
+
+    The parts are the odd and the even wavelengths, and the data without each group of frames. An
+    effect is asked for where the evidence for its size by Schwarz (1978) is above that for none.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    groups : tuple or None
+        As `frame_groups` gives them; None for the halves of the wavelengths alone.
+    temper : float
+        Variance of the residuals, in units of the noise.
+
+    Returns
+    -------
+    dict of str to float
+        Share by name of the effect.
+    """
+    problem, q = model.problem, model.fit.coefficients
+    absent = problem.coefficients(problem._absent())
+    found = {name: [] for name in model.added}
+    prior = np.diag(problem.tight)
+    for part in _parts(problem, groups):
+        rows = np.where(part[:, None], model.jacobian, 0.0)
+        target = np.concatenate([np.where(part, model.residual, 0.0), (absent - q) * problem.tight])
+        table = np.concatenate([rows, prior])
+        scale = np.linalg.norm(table, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        left, singular, right = np.linalg.svd(table / scale, full_matrices=False)
+        inverse = np.where(singular > _OPEN * singular[0], 1 / np.maximum(singular, 1e-300), 0.0)
+        size = q - absent + right.T @ (inverse * (left.T @ target)) / scale
+        half = inverse[:, None] * right / scale
+        for name, parameters in model.added.items():
+            own = [problem.slices[p.name] for p in parameters if p.name in problem.slices]
+            if own:
+                own = np.concatenate([np.arange(s.start, s.stop) for s in own])
+                covariance = temper * half[:, own].T @ half[:, own]
+                strength = size[own] @ np.linalg.pinv(covariance, hermitian=True) @ size[own]
+                found[name].append(strength > own.size * np.log(max(part.sum(), 2)))
+    return {name: float(np.mean(asked)) for name, asked in found.items() if asked}
+
+
+def _parts(problem, groups):
+    """Yield which rows are in each part of the data."""
+
+    def rows(rule):
+        parts = zip(problem.datasets, problem.channels, strict=True)
+        return np.concatenate(
+            [np.broadcast_to(rule(i, d), c.shape).ravel() for i, (d, c) in enumerate(parts)]
+        )
+
+    if len(problem.wavelength) > 3:
+        for half in (0, 1):
+            yield rows(lambda i, d, half=half: (d.bins % 2 == half)[:, None])
+    labels, numbers = groups or ((), ())
+    for k in range(len(labels)):
+        yield rows(lambda i, d, k=k: numbers[i] != k)
 
 
 def left_out_fits(model, labels, numbers):

@@ -11,9 +11,9 @@ from astropolcal.plotting.accuracy import plot_accuracy
 from astropolcal.plotting.comparison import plot_comparison
 from astropolcal.plotting.correlations import plot_correlations
 from astropolcal.plotting.differences import plot_double_differences
-from astropolcal.plotting.effects import plot_effect_scores, plot_effect_sizes
+from astropolcal.plotting.effects import plot_cause_map, plot_effect_sizes
 from astropolcal.plotting.efficiency import plot_derotator_offsets, plot_polarimetric_efficiency
-from astropolcal.plotting.gap import plot_gap_maps, plot_gap_spectrum, plot_where
+from astropolcal.plotting.gap import plot_gap_frames, plot_gap_maps, plot_gap_spectrum, plot_where
 from astropolcal.plotting.history import plot_history
 from astropolcal.plotting.identifiability import plot_identifiability
 from astropolcal.plotting.mirrors import plot_mirrors
@@ -31,14 +31,15 @@ from astropolcal.plotting.targets import plot_target_accuracy
 
 __all__ = [
     "plot_accuracy",
+    "plot_cause_map",
     "plot_comparison",
     "plot_corner",
     "plot_correlations",
     "plot_derotator_offsets",
     "plot_double_differences",
-    "plot_effect_scores",
     "plot_effect_sizes",
     "plot_efficiency",
+    "plot_gap_frames",
     "plot_gap_maps",
     "plot_gap_spectrum",
     "plot_history",

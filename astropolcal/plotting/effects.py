@@ -1,29 +1,28 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Figures of the effects of a diagnosis: their scan, and the sizes of those that were found."""
+"""Figures of the causes that a diagnosis found: where they are, and their sizes."""
 
 import textwrap
 
 import numpy as np
 
-from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap._numbers import Fitted
-from astropolcal.gap._words import in_title, is_determined
-from astropolcal.gap.selection import ENOUGH
+from astropolcal.gap._words import is_determined, labels, share
+from astropolcal.gap.cells import places
+from astropolcal.optics import GENERATORS, Dependence
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
-    ORANGE,
+    GREY,
     SKY,
     VERMILION,
     canvas,
     draw_line,
-    legend_outside,
     style,
     wavelength_label,
 )
 
-__all__ = ["plot_effect_scores", "plot_effect_sizes"]
+__all__ = ["plot_cause_map", "plot_effect_sizes"]
 
 # characters of a label beside a panel
 _LABEL = 26
@@ -31,33 +30,26 @@ _LABEL = 26
 
 def verdict_line(diagnosis):
     """Return the verdict as a line that fits a figure."""
-    largest = sorted(diagnosis.causes, key=lambda cause: -cause.explained)
-    names = in_title([cause.name for cause in largest])
-    several = "effects are" if len(largest) > 1 else "effect is"
+    names = [cause.name for cause in diagnosis.causes]
+    several = names[0] if len(names) == 1 else f"{len(names)} causes"
     return {
-        "named": f"{len(largest)} {several} missing: {names}",
-        "located": f"{len(largest)} {several} missing: {names}",
         "none": "no gap beyond the noise",
-        "unexplained": "a real gap that no effect explains"
-        + (f"\n(in part: {names})" if names else ""),
-    }.get(diagnosis.verdict, diagnosis.verdict)
+        "unexplained": "a real gap that is not explained",
+    }.get(diagnosis.verdict, f"{diagnosis.verdict}: {several}")
 
 
-def plot_effect_scores(diagnosis, *, limit=12, figure=None):
+def plot_cause_map(diagnosis, *, figure=None):
     """
-    Draw how much of the gap each effect of the library would explain.
+    Draw where in the chain a cause is, and of which kind: a map of probabilities.
 
-    The length of a bar is the signal-to-noise ratio of the effect in the scan,
-    the square root of the expected lowering of chi-square over the scatter that
-    remains. Causes that were found and their aliases have their own colours,
-    those for which there is no evidence are pale.
+    Rows are the places in the order in which the light meets them, columns the kinds of
+    perturbation. A cell is the probability that a cause is there, summed over all its
+    dependences and over what cannot be told from it.
 
     Parameters
     ----------
     diagnosis : Diagnosis
         The diagnosis.
-    limit : int
-        Most effects to draw, best first.
     figure : `~matplotlib.figure.Figure`, optional
         An empty figure to draw into.
 
@@ -70,76 +62,113 @@ def plot_effect_scores(diagnosis, *, limit=12, figure=None):
     >>> import astropy.units as u
     >>> from astropolcal import instruments
     >>> from astropolcal.gap import diagnose
-    >>> from astropolcal.plotting.effects import plot_effect_scores
+    >>> from astropolcal.plotting.effects import plot_cause_map
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> data = simulate(chain, charis.wavelength, frames, seed=1)
     >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
-    >>> plot_effect_scores(diagnosis).axes[0].get_xlabel()[:8]
-    'signal-t'
+    >>> plot_cause_map(diagnosis).axes[0].get_yticklabels()[-1].get_text()
+    'detector'
     """
-    scores = sorted(diagnosis.scan.candidates[:limit], key=lambda s: -_strength(s))
-    found = {cause.name for cause in diagnosis.causes}
-    aliases = {one.name for cause in diagnosis.causes for one, _ in cause.aliases} - found
-    # only the kinds that are there are explained
-    used = set()
+    rows = cause_map(diagnosis)
+    shown = [k for k in _FAMILIES if k != _OTHER or any(k in row for row in rows.values())]
+    table = np.array([[row.get(k, (0.0, ""))[0] for k in shown] for row in rows.values()])
     with style():
-        figure = canvas(figure, 10, 2.2 + 0.36 * max(len(scores), 2))
+        figure = canvas(figure, 5.4, 1.6 + 0.5 * len(rows))
         axes = figure.subplots()
-        for i, score in enumerate(scores):
-            name, size = score.effect.name, _strength(score)
-            kind = _kind(name, score.evidence > ENOUGH, found, aliases)
-            used.add(kind)
-            axes.barh(i, size, **_LOOKS[kind])
-            axes.text(size, i, f"  {score.evidence:.0f}", va="center", fontsize=9.5)
-        axes.set_yticks(range(len(scores)), labels=[s.effect.name for s in scores])
-        axes.invert_yaxis()
-        axes.grid(visible=False, axis="y")
-        axes.set_xlabel("signal-to-noise ratio in the scan; at the bars: log Bayes factor")
-        # room for the numbers at the ends of the bars
-        axes.set_xlim(0, 1.18 * max(map(_strength, scores), default=1.0))
-        legend_outside(figure, _keys(used), columns=4)
-        figure.suptitle(f"Scan of the effects\n{verdict_line(diagnosis)}")
-        if not scores:
-            axes.text(0.5, 0.5, "no effect to score", transform=axes.transAxes, ha="center")
+        # one hue from white to dark: it is the same for all kinds of colour vision, and in print
+        axes.imshow(table, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+        for i, row in enumerate(rows.values()):
+            for j, kind in enumerate(shown):
+                chance, words = row.get(kind, (0.0, ""))
+                if chance < _LEAST:
+                    continue
+                look = {"ha": "center", "color": "white" if chance > _DARK else BLACK}
+                axes.text(j, i - 0.16, share(chance), va="center", weight="bold", **look)
+                axes.text(j, i + 0.22, words, va="center", fontsize=8, **look)
+        axes.set_xticks(range(len(shown)), labels=shown, rotation=30, ha="left")
+        axes.set_yticks(range(len(rows)), labels=[_place_label(place) for place in rows])
+        axes.tick_params(length=0, labelsize=9.5)
+        axes.xaxis.tick_top()
+        axes.grid(visible=False)
+        for edge in np.arange(0.5, len(rows) - 1):
+            axes.axhline(edge, color="0.8", linewidth=0.8)
+        for edge in np.arange(0.5, len(shown) - 1):
+            axes.axvline(edge, color="0.8", linewidth=0.8)
+        figure.suptitle("Probability that a cause is there", fontsize=11.5)
     return figure
 
 
-_LOOKS = {
-    "found": {"color": VERMILION},
-    "alias: the data cannot tell": {"facecolor": ORANGE, "edgecolor": BLACK, "hatch": "//"},
-    "significant": {"color": SKY},
-    "not significant": {"color": "0.85"},
+# columns of the map
+_OTHER = "other"
+_FAMILIES = ("retardance", "rotation", "diattenuation", "depolarization", "beams, detector", _OTHER)
+_AXES = {"h": "along axes", "d": "at 45 deg", "c": "circular", "linear": "linear"}
+# probabilities that are not written, and from which the ground is dark
+_LEAST, _DARK = 0.01, 0.65
+# words in the place of a named effect, and the place that they mean
+_PLACES = {
+    "detector": "detector",
+    "spectrograph": "detector",
+    "in front of": "source",
+    "behind the derotator": "after:derotator",
+    "half-wave plate": "in:hwp",
+    "derotator": "in:derotator",
+    "source": "source",
+    "polarizer": "source",
+    "star": "source",
+    "sky": "source",
+    "mirror": "source",
+    "telescope": "source",
 }
 
 
-def _strength(score):
-    # chi-square is the square of a signal-to-noise ratio
-    return float(np.sqrt(score.statistic))
+def cause_map(diagnosis):
+    """Return {place: {family: (probability, what)}}, places in the order of the light."""
+    rows = {p.name: {} for chain in diagnosis.nominal.chains for p in places(chain)}
+    rows["detector"] = rows.pop("detector", {})
+    for cause in diagnosis.causes:
+        own, words = {}, {}
+        for one, part in [(cause, cause.share), *cause.aliases]:
+            place, family, what = _on_map(one.effect, one.cell)
+            own[place, family] = own.get((place, family), 0.0) + part * cause.probability
+            words.setdefault((place, family), what)
+        for (place, family), chance in own.items():
+            before, what = rows.setdefault(place, {}).get(family, (0.0, words[place, family]))
+            # that at least one of several causes is there
+            rows[place][family] = (1 - (1 - before) * (1 - min(chance, 1.0)), what)
+    return rows
 
 
-def _kind(name, significant, found, aliases):
-    if name in found:
-        return "found"
-    if name in aliases:
-        return "alias: the data cannot tell"
-    return "significant" if significant else "not significant"
+def _on_map(effect, cell):
+    """Return place, family and what exactly of a cause."""
+    if cell is not None:
+        family, _, axis = cell.kind.partition("_")
+        known = family in _FAMILIES
+        what = _AXES.get(axis, axis) if known else cell.kind.replace("_", " ")
+        return cell.place, family if known else _FAMILIES[-2], what
+    place = next((own for words, own in _PLACES.items() if words in effect.place), effect.place)
+    words = f"{effect.name} {effect.title}"
+    family = next((family for family in _FAMILIES[:4] if family in words), _OTHER)
+    return place, _FAMILIES[-2] if place == "detector" else family, "named"
 
 
-def _keys(used):
-    from matplotlib.patches import Patch
-
-    return [Patch(label=label, **look) for label, look in _LOOKS.items() if label in used]
+def _place_label(place):
+    head, _, optic = place.partition(":")
+    optic = {"hwp": "half-wave plate"}.get(optic, optic)
+    words = {"in": f"in the {optic}", "after": f"behind the {optic}"}
+    return textwrap.fill(words.get(head, place), 16)
 
 
 def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
     """
-    Draw the fitted size of a cause with its errors by wavelength.
+    Draw the fitted size of a cause with its errors.
 
-    One panel a parameter. Where the data do not tell the size, the wavelength
-    is marked at the foot of the panel.
+    One panel for what it depends on, if that is a cell that changes from frame to frame: the
+    size at the middle wavelength with its 68 % band, and the frames as marks. One panel for each
+    parameter that changes with the wavelength; where the data do not tell the size, the
+    wavelength is marked at the foot of the panel.
 
     Parameters
     ----------
@@ -159,7 +188,7 @@ def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
     Raises
     ------
     ParameterError
-        If the effect is no cause, or has no size that depends on wavelength.
+        If the effect is no cause, or has no size that depends on anything.
 
     Examples
     --------
@@ -179,15 +208,22 @@ def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
     'imbalance'
     """
     sizes = _sizes_by_wavelength(diagnosis, effect, content)
-    nm = 1000 * diagnosis.nominal.problem.wavelength
+    panels = [None, *sizes] if _curve(diagnosis, effect) else list(sizes)
+    if not panels:
+        raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
+    nm, columns = 1000 * diagnosis.nominal.problem.wavelength, min(len(panels), 2)
     with style():
-        figure = canvas(figure, 4.9 * min(len(sizes), 2) + 0.6, 0.4 + 2.5 * -(-len(sizes) // 2))
-        grid = figure.subplots(-(-len(sizes) // 2), min(len(sizes), 2), squeeze=False, sharex=True)
-        for axes in grid.flat[len(sizes) :]:
+        figure = canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2))
+        grid = figure.subplots(-(-len(panels) // 2), columns, squeeze=False)
+        for axes in grid.flat[len(panels) :]:
             axes.set_axis_off()
-        for axes, (name, size) in zip(grid.flat, sizes.items(), strict=False):
-            _size_panel(axes, nm, size, _absent(diagnosis.improved, effect, name))
-            axes.set_ylabel(_label(diagnosis.improved, name, size["unit"]))
+        for axes, name in zip(grid.flat, panels, strict=False):
+            if name is None:
+                _curve_panel(axes, diagnosis, effect)
+                continue
+            size = _in_percent(sizes[name])
+            _size_panel(axes, nm, size, _absent(diagnosis.improved, effect, name, size))
+            axes.set_ylabel(_label(diagnosis, effect, name, size["unit"]))
             wavelength_label(axes)
     return figure
 
@@ -200,26 +236,110 @@ def _sizes_by_wavelength(diagnosis, effect, content):
         sizes = Fitted(diagnosis.improved).sizes(effect)
     else:
         sizes = content["causes"][names.index(effect)]["size"]
-    found = {name: size for name, size in sizes.items() if isinstance(size["value"], list)}
-    if not found:
-        raise ParameterError(f"effect = {effect!r} has no size that depends on wavelength")
-    return found
+    return {name: size for name, size in sizes.items() if _varies(size["value"])}
 
 
-def _absent(model, effect, name):
+def _varies(value):
+    # a figure of a constant shows nothing
+    if not isinstance(value, list):
+        return False
+    known = [abs(one) for one in value if one is not None]
+    return bool(known) and max(value) - min(value) > 1e-6 * max(known)
+
+
+def _in_percent(size):
+    """Return a share in percent, and all else as it is."""
+    if size["unit"]:
+        return size
+    return {
+        "value": [100 * one for one in size["value"]],
+        "std": [None if one is None else 100 * one for one in size["std"]],
+        "unit": "%",
+        "limit": 100 * size["limit"],
+    }
+
+
+def _absent(model, effect, name, size):
     """Return the value at which an effect is absent in the unit of its size, scalar or (W,)."""
     (parameter,) = (p for p in model.added[effect] if p.name == name)
-    return parameter.canonical_neutral / model.problem.free.by_name[name].factor
+    factor = model.problem.free.by_name[name].factor
+    return parameter.canonical_neutral / factor * (100 if size["unit"] == "%" else 1)
 
 
-def _label(model, name, unit):
-    """Return what a size is, in the words of its optic, and its unit."""
-    optic, _, key = name.partition(".")
-    carriers = (leaf for chain in model.chains for leaf in leaves(chain) if leaf.name == optic)
-    carrier = next(carriers, None)
-    description = "" if carrier is None else getattr(carrier, key).__doc__
-    words = f"{key.replace('_', ' ')}{': ' if description else ''}{description}"
-    return textwrap.fill(f"{words} ({unit or 'fraction'})", _LABEL)
+def _label(diagnosis, effect, name, unit):
+    """Return what a size is, and its unit."""
+    cause = next(one for one in diagnosis.causes if one.name == effect)
+    cell = cause.cell.to_dict() if cause.cell else None
+    entry = {"size": diagnosis.improved.added[effect], "effect": cause.effect, "cell": cell}
+    names = [p.name for p in entry["size"]]
+    entry = {"size": names, "effect": effect if cause.is_named else None, "cell": cell}
+    words = dict(zip(names, labels(entry), strict=True))[name]
+    return f"{textwrap.fill(words, _LABEL)} ({unit})"
+
+
+# ---- what a cause depends on ------------------------------------------------------------------
+
+_DRIVERS = {"sequence": "share of the run", "frame": "frame"}
+
+
+def _curve(diagnosis, effect):
+    """Return the dependence of a cause that is a cell and changes from frame to frame."""
+    cause = next(one for one in diagnosis.causes if one.name == effect)
+    if cause.cell is None or cause.is_named or cause.cell.kind not in GENERATORS:
+        return None
+    dependence = Dependence(cause.cell.dependence)
+    return dependence if dependence.driver else None
+
+
+def _curve_panel(axes, diagnosis, effect):
+    dependence, model = _curve(diagnosis, effect), diagnosis.improved
+    driver, problem = dependence.driver, model.problem
+    given = np.concatenate([_positions(dataset, driver) for dataset in problem.datasets])
+    x = np.linspace(given.min(), given.max(), 400)
+    if dependence.kind == "direction":
+        x = np.array([0.0, 1.0])
+    fitted, middle = Fitted(model), len(problem.wavelength) // 2
+    own = np.zeros((problem.size, len(x)))
+    for wave, parameter in zip(dependence.waves(x), model.added[effect], strict=False):
+        where, basis = problem.slices[parameter.name], parameter.basis
+        basis = np.eye(where.stop - where.start) if basis is None else basis
+        own[where] = np.outer(basis[min(middle, len(basis) - 1)], wave)
+    unit, factor = fitted.unit_of(parameter.name)
+    scale = 1 / factor if unit else 100
+    value = scale * (model.fit.coefficients @ own)
+    error = scale * np.sqrt(np.einsum("ij,ik,kj->j", own, fitted.covariance, own))
+    angle = driver not in _DRIVERS and dependence.kind != "direction"
+    x, given = (np.rad2deg(values) if angle else values for values in (x, given))
+    axes.axhline(0, color=BLACK, linewidth=0.8)
+    if dependence.kind == "direction":
+        axes.errorbar(x, value, error, fmt="o", color=BLUE)
+        axes.set_xticks(x, labels=["forwards", "backwards"])
+        axes.set_xlim(-0.5, 1.5)
+    else:
+        axes.fill_between(x, value - error, value + error, color=SKY, alpha=0.5, linewidth=0)
+        axes.plot(x, value, color=BLUE)
+        foot = np.full(len(given), 0.02)
+        axes.plot(given, foot, "|", color=GREY, transform=axes.get_xaxis_transform())
+    axes.set_xlabel(_driver_label(dependence))
+    nm = 1000 * problem.wavelength[middle]
+    axes.set_ylabel(f"size at {nm:.0f} nm ({unit or '%'})")
+
+
+def _positions(dataset, driver):
+    """Return where the driver of a dependence stood in every frame."""
+    given = dataset._given.get(driver)
+    given = dataset.observations.position(driver) if given is None else given
+    return given.mean(axis=0) if given.ndim == 2 else given
+
+
+def _driver_label(dependence):
+    stage = dependence.parts[1] if len(dependence.parts) > 1 else ""
+    stage = {"hwp": "half-wave plate"}.get(stage, stage)
+    return {
+        "harmonic": f"angle of the {stage} (deg)",
+        "direction": f"last move of the {stage}",
+        "move": f"last move of the {stage} (deg)",
+    }.get(dependence.kind) or _DRIVERS[dependence.driver]
 
 
 def _size_panel(axes, nm, size, absent):

@@ -26,11 +26,12 @@ from astropolcal.plotting._style import (
     style,
     wavelength_label,
 )
-from astropolcal.plotting.effects import plot_effect_scores, plot_effect_sizes, verdict_line
+from astropolcal.plotting.effects import plot_cause_map, plot_effect_sizes, verdict_line
 
 __all__ = [
-    "plot_effect_scores",
+    "plot_cause_map",
     "plot_effect_sizes",
+    "plot_gap_frames",
     "plot_gap_maps",
     "plot_gap_spectrum",
     "plot_where",
@@ -158,6 +159,80 @@ def _spectrum_labels(axes, name, channel, last):
     axes.set_ylabel(f"rms of {label} (%)")
     if last:
         wavelength_label(axes)
+
+
+def plot_gap_frames(diagnosis, *, figure=None):
+    """
+    Draw the residuals frame by frame, before and after, with what the causes do.
+
+    Single differences, mean of that third of the wavelengths in which the causes do most. The
+    line is what the model predicts with the causes in it, less what it predicts without.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap import diagnose
+    >>> from astropolcal.plotting.gap import plot_gap_frames
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, charis.wavelength, frames, seed=1)
+    >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
+    >>> plot_gap_frames(diagnosis).axes[0].get_xlabel()[:5]
+    'frame'
+    """
+    nominal, improved = diagnosis.nominal, diagnosis.improved
+    before, after = _gaps(nominal, nominal), _gaps(improved, nominal)
+    n = len(before)
+    with style():
+        figure = canvas(figure, 9, 1.4 + 2.5 * n)
+        grid = figure.subplots(n, 1, squeeze=False)[:, 0]
+        for i, axes in enumerate(grid):
+            observations, order = nominal.observations[i], np.argsort(_wavelength(nominal, i))
+            thirds = [part for part in np.array_split(order, 3) if part.size]
+            does = [rms(before[i][0][part] - after[i][0][part]) for part in thirds]
+            third = thirds[int(np.nanargmax(does))] if np.nanmax(does) > 0 else thirds[-1]
+            old, new = (_mean(gap[i][0][third]) for gap in (before, after))
+            x = np.arange(len(old)) + 0.5
+            axes.axhline(0, color=GREY, linewidth=0.8)
+            look = {"markerfacecolor": "none", "markersize": 6}
+            axes.plot(x, old, "s", color=VERMILION, label="before", **look)
+            if diagnosis.causes:
+                axes.plot(x, old - new, color=BLACK, linewidth=1, label="what the causes do")
+                axes.plot(x, new, "o", color=BLUE, markersize=4, label="after")
+            nm = 1000 * _wavelength(nominal, i)[third]
+            name = shortened(observations.name, _LONGEST_NAME)
+            axes.set_title(f"{name}, {nm.min():.0f} to {nm.max():.0f} nm", loc="left")
+            axes.set_ylabel(f"observed {MINUS} model (%)")
+            _frame_axis(axes, observations)
+        handles = grid[0].get_legend_handles_labels()[0]
+        legend_outside(figure, handles, columns=3)
+        figure.suptitle(f"Residuals of the single differences\n{verdict_line(diagnosis)}")
+    return figure
+
+
+def _wavelength(model, i):
+    return model.problem.wavelength[model.problem.datasets[i].bins]
+
+
+def _mean(values):
+    """Return the mean over the wavelengths of the known values, NaN where there are none."""
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
 
 
 def plot_gap_maps(diagnosis, *, channel="difference", figure=None):

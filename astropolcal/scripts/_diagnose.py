@@ -4,9 +4,10 @@
 import argparse
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
-from astropolcal.exceptions import AstropolcalError
+from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.scripts._common import (
     Input,
     Output,
@@ -20,7 +21,6 @@ from astropolcal.scripts._common import (
     is_quiet,
     printer,
     read_datasets,
-    say_written,
     show,
     wrapped,
     write_json,
@@ -43,6 +43,10 @@ _SPECTRUM = (
     "Gap of the fit at each wavelength before and after, with the noise. The verdict and the "
     "shares are of the differences and the sums of the beams together, of the sums less the "
     "drift and flicker of the lamp; the gap in percent is of the differences alone"
+)
+_FRAMES = (
+    "Residuals of the single differences frame by frame, before and after, in that third of the "
+    "wavelengths in which the causes do most, with what they do"
 )
 
 
@@ -131,8 +135,7 @@ def run(arguments):
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
     written = _write(diagnosis, content, arguments, instrument)
-    say(summary(diagnosis, content))
-    say_written(say, written)
+    say(summary(diagnosis, content, written))
 
 
 def _check_page(path):
@@ -249,23 +252,24 @@ def _write(diagnosis, content, arguments, instrument):
         )
         written.append(arguments.report)
     if arguments.save:
-        _improved(diagnosis, instrument).write(arguments.save, overwrite=True)
+        from astropolcal.gap._numbers import with_causes
+
+        calibration = with_causes(diagnosis.improved, instrument=instrument)
+        calibration.write(arguments.save, overwrite=True)
         written.append(arguments.save)
     return written
 
 
 def _figures(diagnosis):
     """Return the figures of the page by caption."""
+    from astropolcal.gap.report import MAP
     from astropolcal.plotting import gap
 
-    figures = {
+    return ({MAP: gap.plot_cause_map(diagnosis)} if diagnosis.causes else {}) | {
+        _FRAMES: gap.plot_gap_frames(diagnosis),
         _SPECTRUM: gap.plot_gap_spectrum(diagnosis),
         "Residuals of the differences, by wavelength and frame": gap.plot_gap_maps(diagnosis),
-        "Where the gap of the nominal model lies": gap.plot_where(diagnosis),
     }
-    if diagnosis.scan.candidates:
-        figures["Evidence for each effect that was tried"] = gap.plot_effect_scores(diagnosis)
-    return figures
 
 
 def _size_figures(diagnosis, content):
@@ -273,31 +277,10 @@ def _size_figures(diagnosis, content):
     from astropolcal.gap._words import has_sizes
     from astropolcal.plotting.gap import plot_effect_sizes
 
-    return {
-        entry["name"]: plot_effect_sizes(diagnosis, entry["name"], content=content)
-        for entry in content["causes"]
-        if any(has_sizes(entry)) and any(map(_varies, entry["size"].values()))
-    }
-
-
-def _varies(size):
-    value = size["value"]
-    # a figure of a constant shows nothing
-    return isinstance(value, list) and max(value) - min(value) > 1e-6 * max(map(abs, value))
-
-
-def _improved(diagnosis, instrument):
-    """Return the calibration of the improved chains, the effects held at their fitted sizes."""
-    from astropolcal.calibration import calibrate
-
-    model = diagnosis.improved
-    # their sizes are what was found; fitting them again could move them
-    held = [p.name for parameters in model.added.values() for p in parameters]
-    observations = model.observations
-    return calibrate(
-        model.chains,
-        observations,
-        fix=dict.fromkeys(held) or None,
-        ties={name: tie for name, tie in model.problem.ties.items() if name not in held},
-        instrument=instrument,
-    )
+    found = {}
+    for entry in content["causes"]:
+        if any(has_sizes(entry)):
+            # the size of some depends on nothing
+            with suppress(ParameterError):
+                found[entry["name"]] = plot_effect_sizes(diagnosis, entry["name"], content=content)
+    return found

@@ -147,7 +147,24 @@ def _on_start(app):
     write_gallery(Path(app.srcdir) / "generated" / "models", logging.getLogger(__name__).info)
 
 
+def _rows():
+    """Return the directive that lists effects by name, with the words of their declarations."""
+    from sphinx.util.docutils import SphinxDirective
+
+    from gallery import pages
+
+    class Effects(SphinxDirective):
+        has_content = True
+
+        def run(self):
+            names = " ".join(self.content).split()
+            return self.parse_text_to_nodes("\n".join(pages.effect_row(name) for name in names))
+
+    return Effects
+
+
 def setup(app):
     """Connect the gallery to a build."""
+    app.add_directive("effects", _rows())
     app.connect("builder-inited", _on_start, priority=100)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

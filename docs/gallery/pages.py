@@ -16,7 +16,7 @@ from numpydoc.docscrape import NumpyDocString
 from astropolcal import optics
 from astropolcal.chain import leaves
 from astropolcal.converters.optics import node_from_optic
-from astropolcal.gap.effects import EFFECTS, Context
+from astropolcal.gap.effects import EFFECTS, Context, Effect
 from astropolcal.gap.problem import law_basis
 from astropolcal.optics import OPTICS
 from gallery.examples import example_of
@@ -324,7 +324,8 @@ def effect_page(name, words):
         "effect",
         name=name,
         title=effect.title[0].upper() + effect.title[1:],
-        extended=_parts(type(effect))[1],
+        # what is declared has its equation, what is code its words
+        extended="" if type(effect) is Effect else "\n\n".join(_parts(type(effect))[:2]),
         kind=effect.kind,
         place=effect.place,
         shows=effect.shows,
@@ -340,6 +341,45 @@ def effect_page(name, words):
         else "The optic as the edit leaves it, at three wavelengths and before it is fitted:",
         yaml=yaml_of(optic=shown) if shown is not None else "",
     )
+
+
+def effect_row(name):
+    """
+    Return what the list of effects says of one, from its declaration.
+
+    Parameters
+    ----------
+    name : str
+        Effect in ``EFFECTS``.
+    """
+    effect = EFFECTS[name]
+    parts = [f"Place: {effect.place}", f"Shows: {effect.shows}"]
+    if effect.kind != "discrete":
+        keys = sorted(getattr(effect, "components", None) or effect.free)
+        listed = ", ".join(f"``{key}``" for key in keys)
+        sizes = f"about {_quantity(effect.scale)}, at most {_quantity(effect.limit)}"
+        parts.append(f"Law: {_law_of(effect)}")
+        parts.append(f"Parameter{'s' if len(keys) > 1 else ''} {listed}: {sizes}")
+    if effect.absorbed_by:
+        parts.append(f"Taken up by ``{effect.absorbed_by}``")
+    parts.append(f"Reference: {effect.reference}")
+    text = textwrap.indent(textwrap.fill(". ".join(parts) + ".", 96), "    ")
+    return f":doc:`{name} </generated/models/effects/{name}>`\n    {effect.title}.\n\n{text}\n"
+
+
+def _law_of(effect):
+    """Return the law in wavelength in words: those of the function that makes it, if one does."""
+    if isinstance(effect.degree, int):
+        known = effect.degree and f"polynomial of degree {effect.degree} in wavelength"
+        maker = None if type(effect).law is Effect.law else type(effect).law
+    else:
+        known = "one value a wavelength" if effect.degree is None else None
+        maker = effect.degree if callable(effect.degree) else None
+    if "edit" in vars(type(effect)) and hasattr(effect, "is_open"):
+        return "as in the chain"
+    if maker is not None:
+        return inspect.getdoc(maker).removeprefix("Return ").rstrip(".")
+    return known or "the same at all wavelengths"
 
 
 def effects_index():

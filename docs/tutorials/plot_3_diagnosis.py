@@ -26,7 +26,7 @@ from astropolcal import Observations, instruments, optics
 from astropolcal.chain import insert_optic
 from astropolcal.gap import diagnose
 from astropolcal.gap.report import causes_table, summary
-from astropolcal.plotting import plot_effect_scores, plot_gap_maps, plot_gap_spectrum, plot_where
+from astropolcal.plotting import plot_cause_map, plot_gap_frames, plot_gap_maps, plot_gap_spectrum
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 charis = instruments.get("charis")
@@ -61,8 +61,8 @@ else:
 # Ask
 # ---
 #
-# Left alone, ``diagnose`` tries the whole library. A few are enough here, so that the page builds
-# quickly.
+# ``diagnose`` asks for every small error that an optic may have, and for the effects of the library
+# that have a name. A few names are enough here, so that the page builds quickly.
 
 effects = [
     "beam_gain",
@@ -70,7 +70,6 @@ effects = [
     "hwp_tilt",
     "hwp_beam_wander",
     "derotator_diattenuation",
-    "hwp_encoder_eccentricity",
     "static_diattenuator",
 ]
 diagnosis = diagnose(chains, data, effects=effects)
@@ -80,12 +79,26 @@ print(summary(diagnosis))
 # How to read it
 # --------------
 #
-# The first sentence is the size of the gap, on frames that were left out of the fit, beside the
-# noise. The second names causes, in the order in which they were found. The third says what is
+# First comes what the model lacks, with its probability; then how large the gap is on frames that
+# were left out of the fit, in double and in single differences beside the noise; then what is
 # left.
 
 causes = causes_table(diagnosis)
-print(causes[causes.colnames[:4]])
+print(causes["rank", "effect", "probability", "explained"])
+
+# %%
+# Where in the chain the causes are, and of which kind. What the data cannot tell apart shares the
+# probability.
+
+figure = plt.figure(figsize=(6.4, 4.6))
+plot_cause_map(diagnosis, figure=figure)
+
+# %%
+# The residuals frame by frame, before and after, with what the causes do. Unequal gains are the
+# same in all frames; what turns with the half-wave plate goes up and down.
+
+figure = plt.figure(figsize=(9, 6.4))
+plot_gap_frames(diagnosis, figure=figure)
 
 # %%
 # The gap against wavelength, before and after the effects are in the model. Where the second line
@@ -100,20 +113,6 @@ plot_gap_spectrum(diagnosis, figure=figure)
 
 figure = plt.figure(figsize=(12, 7.9))
 plot_gap_maps(diagnosis, figure=figure)
-
-# %%
-# The score is what each effect alone would explain. One that is not a cause may still score,
-# because it looks in part like one that is: read the causes, not the scores.
-
-figure = plt.figure(figsize=(10, 5))
-plot_effect_scores(diagnosis, figure=figure)
-
-# %%
-# Where the gap lies, by harmonic, angle, wavelength and time. This is what there is to go by when
-# the verdict is *unexplained*.
-
-figure = plt.figure(figsize=(10.5, 7))
-plot_where(diagnosis, figure=figure)
 
 # %%
 # And then

@@ -71,18 +71,15 @@ def test_a_depolarizer_gains_no_polarization():
 def test_bounds_that_no_optic_has_do_not_make_a_size_possible():
     """An effect of a user may set bounds of its own: the Mueller matrix is not one then."""
 
-    class Wide(type(get_effect("anisotropic_depolarizer"))):
-        def build(self, size, anchor, context):
-            optic = super().build(size, anchor, context)
-            optic.retained_q.bounds = (0, 1.5)
-            return optic
-
-    problem, parameters = data.clean_model().edited(Wide())
+    effect = get_effect("anisotropic_depolarizer")
+    optic = effect.inserted.copy()
+    optic.retained_q.bounds = (0, 1.5)
+    problem, parameters = data.clean_model().edited(effect.changed(inserted=optic))
     for size, possible in ((0.9, True), (1.1, False)):
         q = problem.start.copy()
         q[problem.slices[parameters[0].name]] = size, 0.0, 0.0
-        model = Model(problem, Fit(q, 0.0, True), {Wide.name: parameters})
-        assert model.is_physical(Wide.name) == possible, size
+        model = Model(problem, Fit(q, 0.0, True), {effect.name: parameters})
+        assert model.is_physical(effect.name) == possible, size
 
 
 def _retaining(share):

@@ -9,72 +9,92 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.gap import _words
+from astropolcal.gap.cells import Cell
 
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
+DRIFT = Cell("in:derotator", "retardance_h", "time")
+BEFORE = {"left_out_before_percent": 2.0, "left_out_after_percent": 0.5}
 
 
-def entry(**changes):
+def named(name="beam_gain", probability=0.1):
+    own = {"effect": name, "cell": None, "probability": probability}
+    return own | {"name": name, "title": f"title of {name}"}
+
+
+def cell(place, kind="diattenuation_h", dependence="constant", probability=0.1):
+    one = Cell(place, kind, dependence)
+    own = {"effect": None, "cell": one.to_dict(), "probability": probability}
+    return own | {"name": f"{place}/{kind}/{dependence}", "title": one.title}
+
+
+def entry(what=None, **changes):
     """What `to_dict` says of a cause."""
     return {
+        **(what or named()),
         "rank": 1,
-        "effect": "beam_gain",
-        "title": "unequal gains",
-        "place": "detector",
+        "probability": 0.97,
+        "share": 1.0,
         "kind": "detector",
         "aliases": [],
-        "alias_titles": [],
-        "p_value": 1e-9,
         "explained": 0.9,
-        "gap_cv_before_percent": 2.0,
-        "gap_cv_after_percent": 0.5,
-        "parameters": {"g.i": {"value": 1.0, "std": 0.01, "unit": "", "limit": 1.0}},
+        "double_difference_share": 0.4,
+        **BEFORE,
+        "size": {"g.i": {"value": 0.5, "std": 0.01, "unit": "", "limit": 1.0}},
         "significance": 40.0,
         "physical": True,
+        "at_bound": 0,
         "trades_with": [],
-        "details": ["The size is physically possible."],
+        "details": ["Something."],
     } | changes
 
 
-def content(**changes):
+def where(kind="pattern", share=0.6, **changes):
+    return {"detail": f"a {kind}", "kind": kind, "share": share, "p_value": 1e-9} | changes
+
+
+def content(*causes, **changes):
     """What `to_dict` says of a diagnosis."""
-    return {
-        "verdict": "effect",
-        "causes": [entry()],
+    target = {"dolp_percent": 1.0, "s_p_percent": 0.05, "s_chi_deg": 0.25, "words": "so"}
+    dataset = {"name": "lamp", "s_res_percent": 1.0, "s_cv_percent": None}
+    accuracy = {"datasets": [dataset], "targets": [target]}
+    one = {
+        "verdict": "named",
+        "frames": [],
+        "causes": list(causes) or [entry()],
         "cross_validated": True,
         "exchanged": False,
         "gap_p_value": 1e-9,
-        "alpha": 0.01,
         "remainder_p_value": 0.4,
         "gap_before_percent": 2.0,
         "gap_after_percent": 0.5,
         "noise_floor_percent": 0.45,
+        "double_difference": {"before_percent": 1.1, "after_percent": 0.4, "noise_percent": 0.3},
         "n_effects": 12,
-        "scores": [{"p_value": 0.3}, {"p_value": 0.2}],
-        "where": [],
-        "shrinkage_percent": {"value": 94.0, "low": 90.0, "high": 96.0},
+        "where": [where(), where("place")],
+        "where_left": [],
+        "left_share": 0.0,
+        "next_observations": [],
+        "nominal": "hwp | wollaston. Free: hwp.theta",
+        "accuracy_before": accuracy,
+        "accuracy_after": accuracy,
     } | changes
+    return one | {"sentences": _words.sentences(one)}
 
 
-# ---- numbers -------------------------------------------------------------------------------
+# ---- numbers and names ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [(None, "-"), (np.nan, "-"), (np.inf, "-"), (1234.5, "1.23e+03"), (0.00123456, "0.00123")],
-)
-def test_number(value, words):
-    assert _words.number(value) == words
-
-
-def test_digits_of_a_number():
-    assert _words.number(1.23456, 5) == "1.2346"
-    assert _words.percent(1.23456, 2) == "1.2"
-    # no digits are lost in front of the point
-    assert _words.percent(1234.5, 2) == "1234"
-    assert _words.percent(-1234.5, 3) == "-1234"
-    assert _words.percent(np.nan) == "-"
-    # a trailing point is no digit
-    assert _words.percent(100.2, 3) == "100"
+def test_numbers_have_the_digits_that_count():
+    for value, words in ((None, "-"), (np.nan, "-"), (1234.5, "1.23e+03"), (0.00123456, "0.00123")):
+        assert _words.number(value) == words
+    for value, words in ((1.9, "1.90"), (0.108, "0.108"), (12345.6, "12346"), (100.2, "100")):
+        assert _words.percent(value) == words
+    for value, words in ((0.3, "0.3"), (2e-6, "2e-06"), (1e-7, "< 1e-6"), (0.0, "< 1e-6")):
+        assert _words.p(value) == words
+        assert (_words.doubt(value) == "beyond doubt") == (value < 1e-6)
+    for value, words in ((0.0, "0 %"), (0.0049, "< 1 %"), (1.0, "100 %"), (None, "-")):
+        assert _words.short_share(value) == words
+    assert _words.change(1.234, None) == "1.2 -> -"
 
 
 @given(st.floats(1e-3, 999))
@@ -82,58 +102,15 @@ def test_percent_is_within_half_a_digit(value):
     assert float(_words.percent(value)) == pytest.approx(value, rel=0.005)
 
 
-@pytest.mark.parametrize(
-    ("value", "alone", "with_letter"),
-    [
-        (0.3, "0.3", "p = 0.3"),
-        (1e-9, "1e-09", "p = 1e-09"),
-        (1e-98, "1e-98", "p = 1e-98"),
-        (0.0, "< 1e-99", "p < 1e-99"),
-        (1e-200, "< 1e-99", "p < 1e-99"),
-    ],
-)
-def test_probabilities(value, alone, with_letter):
-    assert _words.p(value) == alone
-    assert _words.p_is(value) == with_letter
-
-
-@pytest.mark.parametrize(
-    ("value", "words", "short"),
-    [
-        (0.0, "0 %", "0 %"),
-        (0.0049, "less than 1 %", "< 1 %"),
-        (0.005, "less than 1 %", "< 1 %"),
-        (0.006, "1 %", "1 %"),
-        (1.0, "100 %", "100 %"),
-    ],
-)
-def test_shares(value, words, short):
-    assert _words.share(value) == words
-    assert _words.short_share(value) == short
-
-
-def test_change():
-    assert _words.change(1.234, None) == "1.2 -> -"
-    assert _words.change(1.234, 0.1, 3) == "1.23 -> 0.100"
-
-
-# ---- names ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("texts", "options", "words"),
-    [
-        (["a"], {}, "a"),
-        (["a", "b"], {}, "a and b"),
-        (["a", "b", "c"], {"word": "or"}, "a, b or c"),
-        (["a", "b", "c"], {"most": 3}, "a, b and c"),
-        (["a", "b", "c", "d"], {"most": 3}, "a, b, c and 1 more"),
-        (["a", "b", "c", "d"], {"word": "or", "most": 1}, "a or 3 more"),
-    ],
-)
-def test_lists(texts, options, words):
-    assert _words.listed(texts, **options) == words
-    assert _words.listed(iter(texts), **options) == words
+def test_lists_end_with_how_many_more():
+    for texts, options, words in (
+        ("a", {}, "a"),
+        ("abc", {"word": "or"}, "a, b or c"),
+        ("abcd", {"most": 3}, "a, b, c and 1 more"),
+    ):
+        assert _words.listed(iter(texts), **options) == words
+    assert _words.in_title(["a", "b", "c"]) == "a, b and 1 more"
+    assert _words.in_title([]) == ""
 
 
 @given(st.text("abc", max_size=40), st.integers(1, 30))
@@ -144,243 +121,202 @@ def test_a_shortened_name_fits_and_keeps_its_ends(name, width):
         head, tail = found.split(ELLIPSIS)
         assert name.startswith(head)
         assert name.endswith(tail)
-        assert 0 <= len(head) - len(tail) <= 1
     else:
         assert found == name
+    assert _words.shortened("dataset3_polarized_2025-10-05", 19) == f"dataset3{ELLIPSIS}2025-10-05"
 
 
-# ---- sizes ---------------------------------------------------------------------------------
+# ---- sizes ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("size", "words"),
-    [
-        ({"value": 0.5, "std": 0.05, "unit": "deg", "limit": 1.0}, "0.500 +- 0.050 deg"),
-        # an error of a tenth of the limit still tells, more does not
-        ({"value": 0.5, "std": 0.1, "unit": "", "limit": 1.0}, "0.50 +- 0.10"),
-        ({"value": 0.5, "std": 0.101, "unit": "", "limit": 1.0}, "not determined by these data"),
-        ({"value": 55.0, "std": 12.0, "unit": "deg", "limit": 180.0}, "55 +- 12 deg"),
-        ({"value": 1.23456, "std": 0.0, "unit": "", "limit": 1.0}, "1.235 +- 0.000"),
-    ],
-)
-def test_size_of_one_number(size, words):
-    assert _words.sizes({"a.b": size}) == [f"a.b: {words}"]
-
-
-def test_size_of_a_law_is_its_range():
-    size = {"value": [1.0, 3.0, 2.0], "std": [0.1, 0.3, 0.2], "unit": "deg", "limit": 30.0}
-    assert _words.sizes({"a.b": size}) == [
-        "a.b: median 2.00, from 1.00 to 3.00 deg; errors 0.10 to 0.30 deg"
+def test_sizes_are_in_units_that_people_use():
+    known = {"unit": "deg", "limit": 30.0}
+    share = {"unit": "", "limit": 1.0}
+    lines = _words.sizes(
+        entry(
+            size={
+                "a.b": {"value": [1.0, 2.0, 9.0], "std": [0.1, 0.011, 25.0], **known},
+                "a.c": {"value": [1.0, 2.0], "std": [None, 25.0], **known},
+                "a.long_name": {"value": 0.0123456, "std": 0.000123, **share},
+                "a.e": {"value": [0.01, 0.01], "std": [0.001, 0.001], **share},
+            }
+        )
+    )
+    assert lines == [
+        "b: 1.000 to 2.000 deg, median 1.500, errors 0.011 to 0.10 deg; "
+        "determined at 2 of 3 wavelengths",
+        "c: not determined by these data at any wavelength",
+        "long name: 1.235 +- 0.012 %",
+        "e: 1.00 +- 0.10 % at every wavelength",
     ]
 
 
-@pytest.mark.parametrize(
-    ("std", "known"),
-    [([0.01, 0.02], True), ([0.01, None], True), ([None, None], False), ([5.0, 9.0], False)],
-)
-def test_a_size_is_known_if_one_wavelength_tells_it(std, known):
-    size = {"value": [1.0, 2.0], "std": std, "unit": "", "limit": 1.0}
-    assert _words.has_sizes({"parameters": {"a.b": size}}) == [known]
+def test_parameters_of_a_cell_have_names_without_its_name():
+    sizes = dict.fromkeys(("gap_x.amplitude", "gap_x.quadrature"), entry()["size"]["g.i"])
+    own = entry(cell("after:hwp", "rotation", "harmonic:hwp:2"), size=sizes)
+    assert _words.labels(own) == ["amplitude of the cosine", "amplitude of the sine"]
+    # two optics of one effect are told apart
+    sizes = dict.fromkeys(("one.size", "other.size"), entry()["size"]["g.i"])
+    assert _words.labels(entry(size=sizes)) == ["size of one", "size of other"]
 
 
-# ---- a cause -------------------------------------------------------------------------------
+def test_a_size_is_known_if_one_wavelength_tells_it():
+    for std, known in (([0.01, None], True), ([None, None], False), ([5.0, 9.0], False)):
+        size = {"value": [1.0, 2.0], "std": std, "unit": "", "limit": 1.0}
+        assert _words.has_sizes({"size": {"a.b": size}}) == [known]
+    vague = entry(size={"a.b": size}, trades_with=["hwp.w_sio2"])
+    assert "do not tell its size: a part can be exchanged for" in _words.cause(vague, {})
 
 
-def test_words_of_a_cause_say_all_that_is_known():
-    words = _words.cause(entry(), {"beam_gain": 1})
-    assert words.startswith("Unequal gains (detector). It explains 90 % of what exceeds the noise.")
-    assert "Left-out frames: 2.00 % without it, 0.500 % with it." in words
-    assert "corrected for the number of effects: p = 1e-09." in words
-    assert "Its size as a whole is 40 standard errors from zero." in words
-    assert words.endswith("The size is physically possible.")
+# ---- causes and what they may be taken for -------------------------------------------------------
 
 
-def test_a_size_at_a_bound_is_said_to_be_there():
-    several = {"g.i": {"value": [1.0, 0.9], "std": [0.01, 0.01], "unit": "", "limit": 1.0}}
-    for parameters, words in ((entry()["parameters"], ""), (several, " at 1 of 2 values")):
-        found = _words.cause(entry(parameters=parameters, at_bound=1), {})
-        assert found.endswith(f"The size is physically possible: at a bound of the optic{words}.")
+def test_every_cause_has_its_probability_beside_it():
+    assert "title of beam_gain (97 %)." in _words.cause(entry(), {})
+    words = _words.cause(entry(cell("in:derotator", "retardance_h", "time")), {})
+    assert words.startswith("Something in the derotator causes retardance along the axes that")
+    assert "(97 %); no name is known for it." in words
+    two = content(entry(), entry(named("tilt"), probability=0.92, rank=2))
+    assert "title of beam_gain (97 %) and title of tilt (92 %)" in two["sentences"][0]
+
+
+def test_the_same_kind_at_several_places_is_told_once():
+    aliases = [
+        cell("after:hwp", probability=0.3),
+        cell("after:derotator", probability=0.28),
+        cell("source", "rotation", "time", 0.06),
+        cell("after:hwp", "rotation", "time", 0.05),
+    ]
+    one = entry(cell("source"), share=0.3, aliases=aliases)
+    title = _words.title(one)
+    assert title.count("diattenuation") == 1
+    assert "at the source, behind the half-wave plate or behind the derotator" in title
+    assert _words.own_share(one) == pytest.approx(0.88)
+    (other,) = _words.others(one, {})
+    assert other.endswith("(11 %)")
+    # a place that is much less probable is another answer
+    aliases[1]["probability"] = 0.01
+    assert "behind the derotator" not in _words.title(one)
+
+
+def test_long_groups_are_told_shortly():
+    aliases = [named(f"e{i}", 0.05 - 0.001 * i) for i in range(12)]
+    words = _words.cause(entry(share=0.5, aliases=aliases), {})
+    assert "title of e3" in words
+    assert "title of e4" not in words
+    assert "or 8 more" in words
+    # none of them stands out
+    words = _words.cause(entry(share=0.2, aliases=aliases), {})
+    assert words.startswith("The model lacks one of several things (97 %)")
+
+
+def test_an_alias_that_is_a_cause_itself_is_no_alternative():
+    words = _words.cause(entry(aliases=[named("tilt")]), {"beam_gain": 1, "tilt": 2})
+    assert "It resembles cause 2: the data ask for both" in words
+    assert "hardly tell" not in words
+
+
+def test_a_cause_says_which_differences_it_concerns():
+    for kept, words in ((0.001, "it cancels in"), (0.4, "40 % of its signal is in")):
+        assert f"{words} the double differences" in _words.cause(
+            entry(double_difference_share=kept), {}
+        )
+    assert "double" not in _words.cause(entry(double_difference_share=None), {})
 
 
 def test_what_is_not_known_of_a_cause_is_left_out():
-    words = _words.cause(entry(gap_cv_before_percent=None, significance=None), {})
-    assert "Left-out frames" not in words
+    words = _words.cause(entry(left_out_before_percent=None, significance=None), {})
+    assert "left-out" not in words
     assert "standard errors" not in words
+    assert _words.cause(entry(kind="discrete", size={}), {}).endswith("has no size.")
+    assert "impossible" in _words.cause(entry(physical=False), {})
+    assert "at a bound of the optic at 1 of 1" in _words.cause(entry(at_bound=1), {})
 
 
-def test_a_discrete_cause_has_neither_size_nor_scan():
-    words = _words.cause(entry(kind="discrete", parameters={}), {})
-    assert "corrected for the number" not in words
-    assert words.endswith("It is an alternative to the model and has no size.")
+# ---- the summary ----------------------------------------------------------------------------
 
 
-def test_aliases_are_parted_into_causes_and_others():
-    ranks = {"beam_gain": 1, "background": 2, "hwp_tilt": 3}
-    names = ["background", "hwp_tilt", "persistence", "fringes"]
-    one = entry(aliases=names, alias_titles=[f"title of {name}" for name in names])
-    assert _words.open_aliases(one, ranks) == ["title of persistence", "title of fringes"]
-    first, second, *_ = _words.details(one, ranks)
-    assert first == ("These data cannot tell it from: title of persistence; title of fringes.")
-    assert second.startswith("It resembles cause 2 and cause 3: the data ask for both")
+def test_frames_come_first_in_every_verdict():
+    frames = [{"words": "Frame 29 of lamp has another plate angle (98 %)."}]
+    for verdict in ("none", "named", "located", "unexplained"):
+        first = _words.sentences(content(verdict=verdict, frames=frames))[0]
+        assert frames[0]["words"] in first
 
 
-# ---- sentences -----------------------------------------------------------------------------
+def test_every_verdict_has_its_sentence():
+    left = {"where_left": [where(share=0.2)], "left_share": 0.3, "remainder_p_value": 0.0}
+    for changes, words in (
+        ({"verdict": "none", "causes": []}, "The model agrees with the measurements"),
+        ({}, "The model lacks one effect: title of beam_gain (97 %)."),
+        ({"verdict": "unexplained"}, "I do not know what the model lacks: what helps most"),
+        ({"verdict": "unexplained", "causes": []}, "none of the 12 causes that were tried"),
+        ({"verdict": "unexplained", "causes": []}, "60 % of the gap follows a pattern."),
+        ({"verdict": "unexplained"} | left, "20 % of what is left follows a pattern."),
+        (left, "What is left, 30 % of the gap, is more than noise beyond doubt: 20 % of it"),
+        ({}, "What is left is noise (p = 0.4)."),
+        ({"cross_validated": False}, "the frames of the fit"),
+        ({"gap_p_value": 0.02}, "no larger than noise (p = 0.02), but have a pattern"),
+        ({"gap_p_value": 0.0}, "The gap is real beyond doubt."),
+    ):
+        assert words in " ".join(content(**changes)["sentences"])
 
 
-def test_sentences_of_a_gap_that_is_closed():
-    large, what, left = _words.sentences(content())
-    assert large == (
-        "The model misses the single differences of frames left out of the fit by 2.00 % of "
-        "polarization where the noise is 0.450 %; the gap is real (residuals as large by noise "
-        "alone: p = 1e-09)."
-    )
-    assert what == (
-        "The model lacks one effect: unequal gains, which explains 90 % of what exceeds the noise."
-    )
-    assert left == (
-        "With it the model predicts frames left out of the fit to 0.500 % (mean square lower by "
-        "94 %, 68 % interval 90 to 96 %), and what remains is noise (p = 0.4)."
-    )
+def test_double_differences_lead_and_single_ones_follow():
+    text = " ".join(content()["sentences"])
+    numbers = ("1.10 %", "0.400 %", "0.300 %", "2.00 %", "0.500 %", "0.450 %")
+    places = [text.index(number) for number in numbers]
+    assert places == sorted(places)
+    alone = " ".join(content(double_difference=None)["sentences"])
+    assert "In single differences the model is off by 2.00 %" in alone
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"cross_validated": False}, "misses the single differences of the frames of the fit by"),
-        ({"exchanged": True}, "misses the single differences of the frames by"),
-        ({"gap_p_value": 0.02}, "the residuals are no larger than noise (p = 0.02), but"),
-        ({"gap_p_value": 0.0}, "by noise alone: p < 1e-99"),
-    ],
-)
-def test_how_large_the_gap_is(changes, words):
-    assert words in _words.sentences(content(**changes))[0]
+def test_the_sky_is_spoken_of_where_the_improved_model_is_worth_saving():
+    assert "--save" in content()["sentences"][-1]
+    for verdict in ("none", "unexplained"):
+        assert "--save" not in " ".join(content(verdict=verdict)["sentences"])
 
 
-def test_sentences_of_no_gap():
-    large, what, left = _words.sentences(content(verdict="none", causes=[], gap_p_value=0.7))
-    assert large.startswith("The model agrees with the measurements: it predicts the single ")
-    assert large.endswith("the noise is 0.450 % (residuals as large by noise alone: p = 0.7).")
-    # the least of the corrected probabilities
-    assert "None of the 12 effects that were tried is needed (the least," in what
-    assert "p = 0.2" in what
-    assert "would not show" in left
-    nothing = content(verdict="none", causes=[], scores=[])
-    assert _words.sentences(nothing)[1] == (
-        "There was no effect to try that the model does not contain."
-    )
+# ---- the terminal ---------------------------------------------------------------------------
 
 
-def test_sentences_of_a_gap_that_no_effect_touches():
-    where = [{"detail": "derotator at 45 deg", "share": 0.4}]
-    _, what, left = _words.sentences(content(verdict="unexplained", causes=[], where=where))
-    assert what.startswith("None of the 12 effects that were tried explains it")
-    assert left.endswith("; the clearest part of it is derotator at 45 deg (40 % of the gap).")
-    bare = _words.sentences(content(verdict="unexplained", causes=[]))[2]
-    assert bare == "Nothing should be added to the model before its cause is known."
-
-
-def test_sentence_of_effects_that_help_only():
-    some = content(verdict="unexplained", causes=[entry(explained=0.3)])
-    assert _words.sentences(some)[1] == (
-        "The effects that help (unequal gains) explain only 30 % of what exceeds the noise: "
-        "the cause is not in the library."
-    )
-
-
-def test_sentence_of_an_alias_group():
-    group = entry(aliases=["b", "c", "d"], alias_titles=["tb", "tc", "td"])
-    what = _words.sentences(content(causes=[group]))[1]
-    assert "lacks one of these, which the data cannot tell apart: unequal gains, tb, tc or" in what
-    assert "or 1 more, which explains 90 %" in what
-
-
-@pytest.mark.parametrize(
-    ("doubtful", "words"),
-    [
-        (0, "a and b."),
-        (1, "a and b (one of them may as well be another effect, as listed)."),
-        (2, "a and b (2 of them may as well be other effects, as listed)."),
-    ],
-)
-def test_sentence_of_two_causes(doubtful, words):
-    other = {"aliases": ["x"], "alias_titles": ["tx"]}
-    causes = [
-        entry(effect=name, title=name, explained=share) | (other if i < doubtful else {})
-        for i, (name, share) in enumerate((("b", 0.2), ("a", 0.7)))
-    ]
-    what = _words.sentences(content(causes=causes))[1]
-    assert what.startswith("The model lacks 2 effects, which explain 90 % of what exceeds")
-    assert what.endswith(words)
-
-
-def test_what_is_left_is_called_by_its_probability():
-    rest = {"value": None, "low": None, "high": None}
-    causes = [entry(physical=False), entry(title="tilt", physical=False)]
-    left = _words.sentences(content(causes=causes, remainder_p_value=1e-5, shrinkage_percent=rest))[
-        2
-    ]
-    assert left == (
-        "With them the model predicts frames left out of the fit to 0.500 %, and what remains is "
-        "more than noise and unexplained (p = 1e-05); physically impossible is the size of unequal "
-        "gains and tilt."
-    )
-
-
-# ---- the terminal --------------------------------------------------------------------------
-
-
-def report(**changes):
-    accuracy = {
-        "datasets": [{"name": "lamp", "s_res_percent": 1.0, "s_cv_percent": None}],
-        "targets": [
-            {"dolp_percent": 30.0, "column": "s_mean", "s_p_percent": 0.5, "s_chi_deg": 0.25}
-        ],
+def test_the_summary_comes_first_and_lines_fit():
+    alias = [named("b")]
+    many = [entry(named(f"{'x' * 40}{i}"), rank=i + 1, aliases=alias) for i in range(6)]
+    take = {
+        "words": f"Take {'this ' * 30}: tells",
+        "separates": [many[0]["name"], "b"],
+        "gain": 5.0,
     }
-    return (
-        content(
-            sentences=["one.", "two."],
-            next_observations=[{"words": "Take this"}, {"words": "Take that"}],
-            nominal="hwp | wollaston. Free: hwp.theta",
-            accuracy_before=accuracy,
-            accuracy_after=accuracy,
-            where=[
-                {"detail": "harmonic 4", "share": 0.6, "p_value": 1e-9},
-                {"detail": "1450 nm", "share": 0.7, "p_value": 0.0},
-            ],
+    for causes, written in ((many, ["a.json", "b.html"]), (many[:1], [])):
+        one = content(*causes, next_observations=[take] * 3)
+        lines = _words.text(one, ("s_res", "s_cv"), ["Left out: 2."], written).splitlines()
+        assert max(map(len, lines)) <= 80
+        summary = "\n".join(lines[:24])
+        assert all(f"{share:>3}" in summary for share in ("97 %", "2.00 %", "1.10 %"))
+        assert "tells cause 1 from what it may be (5.0 standard" in " ".join(
+            " ".join(lines).split()
         )
-        | changes
-    )
+        assert all(name in "\n".join(lines[:30]) for name in written)
+    assert re.search(r"^  lamp +1\.00 -> 1\.00 +- -> -$", "\n".join(lines), re.MULTILINE)
+    assert "p = 1e-09" not in "\n".join(lines)
 
 
-def test_report_is_in_the_order_of_importance():
-    text = _words.text(report(), ("s_res", "s_cv"))
-    parts = [part.splitlines()[0] for part in text.split("\n\n")]
-    assert [part.split()[0] for part in parts] == [
-        *("one.", "Causes;", "Cause", "What", "Where", "Accuracy", "Nominal"),
-    ]
-    assert max(map(len, text.splitlines())) <= 80
-    assert "  1. Take this\n  2. Take that" in text
-    assert re.search(r"^  lamp +1\.00 -> 1\.00 +- -> -$", text, re.MULTILINE)
-    assert "target of 30 % by s_mean: s_p 0.50 -> 0.50 %, s_chi 0.25 -> 0.25 deg" in text
+def test_of_where_the_gap_lies_five_lines_are_told():
+    looks = [where(share=0.5 - 0.01 * i) for i in range(9)] + [where("place")] * 4
+    assert [one["kind"] for one in _words.worth_reading(looks)] == ["pattern"] * 3 + ["place"] * 2
+    assert len(_words.worth_reading(looks[:9])) == 5
+    text = _words.text(content(where=looks), ("s_res",))
+    assert " 50 %  follows a pattern" in text
+    assert " 60 %  lies in a place" in text
 
 
-def test_shares_of_both_lists_are_said_not_to_add_up():
-    text = _words.text(report(), ("s_res",))
-    where = next(part for part in text.split("\n\n") if part.startswith("Where"))
-    words = " ".join(where.split())
-    assert "each has the share that those before it have left" in words
-    assert "Places overlap" in words
-    assert "do not add up" in words
-    # the smallest probabilities are not written out
-    assert "60 % harmonic 4 (p = 1e-09)" in words
-    assert words.endswith("70 % 1450 nm")
-
-
-def test_empty_parts_are_left_out():
-    text = _words.text(report(causes=[], where=[], next_observations=[]), ("s_res",))
-    assert "Where" not in text
-    assert "observe next" not in text
-    assert "Cause" not in text
+def test_what_is_hardly_probable_is_told_in_the_table_only():
+    doubtful = entry(probability=0.01)
+    text = _words.text(content(doubtful, verdict="unexplained"), ("s_res",))
+    assert "Cause 1:" not in text
+    assert re.search(r"^1 +1 % +90 % +40 %  beam_gain", text, re.MULTILINE)
+    empty = content(verdict="none", causes=[], where=[])
+    assert "cause" not in _words.text(empty | {"causes": []}, ("s_res",))
 
 
 def test_lines_are_broken_under_their_beginning():
@@ -389,15 +325,3 @@ def test_lines_are_broken_under_their_beginning():
     assert lines[1].startswith("    word")
     assert [line for line in lines if line.startswith("     word")]
     assert lines[-1] == ""
-    # a name with hyphens stays whole
-    long = "x" * 70 + " half-wave-plate"
-    assert list(_words._wrapped([long]))[1] == "half-wave-plate"
-
-
-def test_table_of_causes_shortens_long_names():
-    long = entry(effect="x" * 40, place="y" * 60, gap_cv_before_percent=None)
-    lines = _words._table_lines(content(causes=[long, entry(gap_cv_after_percent=None)]))
-    assert max(map(len, lines[1:])) <= 80
-    assert f"{'x' * 13}{ELLIPSIS}{'x' * 12}" in lines[2]
-    assert lines[1].split() == ["effect", "place", "explains", "left-out", "(%)"]
-    assert lines[3].endswith("2.00 -> -")

@@ -3,111 +3,100 @@
 
 from types import SimpleNamespace
 
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
+from astropolcal import instruments
 from astropolcal.exceptions import ParameterError
+from astropolcal.gap import Cause, get_effect
+from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import EffectParameter
+from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.model import nominal_model
 from astropolcal.gap.residuals import Where
 from astropolcal.plotting import effects, gap
-from astropolcal.plotting._style import BLUE, ORANGE, SKY, VERMILION
-from astropolcal.plotting.effects import plot_effect_scores, plot_effect_sizes
+from astropolcal.plotting._style import BLACK, BLUE, ORANGE
+from astropolcal.plotting.effects import cause_map, plot_cause_map, plot_effect_sizes
 from astropolcal.plotting.gap import plot_where
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 NM = np.array([1200.0, 1600.0, 2200.0])
 
 
-def score(name, statistic, p_value, scale=1.0):
-    return SimpleNamespace(
-        effect=SimpleNamespace(name=name), statistic=statistic, scale=scale, p_value=p_value
+def cause(what, probability=1.0, aliases=(), share=1.0):
+    """A cause that is a cell, or a named effect that has none."""
+    cell = what if isinstance(what, Cell) else None
+    effect = CellEffect(what) if cell else get_effect(what)
+    aliases = [(SimpleNamespace(effect=CellEffect(one), cell=one), part) for one, part in aliases]
+    return Cause(effect, cell, probability, aliases, share, 0.0, 0.9)
+
+
+def diagnosis(*causes, verdict="located"):
+    chain = instruments.get("charis").chain(derotator="linear")
+    nominal = SimpleNamespace(chains=[chain])
+    return SimpleNamespace(causes=list(causes), verdict=verdict, nominal=nominal)
+
+
+# ---- the map -------------------------------------------------------------------------------
+
+DRIFT = Cell("in:derotator", "retardance_h", "time")
+
+
+def test_rows_are_places_in_the_order_of_the_light():
+    rows = list(cause_map(diagnosis()))
+    assert rows == ["source", "in:hwp", "after:hwp", "in:derotator", "after:derotator", "detector"]
+    # a place that the chain of these data does not have
+    assert (
+        list(cause_map(diagnosis(cause(Cell("telescope", "rotation", "time")))))[-1] == "telescope"
     )
 
 
-def cause(name, aliases=(), explained=0.9):
-    return SimpleNamespace(name=name, aliases=list(aliases), explained=explained)
-
-
-def diagnosis(scores=(), causes=(), verdict="effect", **settings):
-    return SimpleNamespace(
-        scores=list(scores), causes=list(causes), verdict=verdict, settings=settings
-    )
-
-
-# ---- the scan ------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def scanned():
-    scores = [
-        score("found", 900.0, 0.0),
-        score("alias", 1600.0, 1e-20, scale=4.0),
-        score("strong", 100.0, 1e-6),
-        score("weak", 4.0, 0.4),
+def test_probabilities_are_summed_over_dependences_and_aliases():
+    others = [
+        (Cell("in:derotator", "retardance_d", "step:4"), 0.2),
+        (Cell("after:hwp", "rotation", "time"), 0.3),
     ]
-    return diagnosis(scores, [cause("found", ["alias"])])
+    found = cause_map(diagnosis(cause(DRIFT, 0.9, others, share=0.5)))
+    assert found["in:derotator"]["retardance"] == (pytest.approx(0.63), "along axes")
+    assert found["after:hwp"]["rotation"][0] == pytest.approx(0.27)
+    # of two causes at one place at least one is there
+    found = cause_map(diagnosis(cause(DRIFT, 0.5), cause(DRIFT, 0.5)))
+    assert found["in:derotator"]["retardance"][0] == pytest.approx(0.75)
 
 
-def test_bars_are_signal_to_noise_ratios_in_their_order(scanned):
-    (axes,) = plot_effect_scores(scanned).axes
-    assert [bar.get_width() for bar in axes.patches] == [30.0, 20.0, 10.0, 2.0]
-    names = [text.get_text() for text in axes.get_yticklabels()]
-    assert names == ["found", "alias", "strong", "weak"]
-    # the best one is at the top
-    low, high = axes.get_ylim()
-    assert low > high
-    assert axes.get_xlim() == (0, pytest.approx(1.18 * 30))
+def test_named_effects_have_a_place_in_the_map():
+    for name, place, family in (
+        ("beam_gain", "detector", "beams, detector"),
+        ("hwp_diattenuation", "in:hwp", "diattenuation"),
+        ("static_retarder", "after:derotator", "other"),
+        ("hwp_encoder_eccentricity", "in:hwp", "other"),
+    ):
+        found = {k: row for k, row in cause_map(diagnosis(cause(name))).items() if row}
+        assert list(found) == [place]
+        assert family in found[place] or family == "other"
 
 
-def test_bars_tell_their_kind_by_more_than_colour(scanned):
-    figure = plot_effect_scores(scanned)
-    bars = figure.axes[0].patches
-    assert [bar.get_facecolor() for bar in bars] == [
-        to_rgba(color) for color in (VERMILION, ORANGE, SKY, "0.85")
-    ]
-    assert [bool(bar.get_hatch()) for bar in bars] == [False, True, False, False]
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["found", "alias: the data cannot tell", "significant", "not significant"]
+def test_cells_that_matter_have_words():
+    axes = plot_cause_map(diagnosis(cause(DRIFT, 0.98), cause("beam_gain", 0.3))).axes[0]
+    assert [text.get_text() for text in axes.texts] == ["98 %", "along axes", "30 %", "named"]
+    # dark words on light ground, and the reverse
+    assert [text.get_color() for text in axes.texts[::2]] == ["white", BLACK]
+    assert not plot_cause_map(diagnosis()).axes[0].texts
 
 
-def test_probabilities_stand_at_the_bars(scanned):
-    (axes,) = plot_effect_scores(scanned).axes
-    texts = [text.get_text().strip() for text in axes.texts]
-    assert texts == ["p < 1e-15", "p < 1e-15", "p = 1e-06", "p = 0.4"]
-    places = [text.get_position() for text in axes.texts]
-    assert places == [(30.0, 0), (20.0, 1), (10.0, 2), (2.0, 3)]
-
-
-def test_no_more_than_the_best_are_drawn(scanned):
-    (axes,) = plot_effect_scores(scanned, limit=2).axes
-    assert len(axes.patches) == 2
-
-
-def test_significance_is_that_of_the_diagnosis(scanned):
-    scanned.settings["alpha"] = 0.5
-    labels = [t.get_text() for t in plot_effect_scores(scanned).legends[0].get_texts()]
-    assert "not significant" not in labels
-
-
-def test_nothing_to_score():
-    (axes,) = plot_effect_scores(diagnosis(verdict="none")).axes
-    assert [text.get_text() for text in axes.texts] == ["no effect to score"]
-
-
-@pytest.mark.parametrize(
-    ("verdict", "causes", "line"),
-    [
-        ("effect", [cause("a")], "1 effect is missing: a"),
-        ("effect", [cause("a", explained=0.1), cause("b")], "2 effects are missing: b and a"),
+def test_verdict_as_a_title():
+    for verdict, causes, line in (
+        ("named", ["beam_gain"], "named: beam_gain"),
+        ("located", ["beam_gain", "hwp_tilt"], "located: 2 causes"),
         ("none", [], "no gap beyond the noise"),
-        ("unexplained", [], "a real gap that no effect explains"),
-        ("unexplained", [cause("a")], "a real gap that no effect explains\n(in part: a)"),
-    ],
-)
-def test_verdict_as_a_title(verdict, causes, line):
-    assert effects.verdict_line(diagnosis(causes=causes, verdict=verdict)) == line
+        ("unexplained", ["beam_gain"], "a real gap that is not explained"),
+    ):
+        own = diagnosis(*map(cause, causes), verdict=verdict)
+        assert effects.verdict_line(own) == line
 
 
 # ---- sizes ---------------------------------------------------------------------------------
@@ -119,35 +108,25 @@ def sized(sizes, parameters, factor=1.0):
         wavelength=NM / 1000,
         free=SimpleNamespace(by_name={name: SimpleNamespace(factor=factor) for name in sizes}),
     )
-    model = SimpleNamespace(problem=problem, added={"one": parameters}, chains=[])
-    found = diagnosis(causes=[cause("one")])
+    found = diagnosis(cause("beam_gain"))
+    model = SimpleNamespace(problem=problem, added={"beam_gain": parameters}, chains=[])
     found.nominal = found.improved = model
-    return found, {"causes": [{"parameters": sizes}]}
+    return found, {"causes": [{"size": sizes}]}
 
 
-def size(value, std, unit="", limit=1.0):
+def size(value, std, unit="deg", limit=1.0):
     return {"value": list(value), "std": list(std), "unit": unit, "limit": limit}
 
 
-@pytest.fixture
-def four():
-    names = ["gap_one.horizontal", "gap_one.diagonal", "gap_one.horizontal_rate"]
-    sizes = {name: size([1.0, 2.0, 3.0], [0.01, 0.02, 0.03], "deg") for name in names}
+def test_a_panel_for_each_size_that_depends_on_the_wavelength():
+    names = ["gap_one.horizontal", "gap_one.horizontal_rate", "gap_one.same", "gap_one.common"]
+    sizes = {name: size([1.0, 2.0, 3.0], [0.01, 0.02, 0.03]) for name in names[:2]}
+    sizes["gap_one.same"] = size([1.0] * 3, [0.01] * 3)
     sizes["gap_one.common"] = {"value": 1.0, "std": 0.1, "unit": "", "limit": 1.0}
-    return sized(sizes, [EffectParameter(name, 1, 1) for name in sizes])
-
-
-def test_a_panel_for_each_size_that_depends_on_the_wavelength(four):
-    found, content = four
-    figure = plot_effect_sizes(found, "one", content=content)
-    drawn = [axes for axes in figure.axes if axes.axison]
-    assert [axes.get_ylabel() for axes in drawn] == [
-        "horizontal (deg)",
-        "diagonal (deg)",
-        "horizontal rate (deg)",
-    ]
-    assert all(axes.get_xlabel() == "wavelength (nm)" for axes in drawn)
-    for axes in drawn:
+    found, content = sized(sizes, [EffectParameter(name, 1, 1) for name in names])
+    figure = plot_effect_sizes(found, "beam_gain", content=content)
+    assert [a.get_ylabel() for a in figure.axes] == ["horizontal (deg)", "horizontal rate (deg)"]
+    for axes in figure.axes:
         line, _, (bars,) = axes.containers[0].lines
         np.testing.assert_allclose(line.get_xdata(), NM)
         np.testing.assert_allclose(line.get_ydata(), [1, 2, 3])
@@ -155,47 +134,64 @@ def test_a_panel_for_each_size_that_depends_on_the_wavelength(four):
         np.testing.assert_allclose(lengths, [0.01, 0.02, 0.03])
 
 
-@pytest.mark.parametrize(
-    ("name", "neutral", "factor", "line"),
-    [
-        ("gap_one.horizontal", None, 1.0, 0.0),
-        # a share that is retained is one where there is no effect
-        ("gap_one.retained_q", None, 1.0, 1.0),
+def test_the_line_is_where_the_effect_is_absent():
+    for name, neutral, factor, unit, line in (
+        ("gap_one.horizontal", None, 1.0, "deg", 0.0),
+        # a share that is retained is one where there is no effect, and drawn in percent
+        ("gap_one.retained_q", None, 1.0, "", 100.0),
         # an angle that the model held, in degrees though canonical inside
-        ("k.theta", np.pi / 2, np.pi / 180, 90.0),
+        ("k.theta", np.pi / 2, np.pi / 180, "deg", 90.0),
         # a catalogue's polarization, one a wavelength
-        ("star.q", [0.01, 0.02, 0.03], 1.0, [0.01, 0.02, 0.03]),
-    ],
-)
-def test_the_line_is_where_the_effect_is_absent(name, neutral, factor, line):
-    parameter = EffectParameter(name, 1, 1, neutral=neutral)
-    found, content = sized({name: size([1.0] * 3, [0.01] * 3)}, [parameter], factor)
-    (axes,) = plot_effect_sizes(found, "one", content=content).axes
-    np.testing.assert_allclose(axes.lines[0].get_ydata(), line)
+        ("star.q", [0.01, 0.02, 0.03], 1.0, "", [1, 2, 3]),
+    ):
+        parameter = EffectParameter(name, 1, 1, neutral=neutral)
+        sizes = {name: size([1.0, 1.0, 1.1], [0.01] * 3, unit)}
+        found, content = sized(sizes, [parameter], factor)
+        (axes,) = plot_effect_sizes(found, "beam_gain", content=content).axes
+        np.testing.assert_allclose(axes.lines[0].get_ydata(), line)
 
 
 def test_wavelengths_without_a_size_are_crosses_at_the_foot():
     sizes = {"gap_one.horizontal": size([1.0, 2.0, 3.0], [0.01, 0.2, None])}
     found, content = sized(sizes, [EffectParameter("gap_one.horizontal", 1, 1)])
-    (axes,) = plot_effect_sizes(found, "one", content=content).axes
+    (axes,) = plot_effect_sizes(found, "beam_gain", content=content).axes
     (crosses,) = [line for line in axes.lines if line.get_marker() == "x"]
     np.testing.assert_allclose(crosses.get_xdata(), NM[1:])
-    np.testing.assert_allclose(crosses.get_ydata(), 0.05)
     # in shares of the height of the panel
     assert crosses.get_transform() == axes.get_xaxis_transform()
     assert axes.get_title(loc="left") == "crosses: not determined"
-    sizes["gap_one.horizontal"]["std"] = [None] * 3
-    (axes,) = plot_effect_sizes(found, "one", content=content).axes
-    assert len(axes.get_yticks()) == 0
 
 
-def test_what_has_no_size_is_refused(four):
-    found, content = four
-    with pytest.raises(ParameterError, match="'other' is no cause; these are: one"):
-        plot_effect_sizes(found, "other", content=content)
-    content["causes"][0]["parameters"] = {}
-    with pytest.raises(ParameterError, match="'one' has no size that depends on wavelength"):
-        plot_effect_sizes(found, "one", content=content)
+def test_what_has_no_size_is_refused():
+    found, content = sized({}, [])
+    for name, words in (("other", "is no cause; these are: beam_gain"), ("beam_gain", "anything")):
+        with pytest.raises(ParameterError, match=words):
+            plot_effect_sizes(found, name, content=content)
+
+
+def test_a_cell_is_drawn_over_what_it_depends_on():
+    """The curve is that of the model, in degrees, with its error about it."""
+    chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6, 2.2] * u.um)
+    frames = half_wave_plate_cycles(derotator=[45, 70, 95] * u.deg)
+    model = nominal_model([chain], [simulate(chain, NM * u.nm, frames, seed=1)])
+    for dependence, label in (
+        ("time", "share of the run"),
+        ("harmonic:derotator:2", "angle of the derotator (deg)"),
+        ("direction:hwp", "last move of the half-wave plate"),
+    ):
+        cell = Cell("in:derotator", "retardance_h", dependence)
+        own = cause(cell)
+        own.effect = CellEffect(cell, 0)
+        improved = model.with_effect(own.effect)
+        found = SimpleNamespace(nominal=model, improved=improved, causes=[own])
+        (axes,) = plot_effect_sizes(found, own.name).axes
+        assert axes.get_xlabel() == label
+        assert "deg" in axes.get_ylabel()
+        first = next(iter(improved.sizes(own.name).values()))
+        value = np.rad2deg(first[3].basis @ first[0])[0]
+        if dependence == "time":
+            curve = next(line for line in axes.lines if len(line.get_xdata()) == 400)
+            np.testing.assert_allclose(curve.get_ydata()[[0, -1]], [-value, value], rtol=1e-6)
 
 
 # ---- where ---------------------------------------------------------------------------------

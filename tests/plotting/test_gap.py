@@ -14,18 +14,17 @@ from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap import diagnose, get_effect
-from astropolcal.gap.report import to_dict
 from astropolcal.gap.residuals import locate
 from astropolcal.plotting.gap import (
-    plot_effect_scores,
-    plot_effect_sizes,
+    plot_cause_map,
+    plot_gap_frames,
     plot_gap_maps,
     plot_gap_spectrum,
     plot_where,
 )
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
-ALL = [plot_effect_scores, plot_gap_maps, plot_gap_spectrum, plot_where]
+ALL = [plot_cause_map, plot_gap_frames, plot_gap_maps, plot_gap_spectrum, plot_where]
 WAVELENGTH = [1200, 1400, 1600, 1900, 2200] * u.nm
 
 
@@ -39,7 +38,11 @@ def make(imbalance):
     mask[3, 2] = True
     effects = ["beam_gain", "hwp_diattenuation", "source_circular"]
     return diagnose(
-        chain, data.with_mask(mask, "cosmic ray"), effects=effects, cross_validate=False
+        chain,
+        data.with_mask(mask, "cosmic ray"),
+        effects=effects,
+        cross_validate=False,
+        cells=False,
     )
 
 
@@ -88,15 +91,16 @@ def test_map_of_the_sums(gap):
         plot_gap_maps(gap, channel="product")
 
 
-def test_scores_mark_what_was_found(gap, none):
-    figure = plot_effect_scores(gap)
-    labels = [t.get_text() for t in figure.axes[0].get_yticklabels()]
-    assert labels[0] == gap.causes[0].name == "beam_gain"
-    widths = [patch.get_width() for patch in figure.axes[0].patches]
-    assert widths == sorted(widths, reverse=True)
-    assert widths[0] ** 2 == pytest.approx(gap.scores[0].statistic / gap.scores[0].scale)
-    assert "found" in [t.get_text() for t in figure.legends[0].get_texts()]
-    assert "found" not in [t.get_text() for t in plot_effect_scores(none).legends[0].get_texts()]
+def test_frames_show_what_the_causes_do(gap, none):
+    (axes,) = plot_gap_frames(gap).axes
+    before, after, line = (
+        next(x for x in axes.lines if x.get_label() == label).get_ydata()
+        for label in ("before", "after", "what the causes do")
+    )
+    np.testing.assert_allclose(before - after, line)
+    assert np.std(after) < 0.3 * np.std(before)
+    labels = [line.get_label() for line in plot_gap_frames(none).axes[0].lines]
+    assert "after" not in labels
 
 
 def test_shares_are_those_of_the_table(gap, none):
@@ -115,49 +119,14 @@ def test_shares_end_at_a_hundred(gap):
         assert axes.get_xlim() == (0, 100)
 
 
-def test_sizes_are_those_of_the_fit(gap):
-    figure = plot_effect_sizes(gap, "beam_gain")
-    (axes,) = figure.axes
-    line, _, bars = axes.containers[0].lines
-    np.testing.assert_allclose(line.get_ydata(), 0.02, rtol=0.1)
-    ends = np.array([np.ptp(s[:, 1]) / 2 for s in bars[0].get_segments()])
-    content = to_dict(gap)
-    (size,) = content["causes"][0]["parameters"].values()
-    np.testing.assert_allclose(ends, size["std"], rtol=1e-6)
-    same = plot_effect_sizes(gap, "beam_gain", content=content)
-    assert same.axes[0].get_ylim() == axes.get_ylim()
-
-
-def test_sizes_that_are_not_determined_are_marked(gap):
-    content = to_dict(gap)
-    (size,) = content["causes"][0]["parameters"].values()
-    size["std"][1], size["std"][3] = None, 9.0
-    (axes,) = plot_effect_sizes(gap, "beam_gain", content=content).axes
-    assert len(axes.containers[0].lines[0].get_xdata()) == 3
-    assert axes.get_title(loc="left") == "crosses: not determined"
-
-
-def test_sizes_of_what_is_no_cause(gap):
-    with pytest.raises(ParameterError, match="these are: beam_gain"):
-        plot_effect_sizes(gap, "hwp_diattenuation")
-    content = to_dict(gap)
-    for size in content["causes"][0]["parameters"].values():
-        size["value"] = 0.1
-    with pytest.raises(ParameterError, match="depends on wavelength"):
-        plot_effect_sizes(gap, "beam_gain", content=content)
-
-
 def test_titles_of_many_causes_fit(gap, monkeypatch):
-    """Names of effects and of a dataset that are too long stay within the figure."""
-    (cause,) = gap.causes
-    names = ("hwp_encoder_eccentricity", "derotator_diattenuation", "static_diattenuator")
-    many = [replace(cause, effect=get_effect(n)) for n in (*names, "background", "hwp_tilt")]
-    diagnosis = replace(gap, causes=[*many, cause])
+    """Names of causes and of a dataset that are too long stay within the figure."""
+    many = [replace(gap.causes[0], effect=get_effect("hwp_encoder_eccentricity"))] * 6
     monkeypatch.setattr(gap.nominal.observations[0], "name", "a_very_long_name_of_a_dataset_" * 3)
-    figures = [plot(diagnosis) for plot in (plot_effect_scores, plot_gap_maps, plot_gap_spectrum)]
-    for figure in figures:
-        assert "and 4 more" in figure.get_suptitle()
-        check_titles(figure)
+    for causes in (many, many[:1]):
+        diagnosis = replace(gap, causes=causes)
+        for plot in (plot_gap_frames, plot_gap_maps, plot_gap_spectrum):
+            check_titles(plot(diagnosis))
 
 
 def check_titles(figure):

@@ -6,6 +6,7 @@ One row each of `astropolcal.gap.effects.library`, in `EFFECTS`; `register_effec
 """
 
 from astropolcal.exceptions import GapError
+from astropolcal.gap.effects._check import check_against, check_declared
 from astropolcal.gap.effects.base import (
     KINDS,
     Context,
@@ -13,9 +14,10 @@ from astropolcal.gap.effects.base import (
     EffectParameter,
     tracking_laws,
 )
-from astropolcal.gap.effects.check import check_against, check_declared
-from astropolcal.gap.effects.effect import (
-    Effect,
+from astropolcal.gap.effects.effect import Effect
+from astropolcal.gap.effects.library import LIBRARY
+from astropolcal.gap.effects.roles import Roles, adapted
+from astropolcal.gap.effects.where import (
     Where,
     after,
     before,
@@ -29,8 +31,6 @@ from astropolcal.gap.effects.effect import (
     telescope,
     time,
 )
-from astropolcal.gap.effects.library import LIBRARY
-from astropolcal.gap.effects.roles import Roles, adapted
 from astropolcal.words import did_you_mean
 
 __all__ = [

@@ -8,8 +8,9 @@ from astropolcal import optics
 from astropolcal.calibration._directions import ranked
 from astropolcal.chain import insert_optic, leaves, remove_optic, replace_optic
 from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
-from astropolcal.gap.effects.effect import Effect, Where
+from astropolcal.gap.effects.effect import Effect
 from astropolcal.gap.effects.roles import is_held
+from astropolcal.gap.effects.where import Where
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
 

@@ -4,7 +4,8 @@
 from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap.effects._detector_cells import detector_optic
 from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
-from astropolcal.gap.effects.effect import Effect, Where
+from astropolcal.gap.effects.effect import Effect
+from astropolcal.gap.effects.where import Where
 from astropolcal.optics import GENERATORS
 
 __all__ = ["CellEffect"]

@@ -7,37 +7,23 @@ effect would do to the data; fitted, the edited chains are ordinary chains again
 """
 
 import copy
-from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import Train, insert_optic
+from astropolcal.chain import insert_optic
 from astropolcal.exceptions import GapError, ParameterError
-from astropolcal.gap.cells import Cell, Place, places
+from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
 from astropolcal.gap.effects.roles import SEVERAL, Roles
+from astropolcal.gap.effects.where import Where
 from astropolcal.measurement import Tie
 from astropolcal.optics import GENERATORS, Dependence
 from astropolcal.optics.perturbations import split_run
 from astropolcal.words import did_you_mean
 
-__all__ = [
-    "Effect",
-    "Where",
-    "after",
-    "before",
-    "detector",
-    "direction",
-    "harmonic",
-    "inside",
-    "move",
-    "source",
-    "step",
-    "telescope",
-    "time",
-]
+__all__ = ["Effect"]
 
 # the most that a kind may be: beyond it is no perturbation
 _LIMITS = {"retardance": np.pi, "rotation": np.pi / 4, "diattenuation": 3.0, "depolarization": 3.0}
@@ -52,264 +38,6 @@ _SEVERAL = {
 NUMBER = "number"
 # largest change of an optic's Mueller matrix from the identity that is none
 _SAME = 1e-9
-
-
-# ---- places ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Where:
-    """
-    A place in chains, told by an optic.
-
-    Parameters
-    ----------
-    relation : {"after", "before", "inside", "source", "telescope", "detector"}
-        Inside is the frame that turns with the optic.
-    optic : str or None
-        Its name, or its role.
-    is_role : bool
-        Whether only the role counts, see `Roles`.
-    in_front : bool
-        Whether what is inside an optic stands in front of it.
-    turned : float
-        Orientation to that of the optic, degree.
-    otherwise : Where or None
-        The place of chains that lack the optic.
-
-    See Also
-    --------
-    after, before, inside, source, telescope, detector : make one.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import Where
-    >>> Where("inside", "hwp").words
-    'hwp'
-    """
-
-    relation: str
-    optic: str | None = None
-    is_role: bool = False
-    in_front: bool = False
-    turned: float | None = None
-    otherwise: object = None
-
-    @property
-    def words(self):
-        """The place in words."""
-        side = {"after": "behind the ", "before": "in front of the "}.get(self.relation, "")
-        return f"{side}{self.optic or self.relation}"
-
-    @property
-    def follows(self):
-        """Whether the orientation is that of the optic, whatever that is."""
-        return self.relation == "inside" and self.turned is None
-
-    def anchor(self, roles):
-        """Return the optic by which the place is told, None where there is none."""
-        own = [] if self.is_role else [o for o in roles.leaves if o.name == self.optic]
-        return next(iter(own), getattr(roles, self.optic or "", None))
-
-    def find(self, roles, chosen=None):
-        """Return the `Place` in a chain, or None; no other where an optic was chosen."""
-        if self.relation == "detector":
-            split = next((o for o in roles.leaves if o.splits_light), None)
-            return split and Place("detector", after=split.name)
-        if self.optic is None:
-            there = {place.name: place for place in places(Train(roles.leaves))}
-            return there.get(self.relation)
-        optic = self.anchor(roles)
-        if optic is None:
-            other = self.otherwise if chosen is None else None
-            return other and other.find(roles)
-        in_front = self.in_front or self.relation == "before"
-        side = {"before" if in_front else "after": optic.name}
-        theta, mount = 0.0, None
-        if self.relation == "inside" or self.turned is not None:
-            theta = np.deg2rad(np.mean(optic.theta.value) + (self.turned or 0.0))
-            mount = optic.mount
-        return Place(self.cell_place(roles, optic), mount=mount, theta=float(theta), **side)
-
-    def cell_place(self, roles, optic=None):
-        """Return the name of the place in the vocabulary of `Cell`, the nearest that there is."""
-        optic = self.anchor(roles) if optic is None else optic
-        if optic is None:
-            return self.relation if self.optic is None else "source"
-        if self.relation == "inside" and optic.stage is not None:
-            return f"in:{optic.name}"
-        index = {o.name: i for i, o in enumerate(roles.leaves)}
-        mine = index[optic.name] + (not (self.in_front or self.relation == "before"))
-        found = "source"
-        for place in places(Train(roles.leaves)):
-            its = index[place.before] if place.after is None else index[place.after] + 1
-            if its <= mine and not place.name.startswith("in:"):
-                found = place.name
-        return found
-
-    def in_front_of(self, roles):
-        """Return the name of the place in front of the optic."""
-        return Where("before", self.optic, self.is_role).cell_place(roles)
-
-
-def after(optic):
-    """
-    Return the place behind an optic, by its name or role, in the frame that stands still.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import after
-    >>> after("hwp").words
-    'behind the hwp'
-    """
-    return Where("after", optic)
-
-
-def before(optic):
-    """
-    Return the place in front of an optic, in the frame that stands still.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import before
-    >>> before("wollaston").words
-    'in front of the wollaston'
-    """
-    return Where("before", optic)
-
-
-def inside(optic):
-    """
-    Return the place of an optic, in the frame that turns with it.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import inside
-    >>> inside("derotator").words
-    'derotator'
-    """
-    return Where("inside", optic)
-
-
-def source():
-    """
-    Return the place behind the source.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import source
-    >>> source().words
-    'source'
-    """
-    return Where("source")
-
-
-def telescope():
-    """
-    Return the place behind the telescope, in front of the half-wave plate.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import telescope
-    >>> telescope().words
-    'telescope'
-    """
-    return Where("telescope")
-
-
-def detector():
-    """
-    Return the place behind the beam splitter.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import detector
-    >>> detector().words
-    'detector'
-    """
-    return Where("detector")
-
-
-# ---- dependences -------------------------------------------------------------------------------
-
-
-def harmonic(stage, n):
-    """
-    Return the dependence on cosine and sine of n times the angle of a stage.
-
-    Parameters
-    ----------
-    stage : str
-        Its name.
-    n : int
-        Periods in a turn.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import harmonic
-    >>> harmonic("derotator", 1)
-    'harmonic:derotator:1'
-    """
-    return f"harmonic:{stage}:{n}"
-
-
-def time():
-    """
-    Return the dependence on time, a trend through the run.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import time
-    >>> time()
-    'time'
-    """
-    return "time"
-
-
-def step(frame):
-    """
-    Return the dependence of what is there from a frame on.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import step
-    >>> step(24)
-    'step:24'
-    """
-    return f"step:{frame}"
-
-
-def direction(stage):
-    """
-    Return the dependence on whether the last move of a stage was backwards.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import direction
-    >>> direction("hwp")
-    'direction:hwp'
-    """
-    return f"direction:{stage}"
-
-
-def move(stage):
-    """
-    Return the dependence on how far a stage was moved last.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import move
-    >>> move("derotator")
-    'move:derotator'
-    """
-    return f"move:{stage}"
-
-
-# ---- effects -----------------------------------------------------------------------------------
 
 
 class Effect:
@@ -497,36 +225,13 @@ class Effect:
         return new
 
     def at(self, optic):
-        """
-        Return the effect of one optic of its kind, with the name ``"effect:optic"``.
-
-        Parameters
-        ----------
-        optic : str
-            Its name.
-
-        Returns
-        -------
-        Effect
-        """
+        """Return the effect of one optic of its kind, with the name ``"effect:optic"``."""
         return self.changed(
             optic=optic, name=f"{self.name}:{optic}", title=f"{self.title} ({optic})"
         )
 
     def per_optic(self, chains):
-        """
-        Return the effect once for each optic of the kind that it acts on.
-
-        Parameters
-        ----------
-        chains : sequence
-            One a dataset.
-
-        Returns
-        -------
-        list of Effect
-            Itself for the optic that is the first of its kind, and one for each other.
-        """
+        """Return the effect once for each optic of its kind, itself for the first."""
         if self.acts_on is None or self.optic is not None:
             return [self]
         every = [Roles(chain).all(self.acts_on) for chain in chains]
@@ -536,18 +241,7 @@ class Effect:
         return [self, *(self.at(name) for name in others)]
 
     def applies(self, chains):
-        """
-        Return whether the chains have the place for this effect.
-
-        Parameters
-        ----------
-        chains : sequence
-            One a dataset.
-
-        Returns
-        -------
-        bool
-        """
+        """Return whether one of the chains, one a dataset, has the place for this effect."""
         return any(self.applies_to(self.roles(chain)) for chain in chains)
 
     def applies_to(self, roles):
@@ -576,19 +270,13 @@ class Effect:
         """
         Return the cells of the table of places, kinds and dependences that the effect is.
 
-        Parameters
-        ----------
-        chains : sequence
-            One a dataset.
-
-        Returns
-        -------
-        tuple of Cell
-            The main one first; those that it is nearest to where it is none. Empty for
-            discrete alternatives.
+        The main one comes first; where it is none, those that it is nearest to. A discrete
+        alternative has none.
         """
         every = [self.roles(chain) for chain in chains]
-        roles = next((one for one in every if self.applies_to(one)), next(iter(every), None))
+        # what is in the chains already applies to them no more, and is still what it is
+        there = [one for one in every if self._is_there(one) or self.where.otherwise]
+        roles = next((one for one in there if self.applies_to(one)), next(iter(there), None))
         if roles is None or not (self.kinds or self.near):
             return ()
         where, kinds, text, *_ = (*(self.near or (self.where, self.kinds)), None)
@@ -600,6 +288,9 @@ class Effect:
         cells = [Cell(place, one, text) for text in texts for place in at for one in kinds]
         return tuple(dict.fromkeys(cells))
 
+    def _is_there(self, roles):
+        return self.where.optic is None or self.where.anchor(roles) is not None
+
     def cell(self, chains):
         """Return the main one of `cells`, None where there is none."""
         return next(iter(self.cells(chains)), None)
@@ -607,20 +298,7 @@ class Effect:
     # ---- the edit ----------------------------------------------------------------------------
 
     def edit(self, chains, context):
-        """
-        Return the chains with the effect at zero.
-
-        Parameters
-        ----------
-        chains : sequence
-            One a dataset; not changed.
-        context : Context
-            Wavelengths and fluxes.
-
-        Returns
-        -------
-        Edit
-        """
+        """Return the `Edit` of chains, which stay as they are, with the effect at zero."""
         edited, ties, keys = [], {}, {}
         for i, chain in enumerate(chains):
             roles = self.roles(chain)
@@ -656,7 +334,8 @@ class Effect:
                 return scale * (u.rad if unit else 1), limit * (u.rad if unit else 1)
         sizes = limit / 10 if scale is None else scale, limit
         # perturbations are plain numbers, in radian where they are angles
-        return sizes if self.inserted is not None else tuple(_plain(size) for size in sizes)
+        is_plain = self.inserted is None and type(self).put is Effect.put
+        return tuple(_plain(size) for size in sizes) if is_plain else sizes
 
     def law(self, context, chains=()):
         """Return the law of its parameters in wavelength, None for a single number."""
@@ -674,26 +353,7 @@ class Effect:
         )
 
     def put(self, chain, roles, context, label):
-        """
-        Return a chain with the optics in it, those with parameters, and the ties of these.
-
-        Parameters
-        ----------
-        chain : Optic or `~astropy.modeling.CompoundModel`
-            The chain.
-        roles : Roles
-            Its optics.
-        context : Context
-            Wavelengths and fluxes.
-        label : str
-            Name of the first optic.
-
-        Returns
-        -------
-        chain : `~astropy.modeling.CompoundModel`
-        parts : list of Optic
-        ties : dict of str to Tie
-        """
+        """Return a chain with its optics, those with parameters, and their ties."""
         place = self.where.find(roles, self.optic)
         anchor = self.where.anchor(roles)
         if self.inserted is None:
@@ -743,8 +403,10 @@ class Effect:
         one.name, one.mount = label, one.mount or place.mount
         if self.flux is not None:
             one.reference = self.flux * context.flux
-        if (_has_axes(one) and self.where.relation == "inside") or self.where.turned is not None:
-            one.theta = np.rad2deg(place.theta) * u.deg
+        where = self.where
+        inside = where.relation == "inside" and _has_axes(one)
+        if anchor is not None and (inside or where.turned is not None):
+            one.theta = (anchor.theta.value + (where.turned or 0.0)) * u.deg
         for key in one.param_names:
             getattr(one, key).fixed = key not in (*free, *self.equal)
         return one
@@ -772,16 +434,8 @@ class Effect:
         """
         Return the effect in all the settings among which the data may choose.
 
-        Parameters
-        ----------
-        context : Context
-            Wavelengths and fluxes.
-
-        Returns
-        -------
-        list of Effect
-            Only itself, unless a setting enters the law in a way that is not linear, as the
-            thickness of a window does.
+        Only itself, unless a setting enters the law in a way that is not linear, as the thickness
+        of a window does.
         """
         return [self]
 

@@ -30,26 +30,17 @@ from astropolcal.gap.effects._laws import (
     turned_by,
     without_constant,
 )
-from astropolcal.gap.effects.effect import (
-    NUMBER,
-    Effect,
-    Where,
-    before,
-    harmonic,
-    telescope,
-    time,
-)
+from astropolcal.gap.effects.effect import NUMBER, Effect
+from astropolcal.gap.effects.where import Where, before, harmonic, telescope, time
 
 __all__ = ["LIBRARY"]
 
 _BRYAN = "Bryan et al. 2010, doi:10.1364/AO.49.006313"
 _HARRINGTON_2019 = "Harrington et al. 2019, doi:10.1117/1.JATIS.5.3.038001"
 _HARTEN = "van Harten et al. 2009, arXiv:0903.2740"
-_HINGER = "Essinger-Hileman et al. 2016, doi:10.1063/1.4962023"
 _HOLSTEIN = "van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
 _MCINTOSH = "McIntosh et al. 2026, Sec. 4"
 _PATAT = "Patat & Romaniello 2006, doi:10.1086/497581"
-_SCALE = "geometry of an eccentric scale; compare {}"
 _SIGNS = "McIntosh et al. 2026, Sec. 6.1; van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
 _THART = "'t Hart et al. 2021, doi:10.1117/12.2594962"
 
@@ -68,8 +59,6 @@ _M3 = Where(
 )
 
 _ON_PLATE = {"words": "half-wave plate"}
-_PLATE_STAGE = {"words": "stage of the half-wave plate", "category": "parameter"}
-_DEROTATOR_STAGE = {"words": "stage of the derotator", "category": "parameter"}
 _AT_DETECTOR = {"words": "detector", "category": "detector"}
 _BEHIND = {"words": "relay behind the derotator"}
 _IN_TELESCOPE = {
@@ -79,7 +68,6 @@ _IN_TELESCOPE = {
 
 _WAVES = ("cosine", "sine")
 _ANY_AXIS = ("horizontal", "diagonal")
-_ONCE, _TWICE = harmonic("own", 1), harmonic("own", 2)
 _CIRCULAR_H_D = ("retardance_d", "retardance_h", "rotation")
 _DEPOLARIZED = ("depolarization_d", "depolarization_linear", "depolarization_circular")
 
@@ -97,8 +85,37 @@ def _effect(name, title, place, kind, optic, free, size, shows, reference, **mor
     )  # fmt: skip
 
 
+def _encoder(name, n, place, optic, like, shows):
+    """Return a scale off its axis by d, which reads wrong by d sin(angle) over its radius."""
+    how = ("once a turn (eccentric encoder)", "twice a turn (encoder not round)")[n - 1]
+    return _effect(
+        name, f"angle of the {optic} wrong {how}", place, "orientation",
+        optics.HarmonicRotator(harmonic=n), _WAVES, _size(0.1, 5, u.deg), shows,
+        f"geometry of an eccentric scale; compare {like}", degree=NUMBER,
+        dependence=harmonic("own", n), words=f"stage of the {optic}", category="parameter",
+    )  # fmt: skip
+
+
+def _transmission(name, n, title):
+    """Return a gain of both beams that changes as the plate turns."""
+    return _effect(
+        name, title, _PLATE, (), optics.HarmonicGain(harmonic=n), _WAVES, _size(0.003, 0.1),
+        f"harmonic {n} of the plate angle in sums, none in differences",
+        "Essinger-Hileman et al. 2016, doi:10.1063/1.4962023", degree=NUMBER,
+        dependence=harmonic("own", n), near=(Where("source"), ("diattenuation_h",)), **_ON_PLATE,
+    )  # fmt: skip
+
+
 _NO_RETARDER = optics.LinearRetarder(retardance=0 * u.deg)
 _PLATE_EFFECTS = [
+    # a constant is the misalignment of the plate, which the model fits
+    _effect(
+        "hwp_axis_dispersion", "fast axis of the half-wave plate that turns with wavelength",
+        _PLATE, "orientation", optics.EllipticalRetarder(), "circular", _size(1, 20, u.deg),
+        "phase of harmonic 4 of the plate angle, with wavelength, at all derotator angles",
+        "chromatic zero angles of FORS; Bagnulo et al. 2009, doi:10.1086/605654",
+        degree=without_constant, **_ON_PLATE, category="parameter",
+    ),
     _effect(
         "hwp_retardance", "error of the half-wave plate's retardance law",
         _PLATE, "retardance_h", _NO_RETARDER, "retardance", _size(1, 30, u.deg),
@@ -125,20 +142,12 @@ _PLATE_EFFECTS = [
         "harmonic 2 of the plate angle in sums and in differences of unpolarized light", _BRYAN,
         **_ON_PLATE,
     ),
-    _effect(
-        "hwp_transmission", "transmission of the half-wave plate that changes twice a turn",
-        _PLATE, (), optics.HarmonicGain(harmonic=2), _WAVES, _size(0.003, 0.1),
-        "harmonic 2 of the plate angle in sums, none in differences", _HINGER,
-        degree=NUMBER, dependence=_TWICE, near=(Where("source"), ("diattenuation_h",)),
-        **_ON_PLATE,
+    _transmission(
+        "hwp_transmission", 2, "transmission of the half-wave plate that changes twice a turn",
     ),
-    _effect(
-        "hwp_transmission_once",
+    _transmission(
+        "hwp_transmission_once", 1,
         "dust or a wedge on the half-wave plate, transmission that changes once a turn",
-        _PLATE, (), optics.HarmonicGain(harmonic=1), _WAVES, _size(0.003, 0.1),
-        "harmonic 1 of the plate angle in sums, none in differences", _HINGER,
-        degree=NUMBER, dependence=_ONCE, near=(Where("source"), ("diattenuation_h",)),
-        **_ON_PLATE,
     ),
     # light that leaves one aperture enters none: seen as opposite gains
     _effect(
@@ -155,32 +164,15 @@ _PLATE_EFFECTS = [
         _PLATE, "retardance_h", optics.HarmonicRetarder(harmonic=2), _WAVES,
         _size(0.5, 20, u.deg), "harmonics 2, 4, 6 and 8 of the plate angle",
         "Patanchon et al. 2024, doi:10.1088/1475-7516/2024/01/074",
-        degree=NUMBER, dependence=_TWICE, **_ON_PLATE,
+        degree=NUMBER, dependence=harmonic("own", 2), **_ON_PLATE,
     ),
-    # a constant is the misalignment of the plate, which the model fits
-    _effect(
-        "hwp_axis_dispersion", "fast axis of the half-wave plate that turns with wavelength",
-        _PLATE, "orientation", optics.EllipticalRetarder(), "circular", _size(1, 20, u.deg),
-        "phase of harmonic 4 of the plate angle, with wavelength, at all derotator angles",
-        "chromatic zero angles of FORS; Bagnulo et al. 2009, doi:10.1086/605654",
-        degree=without_constant, **_ON_PLATE, category="parameter",
-    ),
-    # a scale off its axis by d reads wrong by d sin(angle) over its radius
-    _effect(
-        "hwp_encoder_eccentricity",
-        "angle of the half-wave plate wrong once a turn (eccentric encoder)",
-        _PLATE, "orientation", optics.HarmonicRotator(harmonic=1), _WAVES, _size(0.1, 5, u.deg),
+    _encoder(
+        "hwp_encoder_eccentricity", 1, _PLATE, "half-wave plate", "Millar-Blanchaer et al. 2016",
         "harmonics 3 and 5 of the plate angle, none for unpolarized light",
-        _SCALE.format("Millar-Blanchaer et al. 2016"),
-        degree=NUMBER, dependence=_ONCE, **_PLATE_STAGE,
     ),
-    _effect(
-        "hwp_encoder_two_lobe",
-        "angle of the half-wave plate wrong twice a turn (encoder not round)",
-        _PLATE, "orientation", optics.HarmonicRotator(harmonic=2), _WAVES, _size(0.1, 5, u.deg),
+    _encoder(
+        "hwp_encoder_two_lobe", 2, _PLATE, "half-wave plate", "Millar-Blanchaer et al. 2016",
         "harmonics 2 and 6 of the plate angle, none for unpolarized light",
-        _SCALE.format("Millar-Blanchaer et al. 2016"),
-        degree=NUMBER, dependence=_TWICE, **_PLATE_STAGE,
     ),
 ]  # fmt: skip
 
@@ -226,22 +218,12 @@ _DEROTATOR_EFFECTS = [
         "harmonic 2 of the derotator angle, constant with the plate", _HOLSTEIN,
         words="derotator",
     ),
-    _effect(
-        "derotator_encoder_eccentricity",
-        "angle of the derotator wrong once a turn (eccentric encoder)",
-        _DEROTATOR, "orientation", optics.HarmonicRotator(harmonic=1), _WAVES,
-        _size(0.1, 5, u.deg),
-        "rotation of Q and U with the derotator angle, the same at all wavelengths",
-        _SCALE.format("van Holstein et al. 2020"),
-        degree=NUMBER, dependence=_ONCE, **_DEROTATOR_STAGE,
-    ),
-    _effect(
-        "derotator_encoder", "angle of the derotator wrong twice a turn (encoder not round)",
-        _DEROTATOR, "orientation", optics.HarmonicRotator(harmonic=2), _WAVES,
-        _size(0.1, 5, u.deg),
-        "rotation of Q and U with the derotator angle, the same at all wavelengths",
-        _SCALE.format("van Holstein et al. 2020"),
-        degree=NUMBER, dependence=_TWICE, **_DEROTATOR_STAGE,
+    *(
+        _encoder(
+            name, n, _DEROTATOR, "derotator", "van Holstein et al. 2020",
+            "rotation of Q and U with the derotator angle, the same at all wavelengths",
+        )
+        for n, name in enumerate(("derotator_encoder_eccentricity", "derotator_encoder"), 1)
     ),
     # for internal sources the derotator stands still during an exposure: bench data would tie the
     # lag to a rate that they do not have
@@ -251,7 +233,8 @@ _DEROTATOR_EFFECTS = [
         _DEROTATOR, "orientation", lambda derotator: lagging(derotator.mount), "rate", LAG,
         "rotation of Q and U by the rate of the derotator, most near transit", _HOLSTEIN,
         degree=NUMBER, when=lambda roles: any(o.stage == "parallactic" for o in roles.leaves),
-        **_DEROTATOR_STAGE,
+        words="stage of the derotator",
+        category="parameter",
     ),
 ]  # fmt: skip
 

@@ -10,8 +10,6 @@ from astropolcal.gap.effects.effect import Effect
 from astropolcal.gap.problem import GapProblem
 from astropolcal.units import canonical_factor, to_unit
 
-__all__ = ["check_against", "check_declared"]
-
 _NEEDED = ("name", "title", "kind", "place", "shows", "reference")
 # of the largest flux: far above rounding, far below any noise
 _SAME = 1e-10
@@ -22,25 +20,7 @@ _PLACES = (0.0, 0.5)
 
 
 def check_declared(effect):
-    """
-    Check that an effect has its attributes and is of a known kind.
-
-    Parameters
-    ----------
-    effect : Effect
-        The effect.
-
-    Raises
-    ------
-    GapError
-        If one is lacking.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import EFFECTS
-    >>> from astropolcal.gap.effects.check import check_declared
-    >>> check_declared(EFFECTS["beam_gain"])
-    """
+    """Check that an effect has its attributes and is of a known kind."""
     if not isinstance(effect, Effect):
         raise GapError(f"{effect!r} is no Effect")
     lacking = [key for key in _NEEDED if not getattr(effect, key)]
@@ -53,32 +33,7 @@ def check_declared(effect):
 
 
 def check_against(effect, chains, observations):
-    """
-    Check identity at zero, names and derivatives of an effect on chains and data.
-
-    Parameters
-    ----------
-    effect : Effect
-        The effect.
-    chains : sequence
-        The nominal chain of each dataset.
-    observations : sequence of Observations
-        The datasets.
-
-    Raises
-    ------
-    GapError
-        If it fails one of the checks, see `astropolcal.gap.effects.check_effect`.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import EFFECTS
-    >>> from astropolcal.gap.effects.check import check_against
-    >>> check_against(EFFECTS["beam_gain"], [], [])
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.GapError: effect beam_gain: has no place in these chains
-    """
+    """Check identity at zero, names and derivatives of an effect on chains and data."""
     chains, observations = list(chains), list(observations)
     if not effect.applies(chains):
         raise _failed(effect, "has no place in these chains")

@@ -1,0 +1,130 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Places, kinds and dependences, and the derivative of the data to each cell."""
+
+import json
+from itertools import product
+
+import astropy.units as u
+import gap_data as data
+import numpy as np
+import pytest
+from gap_setups import SETUPS
+
+from astropolcal.gap.cells import Cell, Probes, dependences, places
+from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.model import nominal_model
+from astropolcal.gap.problem import GapProblem
+from astropolcal.simulation import half_wave_plate_cycles
+
+pytestmark = pytest.mark.usefixtures("own_instruments")
+EPS = 1e-4
+
+
+def model_of(name):
+    setup = SETUPS[name]()
+    return nominal_model([setup.truth], [setup.observed()])
+
+
+def spread(probes):
+    """Return every place with every kind, and every dependence (one step of many) among them."""
+    steps = [name for name in probes.waves if name.startswith("step")]
+    waves = [name for name in probes.waves if name not in steps[1:]]
+    pairs = [pair for pair in probes.slopes if not probes.is_detector(pair[1])]
+    cells = [Cell(*pair, waves[i % len(waves)]) for i, pair in enumerate(pairs)]
+    own = [kind for _, kind in probes.slopes if probes.is_detector(kind)]
+    return cells + [Cell("detector", kind, probes.dependence_of(kind)) for kind in own]
+
+
+def differences(model, cell):
+    """Return the slope of both channels to each function of a cell, by central differences."""
+    problem, parameters = model.edited(CellEffect(cell, 0))
+    rows = [i for p in parameters for i in range(*problem.slices[p.name].indices(problem.size))]
+    for row in rows:
+        ends = []
+        for sign in (1, -1):
+            moved = problem.start.copy()
+            moved[row] += sign * EPS
+            ends.append(problem.differences(moved)[0])
+        # the gap is the observed less the predicted
+        yield (ends[1] - ends[0]) / (2 * EPS)
+
+
+@pytest.mark.parametrize("name", ["charis", "cassegrain", "irdis lamp", "vampires"])
+def test_derivative_of_every_cell_is_that_of_the_chain_with_its_optic(name):
+    model = model_of(name)
+    probes = Probes(model)
+    cells = spread(probes)
+    assert {cell.dependence.partition(":")[0] for cell in cells} >= {
+        name.partition(":")[0] for name in probes.waves
+    }
+    for cell in cells:
+        detector = probes.is_detector(cell.kind)
+        waves = probes.ones[0] if detector else probes.waves[cell.dependence][0]
+        slope = probes.slopes[cell.place, cell.kind][0]
+        found = [slope * wave for wave in waves]
+        expected = list(differences(model, cell))
+        assert len(found) == len(expected), cell.name
+        for one, other in zip(found, expected, strict=True):
+            # the size of what follows the flux is in units of a usual flux, which is a mean or not
+            scale = np.sum(one * other) / np.sum(one * one) if detector else 1.0
+            assert scale == pytest.approx(1, abs=0.1), cell.name
+            error = np.linalg.norm(other - scale * one) / max(np.linalg.norm(other), 1.0)
+            assert error < (0.01 if detector else 1e-5), cell.name
+
+
+def test_places_are_met_in_the_order_of_the_light():
+    expected = {
+        "charis": ["source", "in:hwp", "after:hwp", "in:derotator", "after:derotator"],
+        "cassegrain": ["source", "telescope", "in:hwp", "after:hwp"],
+        "rotating": ["source", "in:hwp", "after:hwp", "in:rotator", "after:rotator"],
+    }
+    for name, names in expected.items():
+        assert [place.name for place in places(SETUPS[name]().nominal)] == names, name
+    for make in SETUPS.values():
+        chain = make().nominal
+        found = [place.name for place in places(chain)]
+        assert len(set(found)) == len(found)
+        # what is in front of the first optic that turns, and what stands behind the last
+        assert found[0] in ("source", "telescope")
+        # an optic of a cell makes no place of its own
+        edited = CellEffect(Cell(found[-1], "rotation", "time")).edit([chain], make().context())
+        assert [place.name for place in places(edited.chains[0])] == found
+
+
+def test_only_what_data_can_tell_is_a_dependence():
+    def of(observations, chains=None):
+        observations = observations if isinstance(observations, list) else [observations]
+        return dependences(GapProblem([data.chain()] * len(observations), observations))
+
+    whole = of(data.observed())
+    for name, waves in whole.items():
+        assert name == "constant" or np.ptp(waves[0]) > 0, name
+        assert waves[0].shape == (2 if name.startswith("harmonic") else 1, 32)
+    steps = [name for name in whole if name.startswith("step")]
+    assert len(steps) == 29
+    # one plate angle and one derotator angle are no harmonics, and a short run has no steps
+    table = half_wave_plate_cycles(np.zeros(6) * u.deg, [45] * u.deg)
+    assert set(of(data.observed(table=table))) == {"constant", "time", "time2"}
+    # datasets of one source may differ, and are told by their names
+    pair = [data.observed(name="July"), data.observed(seed=2, name="October")]
+    both = of(pair)
+    assert {"dataset:July", "dataset:October"} <= set(both)
+    assert [float(w.mean()) for w in both["dataset:July"]] == [1.0, 0.0]
+    assert not [name for name in whole if name.startswith("dataset")]
+
+
+def test_every_cell_has_a_name_and_words_of_its_own():
+    cells = [
+        Cell(place, kind, dependence)
+        for (place, kind), dependence in product(
+            Probes(data.clean_model()).slopes, ["constant", "time", "time2", "harmonic:hwp:2"]
+        )
+    ]
+    extra = ["step:7", "frame:7", "direction:hwp", "move:derotator", "dataset:July"]
+    cells += [Cell("in:hwp", "rotation", dependence) for dependence in extra]
+    assert len({cell.title for cell in cells}) == len(cells)
+    for cell in cells:
+        again = Cell(**json.loads(json.dumps(cell.to_dict())))
+        assert (again, again.name) == (cell, cell.name)
+        assert 0 < cell.scale < 1
+        assert cell.optic in (None, "hwp", "derotator")
