@@ -328,6 +328,9 @@ class Observations:
             `~astropolcal.optics.COORDINATES`: ``"sequence"``, how far the run has
             come, from 0 in the first frame to 1 in the last (by the column ``time``
             if it gives the time of every frame, else by the order);
+            ``"frame"``, its number from 0; ``"hwp_direction"`` and ``"derotator_direction"``, 1
+            where the last move of that stage was backwards, ``"hwp_move"`` and
+            ``"derotator_move"``, how far it went, in radian;
             ``"flc_state"``, 0 or 1 for the states A and B of a modulator;
             ``"parallactic_rate"`` and ``"derotator_rate"``, by how much that angle
             changes from one frame to the next, in radian; ``"flux"``, the

@@ -449,7 +449,7 @@ def _with_value(problem, parameter, size):
 NEAREST = {
     "derotator_motion", "hwp_transmission", "hwp_transmission_once", "m3_diattenuation",
     "m3_recoating", "m3_retardance", "sky_background", "sky_motion", "source_linear",
-    "polarizer_misalignment", "polarizer_angle_bound",
+    "polarizer_misalignment", "polarizer_angle_bound", "mirror_misalignment",
 }  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from astropolcal.optics._matrices import (
 from astropolcal.optics.positions import (
     COORDINATES,
     FLUXES,
+    MOVES,
     RATES,
     check_broadcast,
     finite_position,
@@ -200,7 +201,7 @@ def test_position_is_finite(bad):
 
 def test_kinds_of_positions_do_not_overlap():
     assert not set(FLUXES) & set(RATES)
-    assert {*FLUXES, *RATES, "sequence", "flc_state"} == set(COORDINATES)
+    assert {*FLUXES, *RATES, *MOVES, "sequence", "flc_state", "frame"} == set(COORDINATES)
 
 
 @pytest.mark.parametrize(("lam", "position"), [((3,), (4,)), ((3,), (2, 4)), ((3, 1, 5), (2, 5))])

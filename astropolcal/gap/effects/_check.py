@@ -108,7 +108,7 @@ def _check_names(effect, edit, problem, nominal):
         if name not in problem.free.by_name:
             known = ", ".join(sorted(set(problem.free.by_name) - set(nominal.free.by_name)))
             raise _failed(effect, f"{name} is not free in its chains; new and free: {known or '-'}")
-        # a lifted bound frees nothing that was not free: it gives room
+        # a lifted bound, or prior, frees nothing that was not free: it gives room
         if name in nominal.free.by_name and effect.kind != "bound":
             raise _failed(effect, f"{name} is free in the chains without it already")
         slot = problem.free.by_name[name]
