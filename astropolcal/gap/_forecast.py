@@ -61,18 +61,19 @@ class Forecast:
         problem, q = self.problem, self.problem.start
         every = np.arange(problem.size)
         #: Coefficients of each cause that has a place.
-        self.own = {
-            name: np.concatenate([every[problem.slices[p.name]] for p in some])
-            for name, some in added.items()
-            if some
-        }
+        self.own = {}
+        for name, some in added.items():
+            rows = [every[problem.slices[p.name]] for p in some if p.name in problem.slices]
+            if sum(map(len, rows)):
+                self.own[name] = np.concatenate(rows)
         slopes, residual = problem.jacobian(q), problem.residual(q)
         tight = np.zeros(problem.size)
         for name, sigma in base.priors.items():
             tight[problem.slices[name]] = 1 / sigma**2
-        for some in added.values():
-            for one in some:
-                tight[problem.slices[one.name]] = 1 / (_WIDE * one.canonical_scale) ** 2
+        absent = np.zeros(problem.free.size)
+        for one in (p for some in added.values() for p in some if p.name in problem.slices):
+            tight[problem.slices[one.name]] = 1 / (_WIDE * one.canonical_scale) ** 2
+            absent[problem.free.by_name[one.name].slice] = one.canonical_neutral
         self.causes = np.zeros(problem.size, dtype=bool)
         for own in self.own.values():
             self.causes[own] = True
@@ -83,7 +84,9 @@ class Forecast:
         self.scale = np.where(norm > 0, norm, 1.0)
         slopes = slopes / self.scale
         self.gram = slopes.T @ slopes + np.diag(tight / self.scale**2 + _HOLD)
-        self.slopes, self.residual, self.value = slopes, residual, q * self.scale
+        self.slopes, self.residual = slopes, residual
+        #: By how much each coefficient is off the value at which its cause is absent.
+        self.value = (q - problem.coefficients(absent)) * self.scale
 
     def foreseen(self, names):
         """

@@ -16,7 +16,6 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
-from astropolcal.chain import leaves
 from astropolcal.gap._bases import law_basis
 from astropolcal.gap.cells import Cell, Probes, Reduced
 from astropolcal.gap.effects.cell import CellEffect
@@ -218,7 +217,7 @@ class Scan:
         found = {}
         for i, run in enumerate(probes.runs):
             if candidate.is_named:
-                alone = _named_in(probes, candidate.named, i, self.temper)
+                alone = _named_in(probes, candidate.named, i, self.temper, candidate.context)
             else:
                 cell = candidate.cell.in_run(run)
                 alone = _of_cell(probes, cell, candidate.degree, self.temper)
@@ -321,7 +320,7 @@ def _cells(probes, temper):
         parts += [(name, *reduced.pair(w)) for name, w in waves.items() if len(w[0]) > 1]
         bent = _bent(probes, place, kind, law_basis(probes.problem.wavelength, degree))
         if bent is not None:
-            parts = [(n, *bent) if n == "constant" else (n, *rest) for n, *rest in parts]
+            parts = [(n, *bent) if n == "constant" else (n, *own) for n, *own in parts]
         for name, one in _candidates(place, kind, degree, parts, scale, temper):
             if name not in best or best[name].evidence < one.evidence:
                 best[name] = one
@@ -426,12 +425,13 @@ def _named(probes, effects, temper, degree="default"):
         if bent:
             found += [replace(one, context=context) for one in bent]
             continue
-        if effect.name in model.added:
-            slopes, size = _columns_of(model.problem, model.jacobian, model.added[effect.name])
-        else:
-            slopes, size = _columns(model, fitting, degree).get(effect.name, (None, None))
-        one = _of_columns(probes, effect, slopes, size, temper)
-        found += [replace(each, context=context) for each in one]
+        slopes, size = _slopes_of(probes, effect, fitting, degree)
+        if size is None or not size.size:
+            continue
+        found += [
+            replace(one, context=context)
+            for one in _of_columns(probes, effect, slopes * size, temper)
+        ]
     return found
 
 
@@ -476,6 +476,34 @@ def _columns(model, effects, degree):
     return {name: found for (name, law), found in known.items() if law == degree}
 
 
+def _named_in(probes, effect, i, temper, context):
+    """Return the candidate of a named effect in one dataset only, in a list."""
+    degree = "default" if context is None else context.degree
+    slopes, size = _slopes_of(probes, effect, [effect], degree)
+    if size is None or not size.size:
+        return []
+    rows = probes.problem.segments[i]
+    alone = np.zeros_like(slopes)
+    alone[rows] = slopes[rows]
+    return _of_columns(probes, effect, alone * size, temper)
+
+
+def _slopes_of(probes, effect, effects, degree):
+    """Return the derivatives to the parameters of an effect, and their usual sizes."""
+    model = probes.model
+    if effect.name in model.added:
+        return _columns_of(model.problem, model.jacobian, model.added[effect.name])
+    return _columns(model, effects, degree).get(effect.name, (None, None))
+
+
+def _of_columns(probes, effect, scaled, temper):
+    """Return the candidate of an effect with these derivatives, of unit size, in a list."""
+    seen = probes.tangent.T @ scaled
+    gram, target = scaled.T @ scaled - seen.T @ seen, scaled.T @ probes.residual
+    values, share = (part[0] for part in _spectra(gram[None], target[None]))
+    return [_with_name(effect, probes.model, values, share, temper)] if _rank(values, 1.0) else []
+
+
 def _columns_of(problem, jacobian, parameters):
     """Return the derivatives to parameters, and their usual sizes."""
     parts = [(problem.slices[p.name], p) for p in parameters if p.name in problem.slices]
@@ -484,34 +512,6 @@ def _columns_of(problem, jacobian, parameters):
     rows = np.concatenate([np.arange(where.start, where.stop) for where, _ in parts])
     size = np.concatenate([np.full(w.stop - w.start, p.canonical_scale) for w, p in parts])
     return jacobian[:, rows], size
-
-
-def _bent_name(probes, effect, context, temper):
-    """Return the candidate of an effect whose derivative vanishes, in a list."""
-
-
-def _named_in(probes, effect, i, temper):
-    """Return the candidate of a named effect in the chain of one dataset only, in a list."""
-    held = probes.model.held_chains
-    edit = effect.edit(list(held), probes.model.context)
-    chains = [*held[:i], edit.chains[i], *held[i + 1 :]]
-    there = {leaf.name for leaf in leaves(chains[i])}
-    own = [p for p in edit.parameters if p.name.partition(".")[0] in there]
-    names = {p.name for p in own}
-    ties = {
-        name: tie
-        for name, tie in edit.ties.items()
-        if tie.source in names and name.partition(".")[0] in there
-    }
-    if not own:
-        return []
-    laws = {p.name: p.basis for p in own if p.basis is not None}
-    model = probes.model
-    problem = GapProblem(
-        chains, model.observations, ties=ties, laws=laws, like=model.problem, copy=False
-    )
-    jacobian = problem.jacobian(problem.start) if problem.size else None
-    return _of_columns(probes, effect, *_columns_of(problem, jacobian, own), temper)
 
 
 def _bent_name(probes, effect, context, temper):

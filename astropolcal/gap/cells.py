@@ -284,7 +284,7 @@ def dependences(problem, most_steps=_MOST_STEPS):
     >>> from astropolcal.gap.cells import dependences
     >>> from astropolcal.gap.model import nominal_model
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = instruments.get("charis").chain(derotator="linear")
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> model = nominal_model([chain], [simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)])
     >>> list(dependences(model.problem, 0))[:4]
@@ -299,12 +299,13 @@ def dependences(problem, most_steps=_MOST_STEPS):
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
     names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
-    runs = [d.observations.name for d in problem.datasets] if count_runs(problem) > 1 else []
+    several = [d.observations.name for d in problem.datasets]
+    runs = several if count_runs(problem) > 1 else []
     steps = [f"step:{n}" for n in _steps(problem, most_steps // max(len(runs), 1))]
     # a frame of one run has nothing to do with that of the same number in another
     alone = [*names[1:], *steps]
-    every = [d.observations.name for d in problem.datasets]
-    names += [f"dataset:{name}" for name in every] if len(every) > 1 else []
+    if len(several) > 1:
+        names += [f"dataset:{name}" for name in several]
     names += [] if runs else steps
     names += [f"{name}/dataset:{run}" for run in runs for name in alone]
     found = {}

@@ -393,7 +393,8 @@ def _cause(group, improved, explained, before=None, after=None):
         explained=float(explained),
         before=before,
         after=after,
-        physical=improved.is_physical(best.name) if best.name in improved.added else True,
+        physical=best.name not in improved.added
+        or (improved.is_physical(best.name) and improved.keeps_polarization(best.name)),
         evidence=float(best.evidence),
         stability=group.stability,
         by_dataset=group.by_dataset,

@@ -472,16 +472,17 @@ def _check(candidates, model):
     for one in candidates:
         if not 0 <= one.dataset < n:
             raise GapError(f"exposure of dataset {one.dataset}; there are {n}, from 0")
-        if len(one.hwp) == 0 or not np.all(np.isfinite(one.hwp)):
-            raise GapError(
-                f"exposure with half-wave-plate angles {one.hwp}: finite ones are needed"
-            )
-        if not (np.isfinite(one.lamp) and one.lamp > 0):
-            raise GapError(f"exposure with lamp = {one.lamp}: it must be positive")
-        if not set(one.states) <= set(STATES):
-            raise GapError(f"exposure with states {one.states}: allowed are {', '.join(STATES)}")
-        if bool(one.states) != (MODULATOR in stages(model.chains[one.dataset])):
-            raise GapError(
-                f"exposure of dataset {one.dataset} with states {one.states}: they are needed "
-                "where the chain has a modulator, and nowhere else"
-            )
+        modulated = MODULATOR in stages(model.trains[one.dataset])
+        wrong = {
+            f"half-wave-plate angles {one.hwp}: finite ones are needed": (
+                len(one.hwp) == 0 or not np.all(np.isfinite(one.hwp))
+            ),
+            f"lamp = {one.lamp}: it must be positive": not (np.isfinite(one.lamp) and one.lamp > 0),
+            f"states {one.states}: allowed are {', '.join(STATES)}": not set(one.states)
+            <= {*STATES},
+            f"states {one.states}: they are needed where the chain has a modulator, and nowhere "
+            "else": bool(one.states) != modulated,
+        }
+        for words, is_wrong in wrong.items():
+            if is_wrong:
+                raise GapError(f"exposure with {words}")

@@ -19,8 +19,6 @@ from astropolcal.optics.perturbations import split_run
 
 __all__ = ["changes", "distinct", "paragraph"]
 
-# kinds whose sizes are angles, in radian
-_ANGLES = ("retardance", "rotation")
 # so many changes are told in the summary
 _MOST = 4
 _LIKELY = 0.5
@@ -228,7 +226,7 @@ def _sentence(cell, entry, names, wavelength):
     plain = Cell(cell.place, cell.kind, split_run(cell.dependence)[0])
     constant = plain.dependence in ("dataset", "constant")
     title = Cell(cell.place, cell.kind, "constant").title if constant else plain.title
-    size = _size(cell, entry["size"], wavelength)
+    size = _size(entry["size"], wavelength)
     chance = f"probability {100 * entry['probability']:.0f} %"
     run = entry["dataset"]
     if constant and len(names) == 2 and size is not None:
@@ -253,12 +251,12 @@ def _number(value, error):
     return f"{value:.{min(digits, 6)}f} +- {error:.{min(digits, 6)}f}"
 
 
-def _size(cell, parameters, wavelength):
+def _size(parameters, wavelength):
     """Return value, error, unit and where of the clearest size of a cause, None if it is open."""
-    angle = cell.kind.partition("_")[0] in _ANGLES
-    factor, unit = (np.rad2deg(1.0), "deg") if angle else (100.0, "%")
     best = None
     for one in parameters.values():
+        # what has no unit is a share
+        factor, unit = (1.0, one["unit"]) if one["unit"] else (100.0, "%")
         values = np.array(np.ravel(one["value"]), dtype=float)
         errors = np.array(np.ravel(one["std"]), dtype=float)
         clear = np.where(errors > 0, np.abs(values) / errors, np.nan)

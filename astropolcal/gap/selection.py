@@ -35,6 +35,8 @@ _NOISE = 1e-3
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
 ENOUGH = 12.0
 _MOST = 8
+# of several runs each by itself, and all together for each of them
+_MOST_ALONE, _MOST_TOGETHER = 6, 10
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
 _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
@@ -175,11 +177,12 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     []
     """
     first = _scanned(base, library, cells)
-    best, left = _search(_State(base), library, first, say, cells, _MOST)
     runs = count_runs(base.problem)
-    if runs > 1 and cells and best.model.p_value < REMAINDER:
-        best, left = _better_apart(base, best, first, say), None
-        best, left = _search(best, library, first, say, cells, _MOST * runs)
+    most = _MOST if runs < 2 or not cells else _MOST // 2
+    best, left = _search(_State(base), library, first, say, cells, most)
+    if runs > 1 and len(best.chosen) >= most and best.model.p_value < REMAINDER:
+        best = _apart(base, first, say)
+        best, left = _search(best, [], first, say, cells, _MOST_TOGETHER * runs)
     if not best.chosen:
         return Selection([], base, first, first, 0.0, [_errors(base, groups)])
     best, scans = _exchanged(base, best, library, first, say, cells)
@@ -209,16 +212,26 @@ def _checked(base, best, groups, say):
         say("left-out frames")
         steps = [base.without(()), *_growing(best)]
         history = [_errors(step, groups) for step in steps]
-        worse = [
-            i
-            for i, (before, after) in enumerate(pairwise(history))
-            if before is not None and _worsens(after, before, steps[i + 1].mean_square)
-        ]
+        worse = _worse(best, steps, history, groups)
         if not worse:
             return best, steps, history
-        chosen = [one for i, one in enumerate(best.chosen) if i != worse[-1]]
+        chosen = [one for i, one in enumerate(best.chosen) if i not in worse]
         model = base.with_effects([o.recipe for o in chosen], like=best.model)
-        best = _State(model, chosen, best.evidence - best.chosen[worse[-1]].evidence)
+        best = _State(model, chosen, best.evidence - sum(best.chosen[i].evidence for i in worse))
+
+
+def _worse(best, steps, history, groups):
+    """Return the numbers of the causes that left-out frames speak against."""
+    if groups is None:
+        return []
+    if len(best.chosen) <= _MOST:
+        pairs = zip(pairwise(history), steps[1:], strict=True)
+        found = [i for i, ((a, b), step) in enumerate(pairs) if _worsens(b, a, step.mean_square)]
+        return found[-1:]
+    # of many, the first may need the last: each is taken out of the whole set
+    scatter, whole = best.model.mean_square, history[-1]
+    without = (foreseen(best.model.without([one.name]), groups) for one in best.chosen)
+    return [i for i, other in enumerate(without) if _worsens(whole, other, scatter)]
 
 
 def _worsens(after, before, scatter):
@@ -287,20 +300,19 @@ def _distinct(candidates, most):
     return found
 
 
-def _better_apart(base, best, first, say):
-    """Return the set of the causes that each run needs by itself, if it is better than another."""
+def _apart(base, first, say):
+    """Return the set of the causes that each run needs by itself."""
     chosen = []
     for i, name in enumerate(first.probes.runs):
         say(f"{name} by itself")
         alone = base.of_dataset(i)
-        state, _ = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST)
+        state, _ = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST_ALONE)
         chosen += [_in_run(one, name, first.probes) for one in state.chosen]
     say("all runs together")
     model = base.with_effects([one.recipe for one in chosen], **_QUICK)
-    temper = max(1.0, min(model.mean_square, best.model.mean_square))
-    gained = 0.5 * (best.model.fit.chi2 - model.fit.chi2) / temper
-    cost = sum(one.cost(temper) for one in chosen) - sum(one.cost(temper) for one in best.chosen)
-    return _State(model, chosen, best.evidence + gained - cost) if gained > cost else best
+    temper = max(1.0, model.mean_square)
+    gained = 0.5 * (base.fit.chi2 - model.fit.chi2) / temper
+    return _State(model, chosen, gained - sum(one.cost(temper) for one in chosen))
 
 
 def _in_run(candidate, name, probes):
@@ -384,6 +396,9 @@ def _exchanged(base, best, library, first, say, cells):
             found = first if not others else _beside(best.model, one, library, cells, like)
             like = like or (found.probes if others else None)
             scans[one.name] = (others, found)
+            if len(best.chosen) > _MOST:
+                # so many that none is sure: what each can be told from is all that is asked
+                continue
             fresh = _best_beside(found, one, library)
             if fresh is None or (fresh.name, fresh.degree) == (one.name, one.degree):
                 continue
@@ -457,8 +472,8 @@ def _grouped(best, steps, scans, unlisted, stable):
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
         lowered = max(before.chi2 - after.chi2, 0.0)
         share = stable.get(one.name, 1.0)
+        chance *= float((1 - unlisted) * share)
         alone = scans[one.name].by_run(members[0][0])
-        chance = float((1 - unlisted) * chance * share)
         found.append(Group(members, chance, lowered, share, alone))
     return found
 

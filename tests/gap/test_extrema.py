@@ -8,10 +8,12 @@ from gap_data import WAVELENGTH as DATA_WAVELENGTH
 from gap_data import chain, clean_model, observed
 
 from astropolcal import instruments, optics
+from astropolcal.chain import join, leaves
 from astropolcal.gap import diagnose
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.model import nominal_model
+from astropolcal.reduction.cubes import both_states
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.2, 1.4, 1.6, 1.8, 2.0, 2.2] * u.um
@@ -99,4 +101,29 @@ def test_no_size_makes_more_polarization_than_there_is(place, kind, size, possib
     cell = CellEffect(Cell(place, kind, "constant"), 0)
     model = clean_model().with_effect(cell, steps=0)
     model.fit.coefficients[model.problem.slices[model.added[cell.name][0].name]] = size
-    assert model.is_physical(cell.name) is possible
+    assert model.keeps_polarization(cell.name) is possible
+
+
+@pytest.mark.parametrize(("q", "u_"), [(0.87, 0.1), (0.9, 0.13)])
+def test_a_held_source_is_looked_at_like_all_others(q, u_):
+    """VAMPIRES with a lamp of which the model says that it knows the polarization."""
+    fields = [610, 670, 720] * u.nm
+    known = leaves(instruments.get("vampires").chain(wavelength=fields, derotator="linear"))[1:]
+    for optic in known[:1]:
+        for key in optic.param_names:
+            getattr(optic, key).fixed = True
+    lamp = optics.PolarizedSource(q=np.full(3, 0.9), u=np.full(3, 0.1), name="lamp")
+    lamp.q.fixed = lamp.u.fixed = True
+    model = join([lamp, *known])
+    true = model.copy()
+    true["lamp"].q, true["lamp"].u = np.full(3, q), np.full(3, u_)
+    table = both_states(half_wave_plate_cycles(derotator=[45, 60, 75, 90] * u.deg))
+    meta = {"instrument": "vampires", "source": "polarized", "pairing": "flc_state"}
+    data = simulate(true, fields, table, flux=1e6, seed=1, meta=meta, name="run")
+    found = diagnose(model, data)
+    (cause,) = found.causes
+    group = [cause, *(one for one, _ in cause.aliases)]
+    assert any(one.cell.place == "source" and one.cell.dependence == "constant" for one in group)
+    source = {"standard_polarization", "source/diattenuation_d/constant"}
+    assert source & {one.name for one in group}
+    assert found.remainder_p_value > 1e-3

@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What to observe next: what is proposed tells apart what it says, as far as it says."""
 
+from types import SimpleNamespace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from gap_data import WAVELENGTH, chain, fitted, frames, observed, with_effect
 
 from astropolcal import instruments
 from astropolcal.exceptions import GapError
-from astropolcal.gap._forecast import expected
+from astropolcal.gap._forecast import Forecast, expected
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import Context, get_effect
 from astropolcal.gap.effects.cell import CellEffect
@@ -185,3 +187,35 @@ def test_impossible_exposures(full, exposure, message):
 def test_unknown_effect(model):
     with pytest.raises(GapError):
         plan(model, even("no_such_effect", PAIR[0]))
+
+
+def test_structure_without_a_cause_wants_the_run_again(model):
+    """Residuals that nothing explains: repetitions tell structure from noise larger than stated."""
+    unexplained = SimpleNamespace(improved=model, causes=[], remainder_p_value=1e-20)
+    (found,) = plan(unexplained)
+    assert found["question"] == "structure"
+    assert found["words"].startswith("Take the run of lamp 3 times")
+    assert found["gain"] > 3
+    assert (found["probability_now"], found["probability_after"]) == (
+        0.5,
+        pytest.approx(1, abs=0.01),
+    )
+    assert plan(SimpleNamespace(improved=model, causes=[], remainder_p_value=0.5)) == []
+
+
+def test_what_frees_a_parameter_counts_from_where_it_was_held():
+    """An orientation beyond its bound, against a rotation of the light behind the plate."""
+    true, narrow = chain(), chain()
+    true["hwp"].theta = 2 * u.deg
+    narrow["hwp"].theta.bounds = (-0.5, 0.5)
+    narrow["calibration_polarizer"].theta.fixed = narrow["derotator"].theta.fixed = True
+    full = fitted(observed(true), [narrow]).with_effect(get_effect("hwp_angle_bound"))
+    rotation = CellEffect(Cell("after:hwp", "rotation", "constant"), 0)
+    forecast = Forecast(full, [(get_effect("hwp_angle_bound"), None), (rotation, None)])
+    held, turned = forecast.foreseen(["hwp_angle_bound", rotation.name])
+    own = forecast.own["hwp_angle_bound"]
+    # beyond the bound at which it was held, not beyond zero
+    assert np.rad2deg(forecast.value / forecast.scale)[own] == pytest.approx(1.5, abs=0.3)
+    assert np.rad2deg(held[2] / forecast.scale)[own] == pytest.approx(1.5, abs=0.3)
+    size = np.rad2deg(turned[2] / forecast.scale)[forecast.own[rotation.name]]
+    assert np.abs(size) == pytest.approx(3.0, abs=0.6)

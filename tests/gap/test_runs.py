@@ -76,12 +76,11 @@ def test_a_change_is_found_with_its_run_cell_and_size():
     assert first["probability"] > 0.9
     (size,) = first["size"].values()
     sign = 1 if first["dataset"] == OCTOBER else -1
-    np.testing.assert_allclose(sign * np.array(size["value"]), 0.05, atol=0.01)
+    assert size["unit"] == "deg"
+    np.testing.assert_allclose(np.deg2rad(sign * np.array(size["value"])), 0.05, atol=0.01)
     assert first["brought_by"] == []
-    assert first["words"].startswith(
-        f'Between "{JULY}" and "{OCTOBER}" the retardance at 45 deg to the axes behind the derotator '
-        "changed by 2."
-    )
+    told = "the retardance at 45 deg to the axes behind the derotator changed by 2."
+    assert first["words"].startswith(f'Between "{JULY}" and "{OCTOBER}" {told}')
     assert first["words"] in content["sentences"]
     json.dumps(content)
 
