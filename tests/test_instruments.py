@@ -594,7 +594,7 @@ def test_diagnosis_finds_a_cause_in_the_only_instrument(lone):
     night = _lone_night(join([first, error, plate, back, last]), cycles=8)
     cal = calibrate(lone.chains_for([night]), [night], instrument="lone", cross_validate=False)
     report = diagnose(cal, night)
-    assert report.verdict == "effect"
+    assert report.verdict == "named"
     assert report.causes[0].effect.name == "hwp_encoder_eccentricity"
 
 

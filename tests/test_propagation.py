@@ -490,3 +490,29 @@ def test_prediction_of_a_measurement_with_frame_optics():
     right, left = plain_fluxes(chain, positions, [1, 0, 0, 0])
     expected = ((right - left) / (right + left))[~observations.mask.T]
     np.testing.assert_allclose(measurement(measurement.index), expected, rtol=0, atol=1e-13)
+
+
+@settings(max_examples=10)
+@given(seed=SEED)
+def test_crossings_are_derivatives_to_the_elements_of_a_matrix(seed):
+    """What any small change of an optic does, against a general matrix that stands behind it."""
+    rng = np.random.default_rng(seed)
+    chain = join(
+        [
+            optics.LinearPolarizer(theta=rng.uniform(-90, 90) * u.deg, name="polarizer"),
+            optics.LinearRetarder(retardance=170 * u.deg, mount="a", name="plate"),
+            optics.MuellerElement(theta=rng.uniform(-90, 90) * u.deg, mount="b", name="any"),
+            optics.Diattenuator(diattenuation=0.1, theta=20 * u.deg, name="mirror"),
+            optics.WollastonPrism(efficiency=0.97, name="wollaston"),
+        ]
+    )
+    positions = {stage: rng.uniform(-3, 3, N_FRAMES) for stage in ("a", "b")}
+    sweep = Propagator(chain, LAM, positions, np.array([1.0, 0.2, -0.1, 0.3])).forward()
+    index = [leaf.name for leaf in leaves(chain)].index("any")
+    weights = rng.normal(size=(2, 3, N_FRAMES))
+    row, light = sweep.crossings([index], weights)[index]
+    keys = chain["any"].param_names
+    wanted = [(index, keys.index(f"m{i}{j}")) for i in range(4) for j in range(4)]
+    expected = sweep.derivatives(wanted, weights)
+    for (i, j), place in zip(np.ndindex(4, 4), wanted, strict=True):
+        np.testing.assert_allclose(row[..., i] * light[..., j], expected[place], atol=1e-12)

@@ -231,7 +231,8 @@ def optic_from_node(name, node):
     """
     from astropolcal.optics import OPTICS
 
-    settings = {key: value for key, value in node.items() if key != "parameters"}
+    # an optic that is on no stage says so: the default of some is another
+    settings = {"mount": None} | {key: value for key, value in node.items() if key != "parameters"}
     values = {key: _value(entry) for key, entry in node["parameters"].items()}
     try:
         optic = OPTICS[name](**values, **settings)

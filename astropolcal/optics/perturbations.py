@@ -213,12 +213,9 @@ class Perturbation(_BeamOptic, FrameOptic):
     0.02
     """
 
-    amplitude = Parameter(
-        default=0.0, bounds=(-3.5, 3.5), description="size of the first function"
-    )
-    quadrature = Parameter(
-        default=0.0, bounds=(-3.5, 3.5), description="size of the second function"
-    )
+    # beyond is no small error of anything, and more than a half turn of a retarder
+    amplitude = Parameter(default=0.0, bounds=(-4, 4), description="size of the first function")
+    quadrature = Parameter(default=0.0, bounds=(-4, 4), description="size of the second function")
 
     def __init__(self, *args, kind="retardance_h", dependence="constant", **kwargs):
         if kind not in GENERATORS:

@@ -70,10 +70,10 @@ def test_nominal_model(benchmark):
 
 
 def test_scan(benchmark, model):
-    """The library without refits."""
-    scores = benchmark.pedantic(scan, (model, SMOOTH), rounds=3, warmup_rounds=1, iterations=1)
-    assert scores[0].effect.name == EFFECT
-    assert len(scores) > 20
+    """All cells and the library without refits."""
+    found = benchmark.pedantic(scan, (model, SMOOTH), rounds=3, warmup_rounds=1, iterations=1)
+    assert EFFECT in [one.name for one in found.candidates[:3]]
+    assert len(found.candidates) > 1000
 
 
 def test_where(benchmark, model):

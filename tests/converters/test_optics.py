@@ -31,9 +31,11 @@ some_bounds = st.tuples(st.none() | numbers, st.none() | numbers)
 # strategies of the settings that some optics have
 SETTINGS = {
     "beam": st.sampled_from(["right", "left"]),
+    "dependence": st.sampled_from(["constant", "time", "harmonic:hwp:2", "step:3/dataset:a/b"]),
     "differential": st.booleans(),
     "film": st.sampled_from(["fused silica", "Al2O3"]),
     "harmonic": st.sampled_from([1, 2, 4]),
+    "kind": st.sampled_from(["retardance_d", "diattenuation_h", "gain"]),
     "material": st.sampled_from(["silver", "gold"]),
     "power": st.sampled_from([1, -1]),
     "reference": st.floats(min_value=0, exclude_min=True, allow_infinity=False),

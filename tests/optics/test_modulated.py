@@ -40,6 +40,7 @@ def test_only_some_optics_stand_on_numbers(name, coordinate, sign):
         "DriftRotator",
         "FerroelectricLiquidCrystal",
         "FluxGain",
+        "Perturbation",
         "PolarizedBackground",
         "StrayLight",
     )

@@ -17,6 +17,7 @@ import pytest
 from scipy.linalg import expm
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from astropolcal import mueller, optics
 from astropolcal.exceptions import ParameterError
@@ -154,6 +155,31 @@ def harmonic_retarder(n):
 
 def harmonic_gain(n, sign=1):
     return lambda x, **amplitudes: gained(1 + sign * u.Quantity(wave(n, x, **amplitudes)).value)
+
+
+def perturbation(kind, wave=lambda x: (x, 0 * x)):
+    """Matrix exponential of the generator, by the series of scipy."""
+
+    def expected(x, amplitude, quadrature):
+        first, second = wave(u.Quantity(x).to_value(getattr(x, "unit", u.one)))
+        exponent = np.asarray(amplitude * first + quadrature * second)
+        if kind == "gain":
+            return gained(1 + exponent)
+        return expm(exponent[..., None, None] * optics.GENERATORS[kind])
+
+    return expected
+
+
+def turning(n):
+    return lambda x: (np.cos(n * np.deg2rad(x)), np.sin(n * np.deg2rad(x)))
+
+
+def drift(x):
+    return 2 * x - 1, 0 * x
+
+
+def switched(x):
+    return 1.0 * x, 0 * x
 
 
 @dataclass(frozen=True)
@@ -397,6 +423,47 @@ CASES = {
         optics.ParityFlip,
         # a mirror, which keeps +Q and changes the sign of U and V, turned by 45 deg
         lambda: mueller.rotate(mueller.linear_retarder(180 * u.deg), 45 * u.deg),
+    ),
+    "Perturbation": case(
+        optics.Perturbation,
+        perturbation("retardance_d", turning(2)),
+        settings={"kind": "retardance_d", "dependence": "harmonic:stage:2"},
+        amplitude=st.floats(-1, 1),
+        quadrature=st.floats(-1, 1),
+    ),
+    "Perturbation, rotation": case(
+        optics.Perturbation,
+        perturbation("rotation", drift),
+        settings={"kind": "rotation", "dependence": "time"},
+        mount="sequence",
+        position=FRACTION,
+        amplitude=st.floats(-1, 1),
+        quadrature=st.just(0.0),
+    ),
+    "Perturbation, diattenuation": case(
+        optics.Perturbation,
+        perturbation("diattenuation_h", turning(1)),
+        settings={"kind": "diattenuation_h", "dependence": "harmonic:stage:1"},
+        amplitude=GAIN,
+        quadrature=GAIN,
+    ),
+    "Perturbation, depolarization": case(
+        optics.Perturbation,
+        perturbation("depolarization_linear", switched),
+        settings={"kind": "depolarization_linear", "dependence": "direction:hwp"},
+        mount="hwp_direction",
+        position=FRACTION,
+        amplitude=FRACTION,
+        quadrature=st.just(0.0),
+    ),
+    "Perturbation, gain": case(
+        optics.Perturbation,
+        perturbation("gain", switched),
+        settings={"kind": "gain", "dependence": "move:derotator"},
+        mount="derotator_move",
+        position=FRACTION,
+        amplitude=GAIN,
+        quadrature=st.just(0.0),
     ),
     "PolarizedSource": case(
         optics.PolarizedSource,

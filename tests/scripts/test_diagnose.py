@@ -77,13 +77,17 @@ def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys):
     arguments = [*tables, "--derotator", "linear", *FEW, *outputs]
     assert main(["diagnose", *map(str, arguments)]) == 0
     printed = capsys.readouterr()
-    assert printed.out.startswith("The model misses the single differences of frames")
+    assert printed.out.startswith("The model lacks one effect: unequal gains of the two beams")
     assert str(report) in printed.out
-    assert re.search(r"^astropolcal: +\d+ s  scanning the effects$", printed.err, re.M)
-    assert re.search(r" s  looking for effect 1, at most \d$", printed.err, re.M)
+    assert re.search(r"^astropolcal: +\d+ s  looking for causes$", printed.err, re.M)
+    assert re.search(r" s  looking for cause 1, at most \d$", printed.err, re.M)
     content = json.loads((tmp_path / "out.json").read_text())
-    assert content["verdict"] == "effect"
-    assert [cause["effect"] for cause in content["causes"]] == ["beam_gain"]
+    assert content["verdict"] == "named"
+    (cause,) = content["causes"]
+    assert (cause["effect"], cause["rank"]) == ("beam_gain", 1)
+    assert cause["cell"] == {"place": "detector", "kind": "gain", "dependence": "constant"}
+    assert cause["probability"] > 0.9
+    assert content["frames"] == []
     assert content["nominal"].count(" | ") == 6
     assert [d["name"] for d in content["accuracy_after"]["datasets"]] == [
         "polarized",
