@@ -22,7 +22,9 @@ _SAME_ANGLE = 0.5
 # next to the solution of all frames the fit to most of them takes few steps
 _STEPS, _SHARE = 8, 1e-5
 # singular values below this share of the largest belong to directions that are open
-_OPEN = 1e-9
+_OPEN = 1e-12
+# so many parts of the data are left out in turn
+_MOST_PARTS = 16
 # a direction that a group determines by more than this share is its own
 _MOST_LEVER = 0.99
 
@@ -292,31 +294,38 @@ def stability(model, groups, temper):
         Share by name of the effect.
     """
     problem, q = model.problem, model.fit.coefficients
-    absent = problem.coefficients(problem._absent())
+    absent, jacobian = problem.coefficients(problem._absent()), model.jacobian
     found = {name: [] for name in model.added}
-    prior = np.diag(problem.tight)
-    for part in _parts(problem, groups):
-        rows = np.where(part[:, None], model.jacobian, 0.0)
-        target = np.concatenate([np.where(part, model.residual, 0.0), (absent - q) * problem.tight])
-        table = np.concatenate([rows, prior])
-        scale = np.linalg.norm(table, axis=0)
-        scale = np.where(scale > 0, scale, 1.0)
-        left, singular, right = np.linalg.svd(table / scale, full_matrices=False)
-        inverse = np.where(singular > _OPEN * singular[0], 1 / np.maximum(singular, 1e-300), 0.0)
-        size = q - absent + right.T @ (inverse * (left.T @ target)) / scale
-        half = inverse[:, None] * right / scale
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    prior = np.diag((problem.tight / scale) ** 2)
+    pull = (absent - q) * problem.tight**2 / scale
+    whole = _normal(jacobian, model.residual, slice(None), scale)
+    for inside, rows in _parts(problem, groups):
+        gram, target = _normal(jacobian, model.residual, rows, scale)
+        if not inside:
+            gram, target = whole[0] - gram, whole[1] - target
+        inverse = np.linalg.pinv(gram + prior, rcond=_OPEN, hermitian=True)
+        size = (q - absent) * scale + inverse @ (target + pull)
+        n = rows.sum() if inside else len(rows) - rows.sum()
         for name, parameters in model.added.items():
             own = [problem.slices[p.name] for p in parameters if p.name in problem.slices]
             if own:
                 own = np.concatenate([np.arange(s.start, s.stop) for s in own])
-                covariance = temper * half[:, own].T @ half[:, own]
+                covariance = temper * inverse[np.ix_(own, own)]
                 strength = size[own] @ np.linalg.pinv(covariance, hermitian=True) @ size[own]
-                found[name].append(strength > own.size * np.log(max(part.sum(), 2)))
+                found[name].append(strength > own.size * np.log(max(n, 2)))
     return {name: float(np.mean(asked)) for name, asked in found.items() if asked}
 
 
+def _normal(jacobian, residual, rows, scale):
+    """Return the normal equations of some rows, of columns over their length."""
+    table = jacobian[rows] / scale
+    return table.T @ table, table.T @ residual[rows]
+
+
 def _parts(problem, groups):
-    """Yield which rows are in each part of the data."""
+    """Yield rows, and whether the part is these or all but these."""
 
     def rows(rule):
         parts = zip(problem.datasets, problem.channels, strict=True)
@@ -326,10 +335,12 @@ def _parts(problem, groups):
 
     if len(problem.wavelength) > 3:
         for half in (0, 1):
-            yield rows(lambda i, d, half=half: (d.bins % 2 == half)[:, None])
+            yield True, rows(lambda i, d, half=half: (d.bins % 2 == half)[:, None])
     labels, numbers = groups or ((), ())
-    for k in range(len(labels)):
-        yield rows(lambda i, d, k=k: numbers[i] != k)
+    # neighbours together where there are many
+    bundle = np.arange(len(labels)) * min(len(labels), _MOST_PARTS) // max(len(labels), 1)
+    for k in np.unique(bundle):
+        yield False, rows(lambda i, d, k=k: bundle[numbers[i]] == k)
 
 
 def left_out_fits(model, labels, numbers):

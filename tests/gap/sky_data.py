@@ -4,6 +4,7 @@
 import astropy.units as u
 import numpy as np
 
+from astropolcal.chain import join, leaves
 from astropolcal.simulation import half_wave_plate_cycles
 
 
@@ -15,3 +16,12 @@ def sky_track(n_cycles, parallactic=(-40, 40), altitude=(55, 68)):
     table["derotator"] = 0.5 * table["altitude"] + 63.5 * u.deg
     table["hwp"] = table["hwp"] + 0.5 * table["parallactic"] + table["altitude"]
     return table
+
+
+def held(chain, without=(), free=()):
+    """Return the chain with everything held but some optics, and some taken out."""
+    train = [leaf.copy() for leaf in leaves(chain) if leaf.name not in without]
+    for leaf in train:
+        for key in leaf.param_names:
+            getattr(leaf, key).fixed = leaf.name not in free or key == "theta"
+    return join(train)

@@ -8,12 +8,15 @@ import gap_data as data
 import numpy as np
 import pytest
 from gap_setups import SETUPS
+from sky_data import held
+from star_data import WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments
 from astropolcal.exceptions import GapError
 from astropolcal.gap import EFFECTS, alternatives, diagnose
 from astropolcal.gap.alternatives import thinned
 from astropolcal.gap.cells import Cell
+from astropolcal.instruments.telescope import published_mirror
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 pytestmark = pytest.mark.usefixtures("own_instruments")
@@ -175,6 +178,23 @@ def test_wrong_frames_are_named_and_left_out():
         assert mask.sum() == 7
 
 
+# ---- on sky ------------------------------------------------------------------------------------
+
+
+def test_a_star_tells_what_a_chain_without_free_parameters_lacks():
+    chain = star_chain()
+    chain["m3"].diattenuation = published_mirror().diattenuation(WAVELENGTH)
+    found = diagnose(held(chain), observe_star(chain, seed=4))
+    assert (found.verdict, found.causes) == ("none", [])
+    star = observe_star(chain, seed=3, parallactic=(-60, 60))
+    found = diagnose(held(chain, without=["m3"]), star)
+    assert found.verdict == "named"
+    assert found.causes[0].name == "m3_diattenuation"
+    measured = found.chains[0]["gap_m3_diattenuation"].diattenuation.value
+    np.testing.assert_allclose(measured, chain["m3"].diattenuation.value, atol=3e-4)
+    assert found.gap_after_percent < 0.2 * found.gap_before_percent
+
+
 # ---- bad input ---------------------------------------------------------------------------------
 
 
@@ -224,8 +244,8 @@ def test_a_sign_may_be_wrong_where_double_differences_are_far_off():
     ]
     for observed, residual, sigma, wrong in cases:
         part = SimpleNamespace(observed=np.full(20, observed), sigma=np.full(20, sigma))
-        signs = np.resize([1.0, -1.0], 20)
-        measurement = SimpleNamespace(datasets=[part], residuals=lambda r=residual: r * signs)
+        left = residual * np.resize([1.0, -1.0], 20)
+        measurement = SimpleNamespace(datasets=[part], residuals=lambda left=left: left)
         given = SimpleNamespace(measurement=measurement)
         assert alternatives._may_be_wrong(given) == wrong, (observed, residual, sigma)
 

@@ -12,27 +12,33 @@ import subprocess
 import sys
 from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 import pytest
+from sky_data import held
 
 from astropolcal import calibrate, instruments
 from astropolcal.calibration import robust_covariance
-from astropolcal.chain import leaves, remove_optic
+from astropolcal.chain import join, leaves, remove_optic
 from astropolcal.gap import diagnose
 from astropolcal.gap.alternatives import thinned
 from astropolcal.gap.remainders import outlying_frames
+from astropolcal.instruments.telescope import published_mirror
 from astropolcal.observations import Observations
 
 pytestmark = pytest.mark.slow
 CHARIS = instruments.get("charis")
 PARITY = {"mirror_flip", "mirror_flip_before_plate", "beams_swapped"}
-DEROTATOR = {
+# what the derotator's retardance is taken for where it is held, next to its true name
+ELLIPTICAL = {
     "derotator_elliptical_retardance",
     "derotator_45_retardance",
     "derotator_circular_retardance",
+    "static_retarder",
+    "polarizer_misalignment",
+    "hwp_misalignment",
+    "derotator_misalignment",
 }
-# orientations of polarizer, plate and derotator take part of an elliptical retardance up
-ORIENTATION = {"polarizer_misalignment", "hwp_misalignment", "derotator_misalignment"}
 
 
 def observed(shared_data, *names):
@@ -42,52 +48,73 @@ def observed(shared_data, *names):
 def named(diagnosis, least=0.0):
     """Return the names of all causes and of what cannot be told from them."""
     causes = [cause for cause in diagnosis.causes if cause.explained > least]
-    return [{cause.name, *cause.aliases} for cause in causes]
+    return [{cause.name, *(other.name for other, _ in cause.aliases)} for cause in causes]
 
 
 def test_beam_switcher_that_the_model_lacks_is_a_parity(shared_data):
     data = observed(shared_data, "dataset3_polarized_2025-10-05")
     chains = [remove_optic(chain, "nbs") for chain in CHARIS.chains_for(data)]
-    found = diagnose(*thinned(chains, data, 5))
-    assert found.verdict == "effect"
-    assert named(found)[0] & PARITY == PARITY
+    found = diagnose(*thinned(chains, data, 5), cells=False)
+    assert named(found)[0] == PARITY
     assert found.causes[0].effect.kind == "discrete"
     assert found.gap_after_percent < found.gap_before_percent / 5
 
 
-@pytest.mark.parametrize("name", ["dataset1_polarized_2025-07-15", "dataset3_polarized_2025-10-05"])
-def test_elliptical_retardance_that_the_derotator_lacks(shared_data, name):
-    data = observed(shared_data, name)
+def test_elliptical_retardance_that_the_derotator_lacks(shared_data):
+    data = observed(shared_data, "dataset3_polarized_2025-10-05")
     chains = CHARIS.chains_for(data, derotator="linear")
     for chain in chains:
         for leaf in leaves(chain):
             leaf.theta.fixed = True
-    found = diagnose(*thinned(chains, data, 6))
-    assert found.verdict == "effect"
+    found = diagnose(*thinned(chains, data, 6), cells=False)
     # the flat field is missing as well; nothing else is as large
     large = named(found, least=0.05)
-    assert any(group & DEROTATOR for group in large)
-    assert all(group & (DEROTATOR | ORIENTATION | {"beam_gain"}) for group in large)
+    assert any(group & ELLIPTICAL for group in large)
+    assert all(group & (ELLIPTICAL | {"beam_gain"}) for group in large)
+    # of frames that were left out
     assert found.held_out[0].shrinkage(found.held_out[-1])[0] > 80
 
 
-def test_fold_mirror_that_the_model_lacks(shared_data):
+def test_what_real_data_lack_is_not_told_with_confidence(shared_data):
+    """Nobody knows what Dataset 3 lacks; the tool must not pretend to, but lower its gap."""
+    data = observed(shared_data, "dataset3_polarized_2025-10-05")
+    found = diagnose(*thinned(CHARIS.chains_for(data), data, 4))
+    assert found.verdict == "unexplained"
+    assert all(cause.probability < 0.5 for cause in found.causes)
+    assert found.held_out[0].shrinkage(found.held_out[-1])[0] > 50
+
+
+def test_unpolarized_run_misses_its_fold_mirror_and_has_an_unstable_lamp(shared_data):
     data = observed(shared_data, "dataset4_unpolarized_2025-10-05")
     chains = [remove_optic(chain, "fold_mirror") for chain in CHARIS.chains_for(data)]
-    found = diagnose(*thinned(chains, data, 8))
-    assert {"source_linear"} & set.union(*named(found))
+    found = diagnose(*thinned(chains, data, 8), cells=False)
+    assert "source_linear" in set.union(*named(found))
+    assert {fault.what for fault in found.frames} == {"lamp"}
+    # at the first derotator angle it had not settled
+    worst = found.frames[0]
+    assert worst.frame < 8
+    row = outlying_frames(found.improved)[0]
+    assert (row["frames"], row["channel"]) == ("0-7", "sum")
+    assert row["words"].startswith("lamp unstable at derotator 45 deg")
 
 
-def test_lamp_that_is_unstable_is_not_blamed_on_the_optics(shared_data):
-    data = observed(shared_data, "dataset4_unpolarized_2025-10-05")
-    model = diagnose(*thinned(CHARIS.chains_for(data), data, 8)).improved
-    worst = outlying_frames(model)[0]
-    first, last = map(int, worst["frames"].split("-"))
-    turned = np.rad2deg(data[0].position("derotator"))[first : last + 1]
-    np.testing.assert_allclose(turned, 45, atol=1)
-    assert len(turned) == 8
-    assert worst["channel"] == "sum"
-    assert worst["words"].startswith("lamp unstable at derotator 45 deg")
+def test_star_misses_flat_field_and_mirror(shared_data):
+    (lamp,) = observed(shared_data, "dataset3_polarized_2025-10-05")
+    (star,) = observed(shared_data, "hd293396_unpolarized_standard_2025-11-03")
+    inside = calibrate(CHARIS.chain(*CHARIS.setup(lamp)), lamp, cross_validate=False).chains[0]
+    start = [leaf.name for leaf in leaves(inside)].index("hwp")
+    outside = leaves(CHARIS.chain(*CHARIS.setup(star)))[:4]
+    chain = held(join([*outside, *leaves(inside)[start:]]), without=["m3"])
+    found = diagnose(*thinned([chain], [star], 8), cells=False)
+    gain, mirror, *_ = named(found)
+    # of a star that is hardly polarized, a diattenuator in front of the prism is a gain
+    assert gain & {"beam_gain", "static_diattenuator"}
+    assert "m3_diattenuation" in mirror
+    measured = found.chains[0]["gap_m3_diattenuation"].diattenuation.value
+    wavelength = found.nominal.observations[0].wavelength.to(u.um)
+    published = published_mirror().diattenuation(wavelength)
+    assert np.sqrt(np.mean((measured - published) ** 2)) < 0.0015
+    assert found.gap_after_percent < 0.15 * found.gap_before_percent
 
 
 # ---- another processor -------------------------------------------------------------------------
@@ -101,12 +128,12 @@ def numbers(shared_data):
     cal = calibrate(chains, data, fix=fix, cross_validate=False)
     wrong = [remove_optic(chain, "nbs") for chain in chains]
     effects = [*sorted(PARITY), "beam_gain", "derotator_diattenuation", "dichroic_j_band"]
-    found = diagnose(*thinned(wrong, data, 3), effects=[*effects, "static_retarder"])
+    found = diagnose(*thinned(wrong, data, 3), effects=[*effects, "static_retarder"], cells=False)
     return {
         "values": (cal.measurement.vector() / cal.measurement.free.factors()).tolist(),
         "errors": cal.covariance.stds.tolist(),
         "robust errors": robust_covariance(cal).stds.tolist(),
-        "causes": [[cause.name, *cause.aliases] for cause in found.causes],
+        "causes": [sorted(group) for group in named(found)],
         "explained": [cause.explained for cause in found.causes],
         "gaps": [found.gap_before_percent, found.gap_after_percent],
     }

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import get_effect
+from astropolcal.gap.model import Linear
 from astropolcal.gap.shrinkage import HeldOut, foreseen, frame_groups, held_out, left_out_fits
 
 
@@ -174,44 +175,44 @@ def test_pure_noise_is_predicted_to_the_noise():
 # ---- foreseen --------------------------------------------------------------------------------
 
 
-class Linear:
-    """A model that is linear in its coefficients, with two groups of three and five frames."""
+class Table:
+    """Data of three and five frames, linear in a few coefficients."""
 
-    def __init__(self, seed, n_waves=4, n_frames=8, size=3):
+    shape = (2, 4, 8)
+
+    def __init__(self, seed):
         rng = np.random.default_rng(seed)
-        shape = (2, n_waves, n_frames)
-        self.slopes = rng.normal(size=(2 * n_waves * n_frames, size))
-        self.target = rng.normal(size=len(self.slopes))
-        sigma = np.broadcast_to(rng.uniform(0.5, 2, (2, n_waves, 1)), shape)
-        self.channel = SimpleNamespace(shape=shape, valid=rng.random(shape[1:]) < 0.8, sigma=sigma)
-        keep = np.broadcast_to(self.channel.valid, shape).ravel()
+        valid = rng.random(self.shape[1:]) < 0.8
+        sigma = np.broadcast_to(rng.uniform(0.5, 2, (2, 4, 1)), self.shape)
+        self.channel = SimpleNamespace(shape=self.shape, valid=valid, sigma=sigma)
+        keep = np.broadcast_to(valid, self.shape).ravel()
+        self.slopes, self.target = rng.normal(size=(64, 3)), rng.normal(size=64)
         self.slopes[~keep], self.target[~keep] = 0.0, 0.0
-        self.problem = SimpleNamespace(
-            channels=[self.channel],
-            segments=[slice(0, len(self.slopes))],
-            tangent=lambda q: np.linalg.svd(self.slopes, full_matrices=False)[0],
-        )
-        self.residual, self.fit = self.left(), SimpleNamespace(coefficients=None)
 
-    def left(self, kept=True):
+    def left(self, kept):
         """Return the residuals of a fit to some of the rows."""
-        rows = np.broadcast_to(kept, len(self.target))
-        found = np.linalg.lstsq(self.slopes[rows], self.target[rows], rcond=None)[0]
+        found = np.linalg.lstsq(self.slopes[kept], self.target[kept], rcond=None)[0]
         return self.target - self.slopes @ found
+
+    @property
+    def model(self):
+        tangent = np.linalg.svd(self.slopes, full_matrices=False)[0]
+        problem = SimpleNamespace(channels=[self.channel], segments=[slice(0, 64)])
+        return Linear(SimpleNamespace(problem=problem), tangent, self.left(slice(None)))
 
 
 @given(st.integers(0, 2**32 - 1))
 def test_what_is_foreseen_of_a_linear_model_is_what_refits_give(seed):
-    model, number = Linear(seed), np.array([0, 0, 0, 1, 1, 1, 1, 1])
-    found = foreseen(model, (["a", "b"], [number]))
+    table, number = Table(seed), np.array([0, 0, 0, 1, 1, 1, 1, 1])
+    found = foreseen(table.model, (["a", "b"], [number]))
     for i in range(2):
-        out = np.broadcast_to(number == i, model.channel.shape)
-        gap = model.left(~out.ravel()).reshape(model.channel.shape)
+        out = np.broadcast_to(number == i, table.shape)
+        gap = table.left(~out.ravel()).reshape(table.shape)
         assert found.whitened[i] == pytest.approx(np.sum(gap[out] ** 2) / 2)
         assert found.squares[i] == pytest.approx(
-            np.sum((gap[0] * model.channel.sigma[0])[out[0]] ** 2)
+            np.sum((gap[0] * table.channel.sigma[0])[out[0]] ** 2)
         )
-        assert found.counts[i] == np.sum(model.channel.valid & (number == i))
+        assert found.counts[i] == np.sum(table.channel.valid & (number == i))
 
 
 def test_what_is_foreseen_is_nearly_what_refits_give():
