@@ -284,7 +284,7 @@ def dependences(problem, most_steps=_MOST_STEPS):
     >>> from astropolcal.gap.cells import dependences
     >>> from astropolcal.gap.model import nominal_model
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = instruments.get("charis").chain(derotator="linear")
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> model = nominal_model([chain], [simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)])
     >>> list(dependences(model.problem, 0))[:4]

@@ -27,7 +27,7 @@ from astropolcal.gap._forecast import (
 from astropolcal.gap._words import listed
 from astropolcal.gap.effects import Roles, get_effect
 from astropolcal.gap.selection import REMAINDER
-from astropolcal.optics import COORDINATES
+from astropolcal.optics import COORDINATES, Dependence
 
 __all__ = ["Exposure", "exposures", "plan"]
 
@@ -366,7 +366,7 @@ def _telling_apart(forecast, group, foreseen):
     hypotheses, now = forecast.foreseen(names), float(np.sum(weights**2))
     best, value = None, -np.inf
     # a short block is no run: how far a drift would come in it is not known
-    timed = any(effect.dependence.partition(":")[0] in _TIMED for effect, _ in recipes)
+    timed = any(Dependence(effect.dependence).kind in _TIMED for effect, _ in recipes)
     for exposure, columns in foreseen:
         if timed and not exposure.what:
             continue
