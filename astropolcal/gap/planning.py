@@ -27,13 +27,14 @@ from astropolcal.gap._forecast import (
 from astropolcal.gap._words import listed
 from astropolcal.gap.effects import Roles, get_effect
 from astropolcal.gap.selection import REMAINDER
-from astropolcal.optics import COORDINATES
+from astropolcal.optics import COORDINATES, Dependence
 
 __all__ = ["Exposure", "exposures", "plan"]
 
 # positions that are set: degree; altitudes from low to high, the range in which stars are observed
 _DEROTATOR, _ALTITUDE = np.arange(0, 180, 15.0), (25.0, 45.0, 65.0, 80.0)
 _TURN = tuple(float(a) for a in np.arange(32) * 11.25)
+_CYCLE = _TURN[:8]
 _SKY = ("parallactic", "altitude")
 _LEVELS = (0.5, 2.0)
 # new angles of the derotator that are tried, and frames of a run that are repeated
@@ -135,7 +136,8 @@ by 45 deg'
         parts += [f"{name} taken out" for name in self.without]
         if self.lamp != 1:
             level = "half" if self.lamp == 0.5 else f"{self.lamp:g} times"
-            parts.append(f"the lamp {level} as bright")
+            source = "a star" if "parallactic" in dict(self.positions) else "the lamp"
+            parts.append(f"{source} {level} as bright")
         return ", ".join(parts)
 
 
@@ -210,6 +212,8 @@ def _run(i, train, observations):
 def _blocks(run, train):
     """Return blocks of plate angles at new positions, and a full turn at an old one."""
     cycle = tuple(float(a) for a in np.unique(np.round(run.hwp, 2))[:8])
+    # a plate that follows the sky has been everywhere
+    cycle = _CYCLE if len(set(np.round(run.hwp, 2))) > len(_TURN) else cycle
     usual = {name: float(np.median(angles)) for name, angles in run.positions}
     moved = next((name for name in ("altitude", "derotator", *usual) if name in usual), None)
     if moved is None:
@@ -362,7 +366,7 @@ def _telling_apart(forecast, group, foreseen):
     hypotheses, now = forecast.foreseen(names), float(np.sum(weights**2))
     best, value = None, -np.inf
     # a short block is no run: how far a drift would come in it is not known
-    timed = any(effect.dependence.partition(":")[0] in _TIMED for effect, _ in recipes)
+    timed = any(Dependence(effect.dependence).kind in _TIMED for effect, _ in recipes)
     for exposure, columns in foreseen:
         if timed and not exposure.what:
             continue
