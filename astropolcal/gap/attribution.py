@@ -196,6 +196,23 @@ class Scan:
             best = max([best, *found], key=lambda one: one.evidence)
         return best
 
+    def of_cell(self, cell, degree):
+        """
+        Return the candidate of a cell with a law of some degree, None where it does nothing.
+
+        Parameters
+        ----------
+        cell : Cell
+            Its place and kind are among those of the probes.
+        degree : int or None
+            Degree of the law in wavelength.
+
+        Returns
+        -------
+        Candidate or None
+        """
+        return next(iter(_of_cell(self.probes, cell, degree, self.temper)), None)
+
     def by_run(self, candidate):
         """
         Return the evidence for a cause in each of several runs alone.

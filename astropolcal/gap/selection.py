@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from astropolcal.gap.attribution import scan
-from astropolcal.gap.cells import count_runs
+from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = ["Group", "Selection", "explained_by_one", "select"]
@@ -37,6 +37,8 @@ ENOUGH = 12.0
 _MOST = 8
 # of several runs each by itself, and all together for each of them
 _MOST_ALONE, _MOST_TOGETHER = 6, 10
+# what a nominal model has of an optic that turns, with the degree of the law in wavelength
+_OF_OPTIC = (("retardance_h", None), ("retardance_d", None), ("rotation", 2))
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
 _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
@@ -309,10 +311,34 @@ def _apart(base, first, say):
         state, _ = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST_ALONE)
         chosen += [_in_run(one, name, first.probes) for one in state.chosen]
     say("all runs together")
-    model = base.with_effects([one.recipe for one in chosen], **_QUICK)
+    names = {one.name for one in chosen}
+    nominal = [one for one in _nominal_changes(first) if one.name not in names]
+    model = base.with_effects([one.recipe for one in (*chosen, *nominal)], **_QUICK)
+    temper = max(1.0, model.mean_square)
+    for one in nominal:
+        lost = 0.5 * (model.without([one.name]).chi2 - model.fit.chi2) / temper
+        if lost > one.cost(temper) + ENOUGH:
+            chosen.append(one)
+    model = base.with_effects([one.recipe for one in chosen], like=model, **_QUICK)
     temper = max(1.0, model.mean_square)
     gained = 0.5 * (base.fit.chi2 - model.fit.chi2) / temper
     return _State(model, chosen, gained - sum(one.cost(temper) for one in chosen))
+
+
+def _nominal_changes(first):
+    """Return the changes of what a nominal model has one value of for all runs."""
+    probes, found = first.probes, []
+    places = list(dict.fromkeys(place for place, _ in probes.slopes))
+    own = [place for place in places if place.startswith("in:")]
+    kinds = [(place, *kind) for place in own for kind in _OF_OPTIC]
+    kinds += [(place, "rotation", 0) for place in places if place == "source"]
+    # the efficiency of the splitter, as seen in front of it
+    behind = [p for p in places if p[:6] == "after:" and len(probes.slopes[p, "rotation"]) > 1]
+    kinds += [(place, "depolarization_linear", None) for place in behind[-1:]]
+    for run in probes.runs[1:]:
+        cells = [(Cell(place, kind, f"dataset:{run}"), degree) for place, kind, degree in kinds]
+        found += [first.of_cell(*each) for each in cells]
+    return [one for one in found if one is not None]
 
 
 def _in_run(candidate, name, probes):
