@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 import pytest
-from scipy.linalg import expm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -219,18 +218,6 @@ class Case:
         return self.position.map(lambda x: x * unit) if self.per_frame else st.none()
 
 
-def perturbed(kind):
-    """Return the exponential of a generator; a gain is linear in its size."""
-
-    def expected(x, amplitude, quadrature):
-        size = amplitude * np.cos(2 * x) + quadrature * np.sin(2 * x)
-        if kind == "gain":
-            return (1 + size) * np.eye(4)
-        return expm(size * optics.GENERATORS[kind])
-
-    return expected
-
-
 def case(optic, expected, smooth=None, settings=None, mount="stage", position=ANGLE, **values):
     strategy = st.fixed_dictionaries(values)
     steep = None if smooth is None else st.fixed_dictionaries(values | smooth)
@@ -349,19 +336,6 @@ CASES = {
         q=st.floats(-0.1, 0.1),
         u=st.floats(-0.1, 0.1),
     ),
-    **{
-        f"Perturbation{label}": case(
-            optics.Perturbation,
-            perturbed(kind),
-            settings={"kind": kind, "dependence": "harmonic:stage:2"},
-            amplitude=GAIN,
-            quadrature=GAIN,
-        )
-        for kind, label in [
-            ("retardance_h", ""),
-            *((kind, f", {kind}") for kind in optics.GENERATORS if kind != "retardance_h"),
-        ]
-    },
     "HarmonicGain": case(optics.HarmonicGain, harmonic_gain(1), cosine=GAIN, sine=GAIN),
     "HarmonicGain, left": case(
         optics.HarmonicGain,
