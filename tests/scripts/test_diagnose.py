@@ -107,7 +107,7 @@ def check_improved(saved, content):
         assert gain.fixed
         np.testing.assert_allclose(gain.value, SIZE, rtol=0.05)
         assert list(leaves(chain))[-1].name in ("gap_beam_gain", "wollaston")
-    (entry,) = content["causes"][0]["parameters"].values()
+    (entry,) = content["causes"][0]["size"].values()
     np.testing.assert_allclose(gain.value, entry["value"], rtol=1e-6)
 
 
