@@ -64,6 +64,8 @@ class Channels:
             )
         self.valid = dataset.valid & np.isfinite(self.observed).all(axis=0)
         self.observed = np.where(self.valid, self.observed, 0.0)
+        #: Whether the table states errors.
+        self.stated = bool(np.any(np.isfinite(self.variance) & (self.variance > 0) & self.valid))
         self.sequence = obs.position("sequence")
         self._whitening = None
 

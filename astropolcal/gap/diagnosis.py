@@ -404,7 +404,9 @@ def _cause(group, improved, explained, before=None, after=None):
 def _verdict(causes, nominal, left_p):
     """Return what can be said of the gap."""
     if not causes:
-        return "unexplained" if left_p < REMAINDER else "none"
+        # noise that the residuals themselves told cannot be exceeded by them
+        known = all(channel.stated for channel in nominal.problem.channels)
+        return "unexplained" if left_p < REMAINDER and known else "none"
     sure = min(cause.probability for cause in causes)
     if sure >= _SURE and all(cause.is_named for cause in causes):
         return "named"

@@ -33,7 +33,7 @@ REMAINDER = 1e-4
 # and more probable than this they may be
 _NOISE = 1e-3
 #: Log evidence that a cause needs: the prior odds against any cause, and the number of looks.
-ENOUGH = 12.0
+ENOUGH = 10.0
 _MOST = 8
 # of several runs each by itself, and all together for each of them
 _MOST_ALONE, _MOST_TOGETHER = 6, 10
@@ -46,6 +46,8 @@ _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
 _SAME = 1e-6
 # an alias is no less probable than this against the best; so many are listed
 _ALIAS, _MOST_ALIASES = np.exp(-7.0), 40
+# a rival whose statistic is as near as this share is fitted in full, where it is as large as that
+_NEAR, _BENT = 0.03, 500.0
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
 # needs
 _UNLISTED = (0.0, 0.02, 0.08, 0.55, 0.75, 0.88, 0.92, 0.95, 0.97)
@@ -196,7 +198,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     best, steps, history = _checked(base, best, groups, say)
     unlisted = _unlisted(base, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
-    found = _grouped(best, steps, scans, unlisted, stable)
+    found = _grouped(base, best, steps, scans, unlisted, stable)
     return Selection(found, best.model, first, left, unlisted, history)
 
 
@@ -490,11 +492,11 @@ def _unlisted(base, best):
     return float(prior + (after - prior) * (1 - np.exp(-share / _LEFT)))
 
 
-def _grouped(best, steps, scans, unlisted, stable):
+def _grouped(base, best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
     found = []
     for one, (before, after) in zip(best.chosen, pairwise(steps), strict=True):
-        members = _members(one, scans[one.name])
+        members = _members(one, scans[one.name], _refits(base, best, one))
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
         lowered = max(before.chi2 - after.chi2, 0.0)
         share = stable.get(one.name, 1.0)
@@ -504,7 +506,17 @@ def _grouped(best, steps, scans, unlisted, stable):
     return found
 
 
-def _members(chosen, beside):
+def _refits(base, best, chosen):
+    """Return what gives the loss of chi-square of a full fit with another in place of a cause."""
+
+    def loss(other):
+        recipes = [(other if one is chosen else one).recipe for one in best.chosen]
+        return base.with_effects(recipes, like=best.model, **_QUICK).fit.chi2 - best.model.fit.chi2
+
+    return loss
+
+
+def _members(chosen, beside, loss):
     """Return the chosen candidate and its aliases, with probabilities that sum to one."""
     rivals = beside.candidates
     own = next((one for one in rivals if one.name == chosen.name), chosen)
@@ -512,9 +524,27 @@ def _members(chosen, beside):
     top = max(own.evidence, rivals[0].evidence) if rivals else own.evidence
     own = replace(chosen, evidence=top)
     weights = {own.name: (own, 1.0)}
+    promised, known = max(chosen.statistic, own.statistic), {}
     for one in rivals:
+        if one.name == own.name or len(weights) > _MOST_ALIASES:
+            continue
         weight = np.exp(min(one.evidence - top, 0.0))
-        if one.name != own.name and weight >= _ALIAS and len(weights) <= _MOST_ALIASES:
+        if weight < _ALIAS and one.statistic > (1 - _NEAR) * promised > _BENT:
+            # where a signal is strong, derivatives alone do not tell what is alike
+            key = round(one.statistic, 3)
+            if key not in known and len(known) < _FITTED[0]:
+                known[key] = 0.5 * max(loss(one), 0.0) / beside.temper
+            weight = (
+                np.exp(
+                    -known.get(key, np.inf)
+                    - max(one.cost(beside.temper), 0.0)
+                    + max(chosen.cost(beside.temper), 0.0)
+                )
+                if key in known
+                else 0.0
+            )
+            weight = min(weight, 1.0)
+        if weight >= _ALIAS:
             weights[one.name] = (one, weight)
     total = sum(weight for _, weight in weights.values())
     members = [(one, float(weight / total)) for one, weight in weights.values()]

@@ -62,7 +62,9 @@ def planted(name, chains, data, snr, size, seed=5):
 def group(model):
     """Return the effect that explains the data best, and what cannot be told from it."""
     found = scan(model, SMOOTH, cells=False).candidates
-    return [one.name for one in found if one.evidence > max(ENOUGH, found[0].evidence - 7)]
+    most = max((one.statistic for one in found), default=0.0)
+    near = [one for one in found if one.statistic > 0.95 * most or one is found[0]]
+    return [one.name for one in near if one.evidence > ENOUGH]
 
 
 @pytest.mark.parametrize("name", NEW)
