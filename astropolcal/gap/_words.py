@@ -377,6 +377,11 @@ def _what_is_left(content):
     text += f" noise {doubt(content['remainder_p_value'])}"
     if where and content["verdict"] != "unexplained":
         text += f": {where_words(where[0], 'it')}"
+    if content.get("nested_percent") is not None:
+        text += (
+            "; frames that took no part in the choice of the causes are predicted to "
+            f"{percent(content['nested_percent'])} %"
+        )
     strange = [entry["title"] for entry in content["causes"] if not entry["physical"]]
     return text + (f"; physically impossible is the size of {listed(strange)}." if strange else ".")
 

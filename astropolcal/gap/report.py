@@ -97,6 +97,7 @@ def to_dict(diagnosis):
         "double_difference": _double(fitted, before, after),
         "gap_p_value": diagnosis.gap_p_value,
         "remainder_p_value": diagnosis.remainder_p_value,
+        "nested_percent": diagnosis.nested.percent if diagnosis.nested else None,
         "unlisted_probability": diagnosis.settings.get("unlisted"),
         "frames": [fault.to_dict() for fault in diagnosis.frames],
         "where": _where(diagnosis.nominal),

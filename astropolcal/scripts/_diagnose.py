@@ -80,6 +80,12 @@ def add_parser(commands):
         action="store_true",
         help="ask what changed between several runs of the same kind of source",
     )
+    parser.add_argument(
+        "--nested",
+        action="store_true",
+        help="choose the causes anew without each group of frames, and predict these: slow, and "
+        "the one measure in which the choice has no part",
+    )
     _add_output_options(parser)
     parser.set_defaults(run=run)
 
@@ -129,7 +135,12 @@ def run(arguments):
     effects = _effects(arguments.effects)
     nominal, datasets, instrument = _nominal(arguments)
     diagnosis = diagnose(
-        nominal, datasets, effects=effects, changes=arguments.changes, progress=progress
+        nominal,
+        datasets,
+        effects=effects,
+        changes=arguments.changes,
+        nested=arguments.nested,
+        progress=progress,
     )
     # once: page, JSON and summary say the same
     content = to_dict(diagnosis)
