@@ -469,6 +469,8 @@ def test_every_effect_is_the_cells_that_it_says():
         nominal = GapProblem(chains, data)
         nominal.settle_noise()
         inside = (nominal.start > nominal.low + 1e-9) & (nominal.start < nominal.high - 1e-9)
+        # what is known beforehand takes up no more than its error
+        inside &= nominal.tight == 0
         tangent = orthonormal(nominal.jacobian(nominal.start)[:, inside])
         own = seen(effect, chains, data, nominal, tangent, CASES[name].size)
         probes = [seen(CellEffect(c, None), chains, data, nominal, tangent) for c in cells]

@@ -109,7 +109,8 @@ def _check_names(effect, edit, problem, nominal):
             known = ", ".join(sorted(set(problem.free.by_name) - set(nominal.free.by_name)))
             raise _failed(effect, f"{name} is not free in its chains; new and free: {known or '-'}")
         # a lifted bound, or prior, frees nothing that was not free: it gives room
-        if name in nominal.free.by_name and effect.kind != "bound":
+        known = name in nominal.free.by_name and name not in nominal.priors
+        if known and effect.kind != "bound":
             raise _failed(effect, f"{name} is free in the chains without it already")
         slot = problem.free.by_name[name]
         if parameter.basis is not None and len(parameter.basis) != slot.size:
