@@ -42,6 +42,8 @@ _OF_OPTIC = (("retardance_h", None), ("retardance_d", None), ("rotation", 2))
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
 _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
+# and so many times as many where all of these are impossible
+_MORE = 3
 # causes that lower chi-square by shares closer than this are the same for these data
 _SAME = 1e-6
 # an alias is no less probable than this against the best; so many are listed
@@ -225,9 +227,10 @@ def _checked(base, best, groups, say):
 
 
 def _worse(best, steps, history, groups):
-    """Return the numbers of the causes that left-out frames speak against."""
-    if groups is None:
-        return []
+    """Return the numbers of causes that are impossible, or that left-out frames speak against."""
+    impossible = [i for i, o in enumerate(best.chosen) if not best.model.is_physical(o.name)]
+    if impossible or groups is None:
+        return impossible[-1:]
     if len(best.chosen) <= _MOST:
         pairs = zip(pairwise(history), steps[1:], strict=True)
         found = [i for i, ((a, b), step) in enumerate(pairs) if _worsens(b, a, step.mean_square)]
@@ -358,18 +361,17 @@ def _search(best, library, first, say, cells, most_causes):
         k = len(best.chosen)
         width, most = (part[min(k, len(part) - 1)] for part in (_WIDTH, _FITTED))
         say(f"looking for cause {k + 1}, at most {most_causes}")
-        grown = {}
         for state in states:
-            found = known.get(state.outline)
-            if found is None:
-                found = known[state.outline] = _scanned(state.model, library, cells)
-            for added in _continuations(found, most):
-                evidence = state.evidence + sum(one.evidence for one in added)
-                outline = state.outline.union(one.name for one in added)
-                if outline not in grown or grown[outline][0] < evidence:
-                    grown[outline] = (evidence, state, added)
-        order = sorted(grown.values(), key=lambda item: -item[0])[:most]
-        fitted = [state for item in order if (state := _extended(*item)) is not None]
+            if state.outline not in known:
+                known[state.outline] = _scanned(state.model, library, cells)
+        fitted = []
+        for several in (most, _MORE * most):
+            # what is impossible is passed over, and is not the end of the search
+            grown = _grown(states, known, several)
+            tried = grown[:most] if several == most else grown[most:]
+            fitted = [state for item in tried if (state := _extended(*item)) is not None]
+            if fitted:
+                break
         fitted.sort(key=lambda state: -state.evidence)
         if not fitted or fitted[0].evidence < best.evidence + ENOUGH:
             break
@@ -378,6 +380,18 @@ def _search(best, library, first, say, cells, most_causes):
             # what is left may be noise: one look beside the best set will tell
             states = states[:1]
     return best, known.get(best.outline)
+
+
+def _grown(states, known, most):
+    """Return evidence, set and causes to add of all continuations of sets, best first."""
+    grown = {}
+    for state in states:
+        for added in _continuations(known[state.outline], most):
+            evidence = state.evidence + sum(one.evidence for one in added)
+            outline = state.outline.union(one.name for one in added)
+            if outline not in grown or grown[outline][0] < evidence:
+                grown[outline] = (evidence, state, added)
+    return sorted(grown.values(), key=lambda item: -item[0])
 
 
 def _continuations(found, most):
