@@ -44,7 +44,16 @@ _SAME = 1e-9
 # size (radian) of a retardance that is tried where its derivative vanishes
 FINITE = 0.1
 #: Usual size of a perturbation (radian, or a share) by kind, the scale of its prior.
-SIZES = {"retardance": 0.1, "rotation": 0.02, "diattenuation": 0.02, "depolarization": 0.05}
+SIZES = {
+    "retardance": 0.1,
+    "rotation": 0.02,
+    "diattenuation": 0.02,
+    "depolarization": 0.05,
+    # what follows the flux would follow the flicker of the lamp as well if it could be large
+    "background": 0.003,
+    "nonlinearity": 0.003,
+    "persistence": 0.003,
+}
 _USUAL = 0.02
 
 

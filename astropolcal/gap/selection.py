@@ -444,6 +444,8 @@ def _exchanged(base, best, library, first, say, cells):
             fresh = _best_beside(found, one, library)
             if fresh is None or (fresh.name, fresh.degree) == (one.name, one.degree):
                 continue
+            if fresh.name in {other.name for other in others}:
+                continue
             place = best.chosen.index(one)
             chosen = [*best.chosen[:place], fresh, *best.chosen[place + 1 :]]
             model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
@@ -522,8 +524,11 @@ def _grouped(base, best, steps, scans, unlisted, stable):
 
 def _refits(base, best, chosen):
     """Return what gives the loss of chi-square of a full fit with another in place of a cause."""
+    taken = {one.name for one in best.chosen if one is not chosen}
 
     def loss(other):
+        if other.name in taken:
+            return np.inf
         recipes = [(other if one is chosen else one).recipe for one in best.chosen]
         return base.with_effects(recipes, like=best.model, **_QUICK).fit.chi2 - best.model.fit.chi2
 
