@@ -309,6 +309,14 @@ def make_cases(
     ------
     GapError
         As `run_challenge`; or if there is a key already, or nothing can be written.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.challenge import Setup, make_cases
+    >>> small = Setup(n_wavelengths=3, n_derotator=3)
+    >>> key = make_cases("sealed", 1, seed=3, kinds=["none"], setup=small)
+    >>> key["case000"]["kind"]
+    'none'
     """
     settings = _settings(n, seed, snr, kinds, setup)
     path = Path(folder) / "key.json"
@@ -342,6 +350,16 @@ def score_cases(folder, outputs):
     ------
     GapError
         If the key or an answer is damaged, or there is no answer at all.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from astropolcal.gap.challenge import Setup, make_cases, score_cases
+    >>> small = Setup(n_wavelengths=3, n_derotator=3)
+    >>> key = make_cases("others", 1, seed=3, kinds=["none"], setup=small)
+    >>> _ = Path("others", "case000.json").write_text('{"verdict": "none"}')
+    >>> score_cases("others", "others").records[0]["result"]
+    'right'
     """
     path, records = Path(folder) / "key.json", []
     with understood(path, GapError, "is no key of challenges"):

@@ -270,6 +270,20 @@ def explained_by_one(model, library, *, cells=True):
     Returns
     -------
     bool
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.model import nominal_model
+    >>> from astropolcal.gap.selection import explained_by_one
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)
+    >>> model = nominal_model([chain], [data])
+    >>> explained_by_one(model, [])
+    False
     """
     found = _scanned(model, library, cells)
     for one in map(found.freer, _distinct(found.candidates, _WIDTH[0])):

@@ -239,6 +239,20 @@ def foreseen(model, groups):
     Returns
     -------
     HeldOut
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.model import nominal_model
+    >>> from astropolcal.gap.shrinkage import foreseen, frame_groups
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)
+    >>> model = nominal_model([chain], [data])
+    >>> bool(foreseen(model, frame_groups([data])).percent < 0.2)
+    True
     """
     labels, numbers = groups
     linear = model if isinstance(model, Linear) else model.without(())
@@ -292,6 +306,20 @@ def stability(model, groups, temper):
     -------
     dict of str to float
         Share by name of the effect.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.model import nominal_model
+    >>> from astropolcal.gap.shrinkage import stability
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
+    >>> data = simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)
+    >>> model = nominal_model([chain], [data])
+    >>> stability(model, None, 1.0)
+    {}
     """
     problem, q = model.problem, model.fit.coefficients
     absent, jacobian = problem.coefficients(problem._absent()), model.jacobian

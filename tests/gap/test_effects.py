@@ -676,8 +676,8 @@ def test_check_refuses():
 def test_declarations_that_are_refused():
     with pytest.raises(GapError, match="kind 'diattenuatoin'; did you mean 'diattenuation'"):
         Effect("x", "x", after("hwp"), "diattenuatoin")
-    with pytest.raises(GapError, match="effect x: dependence = 'tiem'"):
-        Effect("x", "x", after("hwp"), "diattenuation", "tiem")
+    with pytest.raises(GapError, match="effect x: dependence = 'clock'"):
+        Effect("x", "x", after("hwp"), "diattenuation", "clock")
     with pytest.raises(GapError, match=r"place = 'hwp' is none; say after\(optic\)"):
         Effect("x", "x", "hwp", "diattenuation")
     with pytest.raises(GapError, match="no setting 'limits'; did you mean 'limit'"):
