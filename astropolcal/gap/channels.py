@@ -19,6 +19,8 @@ __all__ = ["CHANNELS", "Channels"]
 CHANNELS = ("difference", "sum")
 _LARGEST_DEGREE = 6
 _LARGEST_COLOR = 2
+# a flicker below this is not told to what depends on the flux
+_LARGE_FLICKER = 0.1
 
 
 class Channels:
@@ -223,10 +225,13 @@ class _Lamp:
         Returns
         -------
         `~numpy.ndarray`
-            The drift, and the flicker about it as far as it exceeds the noise.
+            The drift; where it is large, the flicker about it as far as it exceeds the noise.
         """
         curve, root = self._curve(self.degree), np.sqrt(weight)
         drift = curve @ np.linalg.lstsq(curve * root[:, None], shift * root, rcond=None)[0]
+        if self.flicker < _LARGE_FLICKER:
+            # what follows the flux would explain the very flicker that it is made of
+            return drift
         # Wiener filter: a frame is believed by its share of flicker in flicker and noise
         signal = weight * self.flicker**2
         return drift + signal / (1 + signal) * (shift - drift)

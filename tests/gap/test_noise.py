@@ -187,7 +187,7 @@ def test_a_modulator_doubles_the_waves_where_both_states_were_taken(state):
 
 def test_expected_fluxes_are_those_without_noise():
     rng = np.random.default_rng(5)
-    lamp = np.exp(0.1 * np.linspace(-1, 1, 32) + 0.02 * rng.normal(size=32))
+    lamp = np.exp(0.1 * np.linspace(-1, 1, 32) + 0.2 * rng.normal(size=32))
     noisy = data.observed(lamp=lamp, flux=1e4, seed=3)
     clean = data.observed(lamp=lamp, flux=1e4, noise=False)
     problem = GapProblem([data.chain()], [noisy])
