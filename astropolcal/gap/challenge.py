@@ -298,7 +298,7 @@ def make_cases(
     folder : path-like
         Where ``key.json`` and a folder with the tables of each case are written.
     n, seed, snr, kinds, setup, client, progress
-        As `run_challenge` takes them.
+        As ``run_challenge`` takes them.
 
     Returns
     -------
@@ -308,7 +308,7 @@ def make_cases(
     Raises
     ------
     GapError
-        As `run_challenge`; or if there is a key already, or nothing can be written.
+        As ``run_challenge``; or if there is a key already, or nothing can be written.
 
     Examples
     --------

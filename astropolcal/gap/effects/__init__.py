@@ -2,7 +2,7 @@
 """
 The library of effects that a model of a polarimeter may lack.
 
-One row each of `astropolcal.gap.effects.library`, in `EFFECTS`; `register_effect` adds your own.
+One row each of ``astropolcal.gap.effects.library``, in `EFFECTS`; `register_effect` adds your own.
 """
 
 from astropolcal.exceptions import GapError

@@ -79,7 +79,7 @@ class Where:
         return next(iter(own), getattr(roles, self.optic or "", None))
 
     def find(self, roles, chosen=None):
-        """Return the `Place` in a chain, or None; no other where an optic was chosen."""
+        """Return the ``Place`` in a chain, or None; no other where an optic was chosen."""
         if self.relation == "detector":
             split = next((o for o in roles.leaves if o.splits_light), None)
             return split and Place("detector", after=split.name)
@@ -99,7 +99,7 @@ class Where:
         return Place(self.cell_place(roles, optic), mount=mount, theta=float(theta), **side)
 
     def cell_place(self, roles, optic=None):
-        """Return the name of the place in the vocabulary of `Cell`, the nearest that there is."""
+        """Return the name of the place in the vocabulary of ``Cell``, the nearest that there is."""
         optic = self.anchor(roles) if optic is None else optic
         if optic is None:
             return self.relation if self.optic is None else "source"
