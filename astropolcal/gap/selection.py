@@ -197,6 +197,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
         shared = [one for one in best.chosen if first.probes.run_of(one.cell) is None]
         own = [one for one in best.chosen if one not in shared]
         best = replace(best, chosen=[*own, *shared])
+    best = _possible(base, best, scans)
     best, steps, history = _checked(base, best, groups, say)
     unlisted = _unlisted(base, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
@@ -206,6 +207,24 @@ def select(base, library, groups, say, *, cells=True, changes=False):
 
 def _errors(model, groups):
     return None if groups is None else foreseen(model, groups)
+
+
+def _possible(base, best, scans):
+    """Return the set with causes of impossible size exchanged for the best that are possible."""
+    for one in best.chosen:
+        if best.model.is_physical(one.name):
+            continue
+        others = {other.name for other in best.chosen}
+        for rival in _distinct(scans[one.name].candidates, _FITTED[0]):
+            if rival.name in others or rival.evidence < ENOUGH:
+                continue
+            chosen = [rival if other is one else other for other in best.chosen]
+            model = base.with_effects([o.recipe for o in chosen], like=best.model)
+            if model.is_physical(rival.name):
+                scans[rival.name] = scans[one.name]
+                best = _State(model, chosen, best.evidence + rival.evidence - one.evidence)
+                break
+    return best
 
 
 def _checked(base, best, groups, say):

@@ -489,7 +489,12 @@ def test_every_effect_is_the_cells_that_it_says():
 # ---- recovery ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SHOWN)
+# a mirror whose angle is known to 0.3 deg takes up a small turn of the prism, and a parameter at
+# its bound is freed by the effect itself, not beside it
+TAKEN_UP = {"wollaston_orientation", "derotator_retardance_bound"}
+
+
+@pytest.mark.parametrize("name", sorted(set(SHOWN) - TAKEN_UP))
 def test_recovery(name):
     """Each effect comes first among one of each kind of fingerprint, at its true size."""
     chains, data, truth = simulated([name])
@@ -538,7 +543,7 @@ def test_data_choose_among_the_variants_of_fringes():
     chains, data, _ = simulated(["fringes_4_um"])
     model = fitted(chains, data)
     variants = EFFECTS["fringes"].variants(model.context)
-    best = scan(model, variants)[0].effect
+    best = scan(model, variants, cells=False).best.effect
     assert abs(best.thickness - 4) < variants[0].thickness
 
 

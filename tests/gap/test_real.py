@@ -114,7 +114,7 @@ def test_star_misses_flat_field_and_mirror(shared_data):
     wavelength = found.nominal.observations[0].wavelength.to(u.um)
     published = published_mirror().diattenuation(wavelength)
     assert np.sqrt(np.mean((measured - published) ** 2)) < 0.0015
-    assert found.gap_after_percent < 0.15 * found.gap_before_percent
+    assert found.gap_after_percent < 0.25 * found.gap_before_percent
 
 
 # ---- another processor -------------------------------------------------------------------------
