@@ -97,12 +97,6 @@ class Candidate:
         """Effect and context, as `Model.with_effects` takes them."""
         return self.effect, self.context
 
-    def freed(self, context):
-        """Return the same with one value a wavelength."""
-        if self.named is None:
-            return replace(self, degree=None)
-        return replace(self, context=replace(context, degree=None))
-
     def cost(self, temper):
         """Return what its freedom costs, in the logarithm of the evidence."""
         return 0.5 * self.statistic / temper - (self.tempered(temper).evidence - self.prior)
@@ -154,9 +148,6 @@ class Scan:
     ----------
     candidates : list of Candidate
         Best first.
-    inflation : float
-        How far the statistics of all cells together exceed those of noise: 1 where noise is all
-        that is left.
     probes : Probes
         Derivatives of the data to the cells.
     temper : float
@@ -165,12 +156,11 @@ class Scan:
     Examples
     --------
     >>> from astropolcal.gap.attribution import Scan
-    >>> Scan([], 1.0).best is None
+    >>> Scan([]).best is None
     True
     """
 
     candidates: list
-    inflation: float
     probes: object = None
     temper: float = 1.0
 
@@ -313,13 +303,10 @@ def scan(model, effects=(), *, cells=True, temper=1.0, without=None, like=None):
     True
     """
     probes = Probes(model, () if without is None else (without,), like)
-    found, levels = [], []
-    if cells:
-        found = _cells(probes, temper)
-        levels = [(one.statistic, one.rank) for one in found]
+    found = _cells(probes, temper) if cells else []
     found += _named(probes, effects, temper)
     found.sort(key=lambda one: -one.evidence)
-    return Scan(found, _inflation(levels), probes, temper)
+    return Scan(found, probes, temper)
 
 
 def _cells(probes, temper):
@@ -564,16 +551,6 @@ def _with_name(effect, model, values, share, temper):
         (values, share, 1.0),
     )
     return one.tempered(temper)
-
-
-def _inflation(levels):
-    """Return the median of statistics over what noise gives; the empirical null of Efron (2004)."""
-    if not levels:
-        return 1.0
-    statistic, rank = np.array(levels).T
-    # as fractions of the chi-square law: a level of noise has the quantile one half
-    middle = stats.chi2.median(np.maximum(rank, 1))
-    return max(1.0, float(np.median(statistic / middle)))
 
 
 def false_discovery(p_values):

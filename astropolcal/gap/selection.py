@@ -110,8 +110,6 @@ class Selection:
         With all of them.
     scan : Scan
         Evidence beside the base.
-    left : Scan
-        Evidence beside the model.
     unlisted : float
         Probability that the gap has a cause that no table has.
     history : list of HeldOut or None
@@ -120,14 +118,13 @@ class Selection:
     Examples
     --------
     >>> from astropolcal.gap.selection import Selection
-    >>> Selection([], None, None, None, 0.0, []).groups
+    >>> Selection([], None, None, 0.0, []).groups
     []
     """
 
     groups: list
     model: object
     scan: object
-    left: object
     unlisted: float
     history: list
 
@@ -185,12 +182,12 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     first = _scanned(base, library, cells)
     runs = count_runs(base.problem)
     most = _MOST if runs < 2 or not cells else _MOST // 2
-    best, left = _search(_State(base), library, first, say, cells, most)
+    best = _search(_State(base), library, first, say, cells, most)
     if runs > 1 and len(best.chosen) >= most and best.model.p_value < REMAINDER:
         best = _apart(base, first, say)
-        best, left = _search(best, [], first, say, cells, _MOST_TOGETHER * runs)
+        best = _search(best, [], first, say, cells, _MOST_TOGETHER * runs)
     if not best.chosen:
-        return Selection([], base, first, first, 0.0, [_errors(base, groups)])
+        return Selection([], base, first, 0.0, [_errors(base, groups)])
     best, scans = _exchanged(base, best, library, first, say, cells)
     best = replace(best, model=best.model.polished())
     if changes:
@@ -202,7 +199,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     unlisted = _unlisted(base, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     found = _grouped(base, best, steps, scans, unlisted, stable)
-    return Selection(found, best.model, first, left, unlisted, history)
+    return Selection(found, best.model, first, unlisted, history)
 
 
 def _errors(model, groups):
@@ -346,7 +343,7 @@ def _apart(base, first, say):
     for i, name in enumerate(first.probes.runs):
         say(f"{name} by itself")
         alone = base.of_dataset(i)
-        state, _ = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST_ALONE)
+        state = _search(_State(alone), [], _scanned(alone, [], True), say, True, _MOST_ALONE)
         chosen += [_in_run(one, name, first.probes) for one in state.chosen]
     say("all runs together")
     names = {one.name for one in chosen}
@@ -388,7 +385,7 @@ def _in_run(candidate, name, probes):
 
 
 def _search(best, library, first, say, cells, most_causes):
-    """Return the best set of causes, and the scan beside it where it is known."""
+    """Return the best set of causes."""
     states, known = [best], {} if best.chosen else {best.outline: first}
     while len(best.chosen) < most_causes:
         k = len(best.chosen)
@@ -412,7 +409,7 @@ def _search(best, library, first, say, cells, most_causes):
         if best.model.p_value > REMAINDER:
             # what is left may be noise: one look beside the best set will tell
             states = states[:1]
-    return best, known.get(best.outline)
+    return best
 
 
 def _grown(states, known, most):
@@ -577,6 +574,7 @@ def _members(chosen, beside, loss):
     own = replace(chosen, evidence=top)
     weights = {own.name: (own, 1.0)}
     promised, known = max(chosen.statistic, own.statistic), {}
+    cost = max(chosen.cost(beside.temper), 0.0)
     for one in rivals:
         if one.name == own.name or len(weights) > _MOST_ALIASES:
             continue
@@ -586,16 +584,8 @@ def _members(chosen, beside, loss):
             key = round(one.statistic, 3)
             if key not in known and len(known) < _FITTED[0]:
                 known[key] = 0.5 * max(loss(one), 0.0) / beside.temper
-            weight = (
-                np.exp(
-                    -known.get(key, np.inf)
-                    - max(one.cost(beside.temper), 0.0)
-                    + max(chosen.cost(beside.temper), 0.0)
-                )
-                if key in known
-                else 0.0
-            )
-            weight = min(weight, 1.0)
+            dearer = max(one.cost(beside.temper), 0.0) - cost
+            weight = np.exp(min(-known.get(key, np.inf) - dearer, 0.0))
         if weight >= _ALIAS:
             weights[one.name] = (one, weight)
     total = sum(weight for _, weight in weights.values())

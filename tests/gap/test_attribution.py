@@ -104,7 +104,6 @@ def test_every_question_is_asked_once_and_the_best_answer_comes_first(model, fou
     names = [one.name for one in found.candidates]
     assert len(set(names)) == len(names)
     assert {found.best.name, names[1]} == {"beam_gain", GAIN.name}
-    assert found.inflation >= 1
     # of the library only, and of the cells only
     few = scan(model, SMOOTH, cells=False)
     assert {one.name for one in few.candidates} == {o.name for o in found.candidates if o.is_named}
@@ -159,7 +158,10 @@ def test_of_noise_statistics_are_chi_square_with_their_rank(found):
     for seed in range(6):
         quiet = scan(data.clean_model(seed))
         # of real structure all of the cells see something
-        assert quiet.inflation < 2 < found.inflation
+        middle, seen = (
+            np.median([one.statistic for one in each.candidates]) for each in (quiet, found)
+        )
+        assert seen > 2 * middle
         # cells are no independent tests: two that have nothing to do with each other
         for cell in (GAIN, Cell("in:derotator", "diattenuation_h", "constant")):
             (one,) = [c for c in quiet.candidates if c.name == cell.name]
