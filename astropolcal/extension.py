@@ -53,7 +53,7 @@ def get_extensions():
     --------
     >>> from astropolcal.extension import get_extensions
     >>> len(get_extensions()[0].tags)
-    29
+    30
     """
     from asdf.extension import ManifestExtension
 
