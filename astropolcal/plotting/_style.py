@@ -139,6 +139,15 @@ def rms(values, axis=None):
     return np.sqrt(np.where(count, total / np.maximum(count, 1), np.nan))
 
 
+def mean_known(values):
+    """Return the mean over the first axis of the known values, NaN where there are none."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    # np.nanmean would warn of what is not known at all
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
 def cell_edges(centres):
     """Return the edges of cells half way between their centres, which ascend."""
     if len(centres) == 1:

@@ -1,28 +1,36 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Accuracy of a calibration against wavelength."""
+"""Accuracy of a calibration against wavelength: of its data, for targets, for a standard star."""
+
+from itertools import cycle
 
 import astropy.units as u
 import numpy as np
 
+from astropolcal.calibration import paper_accuracies, target_accuracies
 from astropolcal.calibration.groups import what_is_left_out
-from astropolcal.exceptions import ParameterError
+from astropolcal.calibration.targets import TARGETS
+from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
     GREEN,
+    GREY,
     MINUS,
     PURPLE,
+    SIGMA,
     VERMILION,
     canvas,
     draw_line,
     heading,
+    legend_entries,
     legend_outside,
+    looks,
     nanometres,
     style,
     wavelength_label,
 )
 
-__all__ = ["plot_accuracy"]
+__all__ = ["plot_accuracy", "plot_star_check", "plot_target_accuracy"]
 
 _CURVES = {
     "s_res": (
@@ -33,6 +41,9 @@ _CURVES = {
     "s_mean": (BLUE, "s", "s_mean = s_res/√n: scatter of the mean of n data (elsewhere s_rel)"),
     "s_cv": (GREEN, "^", "s_cv: rms error when predicting {} left out of the fit"),
 }
+# what a standard of another source is compared with
+_COMPARED = "s_cv of the data that were fitted, for comparison"
+_NOT_KNOWN = "{}: not known (too few data or groups)"
 _STANDARD_MARKERS = ("D", "v", "P", "X")
 _STANDARD_STYLES = ("-", "--", ":", "-.")
 _REFERENCE_STYLES = ("--", ":", "-.")
@@ -94,7 +105,8 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     # a standard of a source that was not fitted has no panel to be drawn into
     others = [entry for entry in standards if entry["source"] not in sources]
     count = len(records) + len(others)
-    if len(records) > 1 and not curves and _have_one_wavelength(records, standards):
+    grids = [r.accuracy for r in records] + [entry["wavelength_nm"] for entry in standards]
+    if len(records) > 1 and not curves and all(len(grid) == 1 for grid in grids):
         return _draw_side_by_side(figure, calibration, records, standards)
     with style():
         figure = canvas(figure, 8.5, 2.4 + 3.6 * count)
@@ -104,23 +116,36 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
         handles = {}
         for axes, record in zip(panels, records, strict=False):
             name = f"{record.name}: " if count > 1 else ""
-            axes.set_title(name + _counts(record))
+            k = np.max(record.accuracy["k"])
+            counts = f"n = {_span(record.accuracy['n'])} data a wavelength, k = {k} free parameters"
+            axes.set_title(name + counts)
             handles |= _draw_record(axes, record, calibration)
-        looks = _standard_looks(standards)
-        for axes, entries in _placed(panels, records, standards, others):
+        looks = {
+            entry["content_hash"]: {"marker": marker, "linestyle": line}
+            for entry, marker, line in zip(
+                standards, cycle(_STANDARD_MARKERS), cycle(_STANDARD_STYLES), strict=False
+            )
+        }
+        own = [[e for e in standards if e["source"] == record.source] for record in records]
+        for axes, entries in zip(panels, [*own, *([entry] for entry in others)], strict=True):
             for entry in entries:
                 handles |= _draw_standard(axes, entry, looks[entry["content_hash"]])
         for axes, entry in zip(panels[len(records) :], others, strict=True):
             axes.set_title(f"{entry['name']}: n = {_span(entry['n'])} data a wavelength, predicted")
-            handles |= _draw_standard_s_cv(axes, entry)
+            look = {"color": GREEN, "alpha": 0.6, "label": _COMPARED}
+            lam, s_cv = entry["wavelength_nm"], entry["s_cv_percent"]
+            handles["s_cv for comparison"] = draw_line(axes, lam, s_cv, **look)
         for axes in panels:
-            references = _draw_references(axes, curves)
+            references = [
+                axes.plot(lam, value, color=BLACK, linestyle=line, label=label)[0]
+                for (label, (lam, value)), line in zip(
+                    curves.items(), cycle(_REFERENCE_STYLES), strict=False
+                )
+            ]
             axes.set_ylabel("accuracy (% of polarization)")
-        scale_axis(panels[0], _all_values(records, standards, curves))
+        _scale_axis(panels[0], _all_values(records, standards, curves))
         wavelength_label(panels[-1])
-        heading(
-            figure, calibration, "Accuracy of the calibration", [record.name for record in records]
-        )
+        heading(figure, calibration, "Accuracy of the calibration", [r.name for r in records])
         legend_outside(figure, [*handles.values(), *references])
     return figure
 
@@ -142,12 +167,6 @@ def _reference(label, pair):
     return lam, value
 
 
-def _have_one_wavelength(records, standards):
-    return all(len(record.accuracy) == 1 for record in records) and all(
-        len(entry["wavelength_nm"]) == 1 for entry in standards
-    )
-
-
 def _draw_side_by_side(figure, calibration, records, standards):
     """Draw one panel of points over the datasets, then the standards."""
     values = {
@@ -161,15 +180,14 @@ def _draw_side_by_side(figure, calibration, records, standards):
         for name, (color, marker, label) in _CURVES.items():
             label = label.format(what_is_left_out(calibration)) if name == "s_cv" else label
             if not np.isfinite(values[name]).any():
-                label, marker = f"{name}: not known (too few data or groups)", ""
+                label, marker = _NOT_KNOWN.format(name), ""
             axes.plot(at, values[name], marker=marker, ls="", color=color, label=label)
         if standards:
             predicted = [entry["s_standard_percent"][0] for entry in standards]
             label = "s_standard: rms error when predicting a standard, which was not fitted"
             axes.plot(after, predicted, "D", color=PURPLE, label=label)
             compared = [entry["s_cv_percent"][0] for entry in standards]
-            label = "s_cv of the data that were fitted, for comparison"
-            axes.plot(after, compared, "_", color=GREEN, markersize=14, label=label)
+            axes.plot(after, compared, "_", color=GREEN, markersize=14, label=_COMPARED)
         names = [
             f"{record.name}\n{nanometres(record.accuracy['wavelength'])[0]:.0f} nm"
             for record in records
@@ -179,7 +197,7 @@ def _draw_side_by_side(figure, calibration, records, standards):
         n = [count for record in records for count in record.accuracy["n"]]
         k = _span([k for record in records for k in record.accuracy["k"]])
         axes.set_title(f"n = {_span(n)} data a dataset, k = {k} free parameters")
-        scale_axis(axes, _all_values(records, standards, {}))
+        _scale_axis(axes, _all_values(records, standards, {}))
         heading(figure, calibration, "Accuracy of the calibration", [r.name for r in records])
         legend_outside(figure, axes.get_legend_handles_labels()[0])
     return figure
@@ -193,29 +211,10 @@ def _draw_record(axes, record, calibration):
         label = label.format(what_is_left_out(calibration)) if name == "s_cv" else label
         # a curve that is missing is said to be so in the legend, not left out
         if not np.isfinite(values).any():
-            label = f"{name}: not known (too few data or groups)"
+            label = _NOT_KNOWN.format(name)
         lam = nanometres(record.accuracy["wavelength"])
         drawn[name] = draw_line(axes, lam, values, color=color, marker=marker, label=label)
     return drawn
-
-
-def _standard_looks(standards):
-    """Return marker and line style of each standard, by its content."""
-    return {
-        entry["content_hash"]: {
-            "marker": _STANDARD_MARKERS[i % len(_STANDARD_MARKERS)],
-            "linestyle": _STANDARD_STYLES[i % len(_STANDARD_STYLES)],
-        }
-        for i, entry in enumerate(standards)
-    }
-
-
-def _placed(panels, records, standards, others):
-    """Yield each panel with the standards that are drawn into it."""
-    for axes, record in zip(panels, records, strict=False):
-        yield axes, [entry for entry in standards if entry["source"] == record.source]
-    for axes, entry in zip(panels[len(records) :], others, strict=True):
-        yield axes, [entry]
 
 
 def _draw_standard(axes, entry, look):
@@ -224,34 +223,6 @@ def _draw_standard(axes, entry, look):
         axes, entry["wavelength_nm"], entry["s_standard_percent"], color=PURPLE, label=label, **look
     )
     return {entry["content_hash"]: line}
-
-
-def _draw_standard_s_cv(axes, entry):
-    """Draw what a standard of another source is compared with."""
-    label = "s_cv of the data that were fitted, for comparison"
-    line = draw_line(
-        axes, entry["wavelength_nm"], entry["s_cv_percent"], color=GREEN, alpha=0.6, label=label
-    )
-    return {"s_cv for comparison": line}
-
-
-def _draw_references(axes, curves):
-    return [
-        axes.plot(
-            lam,
-            value,
-            color=BLACK,
-            linestyle=_REFERENCE_STYLES[i % len(_REFERENCE_STYLES)],
-            label=label,
-        )[0]
-        for i, (label, (lam, value)) in enumerate(curves.items())
-    ]
-
-
-def _counts(record):
-    k = np.asarray(record.accuracy["k"])
-    span = _span(record.accuracy["n"])
-    return f"n = {span} data a wavelength, k = {k.max()} free parameters"
 
 
 def _span(n):
@@ -265,7 +236,7 @@ def _all_values(records, standards, curves):
     return np.concatenate([*values, *(value for _, value in curves.values())])
 
 
-def scale_axis(axes, values):
+def _scale_axis(axes, values):
     """Use a logarithmic axis where the values need it, with plain numbers on it."""
     # zero stands for what is missing and has no logarithm
     known = values[np.isfinite(values) & (values > 0)]
@@ -281,3 +252,217 @@ def scale_axis(axes, values):
     else:
         # accuracies of similar size are compared by their lengths from zero
         axes.set_ylim(0, 1.08 * known.max() if known.size else None)
+
+
+# ---- targets --------------------------------------------------------------------------------
+_PARTS = {
+    "s_rel": "s_rel, of the polarized source: scales with the polarization",
+    "s_unpol": "s_unpol, of the unpolarized source",
+    "s_sky": "s_sky, of unpolarized stars",
+    "s_abs": "s_abs = √(s_unpol² + s_sky²): scales with the intensity",
+}
+
+
+def plot_target_accuracy(calibration, targets=TARGETS, *, figure=None):
+    """
+    Draw the accuracy for targets against wavelength, and what it is made of.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    targets : sequence of (dolp, aolp)
+        See `~astropolcal.calibration.target_accuracies`.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+        Panels of the residuals' s_rel, s_unpol, s_sky and s_abs, for comparison; of s_p, and of
+        s_chi.
+
+    Raises
+    ------
+    ParameterError
+        If a target is impossible.
+    ObservationError
+        If the chain has no half-wave plate.
+
+    Notes
+    -----
+    Where an open direction makes an error infinite there is no line.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.plotting import plot_target_accuracy
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> len(plot_target_accuracy(cal).axes)
+    3
+    """
+    tables = target_accuracies(calibration, targets)
+    if not tables:
+        raise ObservationError("the chain has no half-wave plate: no accuracy for targets")
+    parts = paper_accuracies(calibration, targets[:1])
+    with style():
+        figure = canvas(figure, 8.5, 11)
+        panels = figure.subplots(3, 1, sharex=True)
+        handles = _draw_parts(panels[0], parts[0]) if parts else []
+        lines = _draw_targets(panels[1], tables, "s_p")
+        # the lines of the angle look as those of the degree, and need no entries of their own
+        _draw_targets(panels[2], tables, "s_chi")
+        for axes, label in zip(panels, ("accuracy (%)", "s_p (%)", "s_chi (°)"), strict=True):
+            axes.set_ylabel(label)
+        panels[1].set_title("Degree of polarization of a target")
+        panels[2].set_title("Angle of polarization of a target")
+        wavelength_label(panels[2])
+        heading(figure, calibration, "Accuracy for targets")
+        legend_outside(figure, [*handles, *lines])
+    return figure
+
+
+def _draw_parts(axes, table):
+    # the parts are those of the instrument and the same for every target: the first will do
+    axes.set_title("Residuals of the calibrations, which know neither telescope nor correlations")
+    lam = nanometres(table["wavelength"])
+    handles, values = [], []
+    for (key, label), (color, marker) in zip(_PARTS.items(), looks(len(_PARTS)), strict=True):
+        value = table[key].to_value(u.percent)
+        look = {"color": color, "marker": marker}
+        if key == "s_abs":
+            # the sum is often its largest part: wide and open, and below it
+            look |= {"linewidth": 4, "markersize": 10, "markerfacecolor": "none", "zorder": 1.9}
+        if not np.isfinite(value).any():
+            # text only: a marker would promise a curve
+            label = f"{key}: not known, no such dataset"
+            look = {"linestyle": "none", "marker": "none"}
+        # what is exactly zero stands for a calibration that is missing
+        handles.append(draw_line(axes, lam, value, label=label, **look))
+        values.append(value)
+    _scale_axis(axes, np.concatenate(values))
+    return handles
+
+
+def _draw_targets(axes, tables, key):
+    lines, values = [], []
+    # apart from the looks of the parts, which share the legend
+    for table, (color, marker) in zip(tables, looks(len(tables) + 4)[4:], strict=True):
+        lam, value = nanometres(table["wavelength"]), table[key].value
+        # large open markers and wide lines below: of curves that coincide all are seen
+        below = len(tables) - 1 - len(lines)
+        look = {"color": color, "marker": marker, "linewidth": 1.5 + 2 * below}
+        look |= {"markersize": 5.5 + 4.5 * below, "markeredgewidth": 1.5}
+        look |= {"markerfacecolor": "none"} if below else {}
+        lines.append(draw_line(axes, lam, value, label=f"target of {_words(table)}", **look))
+        values.append(value)
+    _scale_axis(axes, np.concatenate(values))
+    return lines
+
+
+def _words(table):
+    angle = table.meta["aolp"]
+    dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
+    where = "at its worst angle" if angle is None else f"at {angle.to_value(u.deg):g}°"
+    return f"{dolp:g} % {where}"
+
+
+# ---- a standard star ------------------------------------------------------------------------
+_QUANTITIES = (("dolp", "percent", "DoLP (%)", "%"), ("aolp", "deg", "AoLP (°)", "°"))
+
+
+def plot_star_check(calibration, entry=None, *, figure=None):
+    """
+    Draw degree and angle of polarization of a standard star against wavelength.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        A calibration that was checked with a star; one read from a file will do.
+    entry : dict, optional
+        One of ``calibration.fit["stars"]``, by default the last.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+        Left the degree, right the angle: above observed and catalogue, below their
+        difference. Bars are standard errors of the mean over the cycles; the dashes
+        are the rms error of single cycles.
+
+    Raises
+    ------
+    ObservationError
+        If the calibration was checked with no star.
+
+    Notes
+    -----
+    The figure of the polarized standard of McIntosh et al. (2026, appendix).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments, optics
+    >>> from astropolcal.calibration import add_star_check
+    >>> from astropolcal.plotting import plot_star_check
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> lam = [1.2, 1.6, 2.2] * u.um
+    >>> chain = charis.chain(derotator="linear", wavelength=lam)
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, lam, frames, seed=2))
+    >>> sky = optics.PolarizedSource(u=0.01, name="star") | chain["hwp"] | chain["derotator"]
+    >>> sky = sky | chain["wollaston"]
+    >>> night = simulate(sky, lam, frames, seed=3, meta={"object": "HD 30675"})
+    >>> table = add_star_check(cal, sky, night)
+    >>> len(plot_star_check(cal).axes)
+    4
+    """
+    if entry is None:
+        if not calibration.fit.get("stars"):
+            raise ObservationError("the calibration was checked with no star: nothing to draw")
+        entry = calibration.fit["stars"][-1]
+    values = {key: np.asarray(value) for key, value in entry.items() if isinstance(value, list)}
+    with style():
+        figure = canvas(figure, 12, 6.4)
+        panels = figure.subplots(2, 2, sharex=True, height_ratios=(2, 1))
+        for (top, bottom), quantity in zip(panels.T, _QUANTITIES, strict=True):
+            _draw_star(top, bottom, values, *quantity)
+            wavelength_label(bottom)
+        what = f"{entry['star']}, which no fit saw"
+        heading(figure, calibration, what, [entry["name"]])
+        legend_outside(figure, list(legend_entries(panels.ravel()).values()), columns=2)
+    return figure
+
+
+def _draw_star(top, bottom, values, key, unit, label, short):
+    # lines are drawn through the points as they come
+    order = np.argsort(values["wavelength_nm"])
+    lam = values["wavelength_nm"][order]
+    seen, error, known, spread, off = (
+        values[f"{key}{part}_{unit}"][order]
+        for part in ("", "_err", "_known", "_known_err", "_error")
+    )
+    points = {"color": BLUE, "marker": "o", "linestyle": "none"}
+    observed = f"observed, with 1{SIGMA} errors of the mean"
+    top.errorbar(lam, seen, yerr=np.nan_to_num(error), label=observed, **points)
+    # a star whose polarization no catalogue has is drawn alone
+    if np.isfinite(known).any():
+        top.plot(lam, known, color=VERMILION, label="catalogue, with the published errors")
+        top.fill_between(lam, known - spread, known + spread, color=VERMILION, alpha=0.2, lw=0)
+    bottom.axhline(0, color=GREY, linewidth=1)
+    bottom.errorbar(lam, off, yerr=np.nan_to_num(error), **points)
+    # of the angle no such error is known
+    if key == "dolp":
+        single = values["s_dolp_percent"][order]
+        for sign in (1, -1):
+            label_of = "± rms error of a single cycle" if sign > 0 else None
+            bottom.plot(lam, sign * single, color=GREY, linestyle="--", label=label_of)
+    top.set_ylabel(label)
+    bottom.set_ylabel(f"obs. {MINUS} catalogue\n({short})")

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
@@ -13,13 +13,13 @@ from astropolcal.plotting._style import (
     VERMILION,
     canvas,
     legend_outside,
+    mean_known,
     nanometres,
-    save,
     style,
     wavelength_label,
 )
 
-__all__ = ["plot_corrected", "plot_images", "plot_spectrum", "save_figure"]
+__all__ = ["plot_images"]
 
 # of the brightest pixels, those beyond this quantile may saturate the colours
 _QUANTILE = 0.995
@@ -28,35 +28,7 @@ _MARKERS = {"q": "o", "u": "s", "v": "^"}
 
 
 def plot_corrected(corrected, **options):
-    """
-    Draw corrected images or spectra.
-
-    Parameters
-    ----------
-    corrected : Corrected
-        What to draw.
-    **options
-        Of `plot_images` or `plot_spectrum`.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal import optics
-    >>> from astropolcal.correction import ScienceFrames, correct
-    >>> from astropolcal.plotting.correction import plot_corrected
-    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
-    >>> chain = chain | optics.WollastonPrism(name="wollaston")
-    >>> hwp = [0, 45, 22.5, 67.5] * u.deg
-    >>> right, left = np.array([[1.02, 0.98, 1.0, 1.0], [0.98, 1.02, 1.0, 1.0]])[..., None]
-    >>> star = correct(chain, ScienceFrames.from_arrays(right, left, [1.6] * u.um, {"hwp": hwp}))
-    >>> len(plot_corrected(star).axes)
-    3
-    """
+    """Draw corrected images or spectra, with the options of `plot_images` or `plot_spectrum`."""
     draw = plot_images if corrected.stokes.ndim == 4 else plot_spectrum
     return draw(corrected, **options)
 
@@ -132,24 +104,15 @@ def _panels(corrected, chosen):
     found = corrected.azimuthal()
     images = {name: corrected[name][chosen] for name in "IQU"}
     images |= {"Q$_\\phi$": found["q_phi"][chosen], "U$_\\phi$": found["u_phi"][chosen]}
-    panels = {name: _mean(values) for name, values in images.items()}
+    panels = {name: mean_known(values) for name, values in images.items()}
     error = corrected.error("Q")[chosen]
     kind = "statistical error of Q"
     if not np.isfinite(error).any():
         error, kind = corrected.error("Q", "systematic")[chosen], "systematic error of Q"
     # errors of wavelengths are independent if they are statistical, and hardly if not
     power = 2 if kind.startswith("stat") else 1
-    panels[kind] = _mean(error**power) ** (1 / power) / (len(chosen) ** 0.5 if power == 2 else 1)
+    panels[kind] = mean_known(error**power) ** (1 / power) / len(chosen) ** (1 - 1 / power)
     return panels
-
-
-def _mean(images):
-    """Return the mean of the known values."""
-    known = np.isfinite(images)
-    count = known.sum(axis=0)
-    # np.nanmean would warn of pixels that no wavelength knows
-    total = np.where(known, images, 0.0).sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _panel(figure, axes, name, image, corrected, limit):
@@ -225,40 +188,7 @@ _MODES = {"stokes": "full Mueller matrices", "ip": "instrumental polarization on
 
 
 def plot_spectrum(corrected, *, figure=None):
-    """
-    Draw q and u of a point source, their errors, and how well they are determined.
-
-    Parameters
-    ----------
-    corrected : Corrected
-        A spectrum.
-    figure : `~matplotlib.figure.Figure`, optional
-        Where to draw.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-
-    Raises
-    ------
-    ParameterError
-        If these are images.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal import optics
-    >>> from astropolcal.correction import ScienceFrames, correct
-    >>> from astropolcal.plotting.correction import plot_spectrum
-    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
-    >>> chain = chain | optics.WollastonPrism(name="wollaston")
-    >>> hwp = [0, 45, 22.5, 67.5] * u.deg
-    >>> flux = np.ones((4, 1))
-    >>> found = correct(chain, ScienceFrames.from_arrays(flux, flux, [1.6] * u.um, {"hwp": hwp}))
-    >>> plot_spectrum(found).axes[-1].get_ylabel()
-    'condition'
-    """
+    """Draw q and u of a point source, their errors, and how well they are determined."""
     if corrected.stokes.ndim != 2:
         raise ParameterError("these are images; take an aperture, or draw them with plot_images")
     nm = nanometres(corrected.wavelength)
@@ -341,31 +271,3 @@ def _error_lines(axes, nm, corrected):
         axes.text(
             0.5, 0.5, "no errors are known", transform=axes.transAxes, ha="center", va="center"
         )
-
-
-def save_figure(figure, path):
-    """
-    Write a figure, atomically; the suffix tells the format.
-
-    Parameters
-    ----------
-    figure : `~matplotlib.figure.Figure`
-        The figure.
-    path : path-like
-        The file.
-
-    Raises
-    ------
-    ObservationError
-        If the file cannot be written, or its format is not known.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> from astropolcal.plotting.correction import save_figure
-    >>> save_figure(Figure(), "figure.xyz")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: figure.xyz: no format of this suffix is known
-    """
-    save(figure, path, ObservationError)

@@ -1,19 +1,33 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Polarimetric efficiency over wavelength, derotator angle and offset, and pointing."""
+"""What instruments can measure: polarimetric efficiency, optics side by side, stars of a night."""
+
+from functools import partial
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
+from astropolcal.calibration.comparison import compare
 from astropolcal.calibration.efficiency import has_derotator, polarimetric_efficiency
 from astropolcal.chain import stages
-from astropolcal.plotting._style import canvas, looks, nanometres, style
+from astropolcal.exceptions import ParameterError
+from astropolcal.plotting._style import (
+    GREY,
+    canvas,
+    legend_outside,
+    looks,
+    nanometres,
+    style,
+    wavelength_label,
+)
 
-__all__ = ["plot_derotator_offsets", "plot_polarimetric_efficiency"]
+__all__ = ["plot_comparison", "plot_observability"]
 
 _DEROTATOR = np.arange(0, 181, 2.5)
 _ALTITUDE = np.arange(20, 91, 5.0)
 _PARALLACTIC = np.arange(-180, 181, 10.0)
 _MOST_LINES = 6
+# fewer wavelengths than these are filters: nothing is known in between
 _LEAST_SPECTRUM = 8
 # white contours on the dark end of the colours, black ones on the bright end
 _LEVELS = (0.2, 0.4, 0.6, 0.8, 0.9)
@@ -33,48 +47,18 @@ def plot_polarimetric_efficiency(
     figure=None,
 ):
     """
-    Draw the polarimetric efficiency of an instrument.
+    Draw the polarimetric efficiency of an instrument, see `polarimetric_efficiency`.
 
-    Parameters
-    ----------
-    chain : `~astropy.modeling.CompoundModel`
-        A calibrated chain, see `~astropolcal.calibration.polarimetric_efficiency`.
-    wavelength : `~astropy.units.Quantity`
-        On the grid of the chain's parameters.
-    altitude, parallactic : `~astropy.units.Quantity`
-        Pointing of the first two panels.
-    derotator : `~astropy.units.Quantity`
-        Derotator angle of the third panel.
-    shown : `~astropy.units.Quantity`, optional
-        Wavelengths of the lines, the nearest of the grid; by default six spread over it.
-    instrument, mode
-        Whose half-wave plate it is, see `~astropolcal.calibration.polarimetric_efficiency`.
-    title : str, optional
-        Title of the figure.
-    figure : `~matplotlib.figure.Figure`, optional
-        An empty figure to draw into.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-        Lines against the derotator angle; a map of derotator angle and wavelength; and, for a
-        chain from the sky, a map of parallactic angle and altitude: the least efficiency over the
-        wavelengths. Without a derotator there are lines against the parallactic angle, or
-        against the wavelength behind an internal source.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.plotting import plot_polarimetric_efficiency
-    >>> charis = instruments.get("charis")
-    >>> figure = plot_polarimetric_efficiency(charis.published(), charis.wavelength)
-    >>> len(figure.axes) >= 2
-    True
+    Lines against the derotator angle, at the ``shown`` wavelengths or six; a map of derotator angle
+    and wavelength; for a chain from the sky a map of parallactic angle and altitude at this
+    ``derotator`` angle: the least over the wavelengths. Without a derotator there are lines against
+    the parallactic angle, or against the wavelength behind an internal source.
     """
     lam, moving = nanometres(wavelength), stages(chain)
     at = {"altitude": altitude} if "altitude" in moving else {}
     at |= {"parallactic": parallactic} if "parallactic" in moving else {}
-    asked = _Asked(chain, wavelength, {"instrument": instrument, "mode": mode})
+    settings = {"instrument": instrument, "mode": mode}
+    asked = partial(polarimetric_efficiency, chain, wavelength, **settings)
     # without an altitude axis there is no pointing to map
     turns, maps = has_derotator(chain), "altitude" in at
     panels = (2 if turns else int(not maps)) + maps
@@ -82,8 +66,14 @@ def plot_polarimetric_efficiency(
         fig = canvas(figure, 5.5 * panels + 0.5 * (panels < 2), 5.2)
         axes = list(fig.subplots(1, panels, squeeze=False)[0])
         if turns:
-            _with_derotator(fig, axes, lam, asked(derotator=_DEROTATOR * u.deg, **at), shown)
-            axes[0].set_title(_where(at))
+            values = asked(derotator=_DEROTATOR * u.deg, **at)
+            _lines(axes[0], lam, _DEROTATOR, values, shown)
+            axes[0].set(xlabel="derotator angle (deg)", xlim=(0, 180), xticks=np.arange(0, 181, 45))
+            _map_of_wavelengths(fig, axes[1], lam, values)
+            axes[1].set_title("as on the left, all wavelengths")
+            words = {"altitude": "altitude", "parallactic": "parallactic angle"}
+            where = ", ".join(f"{words[key]} {_degree(angle)}" for key, angle in at.items())
+            axes[0].set_title(where or "behind the internal source")
         elif not maps:
             _without_derotator(axes[0], lam, asked, shown, "parallactic" in at)
         if maps:
@@ -94,35 +84,9 @@ def plot_polarimetric_efficiency(
 
 def plot_derotator_offsets(best, *, title=None, figure=None):
     """
-    Draw the polarimetric efficiency of an observation against the offset of the derotator.
+    Draw mean and least efficiency of an observation, a `BestDerotator`, against the offset.
 
-    Parameters
-    ----------
-    best : `~astropolcal.calibration.BestDerotator`
-        Of `~astropolcal.calibration.best_derotator`.
-    title : str, optional
-        Title of the figure.
-    figure : `~matplotlib.figure.Figure`, optional
-        An empty figure to draw into.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-        Lines of the mean and the least efficiency over the observation and all wavelengths, at
-        the angle of polarization that is measured worst; the best offset is marked.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.calibration import best_derotator
-    >>> from astropolcal.plotting.efficiency import plot_derotator_offsets
-    >>> charis = instruments.get("charis")
-    >>> best = best_derotator(charis.on_sky(charis.published()), charis.wavelength,
-    ...                       [60, 65] * u.deg, [-30, -20] * u.deg,
-    ...                       offsets=range(0, 180, 5) * u.deg)
-    >>> [line.get_label() for line in plot_derotator_offsets(best).axes[0].get_lines()][:2]
-    ['mean', 'least']
+    Over its times, wavelengths and angles of polarization; the best offset is marked.
     """
     # offsets may have been tried in any order
     table = best.table[np.argsort(best.table["offset"])]
@@ -143,31 +107,6 @@ def plot_derotator_offsets(best, *, title=None, figure=None):
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
         fig.suptitle(title or "Polarimetric efficiency of an observation")
     return fig
-
-
-class _Asked:
-    """The efficiency of one chain at angles."""
-
-    def __init__(self, chain, wavelength, settings):
-        self.chain, self.wavelength, self.settings = chain, wavelength, settings
-
-    def __call__(self, **angles):
-        return polarimetric_efficiency(self.chain, self.wavelength, **angles, **self.settings)
-
-
-def _where(at):
-    words = {"altitude": "altitude", "parallactic": "parallactic angle"}
-    if not at:
-        return "behind the internal source"
-    return ", ".join(f"{words[key]} {_degree(angle)}" for key, angle in at.items())
-
-
-def _with_derotator(fig, axes, lam, values, shown):
-    """Draw lines against the derotator angle, and a map of all wavelengths."""
-    _lines(axes[0], lam, _DEROTATOR, values, shown)
-    axes[0].set(xlabel="derotator angle (deg)", xlim=(0, 180), xticks=np.arange(0, 181, 45))
-    _map_of_wavelengths(fig, axes[1], lam, values)
-    axes[1].set_title("as on the left, all wavelengths")
 
 
 def _without_derotator(ax, lam, asked, shown, on_sky):
@@ -245,3 +184,225 @@ def _mesh(ax, x, y, values, contours):
             ax.clabel(lines, fmt="%g", fontsize=9)
     ax.grid(False)
     return mesh
+
+
+# ---- instruments side by side ------------------------------------------------------------------
+# panel, column, unit of the axis, and what differs from the look of the member
+_DRAWN = (
+    (0, "hwp_retardance", u.deg, {}),
+    (1, "derotator_retardance", u.deg, {}),
+    (2, "path_diattenuation", u.percent, {}),
+    (3, "least_efficiency", u.one, {}),
+    (3, "most_efficiency", u.one, {"markerfacecolor": "white"}),
+)
+
+
+def plot_comparison(members, *, title=None, figure=None):
+    """
+    Draw retardances, diattenuation and polarimetric efficiency of several instruments.
+
+    Parameters
+    ----------
+    members : `~astropy.table.QTable`, sequence or dict
+        The table of `~astropolcal.calibration.compare`, or what that takes.
+    title : str, optional
+        Title of the figure.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+        Against the wavelength: retardance of half-wave plate and of derotator, diattenuation
+        of the path behind the telescope, and the range of the efficiency over the derotator
+        angles. Spectra are lines, filters are points on dotted lines. Bars are standard errors of
+        calibrations; where the data leave a value open, the bar goes through the whole panel.
+
+    Examples
+    --------
+    >>> from astropolcal.plotting import plot_comparison
+    >>> figure = plot_comparison(["charis", "irdis"])
+    >>> [axes.get_ylabel() for axes in figure.axes][:2]
+    ['retardance (deg)', 'retardance (deg)']
+    """
+    table = members if isinstance(members, QTable) else compare(members)
+    labels = list(dict.fromkeys(str(label) for label in table["label"]))
+    with style():
+        fig = canvas(figure, 11.5, 8.2)
+        axes = fig.subplots(2, 2, sharex=True).ravel()
+        handles = [
+            _draw_member(axes, table[table["label"] == label], label, *look)
+            for label, look in zip(labels, looks(len(labels)), strict=True)
+        ]
+        _label_panels(axes)
+        legend_outside(fig, handles, columns=min(4, len(labels)))
+        fig.suptitle(title or "Polarization optics behind the telescope")
+    return fig
+
+
+def _draw_member(axes, rows, label, color, marker):
+    # tables hold the wavelengths as they were given, not in order
+    rows = rows[np.argsort(rows["wavelength"])]
+    lam, few = rows["wavelength"].to_value(u.nm), len(rows) < _LEAST_SPECTRUM
+    settings = {"color": color, "marker": marker, "linestyle": ":" if few else "-"}
+    settings |= {"markersize": 6.5 if few else 4.0}
+    handles = []
+    for panel, key, unit, look in _DRAWN:
+        value, std = _column(rows, key, unit), _column(rows, f"{key}_std", unit)
+        handles += axes[panel].plot(lam, value, label=label, **settings | look)
+        _error_bars(axes[panel], lam, value, std, color)
+    return handles[0]
+
+
+def _column(rows, key, unit):
+    """Return a column as plain numbers, NaN where a table of before there were errors has none."""
+    if key not in rows.colnames:
+        return np.full(len(rows), np.nan)
+    return u.Quantity(rows[key]).to_value(unit)
+
+
+def _error_bars(ax, lam, value, std, color):
+    """Draw the standard errors; a value that the data leave open may be anywhere."""
+    known = np.isfinite(value) & np.isfinite(std)
+    if known.any():
+        bars = {"color": color, "elinewidth": 1.2, "zorder": 3}
+        ax.errorbar(lam[known], value[known], std[known], fmt="none", **bars)
+    for x in lam[np.isinf(std)]:
+        ax.axvline(x, color=color, linewidth=1.0, alpha=0.6)
+
+
+def _label_panels(axes):
+    words = (
+        ("half-wave plate", "retardance (deg)"),
+        ("derotator", "retardance (deg)"),
+        ("half-wave plate to beam splitter, at 0°", "diattenuation (%)"),
+        (
+            "efficiency: worst (filled) and best (open) derotator angle",
+            "measured share of the polarization",
+        ),
+    )
+    for ax, (title, ylabel) in zip(axes, words, strict=True):
+        ax.set(title=title, ylabel=ylabel)
+    axes[0].axhline(180, color="0.45", linewidth=0.9, linestyle="--")
+    # what has none lies on the zero line, in full
+    axes[2].set_ylim(bottom=-0.03 * axes[2].get_ylim()[1])
+    axes[3].set_ylim(-0.02, 1.02)
+    for ax in axes[2:]:
+        wavelength_label(ax)
+
+
+# ---- standard stars over a night ---------------------------------------------------------------
+_WIDTH, _HEIGHT = 8.0, 6.4
+_MOST = 8
+# a marker every so many hours tells the curves apart without colour
+_EVERY = 1.0
+_TICK = 45
+_CROWDED = 405
+
+
+def plot_observability(seen, *, total=None, figure=None):
+    """
+    Draw altitude and parallactic angle of stars against time.
+
+    The curves are thick while a star is above its lowest altitude, thin and
+    dotted below; only dark hours are drawn. The parallactic angle has no jumps, as
+    in the table of a star: the axis goes beyond 180 deg where a star does.
+
+    Parameters
+    ----------
+    seen : sequence of Observability
+        Up to eight stars of one night at one site.
+    total : int, optional
+        Of how many stars these are the first, for the title.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If there is no star, are too many, or they are of different nights or sites.
+
+    Examples
+    --------
+    >>> from astropolcal import standards
+    >>> from astropolcal.plotting import plot_observability
+    >>> seen = [standards.observability(n, "subaru", "2025-11-03") for n in
+    ...         ("HD 293396", "HD 30675")]
+    >>> len(plot_observability(seen).axes)
+    2
+    """
+    seen = list(seen)
+    _check(seen)
+    # UTC, before the first dark hour of the first star
+    midnight = np.floor(seen[0].table["time"][0].mjd)
+    with style():
+        figure = canvas(figure, _WIDTH, _HEIGHT)
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        for star, look in zip(seen, looks(len(seen)), strict=True):
+            hours = (star.table["time"].mjd - midnight) * 24
+            _curve(upper, hours, star.table["altitude"].value, star, look)
+            _curve(lower, hours, star.table["parallactic"].value, star, look)
+        _finish(upper, lower, seen)
+        handles = [
+            upper.plot([], [], color=c, marker=m, label=s.name)[0]
+            for s, (c, m) in zip(seen, looks(len(seen)), strict=True)
+        ]
+        dotted = upper.plot([], [], color=GREY, ls=":", label="too low to observe")
+        legend_outside(figure, handles + dotted, columns=min(len(seen) + 1, 4))
+        few = total is not None and total > len(seen)
+        which = f"the first {len(seen)} of {total} standard stars" if few else "Standard stars"
+        title = f"{which[0].upper()}{which[1:]}, night of {seen[0].night}"
+        figure.suptitle(f"{title}\n{_place(seen[0].site)}")
+    return figure
+
+
+def _check(seen):
+    if not 1 <= len(seen) <= _MOST:
+        raise ParameterError(f"{len(seen)} stars cannot be drawn; allowed are 1 to {_MOST}")
+    first = seen[0]
+    for star in seen:
+        if star.night != first.night or not np.all(star.site == first.site):
+            raise ParameterError(
+                f"{star.name} and {first.name} are of different nights or sites; draw them apart"
+            )
+
+
+def _place(site):
+    lon, lat = site.lon.wrap_at(180 * u.deg).deg, site.lat.deg
+    name = f"{site.info.name}, " if site.info.name else ""
+    east, north = "E" if lon >= 0 else "W", "N" if lat >= 0 else "S"
+    return f"{name}{abs(lon):.2f}° {east}, {abs(lat):.2f}° {north}"
+
+
+def _curve(axes, hours, values, star, look):
+    """Draw one star: faint below the limit, with markers where it is observable."""
+    color, marker = look
+    good = star.table["observable"]
+    axes.plot(hours, values, color=color, linestyle=":", linewidth=1)
+    axes.plot(hours, np.where(good, values, np.nan), color=color, linewidth=2)
+    count = max(len(hours) // max(int((hours[-1] - hours[0]) / _EVERY), 1), 1)
+    axes.plot(
+        hours[::count], np.where(good, values, np.nan)[::count], color=color, marker=marker, ls=""
+    )
+
+
+def _finish(upper, lower, seen):
+    limits = {float(star.min_altitude.value) for star in seen}
+    for limit in limits:
+        upper.axhline(limit, color=GREY, linestyle="--", linewidth=1)
+    upper.set_ylabel("altitude (deg)")
+    upper.set_ylim(0, 90)
+    upper.set_yticks(np.arange(0, 91, 15))
+    lower.set_ylabel("parallactic angle (deg)")
+    angles = np.concatenate([star.table["parallactic"].value for star in seen])
+    low = min(_TICK * np.floor(angles.min() / _TICK), -180)
+    high = max(_TICK * np.ceil(angles.max() / _TICK), 180)
+    lower.set_ylim(low, high)
+    # twice as wide where the labels would crowd
+    lower.set_yticks(np.arange(low, high + 1, _TICK if high - low <= _CROWDED else 2 * _TICK))
+    date = seen[0].table["time"][0].to_value("iso", "date")
+    lower.set_xlabel(f"time on {date} (hours UTC)")

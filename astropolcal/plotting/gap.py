@@ -1,41 +1,33 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""
-Figures of a diagnosis: the gap by wavelength, its maps, where it lies.
-
-Those of its effects are in `astropolcal.plotting.effects`, and to be had from here too.
-"""
+"""Figures of a diagnosis: the gap by wavelength and frame, its maps, and its causes."""
 
 import textwrap
 
 import numpy as np
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.gap._words import shortened
-from astropolcal.gap.residuals import locate
+from astropolcal.gap._numbers import Fitted
+from astropolcal.gap._words import is_determined, labels, share, shortened
+from astropolcal.gap.cells import places
+from astropolcal.optics import GENERATORS, Dependence
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
     GREY,
     MINUS,
-    ORANGE,
+    SKY,
     VERMILION,
     canvas,
     cell_edges,
+    draw_line,
     legend_outside,
+    mean_known,
     rms,
     style,
     wavelength_label,
 )
-from astropolcal.plotting.effects import plot_cause_map, plot_effect_sizes, verdict_line
 
-__all__ = [
-    "plot_cause_map",
-    "plot_effect_sizes",
-    "plot_gap_frames",
-    "plot_gap_maps",
-    "plot_gap_spectrum",
-    "plot_where",
-]
+__all__ = ["plot_cause_map", "plot_gap_frames", "plot_gap_maps", "plot_gap_spectrum"]
 
 _CHANNELS = {
     "difference": ("normalized difference of the beams", "R\N{MINUS SIGN}L over R+L"),
@@ -43,7 +35,6 @@ _CHANNELS = {
 }
 # share of the residuals that the colour scale of the maps covers
 _COVERED = 99.5
-_WIDTH = 56
 _MOST_TICKS = 10
 # characters of a dataset's name above a panel
 _LONGEST_NAME = 30
@@ -58,12 +49,6 @@ def _gaps(model, noise):
         percent = 100 * channel.whiten(gap) * channel.sigma
         found.append(np.where(channel.valid, percent, np.nan))
     return found
-
-
-def _name(channel):
-    if channel not in _CHANNELS:
-        raise ParameterError(f"channel = {channel!r}; allowed are {', '.join(_CHANNELS)}")
-    return list(_CHANNELS).index(channel)
 
 
 def plot_gap_spectrum(diagnosis, *, figure=None):
@@ -90,7 +75,7 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
     >>> import astropy.units as u
     >>> from astropolcal import instruments
     >>> from astropolcal.gap import diagnose
-    >>> from astropolcal.plotting.gap import plot_gap_spectrum
+    >>> from astropolcal.plotting import plot_gap_spectrum
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -109,7 +94,7 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
         for i, row in enumerate(grid):
             sigma = nominal.problem.channels[i].sigma
             valid = nominal.problem.channels[i].valid
-            nm = 1000 * nominal.problem.wavelength[nominal.problem.datasets[i].bins]
+            nm = _nm(nominal, i)
             order = np.argsort(nm)
             for c, axes in enumerate(row):
                 floor = rms(np.where(valid, 100 * sigma[c], np.nan), axis=1)[order]
@@ -122,10 +107,15 @@ def plot_gap_spectrum(diagnosis, *, figure=None):
                 hollow = {"markerfacecolor": "none", "markersize": 8}
                 axes.plot(nm[order], one, "s--", color=VERMILION, label="before", **hollow)
                 _percent_axis(axes, np.concatenate([floor, one, two]))
-                _spectrum_labels(axes, nominal.observations[i].name, c, i == n - 1)
+                title, label = list(_CHANNELS.values())[c]
+                name = shortened(nominal.observations[i].name, _LONGEST_NAME)
+                axes.set_title(f"{name}\n{title}", loc="left")
+                axes.set_ylabel(f"rms of {label} (%)")
+                if i == n - 1:
+                    wavelength_label(axes)
         handles = grid[0, 0].get_legend_handles_labels()[0]
         legend_outside(figure, handles, columns=3)
-        figure.suptitle(f"Gap between model and data\n{verdict_line(diagnosis)}")
+        figure.suptitle(f"Gap between model and data\n{_verdict_line(diagnosis)}")
     return figure
 
 
@@ -153,14 +143,6 @@ def _plain(digits=(1,)):
     return FuncFormatter(text)
 
 
-def _spectrum_labels(axes, name, channel, last):
-    title, label = list(_CHANNELS.values())[channel]
-    axes.set_title(f"{shortened(name, _LONGEST_NAME)}\n{title}", loc="left")
-    axes.set_ylabel(f"rms of {label} (%)")
-    if last:
-        wavelength_label(axes)
-
-
 def plot_gap_frames(diagnosis, *, figure=None):
     """
     Draw the residuals frame by frame, before and after, with what the causes do.
@@ -184,7 +166,7 @@ def plot_gap_frames(diagnosis, *, figure=None):
     >>> import astropy.units as u
     >>> from astropolcal import instruments
     >>> from astropolcal.gap import diagnose
-    >>> from astropolcal.plotting.gap import plot_gap_frames
+    >>> from astropolcal.plotting import plot_gap_frames
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -201,11 +183,11 @@ def plot_gap_frames(diagnosis, *, figure=None):
         figure = canvas(figure, 9, 1.4 + 2.5 * n)
         grid = figure.subplots(n, 1, squeeze=False)[:, 0]
         for i, axes in enumerate(grid):
-            observations, order = nominal.observations[i], np.argsort(_wavelength(nominal, i))
-            thirds = [part for part in np.array_split(order, 3) if part.size]
+            observations, nm = nominal.observations[i], _nm(nominal, i)
+            thirds = [part for part in np.array_split(np.argsort(nm), 3) if part.size]
             does = [rms(before[i][0][part] - after[i][0][part]) for part in thirds]
             third = thirds[int(np.nanargmax(does))] if np.nanmax(does) > 0 else thirds[-1]
-            old, new = (_mean(gap[i][0][third]) for gap in (before, after))
+            old, new = (mean_known(gap[i][0][third]) for gap in (before, after))
             x = np.arange(len(old)) + 0.5
             axes.axhline(0, color=GREY, linewidth=0.8)
             look = {"markerfacecolor": "none", "markersize": 6}
@@ -213,26 +195,19 @@ def plot_gap_frames(diagnosis, *, figure=None):
             if diagnosis.causes:
                 axes.plot(x, old - new, color=BLACK, linewidth=1, label="what the causes do")
                 axes.plot(x, new, "o", color=BLUE, markersize=4, label="after")
-            nm = 1000 * _wavelength(nominal, i)[third]
-            name = shortened(observations.name, _LONGEST_NAME)
-            axes.set_title(f"{name}, {nm.min():.0f} to {nm.max():.0f} nm", loc="left")
+            name, of = shortened(observations.name, _LONGEST_NAME), nm[third]
+            axes.set_title(f"{name}, {of.min():.0f} to {of.max():.0f} nm", loc="left")
             axes.set_ylabel(f"observed {MINUS} model (%)")
             _frame_axis(axes, observations)
         handles = grid[0].get_legend_handles_labels()[0]
         legend_outside(figure, handles, columns=3)
-        figure.suptitle(f"Residuals of the single differences\n{verdict_line(diagnosis)}")
+        figure.suptitle(f"Residuals of the single differences\n{_verdict_line(diagnosis)}")
     return figure
 
 
-def _wavelength(model, i):
-    return model.problem.wavelength[model.problem.datasets[i].bins]
-
-
-def _mean(values):
-    """Return the mean over the wavelengths of the known values, NaN where there are none."""
-    known = np.isfinite(values)
-    total = np.where(known, values, 0.0).sum(axis=0)
-    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+def _nm(model, i):
+    """Return the wavelengths of a dataset."""
+    return 1000 * model.problem.wavelength[model.problem.datasets[i].bins]
 
 
 def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
@@ -265,7 +240,7 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     >>> import astropy.units as u
     >>> from astropolcal import instruments
     >>> from astropolcal.gap import diagnose
-    >>> from astropolcal.plotting.gap import plot_gap_maps
+    >>> from astropolcal.plotting import plot_gap_maps
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -275,7 +250,9 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     >>> plot_gap_maps(diagnosis).axes[0].get_ylabel()
     'wavelength (nm)'
     """
-    c = _name(channel)
+    if channel not in _CHANNELS:
+        raise ParameterError(f"channel = {channel!r}; allowed are {', '.join(_CHANNELS)}")
+    c = list(_CHANNELS).index(channel)
     nominal, improved = diagnosis.nominal, diagnosis.improved
     pairs = list(zip(_gaps(nominal, nominal), _gaps(improved, nominal), strict=True))
     sizes = np.abs(np.concatenate([gap[c].ravel() for pair in pairs for gap in pair]))
@@ -284,11 +261,10 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
     with style():
         figure = canvas(figure, 12, 1.5 + 3.2 * len(pairs))
         grid = figure.subplots(len(pairs), 2, sharey="row", squeeze=False)
-        for row, pair, dataset in zip(grid, pairs, nominal.problem.datasets, strict=True):
-            observations = dataset.observations
-            wavelength = nominal.problem.wavelength[dataset.bins]
+        for i, (row, pair) in enumerate(zip(grid, pairs, strict=True)):
+            observations = nominal.observations[i]
             for axes, gap, when in zip(row, pair, ("before", "after"), strict=True):
-                drawn = _map(axes, gap[c], wavelength, limit)
+                drawn = _map(axes, gap[c], _nm(nominal, i), limit)
                 size = rms(gap[c])
                 name = shortened(observations.name, _LONGEST_NAME)
                 axes.set_title(f"{name}, {when}: rms {size:.2g} %", loc="left")
@@ -297,17 +273,17 @@ def plot_gap_maps(diagnosis, *, channel="difference", figure=None):
         extend = "both" if np.nanmax(sizes) > limit else "neither"
         bar = figure.colorbar(drawn, ax=grid, extend=extend, shrink=0.85, aspect=35)
         bar.set_label(f"observed {MINUS} model (%); grey: masked")
-        figure.suptitle(f"Residuals of the {_CHANNELS[channel][0]}\n{verdict_line(diagnosis)}")
+        figure.suptitle(f"Residuals of the {_CHANNELS[channel][0]}\n{_verdict_line(diagnosis)}")
     return figure
 
 
-def _map(axes, gap, wavelength, limit):
-    order = np.argsort(wavelength)
+def _map(axes, gap, nm, limit):
+    order = np.argsort(nm)
     axes.grid(False)
     axes.set_facecolor("0.75")
     return axes.pcolormesh(
         np.arange(gap.shape[1] + 1),
-        cell_edges(1000 * wavelength[order]),
+        cell_edges(nm[order]),
         np.ma.masked_invalid(gap[order]),
         cmap="RdBu_r",
         vmin=-limit,
@@ -338,20 +314,33 @@ def _frame_axis(axes, observations):
     axes.set_xlabel("frames by derotator angle (deg)")
 
 
-def plot_where(diagnosis, *, limit=12, figure=None):
-    """
-    Draw the shares of the gap by axis: what it follows, and where it is largest.
+# ---- the causes -----------------------------------------------------------------------------
+# characters of a label beside a panel
+_LABEL = 26
 
-    Patterns share the gap among themselves; places do so for each axis, so that
-    bars of different axes do not add up.
+
+def _verdict_line(diagnosis):
+    """Return the verdict as a line that fits a figure."""
+    names = [cause.name for cause in diagnosis.causes]
+    several = names[0] if len(names) == 1 else f"{len(names)} causes"
+    return {
+        "none": "no gap beyond the noise",
+        "unexplained": "a real gap that is not explained",
+    }.get(diagnosis.verdict, f"{diagnosis.verdict}: {several}")
+
+
+def plot_cause_map(diagnosis, *, figure=None):
+    """
+    Draw where in the chain a cause is, and of which kind: a map of probabilities.
+
+    Rows are the places in the order in which the light meets them, columns the kinds of
+    perturbation. A cell is the probability that a cause is there, summed over all its
+    dependences and over what cannot be told from it.
 
     Parameters
     ----------
-    diagnosis : Diagnosis or Where
-        The diagnosis, whose nominal model is looked at, or what
-        `~astropolcal.gap.locate` found.
-    limit : int
-        Most bars of either kind.
+    diagnosis : Diagnosis
+        The diagnosis.
     figure : `~matplotlib.figure.Figure`, optional
         An empty figure to draw into.
 
@@ -364,58 +353,260 @@ def plot_where(diagnosis, *, limit=12, figure=None):
     >>> import astropy.units as u
     >>> from astropolcal import instruments
     >>> from astropolcal.gap import diagnose
-    >>> from astropolcal.plotting.gap import plot_where
+    >>> from astropolcal.plotting import plot_cause_map
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
     >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
     >>> data = simulate(chain, charis.wavelength, frames, seed=1)
     >>> diagnosis = diagnose(chain, data, effects=["beam_gain"], cross_validate=False)
-    >>> len(plot_where(diagnosis).axes)
-    2
+    >>> plot_cause_map(diagnosis).axes[0].get_yticklabels()[-1].get_text()
+    'detector'
     """
-    where = diagnosis if hasattr(diagnosis, "table") else _where(diagnosis)
-    told = where.told
-    # two panels, for the shares of one list add up and those of the other do not
-    kinds = [told[told["kind"] == kind][:limit] for kind in ("pattern", "place")]
-    # bars of the same height in both panels
-    heights = [max(len(rows), 1) + 0.4 for rows in kinds]
-    titles = (
-        "what the gap follows (one after the other, shares add up)",
-        "where the gap is large (overlapping, shares do not add up)",
-    )
+    rows = _cause_map(diagnosis)
+    shown = [k for k in _FAMILIES if k != _OTHER or any(k in row for row in rows.values())]
+    table = np.array([[row.get(k, (0.0, ""))[0] for k in shown] for row in rows.values()])
     with style():
-        figure = canvas(figure, 10, 1.8 + 0.5 * sum(heights))
-        panels = figure.subplots(2, 1, height_ratios=heights, sharex=True)
-        for axes, rows, color, title in zip(panels, kinds, (BLUE, ORANGE), titles, strict=True):
-            _shares(axes, rows, color)
-            axes.set_title(title, loc="left")
-        panels[-1].set_xlabel("share of the excess over the noise (%)")
-        figure.suptitle("Where the gap lies")
+        figure = canvas(figure, 5.4, 1.6 + 0.5 * len(rows))
+        axes = figure.subplots()
+        # one hue from white to dark: it is the same for all kinds of colour vision, and in print
+        axes.imshow(table, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+        for i, row in enumerate(rows.values()):
+            for j, kind in enumerate(shown):
+                chance, words = row.get(kind, (0.0, ""))
+                if chance < _LEAST:
+                    continue
+                look = {"ha": "center", "color": "white" if chance > _DARK else BLACK}
+                axes.text(j, i - 0.16, share(chance), va="center", weight="bold", **look)
+                axes.text(j, i + 0.22, words, va="center", fontsize=8, **look)
+        axes.set_xticks(range(len(shown)), labels=shown, rotation=30, ha="left")
+        axes.set_yticks(range(len(rows)), labels=[_place_label(place) for place in rows])
+        axes.tick_params(length=0, labelsize=9.5)
+        axes.xaxis.tick_top()
+        axes.grid(visible=False)
+        for edge in np.arange(0.5, len(rows) - 1):
+            axes.axhline(edge, color="0.8", linewidth=0.8)
+        for edge in np.arange(0.5, len(shown) - 1):
+            axes.axvline(edge, color="0.8", linewidth=0.8)
+        figure.suptitle("Probability that a cause is there", fontsize=11.5)
     return figure
 
 
-# beyond this share (percent) its number stands inside the bar
-_NEAR_THE_EDGE = 93
+# columns of the map
+_OTHER = "other"
+_FAMILIES = ("retardance", "rotation", "diattenuation", "depolarization", "beams, detector", _OTHER)
+_AXES = {"h": "along axes", "d": "at 45 deg", "c": "circular", "linear": "linear"}
+# probabilities that are not written, and from which the ground is dark
+_LEAST, _DARK = 0.01, 0.65
+# words in the place of a named effect, and the place that they mean
+_PLACES = {
+    "detector": "detector",
+    "spectrograph": "detector",
+    "in front of": "source",
+    "behind the derotator": "after:derotator",
+    "half-wave plate": "in:hwp",
+    "derotator": "in:derotator",
+    "source": "source",
+    "polarizer": "source",
+    "star": "source",
+    "sky": "source",
+    "mirror": "source",
+    "telescope": "source",
+}
 
 
-def _where(diagnosis):
-    found = getattr(diagnosis, "where", None)
-    return found if hasattr(found, "table") else locate(diagnosis.nominal)
+def _cause_map(diagnosis):
+    """Return {place: {family: (probability, what)}}, places in the order of the light."""
+    rows = {p.name: {} for chain in diagnosis.nominal.chains for p in places(chain)}
+    rows["detector"] = rows.pop("detector", {})
+    for cause in diagnosis.causes:
+        own, words = {}, {}
+        for one, part in [(cause, cause.share), *cause.aliases]:
+            place, family, what = _on_map(one.effect, one.cell)
+            own[place, family] = own.get((place, family), 0.0) + part * cause.probability
+            words.setdefault((place, family), what)
+        for (place, family), chance in own.items():
+            before, what = rows.setdefault(place, {}).get(family, (0.0, words[place, family]))
+            # that at least one of several causes is there
+            rows[place][family] = (1 - (1 - before) * (1 - min(chance, 1.0)), what)
+    return rows
 
 
-def _shares(axes, rows, color):
-    shares = 100 * np.array(rows["share"], dtype=float)
-    labels = [textwrap.fill(str(row["detail"]), _WIDTH) for row in rows]
-    axes.barh(range(len(rows)), shares, color=color, height=0.6)
-    for i, share in enumerate(shares):
-        inside = share > _NEAR_THE_EDGE
-        ends = {"ha": "right", "color": "white" if color == BLUE else BLACK} if inside else {}
-        axes.text(share, i, f"{share:.0f} " if inside else f" {share:.0f}", va="center", **ends)
-    axes.set_yticks(range(len(rows)), labels=labels, fontsize=10)
-    axes.set_ylim(max(len(rows), 1) - 0.5, -0.5)
-    axes.grid(visible=False, axis="y")
-    axes.set_xlim(0, 100)
-    if not len(rows):
+def _on_map(effect, cell):
+    """Return place, family and what exactly of a cause."""
+    if cell is not None:
+        family, _, axis = cell.kind.partition("_")
+        known = family in _FAMILIES
+        what = _AXES.get(axis, axis) if known else cell.kind.replace("_", " ")
+        return cell.place, family if known else _FAMILIES[-2], what
+    place = next((own for words, own in _PLACES.items() if words in effect.place), effect.place)
+    words = f"{effect.name} {effect.title}"
+    family = next((family for family in _FAMILIES[:4] if family in words), _OTHER)
+    return place, _FAMILIES[-2] if place == "detector" else family, "named"
+
+
+def _place_label(place):
+    head, _, optic = place.partition(":")
+    optic = {"hwp": "half-wave plate"}.get(optic, optic)
+    words = {"in": f"in the {optic}", "after": f"behind the {optic}"}
+    return textwrap.fill(words.get(head, place), 16)
+
+
+def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
+    """
+    Draw the fitted size of a cause, by its name, with its errors.
+
+    One panel for what it depends on, if that is a cell that changes from frame to frame: the size
+    at the middle wavelength with its 68 % band, and the frames as marks. One panel for each
+    parameter that changes with the wavelength; crosses mark where the data do not tell the size.
+    ``content`` is what `~astropolcal.gap.report.to_dict` returned, if it is known already.
+    """
+    sizes = _sizes_by_wavelength(diagnosis, effect, content)
+    panels = [None, *sizes] if _curve(diagnosis, effect) else list(sizes)
+    if not panels:
+        raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
+    nm, columns = 1000 * diagnosis.nominal.problem.wavelength, min(len(panels), 2)
+    with style():
+        figure = canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2))
+        grid = figure.subplots(-(-len(panels) // 2), columns, squeeze=False)
+        for axes in grid.flat[len(panels) :]:
+            axes.set_axis_off()
+        for axes, name in zip(grid.flat, panels, strict=False):
+            if name is None:
+                _curve_panel(axes, diagnosis, effect)
+                continue
+            size = _in_percent(sizes[name])
+            _size_panel(axes, nm, size, _absent(diagnosis.improved, effect, name, size))
+            axes.set_ylabel(_label(diagnosis, effect, name, size["unit"]))
+            wavelength_label(axes)
+    return figure
+
+
+def _sizes_by_wavelength(diagnosis, effect, content):
+    names = [cause.name for cause in diagnosis.causes]
+    if effect not in names:
+        raise ParameterError(f"effect = {effect!r} is no cause; these are: {', '.join(names)}")
+    if content is None:
+        sizes = Fitted(diagnosis.improved).sizes(effect)
+    else:
+        sizes = content["causes"][names.index(effect)]["size"]
+    return {name: size for name, size in sizes.items() if _varies(size["value"])}
+
+
+def _varies(value):
+    # a figure of a constant shows nothing
+    if not isinstance(value, list):
+        return False
+    known = [abs(one) for one in value if one is not None]
+    return bool(known) and max(value) - min(value) > 1e-6 * max(known)
+
+
+def _in_percent(size):
+    """Return a share in percent, and all else as it is."""
+    if size["unit"]:
+        return size
+    return {
+        "value": [100 * one for one in size["value"]],
+        "std": [None if one is None else 100 * one for one in size["std"]],
+        "unit": "%",
+        "limit": 100 * size["limit"],
+    }
+
+
+def _absent(model, effect, name, size):
+    """Return the value at which an effect is absent in the unit of its size, scalar or (W,)."""
+    (parameter,) = (p for p in model.added[effect] if p.name == name)
+    factor = model.problem.free.by_name[name].factor
+    return parameter.canonical_neutral / factor * (100 if size["unit"] == "%" else 1)
+
+
+def _label(diagnosis, effect, name, unit):
+    """Return what a size is, and its unit."""
+    cause = next(one for one in diagnosis.causes if one.name == effect)
+    names = [p.name for p in diagnosis.improved.added[effect]]
+    entry = {"size": names, "cell": cause.cell.to_dict() if cause.cell else None}
+    words = dict(zip(names, labels(entry), strict=True))[name]
+    return f"{textwrap.fill(words, _LABEL)} ({unit})"
+
+
+# ---- what a cause depends on ------------------------------------------------------------------
+
+_DRIVERS = {"sequence": "share of the run", "frame": "frame"}
+
+
+def _curve(diagnosis, effect):
+    """Return the dependence of a cause that is a cell and changes from frame to frame."""
+    cause = next(one for one in diagnosis.causes if one.name == effect)
+    keys = [p.name.partition(".")[2] for p in diagnosis.improved.added.get(effect) or ()]
+    if cause.cell is None or cause.cell.kind not in GENERATORS or keys[:1] != ["amplitude"]:
+        return None
+    dependence = Dependence(cause.cell.dependence)
+    return dependence if dependence.driver else None
+
+
+def _curve_panel(axes, diagnosis, effect):
+    dependence, model = _curve(diagnosis, effect), diagnosis.improved
+    driver, problem = dependence.driver, model.problem
+    given = np.concatenate([_positions(dataset, driver) for dataset in problem.datasets])
+    x = np.linspace(given.min(), given.max(), 400)
+    if dependence.kind == "direction":
+        x = np.array([0.0, 1.0])
+    fitted, middle = Fitted(model), len(problem.wavelength) // 2
+    own = np.zeros((problem.size, len(x)))
+    for wave, parameter in zip(dependence.waves(x), model.added[effect], strict=False):
+        where, basis = problem.slices[parameter.name], parameter.basis
+        basis = np.eye(where.stop - where.start) if basis is None else basis
+        own[where] = np.outer(basis[min(middle, len(basis) - 1)], wave)
+    unit, factor = fitted.unit_of(parameter.name)
+    scale = 1 / factor if unit else 100
+    value = scale * (model.fit.coefficients @ own)
+    error = scale * np.sqrt(np.einsum("ij,ik,kj->j", own, fitted.covariance, own))
+    angle = driver not in _DRIVERS and dependence.kind != "direction"
+    x, given = (np.rad2deg(values) if angle else values for values in (x, given))
+    axes.axhline(0, color=BLACK, linewidth=0.8)
+    if dependence.kind == "direction":
+        axes.errorbar(x, value, error, fmt="o", color=BLUE)
+        axes.set_xticks(x, labels=["forwards", "backwards"])
+        axes.set_xlim(-0.5, 1.5)
+    else:
+        axes.fill_between(x, value - error, value + error, color=SKY, alpha=0.5, linewidth=0)
+        axes.plot(x, value, color=BLUE)
+        foot = np.full(len(given), 0.02)
+        axes.plot(given, foot, "|", color=GREY, transform=axes.get_xaxis_transform())
+    axes.set_xlabel(_driver_label(dependence))
+    nm = 1000 * problem.wavelength[middle]
+    axes.set_ylabel(f"size at {nm:.0f} nm ({unit or '%'})")
+
+
+def _positions(dataset, driver):
+    """Return where the driver of a dependence stood in every frame."""
+    given = dataset._given.get(driver)
+    given = dataset.observations.position(driver) if given is None else given
+    return given.mean(axis=0) if given.ndim == 2 else given
+
+
+def _driver_label(dependence):
+    stage = dependence.parts[1] if len(dependence.parts) > 1 else ""
+    stage = {"hwp": "half-wave plate"}.get(stage, stage)
+    return {
+        "harmonic": f"angle of the {stage} (deg)",
+        "direction": f"last move of the {stage}",
+        "move": f"last move of the {stage} (deg)",
+    }.get(dependence.kind) or _DRIVERS[dependence.driver]
+
+
+def _size_panel(axes, nm, size, absent):
+    known = np.array([is_determined(std, size["limit"]) for std in size["std"]])
+    value = np.array(size["value"], dtype=float)
+    error = np.array(size["std"], dtype=float)
+    # mostly zero; a share that is retained counts from one, what the model held from its value
+    look = {"color": BLACK, "linewidth": 0.8}
+    axes.axhline(absent, **look) if np.ndim(absent) == 0 else draw_line(axes, nm, absent, **look)
+    axes.errorbar(nm[known], value[known], error[known], fmt="o", color=BLUE, elinewidth=1.5)
+    if not known.all():
+        # x in data, y in shares of the panel: the crosses stay at its foot whatever the scale
+        foot = axes.get_xaxis_transform()
+        axes.plot(nm[~known], np.full((~known).sum(), 0.05), "x", color=VERMILION, transform=foot)
+        axes.set_title("crosses: not determined", loc="left", fontsize=10)
+    if not known.any():
         axes.set_yticks([])
-        axes.text(0.5, 0.5, "nothing beyond the noise", transform=axes.transAxes, ha="center")

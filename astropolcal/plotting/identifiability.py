@@ -1,8 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What the data determine, what they leave open, and what they hardly determine."""
+"""What the data determine, what they leave open, and how parameters are correlated."""
 
 import textwrap
 from dataclasses import dataclass
+from itertools import pairwise
 
 import astropy.units as u
 import numpy as np
@@ -15,18 +16,19 @@ from astropolcal.plotting._style import (
     BLUE,
     GREY,
     ORANGE,
+    SIGMA,
     VERMILION,
     canvas,
     element_places,
     heading,
+    legend_outside,
     style,
 )
 from astropolcal.units import angle_to_rad
 
-__all__ = ["plot_identifiability"]
+__all__ = ["plot_correlations", "plot_identifiability"]
 
 _WIDTH = 11.0
-_SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _INFINITE = "\N{INFINITY}"
 # singular values below this share of the largest count as zero
 _OPEN_BELOW = 1e-9
@@ -91,7 +93,7 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
     --------
     >>> import astropy.units as u
     >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.plotting.identifiability import plot_identifiability
+    >>> from astropolcal.plotting import plot_identifiability
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -117,7 +119,10 @@ def plot_identifiability(calibration, *, weakest=3, hwp=None, figure=None):
         _draw_values(figure.add_subplot(grid[0, 0]), finding, known, len(weak))
         _draw_conditions(figure.add_subplot(grid[0, 1]), finding, angles)
         _draw_loadings(figure, figure.add_subplot(grid[1, :]), finding, rows)
-        _write_words(figure.add_subplot(grid[2, :]), words)
+        below = figure.add_subplot(grid[2, :])
+        below.axis("off")
+        where = {"transform": below.transAxes, "va": "top", "ha": "left"}
+        below.text(0, 1, "\n".join(words), fontsize=9, linespacing=1.3, **where)
         heading(figure, calibration, "What the data determine")
     return figure
 
@@ -197,7 +202,7 @@ def _weak_words(names, units, vector, sigma):
     parts.sort(reverse=True)
     named = [text for _, text in parts[:_MOST_NAMES]]
     more = f" and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
-    return f"1{_SIGMA} changes {', '.join(named)}{more}"
+    return f"1{SIGMA} changes {', '.join(named)}{more}"
 
 
 def _step_unit(unit):
@@ -226,7 +231,9 @@ def _draw_values(axes, finding, known, n_weak):
             axes.plot(index[:rank][which], values[:rank][which], marker, color=color, label=label)
     if n_open:
         # at their true values, a rounding error, they would press all others together
-        label = f"{n_open} open: {_rounding(values[rank:])} (below the axis)"
+        worst = values[rank:].max()
+        rounding = f"at most {worst:.1g}" if worst > 0 else "exactly zero"
+        label = f"{n_open} open: {rounding} (below the axis)"
         at_edge = {"color": VERMILION, "label": label, "clip_on": False, "zorder": 3}
         axes.plot(index[rank:], np.full(n_open, low), "v", **at_edge)
         axes.axhline(threshold, color=BLACK, linestyle="--", linewidth=1, label="limit of the rank")
@@ -270,10 +277,6 @@ def _threshold(values, rank, largest):
     low = values[rank] if rank < len(values) else 0.0
     high = values[rank - 1] if rank else largest
     return float(np.clip(_OPEN_BELOW * largest, low, high)) or 1e-12
-
-
-def _rounding(values):
-    return f"at most {values.max():.1g}" if values.max() > 0 else "exactly zero"
 
 
 def _add_error_axis(axes, noise, lowest):
@@ -334,14 +337,6 @@ def _wrapped(rows):
     return lines
 
 
-def _write_words(axes, lines):
-    axes.axis("off")
-    text = "\n".join(lines)
-    axes.text(
-        0, 1, text, transform=axes.transAxes, va="top", ha="left", fontsize=9, linespacing=1.3
-    )
-
-
 # ---- (c) half-wave-plate angles ---------------------------------------------------------------
 
 
@@ -390,3 +385,121 @@ def _say(axes, text):
     axes.set(xticks=[], yticks=[])
     axes.grid(False)
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=9)
+
+
+# ---- correlations ---------------------------------------------------------------------------
+# a parameter common to all wavelengths is drawn this much wider than one of a wavelength
+_WIDE = 4.0
+_SIZE, _MARGIN = 8.5, 2.6
+# numbers are written into the cells of a matrix that is not larger than this
+_FEW = 12
+
+
+def plot_correlations(calibration, *, figure=None):
+    """
+    Draw the correlation matrix of the free parameters.
+
+    Parameters given per wavelength form a block, short wavelengths first;
+    those common to all wavelengths are drawn wider. Rows and columns of
+    parameters without an error, because the data leave them open or because
+    they sit at a bound, are hatched: there is no correlation to show.
+
+    Parameters
+    ----------
+    calibration : Calibration, Resampled or Covariance
+        What has the covariance; a calibration read from a file will do.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+
+    Raises
+    ------
+    ParameterError
+        If there is no free parameter.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.plotting import plot_correlations
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> len(plot_correlations(cal).axes)
+    2
+    """
+    covariance = getattr(calibration, "covariance", calibration)
+    if not len(covariance):
+        raise ParameterError("no free parameter, so no correlation to draw")
+    groups = [(stem, len(at)) for stem, at in element_places(covariance.names).items()]
+    with np.errstate(invalid="ignore"):
+        matrix = covariance.correlation
+    with style():
+        figure = canvas(figure, _SIZE + _MARGIN, _SIZE + 1.4)
+        axes = figure.add_subplot()
+        edges = _edges(groups)
+        image = _draw_matrix(axes, edges, matrix)
+        _name_groups(axes, edges, groups)
+        if len(matrix) <= _FEW:
+            _write_numbers(axes, edges, matrix)
+        figure.colorbar(image, ax=axes, shrink=0.7, pad=0.02, label="correlation")
+        _explain_hatching(figure, matrix)
+        heading(figure, calibration, "Correlations of the parameters")
+    return figure
+
+
+def _edges(groups):
+    """Return the borders of all cells; a parameter that stands alone is wider."""
+    several = any(count > 1 for _, count in groups)
+    widths = [np.full(n, _WIDE if n == 1 and several else 1.0) for _, n in groups]
+    return np.concatenate([[0.0], np.cumsum(np.concatenate(widths))])
+
+
+def _draw_matrix(axes, edges, matrix):
+    # what is not drawn lets the hatched background through
+    axes.patch.set(facecolor="0.88", edgecolor="0.62", hatch="////")
+    axes.grid(False)
+    image = axes.pcolormesh(
+        edges, edges, np.ma.masked_invalid(matrix), cmap="RdBu_r", vmin=-1, vmax=1, rasterized=True
+    )
+    axes.set(xlim=(0, edges[-1]), ylim=(edges[-1], 0), aspect="equal")
+    return image
+
+
+def _name_groups(axes, edges, groups):
+    """Name every group in its middle, and part it from the next."""
+    ends = np.cumsum([0] + [count for _, count in groups])
+    middles = [(edges[a] + edges[b]) / 2 for a, b in pairwise(ends)]
+    labels = [f"{stem} ({count})" if count > 1 else stem for stem, count in groups]
+    axes.set_xticks(middles, labels, rotation=45, ha="right", rotation_mode="anchor")
+    axes.set_yticks(middles, labels)
+    axes.tick_params(length=0)
+    for border in edges[ends[1:-1]]:
+        axes.axhline(border, color="0.25", linewidth=0.6)
+        axes.axvline(border, color="0.25", linewidth=0.6)
+
+
+def _write_numbers(axes, edges, matrix):
+    middles = (edges[1:] + edges[:-1]) / 2
+    for i, row in enumerate(matrix):
+        for j, value in enumerate(row):
+            if np.isfinite(value):
+                color = "white" if abs(value) > _PALE else "black"
+                text = f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
+                axes.text(middles[j], middles[i], text, color=color, ha="center", va="center")
+
+
+def _explain_hatching(figure, matrix):
+    """Say in a legend what the hatched rows are."""
+    from matplotlib.patches import Patch
+
+    without = int((~np.isfinite(np.diag(matrix))).sum())
+    if without:
+        label = f"{without} of {len(matrix)} parameters: left open by the data, or at a bound"
+        hatched = Patch(facecolor="0.88", edgecolor="0.62", hatch="////", label=label)
+        legend_outside(figure, [hatched])

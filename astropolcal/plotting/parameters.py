@@ -1,21 +1,250 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Calibrated parameters against wavelength, with what is known of their errors."""
+"""Calibrated parameters against wavelength and date, with what is known of their errors."""
 
 import textwrap
+from itertools import pairwise
 
 import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
+from astropy.time import Time
 
-from astropolcal.calibration.reflections import mirror_names
+from astropolcal import instruments
+from astropolcal.calibration import mirror_names, mirror_values
+from astropolcal.calibration.history import _Named, _named, parameter_history, significance
+from astropolcal.calibration.reflections import METALS
 from astropolcal.chain import leaves
-from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.plotting._points import draw_entry, draw_law, legend_of, mark_half_wave
-from astropolcal.plotting._style import canvas, heading, looks, style, wavelength_label
+from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
+from astropolcal.plotting._style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    SIGMA,
+    SKY,
+    canvas,
+    heading,
+    legend_entries,
+    legend_outside,
+    looks,
+    nanometres,
+    style,
+    wavelength_label,
+)
 from astropolcal.words import did_you_mean
 
-__all__ = ["plot_efficiency", "plot_parameters", "plot_retardances"]
+__all__ = ["plot_efficiency", "plot_history", "plot_mirrors", "plot_retardances"]
 
+# ---- points and lines of a parameter ----------------------------------------------------------
+_DETERMINED = f"fitted, with 1{SIGMA} error"
+_ALONE = "hollow: not determined alone, so no error"
+_BOUND = "boxed: at a bound, so no error"
+_FIXED = "fixed"
+_STAGE = "fitted per wavelength (first step of two), modulo 360°"
+_LAW = f"law fitted to all wavelengths, with 1{SIGMA} band"
+_LAW_ALONE = "law fitted to all wavelengths (no error: not determined alone)"
+_ORDER = (_DETERMINED, _ALONE, _BOUND, _LAW, _LAW_ALONE, _STAGE)
+_FINE = 201
+# how near to half a wave a panel must be to show that line (deg)
+_NEAR_HALF_WAVE = 45
+_STEP = 1e-3
+_TITLE_WIDTH = 58
+
+
+def _draw_entry(axes, calibration, entry, look):
+    """Draw one parameter, an entry of ``Calibration.parameter_values``, against wavelength."""
+    if not entry["value"].ndim:
+        _draw_constant(axes, nanometres(calibration.wavelength), entry, look[0])
+        return
+    lam = nanometres(calibration.wavelength)
+    color, marker = look
+    order = np.argsort(lam)
+    if entry["fixed"] or entry["tied"]:
+        label = f"follows {entry['tied']}" if entry["tied"] else _FIXED
+        axes.plot(lam[order], entry["value"][order], color=color, linestyle=":", label=label)
+        return
+    # the thin line only leads the eye through points of different kind
+    axes.plot(lam[order], entry["value"][order], color=color, linewidth=0.6, alpha=0.6)
+    _draw_points(axes, lam, entry, color, marker)
+
+
+def _draw_points(axes, lam, entry, color, marker):
+    value, std, bound = entry["value"], entry["std"], entry["at_bound"]
+    known = np.isfinite(std) & ~bound
+    look = {"color": color, "marker": marker, "linestyle": "none"}
+    if known.any():
+        axes.errorbar(lam[known], value[known], yerr=std[known], label=_DETERMINED, **look)
+    if (~known).any():
+        label = _ALONE if (~known & ~bound).any() else None
+        axes.plot(lam[~known], value[~known], markerfacecolor="white", label=label, **look)
+    if bound.any():
+        axes.plot(
+            lam[bound],
+            value[bound],
+            marker="s",
+            markersize=12,
+            linestyle="none",
+            markerfacecolor="none",
+            color=BLACK,
+            label=_BOUND,
+            clip_on=False,
+        )
+
+
+def _draw_constant(axes, lam, entry, color):
+    """Draw a parameter that has one value for all wavelengths."""
+    ends = np.array([lam.min(), lam.max()])
+    value, std = float(entry["value"]), float(entry["std"])
+    kind = _FIXED if entry["fixed"] else "one value for all wavelengths"
+    note = "" if np.isfinite(std) or entry["fixed"] else ", at a bound"
+    if note and not entry["at_bound"]:
+        note = ", not determined alone"
+    axes.plot(ends, [value, value], color=color, label=kind + note)
+    if np.isfinite(std):
+        axes.fill_between(ends, value - std, value + std, color=color, alpha=0.25, linewidth=0)
+
+
+# ---- laws in wavelength ----------------------------------------------------------
+
+
+def _draw_law(axes, calibration, leaf, known, look):
+    """Draw a retardance that follows a law, its band, and the stages' points."""
+    lam = nanometres(calibration.wavelength)
+    # a law is smooth between the wavelengths unless its parameters are given at these
+    if not any(np.size(getattr(leaf, key).value) > 1 for key in leaf.param_names):
+        lam = np.linspace(lam.min(), lam.max(), _FINE)
+    lam = np.sort(lam)
+    value, std = _retardance(leaf, lam), _law_std(calibration, leaf, lam)
+    own = {key: known[f"{leaf.name}.{key}"] for key in leaf.own_names}
+    free = any(not entry["fixed"] for entry in own.values())
+    label = (_LAW_ALONE if std is None else _LAW) if free else f"law, {_FIXED}"
+    axes.plot(lam, value, color=look[0], label=label)
+    if std is not None:
+        axes.fill_between(lam, value - std, value + std, color=look[0], alpha=0.3, linewidth=0)
+    _draw_stage(axes, calibration, leaf)
+    shown = {key: entry for key, entry in own.items() if not entry["fixed"]} or own
+    words = [", ".join(row) for row in _in_rows(_words(shown))]
+    axes.set_title("\n".join([f"{leaf.name}: law", *words]))
+
+
+def _retardance(leaf, lam):
+    return np.atleast_1d(leaf.retardance(lam * u.nm).to_value(u.deg))
+
+
+def _law_std(calibration, leaf, lam):
+    """Return the 1 sigma error of the law, or None where a parameter has none."""
+    covariance = calibration.covariance
+    rows = [
+        (key, covariance.names.index(f"{leaf.name}.{key}"))
+        for key in leaf.own_names
+        if f"{leaf.name}.{key}" in covariance.names
+    ]
+    if not rows:
+        return None
+    index = [i for _, i in rows]
+    matrix = covariance.matrix[np.ix_(index, index)]
+    if not np.isfinite(matrix).all():
+        return None
+    slopes = np.stack([_slope(leaf, key, lam) for key, _ in rows])
+    # sigma^2(lambda) = g^T C g with the slopes g (n_parameters, n_wavelengths)
+    return np.sqrt(np.clip(np.einsum("in,ij,jn->n", slopes, matrix, slopes), 0, None))
+
+
+def _slope(leaf, key, lam):
+    """Return the derivative of the law to a parameter, per its unit, by central differences."""
+    parameter = getattr(leaf, key)
+    unit = 1 if parameter.unit is None else parameter.unit
+    # relative, but for parameters that are zero
+    step = _STEP * max(abs(float(parameter.value)), 1e-6)
+    high, low = (
+        _retardance(leaf.with_parameters(**{key: (parameter.value + sign * step) * unit}), lam)
+        for sign in (1, -1)
+    )
+    return (high - low) / (2 * step)
+
+
+def _draw_stage(axes, calibration, leaf):
+    """Draw the retardances of the first stage that fitted one a wavelength."""
+    lam = nanometres(calibration.wavelength)
+    for stage in calibration.stages:
+        value = stage["parameters"].get(f"{leaf.name}.retardance")
+        if value is not None and np.size(value) == lam.size:
+            value = u.Quantity(value, u.deg).value
+            # a turn more or less is the same retarder: draw the one near the law
+            value = value - 360 * np.round((value - _retardance(leaf, lam)) / 360)
+            axes.plot(lam, value, "o", color=GREY, label=_STAGE)
+            return
+
+
+def _words(own):
+    for key, entry in own.items():
+        std = entry["std"]
+        error = f" ± {float(std):.4f}" if np.ndim(std) == 0 and np.isfinite(std) else ""
+        if np.ndim(entry["value"]) == 0:
+            yield f"{key} = {float(entry['value']):.4f}{error} {entry['unit'] or ''}".rstrip()
+
+
+def _in_rows(words):
+    """Yield lists of words that are not too long for a title."""
+    row = []
+    for word in words:
+        if row and len(", ".join([*row, word])) > _TITLE_WIDTH:
+            yield row
+            row = []
+        row.append(word)
+    yield row
+
+
+def _mark_half_wave(axes):
+    """Draw the line of a perfect half-wave plate where the data come near to it."""
+    # the limits of the data, not of the axes, which a line would widen
+    low, high = axes.dataLim.intervaly
+    for half in (180, -180):
+        if abs(low - half) < _NEAR_HALF_WAVE and abs(high - half) < _NEAR_HALF_WAVE:
+            axes.axhline(half, color=BLACK, linestyle="--", linewidth=1, label="half wave (±180°)")
+
+
+# ---- legend -----------------------------------------------------------------------
+
+
+def _legend(figure, axes, calibration):
+    """Put one legend for all panels below them: each label once, in neutral colours."""
+    entries = legend_entries(axes)
+    labels = [label for label in _ORDER if label in entries]
+    labels += [label for label in entries if label not in labels]
+    handles = [_neutral(entries[label], label) for label in labels]
+    free = len(calibration.identifiability.directions)
+    if _ALONE in labels and free:
+        parameters = "combination of parameters" if free == 1 else "combinations of parameters"
+        handles[labels.index(_ALONE)].set_label(
+            f"{_ALONE} (the data leave {free} {parameters} open)"
+        )
+    return legend_outside(figure, handles)
+
+
+def _neutral(handle, label):
+    """Return a line for the legend; colours and markers differ between the panels."""
+    from matplotlib.lines import Line2D
+
+    line = handle[0] if isinstance(handle, tuple) else handle
+    hollow = line.get_markerfacecolor() in ("white", "none")
+    boxed = label == _BOUND
+    points = line.get_linestyle() == "None"
+    return Line2D(
+        [],
+        [],
+        color=GREY if label == _STAGE else BLACK,
+        linestyle=line.get_linestyle(),
+        linewidth=line.get_linewidth(),
+        marker=("s" if boxed else "o") if points else "",
+        markersize=11 if boxed else line.get_markersize(),
+        markerfacecolor=("none" if boxed else "white") if hollow else None,
+        label=label,
+    )
+
+
+# ---- figures of parameters -------------------------------------------------------------------
 #: Parameters that are retardances, and how to call them (paper, Eq. of the elliptical retarder).
 _RETARDANCES = {
     "horizontal": r"horizontal retardance $\Delta_H$",
@@ -25,7 +254,6 @@ _RETARDANCES = {
 }
 # longer labels do not fit beside a panel
 _LABEL_WIDTH = 28
-_EFFICIENCY = r"modulation efficiency $|\eta|$"
 
 
 def plot_retardances(calibration, *, figure=None):
@@ -87,13 +315,14 @@ def plot_retardances(calibration, *, figure=None):
         for one, (leaf, key), look in zip(axes, panels, looks(len(panels)), strict=True):
             if key in leaf.param_names:
                 entry = known[f"{leaf.name}.{key}"]
-                draw_entry(one, calibration, entry, look)
+                _draw_entry(one, calibration, entry, look)
                 one.set_title(f"{leaf.name}: {key}")
             else:
-                draw_law(one, calibration, leaf, known, look)
-            mark_half_wave(one)
+                _draw_law(one, calibration, leaf, known, look)
+            _mark_half_wave(one)
             one.set_ylabel(f"{_RETARDANCES[key]} (°)")
-        _finish(figure, axes, calibration, "Retardances")
+        heading(figure, calibration, "Retardances")
+        _legend(figure, axes, calibration)
     return figure
 
 
@@ -153,77 +382,41 @@ def plot_efficiency(calibration, *, figure=None):
     with style():
         figure, axes = _grid(figure, len(names))
         for one, name, look in zip(axes, names, looks(len(names)), strict=True):
-            draw_entry(one, calibration, known[name], look)
+            _draw_entry(one, calibration, known[name], look)
             # above 1 there is no physical efficiency
             one.axhline(1, color="black", linestyle="--", linewidth=1, label="perfect: 1")
             one.set_title(name)
-            one.set_ylabel(_EFFICIENCY)
-        _finish(figure, axes, calibration, "Modulation efficiency")
+            one.set_ylabel(r"modulation efficiency $|\eta|$")
+        heading(figure, calibration, "Modulation efficiency")
+        _legend(figure, axes, calibration)
     return figure
 
 
 def plot_parameters(calibration, names=None, *, figure=None):
     """
-    Draw any parameters against wavelength, one panel each.
+    Draw any parameters against wavelength, one panel each; points as in `plot_retardances`.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; one read from a file will do.
-    names : sequence of str, optional
-        ``"optic.parameter"``; by default all free parameters that have one
-        value a wavelength.
-    figure : `~matplotlib.figure.Figure`, optional
-        An empty figure to draw into.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-        Points as in `plot_retardances`; a parameter with one value is a line.
-
-    Raises
-    ------
-    ParameterError
-        If there is no such parameter.
-    ChainError
-        If no parameter is left to draw.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.plotting import plot_parameters
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> [axes.get_title() for axes in plot_parameters(cal).axes]
-    ['derotator.retardance', 'wollaston.efficiency']
+    ``names`` are ``"optic.parameter"``, by default all free ones given per wavelength.
     """
     known = calibration.parameter_values()
     names = _per_wavelength(known) if names is None else list(names)
     for name in names:
-        _check_name(name, known)
+        if name not in known:
+            near = did_you_mean(name, known)
+            raise ParameterError(f"no parameter {name!r}; allowed are {', '.join(known)}{near}")
     if not names:
         raise ChainError("no free parameter has one value a wavelength: nothing to draw")
     optics = _optics(calibration)
     with style():
         figure, axes = _grid(figure, len(names))
         for one, name, look in zip(axes, names, looks(len(names)), strict=True):
-            draw_entry(one, calibration, known[name], look)
+            _draw_entry(one, calibration, known[name], look)
             optic, _, key = name.rpartition(".")
             one.set_title(name)
             one.set_ylabel(_describe(getattr(optics[optic], key)))
-        _finish(figure, axes, calibration, "Parameters for each wavelength")
+        heading(figure, calibration, "Parameters for each wavelength")
+        _legend(figure, axes, calibration)
     return figure
-
-
-def _check_name(name, known):
-    if name not in known:
-        raise ParameterError(
-            f"no parameter {name!r}; allowed are {', '.join(known)}{did_you_mean(name, known)}"
-        )
 
 
 def _describe(parameter):
@@ -275,6 +468,289 @@ def _grid(figure, count):
     return figure, axes
 
 
-def _finish(figure, axes, calibration, what):
-    heading(figure, calibration, what)
-    legend_of(figure, axes, calibration)
+# ---- mirrors --------------------------------------------------------------------------------
+# dashes of their own: a thin metal line must not look like a fit
+_METAL_LOOKS = dict(zip(METALS, ((SKY, "--"), (ORANGE, "-."), (GREEN, ":")), strict=True))
+_MIRROR_LAW_ALONE = "fitted law, not determined: a choice of the law"
+_MIRROR_LABELS = {"diattenuation": "diattenuation (%)", "retardance": "retardance (°)"}
+
+
+def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
+    """
+    Draw diattenuation and retardance of mirrors against wavelength, beside those of bare metals.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    names : sequence of str, optional
+        Mirrors, by default all, see `~astropolcal.calibration.mirror_names`.
+    reference : dict of str to dict, optional
+        Name of a mirror to others that it is compared with, by label, such as
+        ``{"m3": {"published": published_mirror()}}``; anything with the methods ``diattenuation``
+        and ``retardance`` of a wavelength. By default what is published of the instrument.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+        One column a mirror: above its diattenuation, below its retardance. What is held
+        is hollow; what follows a law is a line with its 1 sigma band. The metals are silver, gold
+        and aluminium at 45 deg, with the indices of Rakić et al. (1998).
+
+    Raises
+    ------
+    ChainError
+        If there is no such mirror.
+
+    Notes
+    -----
+    The figures of the fold mirror and of the tertiary mirror of McIntosh et al. (2026).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, optics
+    >>> from astropolcal.plotting import plot_mirrors
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> chain = (optics.Diattenuator(diattenuation=[0.01] * 3, name="fold_mirror")
+    ...          | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(fixed={"efficiency": True}, name="wollaston"))
+    >>> chain["hwp"].retardance.fixed = True
+    >>> data = simulate(chain, [1.2, 1.6, 2.2] * u.um, half_wave_plate_cycles(), seed=2)
+    >>> cal = calibrate(chain, data)
+    >>> [axes.get_title() for axes in plot_mirrors(cal).axes]
+    ['fold_mirror']
+    """
+    names = mirror_names(calibration) if names is None else list(names)
+    if not names:
+        raise ChainError("the calibration has no mirror to draw")
+    tables = [mirror_values(calibration, name) for name in names]
+    # an empty dict is a wish to see none
+    reference = _published(calibration) if reference is None else reference
+    rows = ["diattenuation"]
+    if any("retardance" in table.colnames for table in tables):
+        rows.append("retardance")
+    with style():
+        figure = canvas(figure, 2.5 + 5 * len(names), 2.4 + 3.2 * len(rows))
+        # mirrors side by side on one scale
+        panels = figure.subplots(len(rows), len(names), sharex=True, sharey="row", squeeze=False)
+        for column, table in zip(panels.T, tables, strict=True):
+            column[0].set_title(table.meta["name"])
+            shown = [
+                (axes, key) for axes, key in zip(column, rows, strict=True) if key in table.keys()
+            ]
+            for axes, key in shown:
+                _draw_mirror(axes, calibration, table, key, reference.get(table.meta["name"], {}))
+                axes.set_ylabel(_MIRROR_LABELS[key])
+                axes.tick_params(labelleft=True)
+            # a mirror that only attenuates has no lower panel
+            for axes in column[len(shown) :]:
+                axes.remove()
+            last = column[len(shown) - 1]
+            last.tick_params(labelbottom=True)
+            wavelength_label(last)
+        heading(figure, calibration, "Mirrors")
+        _mirror_legend(figure, panels)
+    return figure
+
+
+def _published(calibration):
+    try:
+        return instruments.get(calibration.instrument).published_mirrors()
+    except InstrumentError:
+        return {}
+
+
+def _draw_mirror(axes, calibration, table, key, reference):
+    lam = nanometres(table["wavelength"])
+    order = np.argsort(lam)
+    for metal, (color, line) in _METAL_LOOKS.items():
+        bare = table[f"{key}_{metal}"][order].value
+        axes.plot(lam[order], bare, color=color, linestyle=line, label=metal)
+    for i, (label, mirror) in enumerate(reference.items()):
+        value = getattr(mirror, key)(table["wavelength"][order])
+        value = value.to_value(u.deg) if key == "retardance" else 100 * value
+        axes.plot(lam[order], value, color=BLACK, linestyle=("-", "--", "-.")[i % 3], label=label)
+    # with a law in wavelength the diattenuation is computed and no parameter
+    law = f"{table.meta['name']}.diattenuation" not in calibration.parameter_values()
+    _draw_mirror_values(axes, lam[order], table[order], key, law)
+
+
+def _draw_mirror_values(axes, lam, table, key, law):
+    value, std = table[key].value, table[f"{key}_err"].value
+    known, look = np.isfinite(std), {"color": BLUE}
+    if law:
+        label = f"fitted law, with 1{SIGMA} band" if known.all() else _MIRROR_LAW_ALONE
+        line = "-" if known.all() else (0, (5, 1))
+        axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, **look)
+        axes.fill_between(lam, value - std, value + std, alpha=0.3, linewidth=0, **look)
+        return
+    points = look | {"marker": "o", "linestyle": "none"}
+    if known.any():
+        label = f"fitted, with 1{SIGMA} error"
+        axes.errorbar(lam[known], value[known], yerr=std[known], label=label, **points)
+    if not known.all():
+        held = key == "retardance" and table.meta["held"]
+        label = "held, not fitted" if held else "no error: not determined alone, or at a bound"
+        axes.plot(lam[~known], value[~known], markerfacecolor="white", label=label, **points)
+
+
+def _mirror_legend(figure, panels):
+    entries = {
+        f"{label} (bare, 45°)" if label in METALS else label: handle
+        for label, handle in legend_entries(panels.ravel()).items()
+    }
+    # sorting is stable: what was calibrated stays in its order, the metals come last
+    ordered = sorted(entries, key=lambda label: "bare" in label)
+    handles = [entries[label] for label in ordered]
+    for handle, label in zip(handles, ordered, strict=True):
+        handle.set_label(label)
+    legend_outside(figure, handles, columns=2)
+
+
+# ---- history --------------------------------------------------------------------------------
+_MOST_LINES = 6
+_MOST_PANELS = 12
+# share of the time axis over which the wavelengths of one calibration are spread
+_SPREAD = 0.03
+
+
+def plot_history(calibrations, parameters=None, *, shown=None, title=None, figure=None):
+    """
+    Draw calibrated parameters against the date from which they hold.
+
+    Parameters
+    ----------
+    calibrations : Library or sequence
+        See `~astropolcal.calibration.parameter_history`; each needs a date.
+    parameters : sequence of str, optional
+        ``"optic.parameter"`` or ``"optic"``; by default all that are free in one of them.
+    shown : int, optional
+        How many wavelengths of a parameter given per wavelength, by default six spread over
+        the grid; they stand side by side so that their errors can be told apart.
+    title : str, optional
+        Title of the figure.
+    figure : `~matplotlib.figure.Figure`, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+        One panel a parameter: values with errors, open symbols where a value was held; between
+        two calibrations how surely they differ, over all wavelengths. Of a parameter
+        per wavelength the differences to its mean over the calibrations.
+
+    Raises
+    ------
+    ParameterError
+        If there is no such parameter, a calibration has no date, or there are too many panels.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.plotting import plot_history
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> years = [calibrate(chain, simulate(chain, charis.wavelength, frames, seed=i,
+    ...                                    meta={"date": f"202{i}-03-01"})) for i in (5, 6)]
+    >>> len(plot_history(years, ["hwp"]).axes)
+    3
+    """
+    table = parameter_history(calibrations, parameters)
+    if np.any(table["date"].mask):
+        without = table["calibration"][table["date"].mask][0]
+        raise ParameterError(f"{without}: no date; state one with with_validity(valid_from=)")
+    names = [n for n in dict.fromkeys(table["parameter"]) if not np.all(_of(table, n)["fixed"])]
+    if not 1 <= len(names) <= _MOST_PANELS:
+        raise ParameterError(
+            f"{len(names)} parameters to draw; allowed are 1 to {_MOST_PANELS}, choose with "
+            "parameters="
+        )
+    with style():
+        columns = min(len(names), 2)
+        rows = -(-len(names) // columns)
+        fig = canvas(figure, 7.2 * columns, 3.6 * rows + 0.6)
+        axes = np.atleast_1d(fig.subplots(rows, columns, sharex=True)).ravel()
+        for ax, name in zip(axes, names, strict=False):
+            own = _of(table, name)
+            _draw_history(ax, own, name, _MOST_LINES if shown is None else shown)
+            _mark_changes(ax, calibrations, own, name)
+        per_wavelength = np.isfinite(table["wavelength"].value).any()
+        aside = "; wavelengths of one date side by side" if per_wavelength else ""
+        for ax in axes[len(names) :]:
+            ax.remove()
+        for ax in axes[: len(names)][-columns:]:
+            ax.tick_params(axis="x", labelbottom=True, labelrotation=25)
+            ax.set_xlabel(f"valid from (UTC{aside})")
+        note = f"{SIGMA}: by how much neighbours differ, over all wavelengths"
+        fig.suptitle(f"{title or 'Calibrated parameters over time'}\n{note}")
+    return fig
+
+
+def _of(table, name):
+    return table[table["parameter"] == name]
+
+
+def _draw_history(ax, own, name, most):
+    """Draw one parameter; of several wavelengths the differences to the mean."""
+    lam = np.unique(own["wavelength"].value)
+    several = np.isfinite(lam).all()
+    unit = own["unit"][0]
+    suffix = f" ({unit})" if unit else ""
+    if several:
+        lam = lam[np.unique(np.linspace(0, lam.size - 1, min(most, lam.size)).astype(int))]
+    # a single date has no range to take a share of: one day
+    width = max(np.ptp(own["date"].mjd), 1.0) * _SPREAD if several else 0.0
+    offsets = np.linspace(-width, width, lam.size) if lam.size > 1 else [0.0]
+    for wavelength, shift, (color, marker) in zip(lam, offsets, looks(lam.size), strict=True):
+        here = own[own["wavelength"].value == wavelength] if several else own
+        days, value, std = here["date"].mjd + shift, here["value"], here["std"]
+        # retardances of the wavelengths differ by tens of degrees, their changes by tenths
+        value = value - np.mean(value) if several else value
+        label = f"{wavelength:.0f} nm" if several else None
+        dates = Time(days, format="mjd").datetime
+        known = np.isfinite(std)
+        ax.plot(dates, value, color=color, lw=0.8, alpha=0.6, zorder=1)
+        ax.errorbar(
+            dates[known], value[known], std[known], fmt=marker, color=color, label=label, zorder=3
+        )
+        ax.plot(dates[~known], value[~known], marker, color=color, mfc="white", ls="", zorder=3)
+    ax.set_title(name)
+    ax.set_ylabel(f"difference to the mean{suffix}" if several else f"value{suffix}")
+    ax.margins(y=0.18)
+    # "+9e1" in a corner is easily missed
+    ax.ticklabel_format(axis="y", useOffset=False)
+    if several:
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _mark_changes(ax, calibrations, own, name):
+    """Write between neighbours how many sigma they differ by."""
+    named = _named(calibrations)
+    held = {row["calibration"]: row["date"].mjd for row in own}
+    for first, second in pairwise(named):
+        try:
+            found = significance([_Named(*first), _Named(*second)], [name])
+        except (ParameterError, FitError):
+            continue
+        if not found.dof or not {first[0], second[0]} <= set(held):
+            continue
+        middle = Time((held[first[0]] + held[second[0]]) / 2, format="mjd").datetime
+        # one tail of a normal law beyond three sigma
+        certain = found.p_value < 0.00135
+        ax.annotate(
+            f"{found.sigma:.1f} {SIGMA}",
+            (middle, 1),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, -4),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            color="black" if certain else GREY,
+            fontweight="bold" if certain else "normal",
+        )

@@ -21,7 +21,7 @@ from astropolcal.plotting._style import (
 from astropolcal.reduction.frames import open_cube
 from astropolcal.reduction.photometry import BEAMS
 
-__all__ = ["plot_apertures", "plot_run", "save_quicklook"]
+__all__ = ["plot_apertures"]
 
 _COLORS = {"right": VERMILION, "left": BLUE}
 _LINES = {"right": "-", "left": "--"}
@@ -195,36 +195,7 @@ def _draw_rectangles(panel, layout):
 
 
 def plot_run(reduction, *, wavelength=None, figure=None):
-    """
-    Draw fluxes, single differences and, for stars, centres and widths over the run.
-
-    Parameters
-    ----------
-    reduction : Reduction
-        The run.
-    wavelength : int, optional
-        Index of the slice; by default the middle one.
-    figure : `~matplotlib.figure.Figure`, optional
-        Where to draw.
-
-    Returns
-    -------
-    `~matplotlib.figure.Figure`
-
-    Raises
-    ------
-    ParameterError
-        If an index is out of range.
-
-    Examples
-    --------
-    >>> from astropolcal.plotting.reduction import plot_run
-    >>> from astropolcal.reduction import Reduction
-    >>> plot_run(Reduction(None, "star"))
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ParameterError: the reduction has no frames
-    """
+    """Draw fluxes, single differences, and places and widths of stars over the run."""
     _chosen(reduction, None)
     k, at = _slice(reduction, wavelength)
     star = reduction.source == "star"
@@ -314,34 +285,7 @@ def _run_handles(reduction, k):
 
 
 def save_quicklook(reduction, folder):
-    """
-    Write the figures of a run as PNG files.
-
-    Parameters
-    ----------
-    reduction : Reduction
-        The run.
-    folder : path-like
-        Where to write; it is created if it does not exist.
-
-    Returns
-    -------
-    list of `~pathlib.Path`
-        ``apertures.png`` and ``run.png``.
-
-    Raises
-    ------
-    ObservationError
-        If the folder or a file cannot be written.
-
-    Examples
-    --------
-    >>> from astropolcal.plotting.reduction import save_quicklook
-    >>> save_quicklook(None, "/nowhere/deep/down")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: /nowhere/deep/down: there is no folder /nowhere/deep
-    """
+    """Write ``apertures.png`` and ``run.png`` of a run to a folder; return their paths."""
     folder = Path(folder)
     if not os.path.isdir(folder.parent):
         raise ObservationError(f"{folder}: there is no folder {folder.parent}")

@@ -1,46 +1,219 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""A map of the residuals: where the model fails."""
+"""The data of a calibration and its model against angles, and maps of what is left between them."""
 
+from dataclasses import dataclass
+
+import astropy.units as u
 import numpy as np
 
-from astropolcal.plotting._data import SAME_ANGLE, DataGrid
+from astropolcal.chain import stages
+from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
+from astropolcal.observations import is_star
+from astropolcal.optics import COORDINATES
 from astropolcal.plotting._style import (
     BLUE,
+    COLORS,
     GREY,
     MINUS,
+    SIGMA,
     canvas,
     cell_edges,
     clusters,
     degrees,
     heading,
+    legend_outside,
+    looks,
+    nanometres,
     rms,
     style,
 )
+from astropolcal.propagation import Propagator
 
-__all__ = ["plot_residuals"]
+__all__ = ["plot_double_differences"]
 
-# share of the residuals that the colour scale covers, so that one outlier does not blank the map
-_COVERED = 99
-_MAX_TICKS = 12
-# maps have one scale unless those of their own differ by more than this factor
-_ONE_SCALE = 3
-# room above the tallest bar
-_HEADROOM = 1.05
+# angles (deg) that differ by less are the same setting of a stage
+SAME_ANGLE = 0.5
 
 
-def plot_residuals(calibration, *, figure=None):
+@dataclass
+class Series:
+    """Data taken with the same setting of the half-wave plate."""
+
+    label: str
+    #: Which data belong to it, indices on the second axis of the grids.
+    data: np.ndarray
+    #: Mean position (rad) of every stage in each frame of a datum, or None if one moves.
+    positions: dict | None
+
+
+class DataGrid:
     """
-    Draw a map of the residuals: wavelength against datum, by derotator angle.
+    One dataset as arrays of shape (n_wavelengths, n_groups), NaN where masked.
 
-    Above the map is the rms of each datum over the wavelengths, at its right
-    the rms of each wavelength over the data; one map a dataset. All maps have the
-    same colours, or where the residuals differ much in size each a scale of its own.
-    Masked data are grey. Datasets of one wavelength each are drawn as bars, not as maps.
+    A group is the frame, or the pair of frames, that gives one datum.
+    """
+
+    def __init__(self, calibration, dataset):
+        residuals = calibration.residuals  # first: says clearly if there are no data
+        measurement = calibration.measurement
+        count = len(calibration.datasets)
+        if isinstance(dataset, bool) or dataset not in range(count):
+            raise ParameterError(
+                f"dataset = {dataset!r}; allowed are whole numbers 0 to {count - 1}"
+            )
+        self.part = measurement.datasets[dataset]
+        self.chain = calibration.chains[dataset]
+        if not self.part.n_data:
+            raise ObservationError(f"{self.part.observations.name}: no datum is left to draw")
+        self.observable = measurement.observable
+        self.wavelength = nanometres(self.part.observations.wavelength)
+        self.observed = self._grid(self.part.observed)
+        self.residual = self._grid(residuals[measurement.segments[dataset]])
+        self.sigma = self._grid(self.part.sigma)
+        self.calibrated_um = measurement.wavelength
+        self.is_star = is_star(self.part.observations.source) and "altitude" in self.part.positions
+        self.derotator = np.rad2deg(self.position("derotator")[0])
+
+    @property
+    def abscissa(self):
+        """What the data are drawn against, in degree, and how that is called."""
+        if self.is_star:
+            return np.rad2deg(self.position("altitude").mean(axis=0)), "altitude of the star (°)"
+        return self.derotator, "derotator angle (°)"
+
+    def _grid(self, flat):
+        grid = np.full(self.part.valid.shape, np.nan)
+        grid[self.part.valid] = flat
+        return grid
+
+    @property
+    def quantity(self):
+        """Name of the observable in words."""
+        return self.observable.name.replace("_", " ")
+
+    # ---- where the stages stand -------------------------------------------------
+
+    def position(self, stage):
+        """Return the position (rad) of a stage, shape (frames_per_datum, n_groups)."""
+        # as the model has them, which need not be the table's columns
+        if stage in self.part.positions:
+            return self.part.positions[stage]
+        return self.part.observations.position(stage)[self.part.frames.T]
+
+    def series(self):
+        """Return the data by setting of the half-wave plate, ordered by its angle."""
+        # half a turn does not matter; a value just below it belongs to zero
+        angle = np.mod(np.rad2deg(self._plate()) + SAME_ANGLE, 180) - SAME_ANGLE
+        number, state = clusters(angle[0], SAME_ANGLE), self._state()
+        settings = sorted(set(zip(number, state, strict=True)))
+        return [self._one_series(angle, (number == n) & (state == now), now) for n, now in settings]
+
+    def _state(self):
+        """Return the states of a modulator in the frames of a datum, empty without one."""
+        if "flc_state" not in stages(self.chain):
+            return np.full(self.part.frames.shape[0], "")
+        state = self.part.observations.position("flc_state")[self.part.frames] > 0.5
+        names = [["AB"[one] for one in states] for states in state.astype(int)]
+        return np.array([one[0] if len(set(one)) == 1 else f" {MINUS} ".join(one) for one in names])
+
+    def _plate(self):
+        """Return the angle of the plate: as commanded where it follows the sky."""
+        if self.is_star:
+            return self.part.observations.position("hwp")[self.part.frames.T]
+        return self.position("hwp")
+
+    def _one_series(self, angle, member, state):
+        angles = [degrees(value) for value in np.median(angle[:, member], axis=1)]
+        # where the states of a modulator make the difference the plate stands still
+        one = state and len(set(angles)) == 1
+        plate = angles[0] if one else f" {MINUS} ".join(angles)
+        label = f"{plate}, {state}" if state else plate
+        return Series(label, np.flatnonzero(member), self._steady(member))
+
+    def _steady(self, member):
+        others = {s: a[:, member] for s, a in self.part.positions.items() if s != "derotator"}
+        if any(np.ptp(angle, axis=1).max() > np.deg2rad(SAME_ANGLE) for angle in others.values()):
+            return None
+        return {stage: angle.mean(axis=1) for stage, angle in others.items()}
+
+    # ---- the model ---------------------------------------------------------------
+
+    def curve(self, series, bins, derotator):
+        """
+        Return the model between the data, shape (n_bins, n_angles).
+
+        The derotator turns (``derotator`` in degree); every other stage stays
+        where it stands in the series.
+        """
+        angle = np.deg2rad(derotator)
+        per_datum, n = self.part.frames.shape[1], len(angle)
+        positions = {stage: np.repeat(p, n) for stage, p in series.positions.items()}
+        positions["derotator"] = np.tile(angle, per_datum)
+        # between the data there is neither a time nor a flux: such optics do nothing there
+        others = [s for s in stages(self.chain) if s in COORDINATES and s != "flc_state"]
+        positions |= {stage: np.zeros(1) for stage in others}
+        if "flc_state" in stages(self.chain):
+            state = self.part.observations.position("flc_state")
+            positions["flc_state"] = np.repeat(state[self.part.frames[series.data[0]]], n)
+        # the chain's parameters are given on the calibration's own grid of wavelengths
+        propagator = Propagator(self.chain, self.calibrated_um, positions)
+        right, left = (
+            flux[self.part.bins[bins]].reshape(len(bins), per_datum, n).transpose(1, 0, 2)
+            for flux in propagator.fluxes()
+        )
+        return self.observable.evaluate(right, left)
+
+    # ---- wavelengths ---------------------------------------------------------------
+
+    def spread_bins(self, count):
+        """Return bins with data, spread over the range."""
+        usable = np.flatnonzero(np.isfinite(self.observed).any(axis=1))
+        usable = usable[np.argsort(self.wavelength[usable])]
+        if len(usable) <= count:
+            return usable
+        # few wavelengths leave nothing between them to be spread over
+        ends = 1 if len(usable) > 2 * count else 0
+        places = np.linspace(0, len(usable) - 1, count + 2 * ends)[ends : ends + count]
+        return usable[np.round(places).astype(int)]
+
+    def nearest_bins(self, wavelengths):
+        """Return the bins nearest to wavelengths, each once."""
+        wanted = nanometres(wavelengths)
+        low, high = self.wavelength.min(), self.wavelength.max()
+        for value in wanted:
+            if not 0.99 * low <= value <= 1.01 * high:
+                raise WavelengthRangeError(
+                    f"wavelength {value:g} nm; {self.part.observations.name} has "
+                    f"{low:.1f} to {high:.1f} nm"
+                )
+        nearest = np.abs(self.wavelength[None, :] - wanted[:, None]).argmin(axis=1)
+        return np.array(list(dict.fromkeys(nearest.tolist())))
+
+
+# ---- observed and modelled differences ------------------------------------------------------
+_PANELS = 4
+# so many that a curve over 180 deg has no corners
+_CURVE_POINTS = 241
+
+
+def plot_double_differences(calibration, wavelengths=None, dataset=0, *, figure=None):
+    """
+    Draw observed and modelled differences against the derotator angle, or a star's altitude.
+
+    One pair of panels a wavelength: above the observed data and the model,
+    evaluated between the data too; below their difference in percent. Stars are drawn
+    against their altitude, by the commanded angle of the half-wave plate. Where
+    another stage than the derotator moves within a series, the model is drawn
+    at the data only.
 
     Parameters
     ----------
     calibration : Calibration
         A calibration that still has its data.
+    wavelengths : `~astropy.units.Quantity`, optional
+        The nearest wavelengths of the data are shown; by default four.
+    dataset : int
+        Which of the calibration's datasets.
     figure : `~matplotlib.figure.Figure`, optional
         An empty figure to draw into.
 
@@ -52,21 +225,183 @@ def plot_residuals(calibration, *, figure=None):
     ------
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
+    ParameterError, WavelengthRangeError
+        If there is no such dataset, or a wavelength outside its range.
     ObservationError
-        If every datum of a dataset is masked.
+        If every datum of the dataset is masked.
+
+    Notes
+    -----
+    The figure of double differences of McIntosh et al. (2026), with residuals.
 
     Examples
     --------
     >>> import astropy.units as u
     >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.plotting import plot_residuals
+    >>> from astropolcal.plotting import plot_double_differences
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
     >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
     >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> plot_residuals(cal).axes[0].get_ylabel()
-    'wavelength (nm)'
+    >>> len(plot_double_differences(cal, [1330, 1575] * u.nm).axes)
+    4
+    """
+    grid = DataGrid(calibration, dataset)
+    bins = grid.spread_bins(_PANELS) if wavelengths is None else grid.nearest_bins(wavelengths)
+    series = grid.series()
+    with style():
+        columns = min(2, len(bins))
+        rows = -(-len(bins) // columns)
+        # as high as a legend of all settings beside the panels, and a title above it
+        height = max(1.2 + 4.1 * rows, 2.2 + 0.24 * len(series))
+        figure = canvas(figure, 3.0 + 4.4 * columns, height)
+        pairs = _panels(figure, len(bins), rows, columns)
+        fine = _fine(grid.abscissa[0])
+        curves = [None if one.positions is None else grid.curve(one, bins, fine) for one in series]
+        spread = calibration.datasets[dataset].accuracy["s_res"].to_value(u.percent)
+        for i, (pair, row) in enumerate(zip(pairs, bins, strict=True)):
+            _draw_heading(pair, grid.wavelength[row], spread[row])
+            for one, curve, look in zip(series, curves, _looks(len(series)), strict=True):
+                _draw_series(pair, grid, row, one, look)
+                if curve is not None:
+                    pair[0].plot(fine, curve[i], color=look["color"], linestyle=look["linestyle"])
+        _label(pairs, grid, columns)
+        heading(figure, calibration, grid.quantity.capitalize(), [grid.part.observations.name])
+        _legend(figure, grid, series, bins, spread[bins])
+    return figure
+
+
+def _panels(figure, count, rows, columns):
+    """Return (data, residual) axes for each wavelength, all with the same scales."""
+    # residuals need less height than data
+    spec = figure.add_gridspec(2 * rows, columns, height_ratios=(3, 1.5) * rows)
+    pairs = []
+    for i in range(count):
+        row, column = divmod(i, columns)
+        first = pairs[0] if pairs else (None, None)
+        top = figure.add_subplot(spec[2 * row, column], sharex=first[0], sharey=first[0])
+        bottom = figure.add_subplot(spec[2 * row + 1, column], sharex=top, sharey=first[1])
+        pairs.append((top, bottom))
+    return pairs
+
+
+def _looks(count):
+    """Return the looks of the series: where colours recur, lines are dashed and markers open."""
+    found = []
+    for i, (color, marker) in enumerate(looks(count)):
+        again = i // len(COLORS) % 2 == 1
+        found.append(
+            {
+                "color": color,
+                "marker": marker,
+                "markerfacecolor": "white" if again else color,
+                "linestyle": "--" if again else "-",
+            }
+        )
+    return found
+
+
+def _draw_heading(pair, wavelength, s_res):
+    top, bottom = pair
+    bottom.axhline(0, color=GREY, linewidth=1)
+    known = np.isfinite(s_res)
+    top.set_title(f"{wavelength:.1f} nm" + (f",  s_res = {s_res:.2f} %" if known else ""))
+    if known:
+        bottom.axhspan(-s_res, s_res, color="0.92", zorder=0)
+
+
+def _draw_series(pair, grid, row, one, look):
+    """Draw the data of one setting of the half-wave plate, and their residuals."""
+    angle = grid.abscissa[0][one.data]
+    value, residual, sigma = (
+        array[row, one.data] for array in (grid.observed, grid.residual, grid.sigma)
+    )
+    points = look | {"linestyle": "none", "label": one.label}
+    pair[0].errorbar(angle, value, yerr=_bars(sigma), **points)
+    pair[1].errorbar(angle, 100 * residual, yerr=_bars(100 * sigma), **points)
+    # where a stage moves from datum to datum there is no model between the data
+    if one.positions is None:
+        pair[0].plot(angle, value - residual, "x", color=look["color"], markersize=8)
+
+
+def _bars(sigma):
+    # bars of length zero would look like errors that are very small
+    return np.nan_to_num(sigma) if np.isfinite(sigma).any() else None
+
+
+def _fine(angle):
+    """Return angles for the curve: a little beyond the data, ten degrees around a single one."""
+    low, high = angle.min(), angle.max()
+    # a single angle would give a curve without a length
+    margin = 0.04 * (high - low) if high - low > 1 else 10
+    return np.linspace(low - margin, high + margin, _CURVE_POINTS)
+
+
+def _label(pairs, grid, columns):
+    for i, (top, bottom) in enumerate(pairs):
+        top.tick_params(labelbottom=False)
+        last = i + columns >= len(pairs)
+        bottom.tick_params(labelbottom=last)
+        if last:
+            bottom.set_xlabel(grid.abscissa[1])
+        if i % columns == 0:
+            top.set_ylabel(grid.quantity.replace(" ", "\n", 1))
+            bottom.set_ylabel(f"obs. {MINUS} model\n(%)")
+        else:
+            top.tick_params(labelleft=False)
+            bottom.tick_params(labelleft=False)
+    fine = _fine(grid.abscissa[0])
+    pairs[0][0].set_xlim(fine[0], fine[-1])
+
+
+def _legend(figure, grid, series, bins, s_res):
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    # what is not drawn has no entry in the legend
+    curves = any(one.positions is not None for one in series)
+    handles = [
+        Line2D([], [], **(look if curves else look | {"linestyle": ""}), label=one.label)
+        for one, look in zip(series, _looks(len(series)), strict=True)
+    ]
+    bars = np.isfinite(grid.sigma[bins]).any()
+    seen = f"observed, with 1{SIGMA} errors" if bars else "observed (no errors given)"
+    handles.append(Line2D([], [], color=GREY, marker="o", linestyle="", label=seen))
+    if curves:
+        handles.append(Line2D([], [], color=GREY, label="model"))
+    if any(one.positions is None for one in series):
+        handles.append(Line2D([], [], color=GREY, marker="x", linestyle="", label="model at data"))
+    if np.isfinite(s_res).any():
+        handles.append(Patch(color="0.92", label="± s_res"))
+    frames = f"plus {MINUS} minus frame" if grid.part.frames.shape[1] == 2 else "of the frame"
+    plate = "half-wave plate\nas commanded" if grid.is_star else "half-wave plate"
+    legend_outside(
+        figure,
+        handles,
+        # at the top a long title would run into it
+        place="outside right center",
+        title=f"{plate},\n{frames}",
+    )
+
+
+# ---- maps of the residuals -------------------------------------------------------------------
+# share of the residuals that the colour scale covers, so that one outlier does not blank the map
+_COVERED = 99
+_MAX_TICKS = 12
+# maps have one scale unless those of their own differ by more than this factor
+_ONE_SCALE = 3
+# room above the tallest bar
+_HEADROOM = 1.05
+
+
+def plot_residuals(calibration, *, figure=None):
+    """
+    Draw a map of the residuals: wavelength against datum, by derotator angle; one a dataset.
+
+    Above it stands the rms of each datum, at its right that of each wavelength. All maps have the
+    same colours, or where the residuals differ much in size each its own. Masked data are grey.
+    Datasets of one wavelength each are bars. The calibration needs its data.
     """
     grids = [DataGrid(calibration, i) for i in range(len(calibration.datasets))]
     with style():
@@ -74,12 +409,8 @@ def plot_residuals(calibration, *, figure=None):
             figure = _draw_bars(figure, grids)
         else:
             figure = _draw_maps(figure, grids)
-        heading(
-            figure,
-            calibration,
-            f"Residuals of the {grids[0].quantity}",
-            [grid.part.observations.name for grid in grids],
-        )
+        names = [grid.part.observations.name for grid in grids]
+        heading(figure, calibration, f"Residuals of the {grids[0].quantity}", names)
     return figure
 
 
@@ -174,11 +505,15 @@ def _draw_dataset(main, above, right, grid, limit):
     above.stairs(rms(percent, axis=0), columns, color=BLUE, fill=True)
     above.tick_params(labelbottom=False)
     above.set_ylabel("rms (%)")
-    _wavelength_rms(right, rms(percent, axis=1), grid.wavelength[lam])
+    each = rms(percent, axis=1)
+    right.plot(each, grid.wavelength[lam], "o-", color=BLUE)
+    right.set_xlabel("rms (%)")
+    right.tick_params(labelleft=False)
     for axes in (above, right):
         axes.margins(0)
     # exact data have no bars
     above.set_ylim(0, _HEADROOM * np.nanmax(rms(percent, axis=0)) or 1)
+    right.set_xlim(0, 1.1 * np.nanmax(each) or 1)
     return drawn
 
 
@@ -207,10 +542,3 @@ def _name_groups(main, grid, order, group, ends):
     labels = [series.label for series in grid.series()]
     within = ", ".join(labels) if len(labels) <= 8 else f"{labels[0]} to {labels[-1]}"
     main.set_xlabel(f"derotator angle; at each, left to right, half-wave plate at\n{within}")
-
-
-def _wavelength_rms(axes, values, wavelength):
-    axes.plot(values, wavelength, "o-", color=BLUE)
-    axes.set_xlabel("rms (%)")
-    axes.tick_params(labelleft=False)
-    axes.set_xlim(0, 1.1 * np.nanmax(values) or 1)

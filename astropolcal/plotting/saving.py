@@ -14,21 +14,17 @@ from astropolcal.exceptions import (
     ObservationError,
 )
 from astropolcal.plotting._style import save
-from astropolcal.plotting.accuracy import plot_accuracy
-from astropolcal.plotting.correlations import plot_correlations
-from astropolcal.plotting.differences import plot_double_differences
-from astropolcal.plotting.identifiability import plot_identifiability
-from astropolcal.plotting.mirrors import plot_mirrors
+from astropolcal.plotting.accuracy import plot_accuracy, plot_star_check, plot_target_accuracy
+from astropolcal.plotting.identifiability import plot_correlations, plot_identifiability
 from astropolcal.plotting.parameters import (
     other_parameters,
     plot_efficiency,
+    plot_mirrors,
     plot_parameters,
     plot_retardances,
 )
 from astropolcal.plotting.posterior import MAX_CORNER, MAX_TRACES, plot_corner, plot_traces
-from astropolcal.plotting.residuals import plot_residuals
-from astropolcal.plotting.star_check import plot_star_check
-from astropolcal.plotting.targets import plot_target_accuracy
+from astropolcal.plotting.residuals import plot_double_differences, plot_residuals
 
 __all__ = ["save_all"]
 

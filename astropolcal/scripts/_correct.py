@@ -403,9 +403,10 @@ def _write_others(result, star, arguments):
         with atomic_path(arguments.spectrum, ObservationError) as temporary:
             table.write(temporary, format="ascii.ecsv", overwrite=True)
     if arguments.plot:
-        from astropolcal.plotting.correction import plot_corrected, save_figure
+        from astropolcal.plotting._style import save
+        from astropolcal.plotting.correction import plot_corrected
 
-        save_figure(plot_corrected(result), arguments.plot)
+        save(plot_corrected(result), arguments.plot, ObservationError)
 
 
 def _summary(result, star, arguments, n_frames):

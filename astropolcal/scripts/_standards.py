@@ -485,7 +485,7 @@ def _site(text):
 
 
 def _plot(seen, total, path):
+    from astropolcal.plotting import plot_observability
     from astropolcal.plotting._style import save
-    from astropolcal.plotting.standards import plot_observability
 
     save(plot_observability(seen, total=total), path)

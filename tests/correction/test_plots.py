@@ -5,13 +5,8 @@ import numpy as np
 import pytest
 
 from astropolcal.correction import ScienceFrames, correct
-from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.plotting.correction import (
-    plot_corrected,
-    plot_images,
-    plot_spectrum,
-    save_figure,
-)
+from astropolcal.exceptions import ParameterError
+from astropolcal.plotting.correction import plot_corrected, plot_images, plot_spectrum
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +67,3 @@ def test_what_is_asked_of_the_wrong_kind(images):
         plot_images(images.aperture(5))
     with pytest.raises(ParameterError, match="wavelength = 40"):
         plot_images(images, wavelength=40)
-
-
-def test_files(images, tmp_path):
-    save_figure(plot_spectrum(images.aperture(6)), tmp_path / "star.png")
-    assert (tmp_path / "star.png").stat().st_size > 1e4
-    with pytest.raises(ObservationError, match="no format"):
-        save_figure(plot_spectrum(images.aperture(6)), tmp_path / "star.docx")

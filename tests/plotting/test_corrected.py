@@ -10,7 +10,7 @@ import pytest
 from astropolcal import optics
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting import correction
+from astropolcal.plotting import _style, correction
 from astropolcal.plotting.correction import plot_corrected, plot_images, plot_spectrum
 
 HWP = [0, 45, 22.5, 67.5] * u.deg
@@ -215,7 +215,7 @@ def test_top_of_a_scale(values, top):
 
 def test_mean_of_what_is_known():
     stack = np.array([[[1.0, np.nan]], [[3.0, np.nan]]])
-    np.testing.assert_array_equal(correction._mean(stack), [[2.0, np.nan]])
+    np.testing.assert_array_equal(_style.mean_known(stack), [[2.0, np.nan]])
 
 
 @pytest.mark.parametrize(

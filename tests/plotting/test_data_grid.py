@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from astropolcal import calibrate, instruments
-from astropolcal.exceptions import ParameterError, WavelengthRangeError
-from astropolcal.plotting import plot_double_differences
-from astropolcal.plotting._data import DataGrid, _label, check_dataset
+from astropolcal.exceptions import WavelengthRangeError
+from astropolcal.plotting.residuals import DataGrid
 from astropolcal.reduction.cubes import both_states
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -70,19 +69,6 @@ def test_series_of_a_modulator_name_its_states(modulated):
     assert labels[0] == f"0°, A {MINUS} B"
     assert len(labels) == 8
     assert all(label.endswith(f", A {MINUS} B") for label in labels)
-
-
-@pytest.mark.parametrize(
-    ("angles", "state", "label"),
-    [
-        (["0°", "45°"], "", f"0° {MINUS} 45°"),
-        (["0°"], "A", "0°, A"),
-        (["0°", "0°"], f"A {MINUS} B", f"0°, A {MINUS} B"),
-        (["0°", "45°"], "A", f"0° {MINUS} 45°, A"),
-    ],
-)
-def test_labels_of_series(angles, state, label):
-    assert _label(angles, state) == label
 
 
 # ---- the model between the data ------------------------------------------------------------
@@ -149,14 +135,3 @@ def test_nearest_wavelengths_come_once_and_as_asked():
 def test_wavelengths_outside_the_range_are_refused(wavelength):
     with pytest.raises(WavelengthRangeError, match=r"nm; run has 1200\.0 to 1600\.0 nm"):
         lambdas([1200, 1400, 1600]).nearest_bins(wavelength)
-
-
-@pytest.mark.parametrize("dataset", [-1, 2, True, "polarized", 0.5])
-def test_datasets_that_are_none(several, dataset):
-    with pytest.raises(ParameterError, match="allowed are whole numbers 0 to 1"):
-        check_dataset(several, dataset)
-
-
-def test_dataset_numbers_of_numpy_will_do(several):
-    assert check_dataset(several, np.int64(1)) == 1
-    assert plot_double_differences(several, dataset=np.int64(1)) is not None

@@ -13,9 +13,8 @@ from astropolcal import Observations, calibrate, instruments, optics
 from astropolcal.chain import leaves
 from astropolcal.exceptions import CalibrationFileError, ParameterError, WavelengthRangeError
 from astropolcal.observations import get_observable
-from astropolcal.plotting import plot_double_differences, plot_residuals
-from astropolcal.plotting._data import DataGrid
-from astropolcal.plotting.differences import _looks
+from astropolcal.plotting import plot_double_differences
+from astropolcal.plotting.residuals import DataGrid, _looks, plot_residuals
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 

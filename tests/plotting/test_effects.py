@@ -6,8 +6,6 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import QTable
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from astropolcal import instruments
@@ -17,11 +15,9 @@ from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import EffectParameter
 from astropolcal.gap.effects.cell import CellEffect
 from astropolcal.gap.model import nominal_model
-from astropolcal.gap.residuals import Where
-from astropolcal.plotting import effects, gap
-from astropolcal.plotting._style import BLACK, BLUE, ORANGE
-from astropolcal.plotting.effects import cause_map, plot_cause_map, plot_effect_sizes
-from astropolcal.plotting.gap import plot_where
+from astropolcal.plotting import gap, plot_cause_map
+from astropolcal.plotting._style import BLACK
+from astropolcal.plotting.gap import _cause_map, plot_effect_sizes
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 NM = np.array([1200.0, 1600.0, 2200.0])
@@ -47,11 +43,11 @@ DRIFT = Cell("in:derotator", "retardance_h", "time")
 
 
 def test_rows_are_places_in_the_order_of_the_light():
-    rows = list(cause_map(diagnosis()))
+    rows = list(_cause_map(diagnosis()))
     assert rows == ["source", "in:hwp", "after:hwp", "in:derotator", "after:derotator", "detector"]
     # a place that the chain of these data does not have
     assert (
-        list(cause_map(diagnosis(cause(Cell("telescope", "rotation", "time")))))[-1] == "telescope"
+        list(_cause_map(diagnosis(cause(Cell("telescope", "rotation", "time")))))[-1] == "telescope"
     )
 
 
@@ -60,11 +56,11 @@ def test_probabilities_are_summed_over_dependences_and_aliases():
         (Cell("in:derotator", "retardance_d", "step:4"), 0.2),
         (Cell("after:hwp", "rotation", "time"), 0.3),
     ]
-    found = cause_map(diagnosis(cause(DRIFT, 0.9, others, share=0.5)))
+    found = _cause_map(diagnosis(cause(DRIFT, 0.9, others, share=0.5)))
     assert found["in:derotator"]["retardance"] == (pytest.approx(0.63), "along axes")
     assert found["after:hwp"]["rotation"][0] == pytest.approx(0.27)
     # of two causes at one place at least one is there
-    found = cause_map(diagnosis(cause(DRIFT, 0.5), cause(DRIFT, 0.5)))
+    found = _cause_map(diagnosis(cause(DRIFT, 0.5), cause(DRIFT, 0.5)))
     assert found["in:derotator"]["retardance"][0] == pytest.approx(0.75)
 
 
@@ -75,7 +71,7 @@ def test_named_effects_have_a_place_in_the_map():
         ("static_retarder", "after:derotator", "other"),
         ("hwp_encoder_eccentricity", "in:hwp", "other"),
     ):
-        found = {k: row for k, row in cause_map(diagnosis(cause(name))).items() if row}
+        found = {k: row for k, row in _cause_map(diagnosis(cause(name))).items() if row}
         assert list(found) == [place]
         assert family in found[place] or family == "other"
 
@@ -96,7 +92,7 @@ def test_verdict_as_a_title():
         ("unexplained", ["beam_gain"], "a real gap that is not explained"),
     ):
         own = diagnosis(*map(cause, causes), verdict=verdict)
-        assert effects.verdict_line(own) == line
+        assert gap._verdict_line(own) == line
 
 
 # ---- sizes ---------------------------------------------------------------------------------
@@ -194,46 +190,6 @@ def test_a_cell_is_drawn_over_what_it_depends_on():
             np.testing.assert_allclose(curve.get_ydata()[[0, -1]], [-value, value], rtol=1e-6)
 
 
-# ---- where ---------------------------------------------------------------------------------
-
-
-def where(*rows):
-    names = ("axis", "detail", "kind", "share", "p_single", "p_value")
-    table = QTable({name: [row[i] for row in rows] for i, name in enumerate(names)})
-    return Where(table, 100.0, 500)
-
-
-def test_patterns_and_places_have_panels_of_their_own():
-    found = where(
-        ("hwp", "harmonic 4 " * 12, "pattern", 0.6, 0.0, 1e-9),
-        ("time", "a trend", "pattern", 0.005, 0.0, 1e-9),
-        ("beam", "the sums", "place", 0.97, 0.0, 1e-9),
-        ("dataset", "lamp", "place", 0.3, 0.5, 0.5),
-    )
-    top, bottom = plot_where(found).axes
-    # what is minute or not significant is left out
-    assert [bar.get_width() for bar in top.patches] == pytest.approx([60])
-    assert [bar.get_width() for bar in bottom.patches] == pytest.approx([97])
-    assert [bar.get_facecolor() for bar in (*top.patches, *bottom.patches)] == [
-        to_rgba(BLUE),
-        to_rgba(ORANGE),
-    ]
-    assert "shares add up" in top.get_title(loc="left")
-    assert "do not add up" in bottom.get_title(loc="left")
-    (label,) = top.get_yticklabels()
-    assert max(map(len, label.get_text().splitlines())) <= 56
-    # a number that would leave the panel stands inside its bar
-    assert top.texts[0].get_ha() == "left"
-    assert bottom.texts[0].get_ha() == "right"
-
-
-def test_no_more_places_than_asked_for():
-    found = where(*(("x", f"at {i}", "place", 0.5 - 0.01 * i, 0.0, 1e-9) for i in range(20)))
-    assert len(plot_where(found).axes[1].patches) == 12
-    assert len(plot_where(found, limit=3).axes[1].patches) == 3
-    assert [t.get_text() for t in plot_where(found).axes[0].texts] == ["nothing beyond the noise"]
-
-
 # ---- axes of the other figures -------------------------------------------------------------
 
 
@@ -287,9 +243,3 @@ def test_frames_are_named_by_their_derotator_angle(derotator, label, ticks):
         assert len(axes.lines) == len(set(derotator)) - 1
     else:
         assert not axes.lines
-
-
-def test_unknown_channels_are_refused():
-    assert [gap._name(name) for name in ("difference", "sum")] == [0, 1]
-    with pytest.raises(ParameterError, match="channel = 'ratio'; allowed are difference, sum"):
-        gap._name("ratio")

@@ -10,8 +10,10 @@ from astropolcal import instruments, optics
 from astropolcal.calibration import best_derotator, polarimetric_efficiency
 from astropolcal.chain import remove_optic
 from astropolcal.instruments import SkyLaw
-from astropolcal.plotting import plot_polarimetric_efficiency
-from astropolcal.plotting.efficiency import plot_derotator_offsets
+from astropolcal.plotting.efficiency import (
+    plot_derotator_offsets,
+    plot_polarimetric_efficiency,
+)
 
 CHARIS = instruments.get("charis")
 

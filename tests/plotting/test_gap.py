@@ -14,17 +14,15 @@ from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap import diagnose, get_effect
-from astropolcal.gap.residuals import locate
 from astropolcal.plotting.gap import (
     plot_cause_map,
     plot_gap_frames,
     plot_gap_maps,
     plot_gap_spectrum,
-    plot_where,
 )
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
-ALL = [plot_cause_map, plot_gap_frames, plot_gap_maps, plot_gap_spectrum, plot_where]
+ALL = [plot_cause_map, plot_gap_frames, plot_gap_maps, plot_gap_spectrum]
 WAVELENGTH = [1200, 1400, 1600, 1900, 2200] * u.nm
 
 
@@ -101,22 +99,6 @@ def test_frames_show_what_the_causes_do(gap, none):
     assert np.std(after) < 0.3 * np.std(before)
     labels = [line.get_label() for line in plot_gap_frames(none).axes[0].lines]
     assert "after" not in labels
-
-
-def test_shares_are_those_of_the_table(gap, none):
-    where = locate(gap.nominal)
-    axes = plot_where(where).axes[0]
-    widths = [patch.get_width() for patch in axes.patches]
-    told = where.told
-    assert widths == pytest.approx(list(100 * told["share"][told["kind"] == "pattern"]))
-    assert plot_where(gap).axes[0].patches[0].get_width() == pytest.approx(widths[0])
-    texts = [t.get_text() for t in plot_where(none).axes[0].texts]
-    assert "nothing beyond the noise" in texts
-
-
-def test_shares_end_at_a_hundred(gap):
-    for axes in plot_where(gap).axes:
-        assert axes.get_xlim() == (0, 100)
 
 
 def test_titles_of_many_causes_fit(gap, monkeypatch):

@@ -9,7 +9,7 @@ import pytest
 
 from astropolcal import calibrate, optics
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting.history import plot_history
+from astropolcal.plotting import plot_history
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1200, 1600, 2200] * u.nm

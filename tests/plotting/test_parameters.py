@@ -10,7 +10,7 @@ import pytest
 from astropolcal import calibrate, optics
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.measurement import Tie
-from astropolcal.plotting import plot_efficiency, plot_parameters, plot_retardances
+from astropolcal.plotting.parameters import plot_efficiency, plot_parameters, plot_retardances
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 LAMBDA = [1200, 1400, 1600, 1900, 2200]

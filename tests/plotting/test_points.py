@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from astropolcal import optics
-from astropolcal.plotting import _points, efficiency, reduction, saving
+from astropolcal.plotting import efficiency, parameters, reduction, saving
 from astropolcal.plotting._style import BLUE, GREY
 
 NM = np.array([1600.0, 1200.0, 2200.0])
@@ -34,7 +34,7 @@ def entry(value, std, bound=False, fixed=False, tied=None):
 
 def drawn(one):
     axes = Figure().subplots()
-    _points.draw_entry(axes, calibration(), one, LOOK)
+    parameters._draw_entry(axes, calibration(), one, LOOK)
     return axes
 
 
@@ -52,13 +52,13 @@ def test_what_is_determined_is_filled_with_its_error():
     assert line.get_xdata().tolist() == NM.tolist()
     lengths = [np.ptp(segment[:, 1]) / 2 for segment in bars.get_segments()]
     np.testing.assert_allclose(lengths, [0.1, 0.2, 0.3])
-    assert labels(axes) == [_points._DETERMINED]
+    assert labels(axes) == [parameters._DETERMINED]
     # the thin line leads from one wavelength to the next, whatever their order
     (thin,) = [one for one in axes.lines if one.get_linewidth() == 0.6]
     assert thin.get_xdata().tolist() == [1200, 1600, 2200]
 
 
-def test_kinds_of_points_are_told_by_their_shape():
+def test_kinds_ofparameters_are_told_by_their_shape():
     axes = drawn(entry([1.0, 2.0, 3.0], [0.1, np.nan, 0.3], [False, False, True]))
     hollow = [one for one in axes.lines if one.get_markerfacecolor() == "white"]
     boxes = [one for one in axes.lines if one.get_marker() == "s"]
@@ -66,12 +66,12 @@ def test_kinds_of_points_are_told_by_their_shape():
     assert points.lines[0].get_xdata().tolist() == [1600]
     assert hollow[0].get_xdata().tolist() == [1200, 2200]
     assert boxes[0].get_xdata().tolist() == [2200]
-    assert set(labels(axes)) == {_points._DETERMINED, _points._ALONE, _points._BOUND}
+    assert set(labels(axes)) == {parameters._DETERMINED, parameters._ALONE, parameters._BOUND}
 
 
 def test_at_a_bound_alone_is_not_called_open():
     axes = drawn(entry([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], [True, False, False]))
-    assert set(labels(axes)) == {_points._DETERMINED, _points._BOUND}
+    assert set(labels(axes)) == {parameters._DETERMINED, parameters._BOUND}
 
 
 @pytest.mark.parametrize(
@@ -119,9 +119,9 @@ def test_band_of_a_law_is_propagated_from_the_covariance():
     lam = np.array([1200.0, 1700.0])
     sigma = 1e-4
     covariance = SimpleNamespace(names=["other.x", "hwp.w_sio2"], matrix=np.diag([7.0, sigma**2]))
-    found = _points._law_std(calibration(covariance=covariance), plate, lam)
+    found = parameters._law_std(calibration(covariance=covariance), plate, lam)
     thicker = plate.with_parameters(w_sio2=(plate.w_sio2.value + 0.1) * u.mm)
-    slope = (_points._retardance(thicker, lam) - _points._retardance(plate, lam)) / 0.1
+    slope = (parameters._retardance(thicker, lam) - parameters._retardance(plate, lam)) / 0.1
     np.testing.assert_allclose(found, np.abs(slope) * sigma, rtol=1e-6)
 
 
@@ -134,18 +134,18 @@ def test_band_of_a_law_is_propagated_from_the_covariance():
 )
 def test_a_law_whose_parameters_have_no_error_has_no_band(covariance):
     plate = optics.TwoLayerWaveplate(mount="hwp", name="hwp")
-    assert _points._law_std(calibration(covariance=covariance), plate, NM) is None
+    assert parameters._law_std(calibration(covariance=covariance), plate, NM) is None
 
 
 def test_first_step_is_drawn_on_the_turn_of_the_law():
     plate = optics.TwoLayerWaveplate(mount="hwp", name="hwp")
-    law = _points._retardance(plate, NM)
+    law = parameters._retardance(plate, NM)
     stage = {"parameters": {"hwp.retardance": law + np.array([0.5, 360.5, -719.5])}}
     axes = Figure().subplots()
-    _points._draw_stage(axes, calibration(stages=[{"parameters": {}}, stage]), plate)
+    parameters._draw_stage(axes, calibration(stages=[{"parameters": {}}, stage]), plate)
     (line,) = axes.lines
     np.testing.assert_allclose(line.get_ydata(), law + 0.5)
-    assert (line.get_label(), line.get_color()) == (_points._STAGE, GREY)
+    assert (line.get_label(), line.get_color()) == (parameters._STAGE, GREY)
 
 
 def test_values_of_a_law_are_words():
@@ -154,8 +154,8 @@ def test_values_of_a_law_are_words():
         "w_mgf2": entry(1.25, np.nan),
         "many": entry([1.0, 2.0], 0.1),
     }
-    assert list(_points._words(own)) == ["w_sio2 = 1.6500 ± 0.0100 deg", "w_mgf2 = 1.2500 deg"]
-    rows = list(_points._in_rows(["x" * 30, "y" * 30, "z"]))
+    assert list(parameters._words(own)) == ["w_sio2 = 1.6500 ± 0.0100 deg", "w_mgf2 = 1.2500 deg"]
+    rows = list(parameters._in_rows(["x" * 30, "y" * 30, "z"]))
     assert rows == [["x" * 30], ["y" * 30, "z"]]
 
 
@@ -166,22 +166,22 @@ def test_values_of_a_law_are_words():
 def test_half_wave_is_marked_where_the_data_come_near(values, halves):
     axes = Figure().subplots()
     axes.plot([1, 2], values)
-    _points.mark_half_wave(axes)
+    parameters._mark_half_wave(axes)
     assert [line.get_ydata()[0] for line in axes.lines[1:]] == halves
 
 
 def test_legend_says_how_much_is_open():
     figure = Figure()
     axes = figure.subplots(1, 2)
-    _points.draw_entry(axes[0], calibration(), entry([1.0, 2.0, 3.0], np.nan), LOOK)
-    _points.draw_entry(axes[1], calibration(), entry([1.0, 2.0, 3.0], 0.1), ("red", "s"))
+    parameters._draw_entry(axes[0], calibration(), entry([1.0, 2.0, 3.0], np.nan), LOOK)
+    parameters._draw_entry(axes[1], calibration(), entry([1.0, 2.0, 3.0], 0.1), ("red", "s"))
     for count, words in ((1, "1 combination of parameters"), (2, "2 combinations of parameters")):
         known = calibration(identifiability=SimpleNamespace(directions=[{}] * count))
-        legend = _points.legend_of(figure, axes, known)
+        legend = parameters._legend(figure, axes, known)
         texts = [text.get_text() for text in legend.get_texts()]
         # in the order of certainty, each once, and in no panel's colour
-        assert texts[0] == _points._DETERMINED
-        assert texts[1] == f"{_points._ALONE} (the data leave {words} open)"
+        assert texts[0] == parameters._DETERMINED
+        assert texts[1] == f"{parameters._ALONE} (the data leave {words} open)"
         assert {handle.get_color() for handle in legend.legend_handles} == {"#000000"}
 
 
@@ -254,21 +254,6 @@ def test_lines_of_the_efficiency(shown, names):
     assert [line.get_label() for line in axes.lines] == names
     np.testing.assert_allclose(axes.lines[0].get_ydata(), values[:, 0])
     assert axes.get_ylabel() == "measured share of the polarization"
-
-
-@pytest.mark.parametrize(
-    ("at", "words"),
-    [
-        ({}, "behind the internal source"),
-        ({"altitude": 60 * u.deg}, "altitude 60°"),
-        (
-            {"altitude": 60 * u.deg, "parallactic": 0.5 * np.pi * u.rad},
-            "altitude 60°, parallactic angle 90°",
-        ),
-    ],
-)
-def test_pointing_in_words(at, words):
-    assert efficiency._where(at) == words
 
 
 def test_what_does_not_move_is_drawn_first():

@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from astropolcal.plotting import plot_residuals
-from astropolcal.plotting._data import DataGrid
-from astropolcal.plotting.residuals import _layout, _limit, _name_groups, _scales
+from astropolcal.plotting.residuals import (
+    DataGrid,
+    _layout,
+    _limit,
+    _name_groups,
+    _scales,
+    plot_residuals,
+)
 
 
 def parts(figure):

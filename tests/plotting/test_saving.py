@@ -19,12 +19,11 @@ from astropolcal.plotting import (
     plot_accuracy,
     plot_double_differences,
     plot_efficiency,
-    plot_parameters,
-    plot_residuals,
     plot_retardances,
     save_all,
 )
-from astropolcal.plotting.parameters import other_parameters
+from astropolcal.plotting.parameters import other_parameters, plot_parameters
+from astropolcal.plotting.residuals import plot_residuals
 
 DRAW = [
     plot_accuracy,

@@ -6,7 +6,7 @@ import pytest
 
 from astropolcal import standards
 from astropolcal.exceptions import ParameterError
-from astropolcal.plotting.standards import plot_observability
+from astropolcal.plotting import plot_observability
 
 NIGHT = "2025-11-03"
 
