@@ -10,14 +10,11 @@ import numpy as np
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
-    Folder,
     Input,
     Output,
-    add_edits,
-    add_full,
-    add_json,
-    add_online,
-    add_quiet,
+    add_command,
+    add_shared,
+    adder,
     check_suffix,
     edit_chains,
     instrument_of,
@@ -30,7 +27,7 @@ from astropolcal.scripts._common import (
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
-_EPILOG = """\
+_EXAMPLES = """\
 examples:
   astropolcal calibrate                          the packaged example
   astropolcal calibrate run.ecsv -o cal.asdf     one dataset, kept as a file
@@ -44,168 +41,129 @@ examples:
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    import argparse
-
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "calibrate",
-        help="fit an instrument's chain of optics to observation tables",
-        description="Fit an instrument's chain of optics to observation tables. Without files,\n"
+        run,
+        "fit an instrument's chain of optics to observation tables",
+        "Fit an instrument's chain of optics to observation tables. Without files,\n"
         "the packaged example is calibrated.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
-    parser.add_argument(
-        "files", nargs="*", metavar="FILE", type=Input, help="observation tables (ECSV)"
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="CAL.asdf",
+    add = adder(parser)
+    add("files FILE", "observation tables (ECSV)", nargs="*", type=Input)
+    add(
+        "-o --output CAL.asdf",
+        "write the calibration here; overwritten if it exists",
         type=Output,
-        help="write the calibration here; overwritten if it exists",
     )
-    parser.add_argument("--instrument", metavar="NAME", help="default: as the tables say")
-    _add_model_options(parser)
-    _add_accuracy_options(parser)
-    parser.add_argument(
-        "--plots", metavar="DIR", type=Folder, help="save the figures in this folder"
+    add("--instrument NAME", "default: as the tables say")
+    _add_model_options(add)
+    _add_fit_options(add)
+    add_shared(parser, "fix", "free")
+    add(
+        "--start OLD.asdf",
+        "start from this calibration, hold it, and refit only what --free names",
+        type=Input,
     )
-    add_full(parser)
-    add_json(parser)
-    add_online(parser)
-    add_quiet(parser)
-    parser.set_defaults(run=run)
+    add_shared(parser, "prior")
+    add(
+        "--gauge",
+        "where the data leave a choice: the least misalignments (default), or where the fit ends",
+        choices=("minimal", "none"),
+        default="minimal",
+    )
+    add_shared(parser, "without")
+    _add_accuracy_options(add)
+    add_shared(parser, "plots", "full", "json", "online", "quiet")
 
 
-def _add_model_options(parser):
-    """Add what says how the model is made and fitted."""
-    parser.add_argument(
-        "--derotator",
-        metavar="MODEL",
-        help="elliptical (default) or linear retarder, or kmirror: three silver mirrors with films",
+def _add_model_options(add):
+    """Add what says how the model is made."""
+    add(
+        "--derotator MODEL",
+        "elliptical (default) or linear retarder, or kmirror: three silver mirrors with films",
     )
-    parser.add_argument(
-        "--bounds",
-        metavar="KIND",
-        help="physical (default), or those of the paper",
-    )
-    parser.add_argument(
-        "--m3",
-        metavar="MODEL",
-        help="tertiary mirror of stars: free (default, a diattenuation a wavelength), "
+    add("--bounds KIND", "physical (default), or those of the paper")
+    add(
+        "--m3 MODEL",
+        "tertiary mirror of stars: free (default, a diattenuation a wavelength), "
         "'power law' (the paper's permittivity) or metal (silver with a film)",
     )
-    parser.add_argument(
-        "--plate",
-        metavar="MODEL",
-        help="half-wave plate of VAMPIRES: free (default, a retardance per band) or two-layer (one "
+    add(
+        "--plate MODEL",
+        "half-wave plate of VAMPIRES: free (default, a retardance per band) or two-layer (one "
         "law for all bands)",
     )
-    parser.add_argument(
+    add(
         "--exact",
-        action="store_true",
-        help="take the polarization of standard stars and the orientation of fixed optics as "
+        "take the polarization of standard stars and the orientation of fixed optics as "
         "exact, as published calibrations do; by default they have the errors of the catalogue "
         "and of the mounting",
     )
-    parser.add_argument(
-        "--nuisance",
-        action="append",
-        default=[],
-        metavar="KIND[:DATASET]",
-        help="add what differs from dataset to dataset, with a prior: background, beam_gain, or "
+    add(
+        "--nuisance KIND[:DATASET] ...",
+        "add what differs from dataset to dataset, with a prior: background, beam_gain, or "
         "lamp (q and u of an unpolarized internal source); for all datasets or for one",
     )
-    _add_fit_options(parser)
-    _add_parameter_options(parser)
 
 
-def _add_fit_options(parser):
+def _add_fit_options(add):
     """Add what says how the model is fitted."""
-    parser.add_argument(
-        "--observable",
-        metavar="NAME",
+    add(
+        "--observable NAME",
+        "what is fitted (default: %(default)s)",
         default="normalized_double_difference",
-        help="what is fitted (default: %(default)s)",
     )
-    parser.add_argument(
-        "--strategy",
-        metavar="HOW",
-        default="joint",
-        help="joint (default), two-step (the paper's fit of a polarized source), or sequential: "
+    add(
+        "--strategy HOW",
+        "joint (default), two-step (the paper's fit of a polarized source), or sequential: "
         "polarized source, unpolarized source, stars, each step holding what came before",
+        default="joint",
     )
-    parser.add_argument(
-        "--loss",
-        metavar="NAME",
+    add(
+        "--loss NAME",
+        "linear (default: least squares), huber, cauchy or bisquare: data far off count less",
         default="linear",
-        help="linear (default: least squares), huber, cauchy or bisquare: data far off count less",
     )
-    parser.add_argument(
+    add(
         "--keep-all",
-        action="store_true",
-        help="mask nothing by itself: neither an unstable lamp, nor saturated frames, nor "
+        "mask nothing by itself: neither an unstable lamp, nor saturated frames, nor "
         "incomplete half-wave-plate cycles",
     )
-    parser.add_argument(
+    add(
         "--weights",
+        "equal weights (default), one over the residuals' scatter at each wavelength, or one "
+        "over the tables' errors",
         choices=("none", "wavelength", "errors"),
         default="none",
-        help="equal weights (default), one over the residuals' scatter at each wavelength, or one "
-        "over the tables' errors",
     )
-    parser.add_argument(
+    add(
         "--errors",
+        "errors from how the residuals scatter and hang together (default), or those of "
+        "independent data with the noise of --weights",
         choices=("scatter", "white"),
         default="scatter",
-        help="errors from how the residuals scatter and hang together (default), or those of "
-        "independent data with the noise of --weights",
     )
 
 
-def _add_parameter_options(parser):
-    """Add what says which parameters are free."""
-    add_edits(parser, "fix", "free")
-    parser.add_argument(
-        "--start",
-        metavar="OLD.asdf",
-        type=Input,
-        help="start from this calibration, hold it, and refit only what --free names",
-    )
-    add_edits(parser, "prior")
-    parser.add_argument(
-        "--gauge",
-        choices=("minimal", "none"),
-        default="minimal",
-        help="where the data leave a choice: the least misalignments (default), or where the "
-        "fit ends",
-    )
-    add_edits(parser, "without")
-
-
-def _add_accuracy_options(parser):
+def _add_accuracy_options(add):
     """Add what says how the accuracy is judged."""
-    parser.add_argument(
-        "--standard",
-        action="append",
-        default=[],
-        metavar="FILE",
-        type=Input,
-        help="table that is predicted, not fitted; its errors are s_standard. A standard star is "
+    add(
+        "--standard FILE ...",
+        "table that is predicted, not fitted; its errors are s_standard. A standard star is "
         "compared with the catalogue, too",
+        type=Input,
     )
-    parser.add_argument(
+    add(
         "--groups",
-        choices=("derotator", "cycle", "dataset"),
-        help="what cross-validation leaves out: derotator angles (default, where there are "
+        "what cross-validation leaves out: derotator angles (default, where there are "
         "three), cycles of the half-wave plate, or whole datasets",
+        choices=("derotator", "cycle", "dataset"),
     )
-    parser.add_argument(
-        "--target",
-        action="append",
-        default=[],
-        metavar="DOLP[,AOLP]",
-        help="target whose accuracy is given, in percent and degree (default: 30, 1 and 0.1, at "
+    add(
+        "--target DOLP[,AOLP] ...",
+        "target whose accuracy is given, in percent and degree (default: 30, 1 and 0.1, at "
         "any angle)",
     )
 

@@ -12,8 +12,9 @@ from astropolcal.exceptions import AstropolcalError, GapError
 from astropolcal.scripts._common import (
     Continued,
     Output,
-    add_json,
-    add_quiet,
+    add_command,
+    add_shared,
+    adder,
     is_quiet,
     show,
     wrapped,
@@ -22,7 +23,7 @@ from astropolcal.scripts._common import (
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
-_EPILOG = """\
+_EXAMPLES = """\
 examples:
   astropolcal challenge -n 20
   astropolcal challenge run -n 1000 --workers 8 --checkpoint run.jsonl
@@ -38,72 +39,54 @@ _BETWEEN = 10
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "challenge",
-        help="test the diagnosis, or another tool, on sealed simulated data",
-        description="Simulate calibrations with random faults, diagnose each without the key,\n"
+        run,
+        "test the diagnosis, or another tool, on sealed simulated data",
+        "Simulate calibrations with random faults, diagnose each without the key,\n"
         "and compare the answers with the truth.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
-    parser.add_argument(
+    add = adder(parser)
+    add(
         "action",
+        "run: make, diagnose and score (default); make DIR: write cases to files; "
+        "score DIR OUTPUTS: score the answers of any tool to them",
         nargs="?",
         default="run",
         choices=("run", "make", "score"),
-        help="run: make, diagnose and score (default); make DIR: write cases to files; "
-        "score DIR OUTPUTS: score the answers of any tool to them",
     )
-    parser.add_argument(
-        "folders", nargs="*", default=[], metavar="FOLDER", help="of the cases, and of the answers"
-    )
-    parser.add_argument(
-        "-n",
-        "--count",
-        dest="n",
-        type=int,
-        default=20,
-        metavar="N",
-        help="how many (default: %(default)s)",
-    )
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="default: %(default)s")
-    parser.add_argument(
-        "--snr",
+    add("folders FOLDER", "of the cases, and of the answers", nargs="*", default=[])
+    add("-n --count N", "how many (default: %(default)s)", dest="n", type=int, default=20)
+    add("--seed S", "default: %(default)s", type=int, default=0)
+    add(
+        "--snr LOW:HIGH",
+        "signal-to-noise ratio of each fault (default: 12:120)",
         type=_range,
         default=(12.0, 120.0),
-        metavar="LOW:HIGH",
-        help="signal-to-noise ratio of each fault (default: 12:120)",
     )
-    parser.add_argument(
-        "--kinds",
+    add(
+        "--kinds KIND,KIND,...",
+        "none, cell, listed, pair, detector, frame, mechanism, absorbed (default: all)",
         type=lambda text: text.split(","),
-        metavar="KIND,KIND,...",
-        help="none, cell, listed, pair, detector, frame, mechanism, absorbed (default: all)",
     )
-    parser.add_argument(
-        "--instrument", default="charis", metavar="NAME", help="default: %(default)s"
-    )
-    parser.add_argument("--wavelengths", type=int, default=8, metavar="N", help="default: 8")
-    parser.add_argument("--derotator-angles", type=int, default=8, metavar="N", help="default: 8")
-    parser.add_argument(
-        "--checkpoint",
-        metavar="FILE",
+    add("--instrument NAME", "default: %(default)s", default="charis")
+    add("--wavelengths N", "default: 8", type=int, default=8)
+    add("--derotator-angles N", "default: 8", type=int, default=8)
+    add(
+        "--checkpoint FILE",
+        "append each outcome of a run to this file, and go on from it",
         type=Continued,
-        help="append each outcome of a run to this file, and go on from it",
     )
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default: 1")
-    parser.add_argument(
-        "--figure", metavar="FILE", type=Output, help="draw the rates (PNG, PDF or SVG)"
-    )
-    parser.add_argument(
-        "--reliability",
-        metavar="FILE",
+    add("--workers N", "processes; default: 1", type=int, default=1)
+    add("--figure FILE", "draw the rates (PNG, PDF or SVG)", type=Output)
+    add(
+        "--reliability FILE",
+        "draw how many causes are right against their probability (PNG, PDF or SVG)",
         type=Output,
-        help="draw how many causes are right against their probability (PNG, PDF or SVG)",
     )
-    add_json(parser)
-    add_quiet(parser)
-    parser.set_defaults(run=run)
+    add_shared(parser, "json", "quiet")
 
 
 def _range(text):

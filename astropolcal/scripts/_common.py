@@ -30,18 +30,6 @@ _NO_TABLES = {
     "cubes",
 }
 
-# options that edit the model, for edit_chains
-_EDITS = {
-    "fix": ("NAME[=VALUE]", "hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg"),
-    "free": ("NAME", "free a parameter, such as wollaston.theta"),
-    "prior": (
-        "NAME=MEAN+-STD",
-        "normal prior on a parameter, such as hwp.theta=0+-0.1deg",
-    ),
-    "without": ("OPTIC", "take an optic out of the model"),
-}
-
-
 # ---- files that are named -------------------------------------------------------------------
 
 
@@ -229,37 +217,72 @@ def _are_same(path, other):
 # ---- options --------------------------------------------------------------------------------
 
 
-def add_json(parser, what="write a summary"):
-    """Add ``--json``."""
-    meaning = f"{what} for machines (- for stdout)"
-    parser.add_argument("--json", metavar="FILE", type=Output, help=meaning)
+def add_command(commands, name, run, meaning, description, examples=None, **defaults):
+    """Add a subcommand to what ``add_subparsers`` returned; return its parser."""
+    # texts with examples are shown as they are written
+    form = argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter
+    texts = {"help": meaning, "description": description, "epilog": examples}
+    parser = commands.add_parser(name, formatter_class=form, **texts)
+    parser.set_defaults(run=run, **defaults)
+    return parser
 
 
-def add_quiet(parser, meaning="print nothing but warnings and errors"):
-    """Add ``--quiet``."""
-    parser.add_argument("-q", "--quiet", action="store_true", help=meaning)
+def adder(parser):
+    """
+    Return what adds an argument to a parser or a group.
+
+    It takes names and value as the help shows them, such as ``"-o --output FILE"`` or ``"files
+    FILE"``, with ``...`` after them for an option that may be repeated; what it means; and settings
+    of ``add_argument``. An option that takes no value is a switch.
+    """
+
+    def add(form, meaning, **settings):
+        words = form.split()
+        if words[-1] == "...":
+            words.pop()
+            settings |= {"action": "append", "default": []}
+        flags = [word for word in words if word.startswith("-")] or words[:1]
+        if words != flags:
+            settings["metavar"] = words[-1]
+        elif flags[0].startswith("-") and not {"choices", "action"} & set(settings):
+            settings["action"] = "store_true"
+        parser.add_argument(*flags, help=meaning, **settings)
+
+    return add
 
 
-def add_full(parser):
-    """Add ``--full``."""
-    meaning = "print everything; by default what fits a terminal of 80 columns and 24 lines"
-    parser.add_argument("--full", action="store_true", help=meaning)
-
-
-def add_online(parser):
-    """Add ``--online``, which `astropolcal.scripts.main` obeys."""
-    parser.add_argument(
-        "--online",
-        action="store_true",
-        help="fetch new tables of the Earth's rotation; by default the network is not used",
-    )
-
-
-def add_edits(parser, *names):
-    """Add options that edit the model and may be given several times."""
+def add_shared(parser, *names):
+    """Add options that several commands have."""
     for name in names:
-        form, meaning = _EDITS[name]
-        parser.add_argument(f"--{name}", action="append", default=[], metavar=form, help=meaning)
+        form, meaning, *kind = _SHARED[name]
+        adder(parser)(form, meaning, **({"type": kind[0]} if kind else {}))
+
+
+_SHARED = {
+    "full": (
+        "--full",
+        "print everything; by default what fits a terminal of 80 columns and 24 lines",
+    ),
+    "json": ("--json FILE", "write a summary for machines (- for stdout)", Output),
+    # obeyed by astropolcal.scripts.main
+    "online": (
+        "--online",
+        "fetch new tables of the Earth's rotation; by default the network is not used",
+    ),
+    "quiet": ("-q --quiet", "print nothing but warnings and errors"),
+    "plots": ("--plots DIR", "save the figures in this folder", Folder),
+    # those that edit the model, for edit_chains
+    "fix": (
+        "--fix NAME[=VALUE] ...",
+        "hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg",
+    ),
+    "free": ("--free NAME ...", "free a parameter, such as wollaston.theta"),
+    "prior": (
+        "--prior NAME=MEAN+-STD ...",
+        "normal prior on a parameter, such as hwp.theta=0+-0.1deg",
+    ),
+    "without": ("--without OPTIC ...", "take an optic out of the model"),
+}
 
 
 def angles(text):
@@ -320,10 +343,24 @@ def wrapped(line, indent=0):
     )
 
 
+def plain(value):
+    """Return a value as JSON knows it: null for what is no finite number, text for the unknown."""
+    if isinstance(value, dict):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, str | bool | int) or value is None:
+        return value
+    return " ".join(str(value).split())
+
+
 def write_json(content, path):
     """Write a dictionary as JSON, atomically; ``-`` is the standard output."""
-    # NaN and infinity are no JSON: what makes the content has to write null
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    text = json.dumps(plain(content), indent=1, allow_nan=False) + "\n"
     if str(path) == "-":
         sys.stdout.write(text)
         return
@@ -421,30 +458,10 @@ def _check_table(path):
 
 def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
     """
-    Return the chains with optics taken out and parameters freed or fixed.
+    Return the chains with optics taken out and parameters freed, fixed or given a prior.
 
-    Parameters
-    ----------
-    chains : list
-        The chains of all datasets.
-    without : sequence of str
-        Names of optics to take out.
-    free : sequence of str
-        ``optic.parameter``, or ``optic`` for all of its parameters.
-    fix : sequence of str
-        The same, with ``=VALUE`` to set it; a number without unit is in the
-        parameter's own.
-    prior : sequence of str
-        ``optic.parameter=MEAN+-STD``, units as for ``fix``; frees the parameter.
-
-    Returns
-    -------
-    list
-
-    Raises
-    ------
-    ChainError, ParameterError
-        If a name or a value does not fit, or a parameter is to be fixed and free at once.
+    The texts are those of the options, see ``_SHARED``; a number without unit is in the parameter's
+    own. What does not fit, or is to be fixed and free at once, raises an error.
     """
     _check_fixed(fix, free, prior)
     # before the rest: what is out of the model has no parameters to edit

@@ -13,9 +13,9 @@ from astropolcal.scripts._common import (
     Frames,
     Input,
     Output,
-    add_json,
-    add_online,
-    add_quiet,
+    add_command,
+    add_shared,
+    adder,
     check_suffix,
     cube_files,
     is_quiet,
@@ -27,7 +27,7 @@ from astropolcal.scripts._common import (
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
-_EPILOG = """\
+_EXAMPLES = """\
 examples:
   astropolcal correct --calibration cal.asdf cubes/ --raw raw/ -o stokes.fits
   astropolcal correct --calibration library/ cubes/ -o out.fits --plot fig.png
@@ -35,189 +35,156 @@ examples:
       --rotation pupil --camera-angle 113 --open-directions ignore
 """
 
-_OUTPUT = "the product; overwritten if it exists"
-
 # what a chain may ask of a frame
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "correct",
-        help="correct science cubes with a calibration and write Stokes parameters",
-        description="Solve for the Stokes parameters of the light that entered the telescope, by\n"
+        run,
+        "correct science cubes with a calibration and write Stokes parameters",
+        "Solve for the Stokes parameters of the light that entered the telescope, by\n"
         "least squares over all frames, and write them with their errors.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
-    parser.add_argument(
-        "cubes", metavar="CUBES", nargs="+", type=Frames, help="cubes, or folders of them (*.fits)"
-    )
-    parser.add_argument(
-        "--calibration",
-        metavar="LIB_OR_FILE",
+    add = adder(parser)
+    add("cubes CUBES", "cubes, or folders of them (*.fits)", nargs="+", type=Frames)
+    add(
+        "--calibration LIB_OR_FILE",
+        "a calibration file, or a folder of them, from which the one that holds for the "
+        "frames is taken",
         type=Input,
         required=True,
-        help="a calibration file, or a folder of them, from which the one that holds for the "
-        "frames is taken",
     )
-    parser.add_argument(
-        "-o", "--output", metavar="OUT.fits", type=Output, required=True, help=_OUTPUT
-    )
-    _add_solution(parser)
-    _add_instrument(parser)
-    _add_images(parser)
-    _add_errors(parser)
-    parser.add_argument(
-        "--spectrum",
-        metavar="OUT.ecsv",
+    add(
+        "-o --output OUT.fits",
+        "the product; overwritten if it exists",
         type=Output,
-        help="table of the star in an aperture",
+        required=True,
     )
-    parser.add_argument(
-        "--radius",
-        metavar="PIXELS",
+    _add_solution(add)
+    _add_instrument(add)
+    _add_images(add)
+    _add_errors(add)
+    add("--spectrum OUT.ecsv", "table of the star in an aperture", type=Output)
+    add(
+        "--radius PIXELS",
+        "of the aperture (default: 10, or half of a smaller --size)",
         type=float,
-        help="of the aperture (default: 10, or half of a smaller --size)",
     )
-    parser.add_argument("--plot", metavar="FILE", type=Output, help="figure of the result")
-    parser.add_argument("--workers", metavar="N", type=int, help="threads of dask")
-    parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of dask.distributed")
-    add_json(parser)
-    add_online(parser)
-    add_quiet(parser)
-    parser.set_defaults(run=run)
+    add("--plot FILE", "figure of the result", type=Output)
+    add("--workers N", "threads of dask", type=int)
+    add("--cluster ADDRESS", "scheduler of dask.distributed")
+    add_shared(parser, "json", "online", "quiet")
 
 
-def _add_solution(parser):
+def _add_solution(add):
     """Add what says what is solved for, and from what."""
-    parser.add_argument(
+    add(
         "--mode",
+        "stokes (default): invert the Mueller matrices; ip: instrumental polarization only",
         choices=("stokes", "ip"),
         default="stokes",
-        help="stokes (default): invert the Mueller matrices; ip: instrumental polarization only",
     )
-    parser.add_argument(
+    add(
         "--observable",
-        choices=("intensity", "single", "double"),
-        help="what is fitted: the beams, or their single or double differences and sums "
+        "what is fitted: the beams, or their single or double differences and sums "
         "(default: what the calibration fitted)",
+        choices=("intensity", "single", "double"),
     )
-    parser.add_argument(
-        "--components", choices=("IQU", "IQUV"), default="IQU", help="default: IQU, V is zero"
-    )
-    parser.add_argument(
+    add("--components", "default: IQU, V is zero", choices=("IQU", "IQUV"), default="IQU")
+    add(
         "--weights",
+        "of the fluxes: equal (default), or one over their variances",
         choices=("equal", "variance"),
         default="equal",
-        help="of the fluxes: equal (default), or one over their variances",
     )
-    parser.add_argument(
+    add(
         "--brightness",
+        "relative brightness of the frames: by the light in the images (default), or by "
+        "their exposure times alone",
         choices=("exposure", "measured"),
         default="measured",
-        help="relative brightness of the frames: by the light in the images (default), or by "
-        "their exposure times alone",
     )
-    parser.add_argument(
-        "--max-condition",
-        metavar="X",
+    add(
+        "--max-condition X",
+        "condition number from which on Stokes parameters count as poorly determined "
+        "and are left out (default: 30)",
         type=float,
         default=30.0,
-        help="condition number from which on Stokes parameters count as poorly determined "
-        "and are left out (default: 30)",
     )
 
 
-def _add_errors(parser):
+def _add_errors(add):
     """Add what says how the calibration's errors are propagated."""
-    parser.add_argument(
-        "--open-directions",
-        metavar="SIGMA",
+    add(
+        "--open-directions SIGMA",
+        "systematic errors along what the calibration leaves open: infinite (default), "
+        "ignore, or the standard deviation of the angle that each is named after, in degrees",
         type=number_or("infinite", "ignore"),
         default="infinite",
-        help="systematic errors along what the calibration leaves open: infinite (default), "
-        "ignore, or the standard deviation of the angle that each is named after, in degrees",
     )
-    parser.add_argument(
-        "--samples",
-        metavar="N",
+    add(
+        "--samples N",
+        "systematic errors from N samples of the calibration (default: linearized)",
         type=int,
         default=0,
-        help="systematic errors from N samples of the calibration (default: linearized)",
     )
-    parser.add_argument("--seed", metavar="N", type=int, help="of the random numbers of --samples")
+    add("--seed N", "of the random numbers of --samples", type=int)
 
 
-def _add_instrument(parser):
-    parser.add_argument("--instrument", metavar="NAME", help="default: that of the calibration")
-    parser.add_argument(
-        "--raw",
-        metavar="DIR",
-        type=Frames,
-        help="folder of raw frames, for keywords that the cubes lack",
-    )
-    parser.add_argument(
-        "--optics-in",
-        metavar="NAME,NAME,...",
-        type=lambda text: [name.strip() for name in text.split(",") if name.strip()],
-        help="all optional optics that were in the beam ('' for none), where headers do not tell "
+def _add_instrument(add):
+    add("--instrument NAME", "default: that of the calibration")
+    add("--raw DIR", "folder of raw frames, for keywords that the cubes lack", type=Frames)
+    add(
+        "--optics-in NAME,NAME,...",
+        "all optional optics that were in the beam ('' for none), where headers do not tell "
         "and the calibration has several sets of them",
+        type=lambda text: [name.strip() for name in text.split(",") if name.strip()],
     )
-    parser.add_argument(
-        "--filter",
-        metavar="MODE",
-        help="mode of the instrument, as the calibration calls it; default: what headers say",
+    add(
+        "--filter MODE",
+        "mode of the instrument, as the calibration calls it; default: what headers say",
     )
-    parser.add_argument(
+    add(
         "--any-date",
-        action="store_true",
-        help="take the calibration even if it does not hold for the date of the frames",
+        "take the calibration even if it does not hold for the date of the frames",
     )
-    parser.add_argument(
-        "--max-age",
-        metavar="YEARS",
-        type=float,
-        help="time between the data of the calibration and the frames from which on there is a "
+    add(
+        "--max-age YEARS",
+        "time between the data of the calibration and the frames from which on there is a "
         "warning (default: that of the instrument, mostly 1)",
+        type=float,
     )
-    parser.add_argument(
+    add(
         "--interpolate",
-        action="store_true",
-        help="interpolate parameters that are known at the calibrated wavelengths only",
+        "interpolate parameters that are known at the calibrated wavelengths only",
     )
 
 
-def _add_images(parser):
-    parser.add_argument(
-        "--centre",
-        metavar="X,Y",
+def _add_images(add):
+    add(
+        "--centre X,Y",
+        "place of the star in the left beam, 0-based; by default it is found",
         type=_point,
-        help="place of the star in the left beam, 0-based; by default it is found",
     )
-    parser.add_argument(
-        "--size",
-        metavar="PIXELS",
-        type=int,
-        default=51,
-        help="width of the images of the product (default: 51)",
-    )
-    parser.add_argument(
+    add("--size PIXELS", "width of the images of the product (default: 51)", type=int, default=51)
+    add(
         "--rotation",
+        "how the field turned: not known, images stay as they are (default); the +y axis at a "
+        "fixed position angle; at a fixed angle from the zenith",
         choices=("none", "fixed", "pupil"),
         default="none",
-        help="how the field turned: not known, images stay as they are (default); the +y axis at a "
-        "fixed position angle; at a fixed angle from the zenith",
     )
-    parser.add_argument(
-        "--camera-angle",
-        metavar="DEG",
+    add(
+        "--camera-angle DEG",
+        "position angle of the +y axis, or with --rotation pupil that from the zenith (default: 0)",
         type=float,
-        help="position angle of the +y axis, or with --rotation pupil that from the zenith "
-        "(default: 0)",
     )
-    parser.add_argument("--mirrored", action="store_true", help="east is to the right of north")
+    add("--mirrored", "east is to the right of north")
 
 
 def _point(text):

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal diagnose``: which effect a model lacks, and how far that explains the gap."""
 
-import argparse
 import sys
 import time
 from contextlib import suppress
@@ -11,10 +10,9 @@ from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.scripts._common import (
     Input,
     Output,
-    add_edits,
-    add_json,
-    add_online,
-    add_quiet,
+    add_command,
+    add_shared,
+    adder,
     check_suffix,
     edit_chains,
     instrument_of,
@@ -26,7 +24,7 @@ from astropolcal.scripts._common import (
     write_json,
 )
 
-_EPILOG = """\
+_EXAMPLES = """\
 examples:
   astropolcal diagnose polarized.ecsv unpolarized.ecsv --report gap.html
   astropolcal diagnose cal.asdf polarized.ecsv      the model of a calibration
@@ -52,72 +50,47 @@ _FRAMES = (
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "diagnose",
-        help="find what a model lacks to explain the measurements",
-        description="Find what an instrument's model lacks to explain the measurements: where\n"
+        run,
+        "find what a model lacks to explain the measurements",
+        "Find what an instrument's model lacks to explain the measurements: where\n"
         "the gap lies, which effect causes it, and how far it shrinks on left-out frames.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
-    parser.add_argument(
-        "files",
-        nargs="*",
-        metavar="FILE",
-        type=Input,
-        help="observation tables (ECSV); before them may stand a calibration (.asdf), whose "
+    add = adder(parser)
+    add(
+        "files FILE",
+        "observation tables (ECSV); before them may stand a calibration (.asdf), whose "
         "model is then the nominal one",
+        nargs="*",
+        type=Input,
     )
-    _add_model_options(parser)
-    parser.add_argument(
-        "--effects",
+    add("--instrument NAME", "default: as the tables say")
+    add(
+        "--derotator MODEL",
+        "elliptical (default) or linear retarder, or kmirror; not with a calibration",
+    )
+    add_shared(parser, "without", "free", "fix")
+    add(
+        "--effects all|NAME,NAME",
+        "which effects to try (default: all; help lists them)",
         default="all",
-        metavar="all|NAME,NAME",
-        help="which effects to try (default: all; help lists them)",
     )
-    parser.add_argument(
-        "--changes",
-        action="store_true",
-        help="ask what changed between several runs of the same kind of source",
-    )
-    parser.add_argument(
+    add("--changes", "ask what changed between several runs of the same kind of source")
+    add(
         "--nested",
-        action="store_true",
-        help="choose the causes anew without each group of frames, and predict these: slow, and "
+        "choose the causes anew without each group of frames, and predict these: slow, and "
         "the one measure in which the choice has no part",
     )
-    _add_output_options(parser)
-    parser.set_defaults(run=run)
-
-
-def _add_model_options(parser):
-    """Add what says which model is the nominal one."""
-    parser.add_argument("--instrument", metavar="NAME", help="default: as the tables say")
-    parser.add_argument(
-        "--derotator",
-        metavar="MODEL",
-        help="elliptical (default) or linear retarder, or kmirror; not with a calibration",
-    )
-    add_edits(parser, "without", "free", "fix")
-
-
-def _add_output_options(parser):
-    """Add what says what is written."""
-    parser.add_argument(
-        "--report",
-        metavar="FILE.html",
+    add("--report FILE.html", "write a page with tables and figures", type=Output)
+    add(
+        "--save CAL.asdf",
+        "calibrate with the effects that were found, and write the calibration",
         type=Output,
-        help="write a page with tables and figures",
     )
-    parser.add_argument(
-        "--save",
-        metavar="CAL.asdf",
-        type=Output,
-        help="calibrate with the effects that were found, and write the calibration",
-    )
-    add_json(parser)
-    add_online(parser)
-    add_quiet(parser)
+    add_shared(parser, "json", "online", "quiet")
 
 
 def run(arguments):

@@ -10,9 +10,9 @@ from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.scripts._common import (
     Input,
     Output,
-    add_json,
-    add_online,
-    add_quiet,
+    add_command,
+    add_shared,
+    adder,
     is_quiet,
     say_written,
     show,
@@ -22,7 +22,7 @@ from astropolcal.units import iso_date, plain_number
 
 # what is printed as more than 1
 _ABOVE_ONE = 1.0005
-_EPILOG = """\
+_EXAMPLES = """\
 examples:
   astropolcal efficiency                         published values of CHARIS
   astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o plot.png
@@ -34,67 +34,45 @@ examples:
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    import argparse
-
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "efficiency",
-        help="polarimetric efficiency over wavelength, derotator angle and pointing",
-        description="Share of the linear polarization that an observation measures, over\n"
+        run,
+        "polarimetric efficiency over wavelength, derotator angle and pointing",
+        "Share of the linear polarization that an observation measures, over\n"
         "wavelength, derotator angle, altitude and parallactic angle; and the derotator\n"
         "offset that loses least of it. Without a calibration the published values are\n"
         "taken.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
-    parser.add_argument("file", nargs="?", metavar="CAL.asdf", type=Input, help="calibration")
-    parser.add_argument("--instrument", metavar="NAME", help="default: that of the file, or charis")
-    _add_observation(parser)
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="FILE",
-        type=Output,
-        help="save the figure (PNG, PDF, SVG); with --target that of the derotator offsets",
-    )
-    add_json(parser)
-    add_online(parser)
-    add_quiet(parser)
-    parser.set_defaults(run=run)
-
-
-def _add_observation(parser):
-    """Add what says of which observations the efficiency is."""
+    add = adder(parser)
+    add("file CAL.asdf", "calibration", nargs="?", type=Input)
+    add("--instrument NAME", "default: that of the file, or charis")
     # without a default, so that it is known whether the table was asked for
-    parser.add_argument("--altitude", type=float, metavar="DEG", help="default: 60")
-    parser.add_argument("--parallactic", type=float, metavar="DEG", help="default: 0")
-    parser.add_argument(
-        "--derotator",
+    add("--altitude DEG", "default: 60", type=float)
+    add("--parallactic DEG", "default: 0", type=float)
+    add(
+        "--derotator DEG",
+        "angles of the table (default: 0 to 90 in steps of 15)",
         type=float,
         nargs="+",
-        metavar="DEG",
-        help="angles of the table (default: 0 to 90 in steps of 15)",
     )
-    parser.add_argument(
-        "--wavelength",
+    add(
+        "--wavelength UM",
+        "wavelengths of the table in micrometre, the nearest calibrated ones",
         type=float,
         nargs="+",
-        metavar="UM",
-        help="wavelengths of the table in micrometre, the nearest calibrated ones",
     )
-    parser.add_argument(
-        "--target",
-        metavar="RA,DEC",
-        help="for the best derotator offset: position in degree",
+    add("--target RA,DEC", "for the best derotator offset: position in degree")
+    add("--night START/END", "times in UTC, with --target")
+    add("--law MODE", "what the derotator keeps still, such as field (default: pupil)")
+    add("--date DATE", "of the telescope's mirrors, where that matters")
+    add(
+        "-o --output FILE",
+        "save the figure (PNG, PDF, SVG); with --target that of the derotator offsets",
+        type=Output,
     )
-    parser.add_argument("--night", metavar="START/END", help="times in UTC, with --target")
-    parser.add_argument(
-        "--law",
-        metavar="MODE",
-        help="what the derotator keeps still, such as field (default: pupil)",
-    )
-    parser.add_argument(
-        "--date", metavar="DATE", help="of the telescope's mirrors, where that matters"
-    )
+    add_shared(parser, "json", "online", "quiet")
 
 
 def run(arguments):

@@ -6,9 +6,10 @@ from pathlib import Path
 from astropolcal.exceptions import ObservationError
 from astropolcal.scripts._common import (
     Input,
-    add_full,
-    add_json,
-    add_quiet,
+    Output,
+    add_command,
+    add_shared,
+    adder,
     printer,
     wrapped,
     write_json,
@@ -19,25 +20,26 @@ from astropolcal.words import counted
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "info",
-        help="say what a calibration, a folder of them, a table, cube or product holds",
-        description="Say what a calibration file, a folder of calibrations, an observation "
+        run,
+        "say what a calibration, a folder of them, a table, cube or product holds",
+        "Say what a calibration file, a folder of calibrations, an observation "
         "table, an image cube or a corrected product holds; of a calibration also how good it is "
         "and for what it is valid. Without a file, what this installation knows.",
     )
-    parser.add_argument(
-        "file",
+    add = adder(parser)
+    add(
+        "file FILE|DIR",
+        "ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product",
         nargs="?",
-        metavar="FILE|DIR",
         type=Input,
-        help="ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product",
     )
-    parser.add_argument("--instruments", action="store_true", help="list the instruments only")
-    add_full(parser)
-    add_json(parser, "write it")
-    add_quiet(parser)
-    parser.set_defaults(run=run)
+    add("--instruments", "list the instruments only")
+    add_shared(parser, "full")
+    add("--json FILE", "write it for machines (- for stdout)", type=Output)
+    add_shared(parser, "quiet")
 
 
 def run(arguments):

@@ -13,9 +13,9 @@ from astropolcal.scripts._common import (
     Folder,
     Frames,
     Output,
-    add_json,
-    add_online,
-    add_quiet,
+    add_command,
+    add_shared,
+    adder,
     angles,
     check_suffix,
     cube_files,
@@ -29,7 +29,7 @@ from astropolcal.words import counted
 # a folder of other files must not push the summary off the screen
 _MAX_LISTED = 20
 
-_EPILOG = """\
+_EXAMPLES = """\
 examples:
   astropolcal reduce cubes/ --raw raw/ --source polarized -o run.ecsv
   astropolcal reduce cubes/ --raw raw/ --source star -o star.ecsv
@@ -39,93 +39,65 @@ examples:
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "reduce",
-        help="measure both beams in FITS cubes and write an observation table",
-        description="Measure the fluxes of both beams in extracted cubes. A file that cannot be\n"
+        run,
+        "measure both beams in FITS cubes and write an observation table",
+        "Measure the fluxes of both beams in extracted cubes. A file that cannot be\n"
         "used is left out and listed with the reason.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
-    parser.add_argument(
-        "cubes", metavar="CUBES", nargs="+", type=Frames, help="cubes, or folders of them (*.fits)"
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="OBS.ecsv",
+    add = adder(parser)
+    add("cubes CUBES", "cubes, or folders of them (*.fits)", nargs="+", type=Frames)
+    add(
+        "-o --output OBS.ecsv",
+        "the table; overwritten if it exists",
         type=Output,
         required=True,
-        help="the table; overwritten if it exists",
     )
-    _add_meta(parser)
-    _add_photometry(parser)
-    parser.add_argument("--workers", metavar="N", type=int, help="number of processes")
-    parser.add_argument(
-        "--resume",
-        metavar="FILE",
-        type=Continued,
-        help="journal of what is done, to go on after a stop",
-    )
-    parser.add_argument(
-        "--quicklook", metavar="DIR", type=Folder, help="write figures to this folder"
-    )
-    add_json(parser)
-    add_online(parser)
-    add_quiet(parser)
-    parser.set_defaults(run=run)
-
-
-def _add_meta(parser):
-    """Add what says what the cubes are of, beside or in the place of their headers."""
-    parser.add_argument("--instrument", metavar="NAME", default="charis", help="default: charis")
-    parser.add_argument(
-        "--raw",
-        metavar="DIR",
-        type=Frames,
-        help="folder of raw frames, for keywords that the cubes lack",
-    )
-    parser.add_argument(
-        "--source",
-        metavar="KIND",
-        default="internal",
-        help="internal (default), polarized, unpolarized (internal source with and without its "
-        "polarizer), star, 'unpolarized standard star', 'polarized standard star'",
-    )
-    parser.add_argument(
-        "--meta",
-        metavar="KEY=VALUE",
-        type=_pair,
-        action="append",
-        default=[],
-        help="more for the table's meta, such as yjh50_dichroic=in",
-    )
-    parser.add_argument(
-        "--hwp-sequence",
-        metavar="DEG,DEG,...",
-        type=angles,
-        help="commanded angles that replace wrong ones of the headers, in turn",
-    )
-
-
-def _add_photometry(parser):
-    parser.add_argument(
+    _add_meta(add)
+    add(
         "--background",
+        "internal source: subtract nothing (default) or the level outside the beams",
         choices=("none", "outside"),
-        help="internal source: subtract nothing (default) or the level outside the beams",
     )
-    parser.add_argument(
-        "--radius",
-        metavar="PIXELS",
-        type=number_or("fwhm", "growth"),
-        help="stars: radius of the aperture; fwhm (default, 3 full widths), growth (99 %% of the "
+    add(
+        "--radius PIXELS",
+        "stars: radius of the aperture; fwhm (default, 3 full widths), growth (99 %% of the "
         "light) or pixels",
+        type=number_or("fwhm", "growth"),
     )
-    parser.add_argument(
+    add(
         "--aperture-correction",
-        action="store_true",
+        "stars: scale the fluxes to all of the star's light, by a profile of its wings",
         default=None,
-        help="stars: scale the fluxes to all of the star's light, by a profile of its wings",
+    )
+    add("--workers N", "number of processes", type=int)
+    add("--resume FILE", "journal of what is done, to go on after a stop", type=Continued)
+    add("--quicklook DIR", "write figures to this folder", type=Folder)
+    add_shared(parser, "json", "online", "quiet")
+
+
+def _add_meta(add):
+    """Add what says what the cubes are of, beside or in the place of their headers."""
+    add("--instrument NAME", "default: charis", default="charis")
+    add("--raw DIR", "folder of raw frames, for keywords that the cubes lack", type=Frames)
+    add(
+        "--source KIND",
+        "internal (default), polarized, unpolarized (internal source with and without its "
+        "polarizer), star, 'unpolarized standard star', 'polarized standard star'",
+        default="internal",
+    )
+    add(
+        "--meta KEY=VALUE ...",
+        "more for the table's meta, such as yjh50_dichroic=in",
+        type=_pair,
+    )
+    add(
+        "--hwp-sequence DEG,DEG,...",
+        "commanded angles that replace wrong ones of the headers, in turn",
+        type=angles,
     )
 
 

@@ -9,12 +9,11 @@ from astropolcal.exceptions import AstropolcalError, FitError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
     Continued,
-    Folder,
     Input,
     Output,
-    add_json,
-    add_online,
-    add_quiet,
+    add_command,
+    add_shared,
+    adder,
     check_suffix,
     printer,
     read_datasets,
@@ -26,7 +25,7 @@ from astropolcal.scripts._common import (
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
-_EPILOG = """\
+_EXAMPLES = """\
 examples:
   astropolcal sample cal.asdf run.ecsv -o sampled.asdf --plots figures
   astropolcal sample cal.asdf a.ecsv b.ecsv --parameters hwp.w_sio2 hwp.w_mgf2
@@ -42,71 +41,43 @@ _COLUMNS = ("median", "lower", "upper", "fitted")
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "sample",
-        help="sample the posterior of a calibration's parameters",
-        description="Sample the posterior of a calibration's parameters with an ensemble of\n"
+        run,
+        "sample the posterior of a calibration's parameters",
+        "Sample the posterior of a calibration's parameters with an ensemble of\n"
         "walkers, and keep the samples with the calibration.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
+        # the samples come to what the calibration holds, and nothing of it is lost
+        may_replace={"output": "calibration"},
     )
-    parser.add_argument("calibration", metavar="CAL.asdf", type=Input, help="calibration file")
-    parser.add_argument(
-        "files",
-        nargs="+",
-        metavar="FILE",
-        type=Input,
-        help="the tables that it was made from (ECSV)",
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT.asdf",
+    add = adder(parser)
+    add("calibration CAL.asdf", "calibration file", type=Input)
+    add("files FILE", "the tables that it was made from (ECSV)", nargs="+", type=Input)
+    add(
+        "-o --output OUT.asdf",
+        "write the calibration with samples here; overwritten if it exists",
         type=Output,
-        help="write the calibration with samples here; overwritten if it exists",
     )
-    _add_run_options(parser)
-    parser.add_argument(
-        "--plots", metavar="DIR", type=Folder, help="save the figures in this folder"
-    )
-    add_json(parser)
-    add_online(parser)
-    add_quiet(parser)
-    # the samples come to what the calibration holds, and nothing of it is lost
-    parser.set_defaults(run=run, may_replace={"output": "calibration"})
-
-
-def _add_run_options(parser):
-    """Add what says what is sampled, and how long."""
-    parser.add_argument(
-        "--parameters",
+    add(
+        "--parameters NAME",
+        "what varies, such as hwp.w_sio2; the rest is held at its fitted values (default: "
+        "all free parameters)",
         nargs="+",
         action="extend",
-        metavar="NAME",
-        help="what varies, such as hwp.w_sio2; the rest is held at its fitted values (default: "
-        "all free parameters)",
     )
-    parser.add_argument(
-        "--walkers", type=int, metavar="N", help="default: twice the parameters, at least 24"
-    )
-    parser.add_argument("--steps", type=int, default=5000, metavar="N", help="default: %(default)s")
-    parser.add_argument(
-        "--burn",
+    add("--walkers N", "default: twice the parameters, at least 24", type=int)
+    add("--steps N", "default: %(default)s", type=int, default=5000)
+    add(
+        "--burn N|auto",
+        "steps to leave out at the start (default: auto, 5 autocorrelation times)",
         type=_burn_in,
-        default=None,
-        metavar="N|auto",
-        help="steps to leave out at the start (default: auto, 5 autocorrelation times)",
     )
-    parser.add_argument("--seed", type=int, metavar="N", help="makes the run repeatable")
-    parser.add_argument(
-        "--checkpoint",
-        metavar="FILE.h5",
-        type=Continued,
-        help="write the steps here while the run lasts",
-    )
-    parser.add_argument(
-        "--resume", action="store_true", help="go on from the checkpoint, if there is one"
-    )
+    add("--seed N", "makes the run repeatable", type=int)
+    add("--checkpoint FILE.h5", "write the steps here while the run lasts", type=Continued)
+    add("--resume", "go on from the checkpoint, if there is one")
+    add_shared(parser, "plots", "json", "online", "quiet")
 
 
 def _burn_in(text):

@@ -1,16 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """``astropolcal simulate``: beam fluxes or image cubes of an instrument, with noise."""
 
-import argparse
-
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
     Folder,
     Input,
     Output,
-    add_json,
-    add_quiet,
+    add_command,
+    add_shared,
+    adder,
     angles,
     check_suffix,
     edit_chains,
@@ -25,7 +24,7 @@ EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 # double differences of Q, then of U: the order in which stars are observed
 _STAR_CYCLE = [0, 45, 22.5, 67.5]
 
-_EPILOG = """\
+_EXAMPLES = """\
 examples:
   astropolcal simulate -o run.ecsv                      the packaged example
   astropolcal simulate -o run.ecsv --derotator 45,70,95 --fix hwp.w_sio2=1.66mm
@@ -50,133 +49,92 @@ _IMAGES = {
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "simulate",
-        help="simulate an observation table or image cubes, with photon and read noise",
-        description="Simulate the beam fluxes of an instrument's chain: the published values,\n"
+        run,
+        "simulate an observation table or image cubes, with photon and read noise",
+        "Simulate the beam fluxes of an instrument's chain: the published values,\n"
         "or those of a calibration file. With --cubes, simulate its image cubes.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="OBS.ecsv",
+    add = adder(parser)
+    add(
+        "-o --output OBS.ecsv",
+        "the table (required without --cubes; with it, the true fluxes); overwritten if it exists",
         type=Output,
-        help="the table (required without --cubes; with it, the true fluxes); overwritten if it "
-        "exists",
     )
-    parser.add_argument("--instrument", metavar="NAME", default="charis", help="default: charis")
-    parser.add_argument(
-        "--calibration", metavar="CAL.asdf", type=Input, help="take the chain from this file"
-    )
-    _add_angles(parser)
-    _add_star(parser)
-    _add_cubes(parser)
-    _add_noise(parser)
-    parser.add_argument(
-        "--fix",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="set a parameter of the true chain",
-    )
-    parser.add_argument(
-        "--without",
-        action="append",
-        default=[],
-        metavar="OPTIC",
-        help="take an optic out of the true chain",
-    )
-    add_json(parser)
-    add_quiet(parser)
-    parser.set_defaults(run=run)
+    add("--instrument NAME", "default: charis", default="charis")
+    add("--calibration CAL.asdf", "take the chain from this file", type=Input)
+    _add_frames(add)
+    _add_cubes(adder(parser.add_argument_group("image cubes")))
+    _add_noise(add)
+    add("--fix NAME=VALUE ...", "set a parameter of the true chain")
+    add("--without OPTIC ...", "take an optic out of the true chain")
+    add_shared(parser, "json", "quiet")
 
 
-def _add_angles(parser):
-    parser.add_argument(
-        "--hwp",
-        metavar="DEG,DEG,...",
+def _add_frames(add):
+    add(
+        "--hwp DEG,DEG,...",
+        "half-wave-plate angles (default: 0 to 78.75 by 11.25)",
         type=angles,
-        default=None,
-        help="half-wave-plate angles (default: 0 to 78.75 by 11.25)",
     )
-    parser.add_argument(
-        "--derotator",
-        metavar="DEG,DEG,...",
+    add(
+        "--derotator DEG,DEG,...",
+        "derotator angles (default: 45 to 132.5 by 12.5)",
         type=angles,
-        default=None,
-        help="derotator angles (default: 45 to 132.5 by 12.5)",
     )
-
-
-def _add_noise(parser):
-    parser.add_argument(
-        "--flux",
-        type=float,
-        metavar="ADU",
-        help=f"flux that enters, per wavelength (default: {EXAMPLE['flux']:g}; cubes: less where "
-        "the brightest pixel would be above half of the saturation)",
-    )
-    parser.add_argument(
-        "--gain",
-        type=float,
-        default=EXAMPLE["gain"],
-        metavar="E/ADU",
-        help="electrons per adu (default: %(default)g; cubes: the instrument's)",
-    )
-    parser.add_argument(
-        "--read-noise",
-        type=float,
-        default=EXAMPLE["read_noise"],
-        metavar="E",
-        help="electrons per beam and frame (default: %(default)g; cubes: the instrument's)",
-    )
-    parser.add_argument("--no-noise", action="store_true", help="leave the noise out")
-    parser.add_argument("--seed", type=int, default=EXAMPLE["seed"], help="default: %(default)s")
-
-
-def _add_star(parser):
-    parser.add_argument(
+    add(
         "--source",
+        "the internal source, or a star (default: %(default)s)",
         choices=("internal", "star"),
         default="internal",
-        help="the internal source, or a star (default: %(default)s)",
     )
     for name in ("altitude", "parallactic"):
-        parser.add_argument(
-            f"--{name}",
-            metavar="DEG[,DEG]",
-            type=angles,
-            help=f"{name} angle of a star in all frames, or in the first and last",
-        )
+        meaning = f"{name} angle of a star in all frames, or in the first and last"
+        add(f"--{name} DEG[,DEG]", meaning, type=angles)
 
 
-def _add_cubes(parser):
-    group = parser.add_argument_group("image cubes")
-    group.add_argument(
-        "--cubes",
-        metavar="DIR",
-        type=Folder,
-        help="write image cubes to this folder, raw headers to DIR/raw",
+def _add_noise(add):
+    add(
+        "--flux ADU",
+        f"flux that enters, per wavelength (default: {EXAMPLE['flux']:g}; cubes: less where "
+        "the brightest pixel would be above half of the saturation)",
+        type=float,
     )
-    group.add_argument(
+    add(
+        "--gain E/ADU",
+        "electrons per adu (default: %(default)g; cubes: the instrument's)",
+        type=float,
+        default=EXAMPLE["gain"],
+    )
+    add(
+        "--read-noise E",
+        "electrons per beam and frame (default: %(default)g; cubes: the instrument's)",
+        type=float,
+        default=EXAMPLE["read_noise"],
+    )
+    add("--no-noise", "leave the noise out")
+    add("--seed SEED", "default: %(default)s", type=int, default=EXAMPLE["seed"])
+
+
+def _add_cubes(add):
+    add("--cubes DIR", "write image cubes to this folder, raw headers to DIR/raw", type=Folder)
+    add(
         "--psf",
+        "profile of a star's core (default: %(default)s)",
         choices=("moffat", "gaussian"),
         default=_PSF,
-        help="profile of a star's core (default: %(default)s)",
     )
     for name, (default, unit, meaning) in _IMAGES.items():
-        group.add_argument(
-            f"--{name.replace('_', '-')}",
+        add(
+            f"--{name.replace('_', '-')} {unit}",
+            f"{meaning} (default: %(default)g)",
             type=float,
             default=default,
-            metavar=unit,
-            help=f"{meaning} (default: %(default)g)",
         )
-    group.add_argument(
-        "--saturate", action="store_true", help="cut pixels off at the instrument's saturation"
-    )
+    add("--saturate", "cut pixels off at the instrument's saturation")
 
 
 def run(arguments):

@@ -6,9 +6,9 @@ import math
 from astropolcal.exceptions import ParameterError
 from astropolcal.scripts._common import (
     Output,
-    add_json,
-    add_online,
-    add_quiet,
+    add_command,
+    add_shared,
+    adder,
     printer,
     wrapped,
     write_json,
@@ -26,55 +26,40 @@ _LISTED = 20
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "standards",
-        help="list polarimetric standard stars and when they are observable",
-        description="List the polarimetric standard stars of the catalogue. With a site and a "
+        run,
+        "list polarimetric standard stars and when they are observable",
+        "List the polarimetric standard stars of the catalogue. With a site and a "
         "night, those that rise above the limit, the best for the diattenuation of the telescope "
         "first. With a name, all that is known of that star.",
     )
-    add = parser.add_argument
-    add("name", nargs="?", metavar="NAME", help="a star, such as 'HD 293396'")
-    add("--kind", choices=("polarized", "unpolarized"), help="only stars of this kind")
+    add = adder(parser)
+    add("name NAME", "a star, such as 'HD 293396'", nargs="?")
+    add("--kind", "only stars of this kind", choices=("polarized", "unpolarized"))
     add(
-        "--band",
-        metavar="BAND",
-        help="magnitude and polarization in this band, such as H; the magnitude in V "
+        "--band BAND",
+        "magnitude and polarization in this band, such as H; the magnitude in V "
         "where the catalogue has none in it",
     )
     add(
-        "--magnitude",
-        metavar="LO,HI",
-        help="brightest and faintest magnitude, in --band, or in V where "
-        "the catalogue has none in it",
+        "--magnitude LO,HI",
+        "brightest and faintest magnitude, in --band, or in V where the catalogue has none in it",
     )
-    add("--near", metavar="RA,DEC", help="degrees, or 05:26:06,+16:42:00")
-    add("--radius", metavar="DEG", type=float, help="goes with --near (default: 15)")
-    add("--site", metavar="SITE", help="subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT")
-    add("--night", metavar="YYYY-MM-DD", help="date of the evening at the site")
+    add("--near RA,DEC", "degrees, or 05:26:06,+16:42:00")
+    add("--radius DEG", "goes with --near (default: 15)", type=float)
+    add("--site SITE", "subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT")
+    add("--night YYYY-MM-DD", "date of the evening at the site")
+    add("--min-altitude DEG", "lowest altitude (default: 30)", type=float, default=30.0)
     add(
-        "--min-altitude",
-        metavar="DEG",
-        type=float,
-        default=30.0,
-        help="lowest altitude (default: 30)",
-    )
-    add(
-        "--limit",
-        metavar="N",
+        "--limit N",
+        f"how many to list, the best first (default: {_LISTED} of a night, else all)",
         type=int,
-        help=f"how many to list, the best first (default: {_LISTED} of a night, else all)",
     )
-    add_json(parser, "write it")
-    add(
-        "--plot",
-        metavar="FILE",
-        type=Output,
-        help="draw altitude and parallactic angle over the night",
-    )
-    add_online(parser)
-    add_quiet(parser)
-    parser.set_defaults(run=run)
+    add("--json FILE", "write it for machines (- for stdout)", type=Output)
+    add("--plot FILE", "draw altitude and parallactic angle over the night", type=Output)
+    add_shared(parser, "online", "quiet")
 
 
 def run(arguments):
