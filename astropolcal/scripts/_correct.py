@@ -2,13 +2,18 @@
 """``astropolcal correct``: from science cubes to Stokes parameters."""
 
 import argparse
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal.exceptions import ObservationError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    CalibrationFileError,
+    ObservationError,
+    ParameterError,
+)
 from astropolcal.files import one_line
-from astropolcal.scripts._choosing import choose_calibration, configured
 from astropolcal.scripts._common import (
     Frames,
     Input,
@@ -35,8 +40,20 @@ examples:
       --rotation pupil --camera-angle 113 --open-directions ignore
 """
 
-# what a chain may ask of a frame
-_ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
+# by what a library may ask for
+_OPTIONS = {
+    "instrument": "--instrument NAME",
+    "mode": "--filter MODE",
+    "optics_in": "--optics-in NAME,NAME,...",
+}
+# what a user can do about frames that do not say enough
+_WAYS = {
+    "date": "--any-date takes it all the same",
+    "mode": "--filter {}",
+    "other date": "; --any-date takes it all the same",
+    "raw": "; --raw names a folder of raw frames",
+    "centre": "; give its place with --centre",
+}
 
 
 def add_parser(commands):
@@ -198,7 +215,8 @@ def _point(text):
 def run(arguments):
     """Correct the cubes and write the product."""
     from astropolcal import instruments
-    from astropolcal.correction import ScienceFrames
+    from astropolcal.correction import ScienceFrames, correct
+    from astropolcal.reduction.science import configured, survey_frames
 
     check_suffix("-o", arguments.output, ".fits")
     check_suffix("--spectrum", arguments.spectrum, ".ecsv")
@@ -210,7 +228,9 @@ def run(arguments):
     instrument = configured(instrument, files)
     # one a frame: files of left beams follow those of the right ones
     files = instrument.files.frame_files(files)
-    table, centres, scale, left_scale = _headers(files, instrument, arguments)
+    table, centres, scale, left_scale = survey_frames(
+        files, instrument.files, raw=arguments.raw, centre=arguments.centre, ways=_WAYS
+    )
     frames = ScienceFrames.from_files(
         files,
         instrument,
@@ -226,7 +246,26 @@ def run(arguments):
         date=None,
         mode=calibration.validity.mode,
     )
-    result = _corrected(calibration, frames, chain, arguments, provenance)
+    result = correct(
+        calibration,
+        frames,
+        mode=arguments.mode,
+        observable=arguments.observable,
+        brightness="measured" if arguments.brightness == "measured" else "given",
+        components=arguments.components,
+        weights="variance" if arguments.weights == "variance" else None,
+        max_condition=arguments.max_condition,
+        open_directions=arguments.open_directions,
+        any_date=True,
+        n_samples=arguments.samples,
+        seed=arguments.seed,
+        workers=arguments.workers,
+        cluster=arguments.cluster,
+        progress=not arguments.quiet,
+        provenance=provenance,
+        chain=chain,
+        interpolate=arguments.interpolate,
+    )
     result.write(arguments.output, overwrite=True)
     # for the report, too, not only for --spectrum
     star = result.aperture(_radius(arguments))
@@ -264,90 +303,81 @@ def _radius(arguments):
     return min(10.0, arguments.size / 2) if arguments.radius is None else arguments.radius
 
 
-def _corrected(calibration, frames, chain, arguments, provenance):
-    from astropolcal.correction import correct
+# ---- the calibration ------------------------------------------------------------------------
 
-    return correct(
+
+def choose_calibration(arguments, files):
+    """
+    Return the calibration of the frames, its chain and what is said of where it comes from.
+
+    A file that says itself that it does not hold for the frames is refused like one in a library,
+    unless the user wants it for any date.
+    """
+    from astropolcal import Calibration, instruments
+    from astropolcal.calibration.validity import content_hash
+    from astropolcal.correction import sky_chain
+    from astropolcal.reduction.science import read_night
+
+    path = Path(arguments.calibration)
+    # a folder is searched when it is known what the frames need
+    calibration = None if path.is_dir() else Calibration.read(path)
+    name = arguments.instrument or getattr(calibration, "instrument", None) or "charis"
+    night = read_night(files, instruments.get(name))
+    # what the user says goes before what headers tell
+    beam = night.beam if arguments.optics_in is None else {}
+    if calibration is None:
+        entry = _of_library(path, arguments, night, beam, files)
+        calibration, path = entry.calibration, entry.path
+    _check_validity(calibration, path, arguments, night)
+    chain = sky_chain(
         calibration,
-        frames,
-        mode=arguments.mode,
-        observable=arguments.observable,
-        brightness="measured" if arguments.brightness == "measured" else "given",
-        components=arguments.components,
-        weights="variance" if arguments.weights == "variance" else None,
-        max_condition=arguments.max_condition,
-        open_directions=arguments.open_directions,
-        any_date=True,
-        n_samples=arguments.samples,
-        seed=arguments.seed,
-        workers=arguments.workers,
-        cluster=arguments.cluster,
-        progress=not arguments.quiet,
-        provenance=provenance,
-        chain=chain,
-        interpolate=arguments.interpolate,
+        optics_in=arguments.optics_in,
+        beam=beam,
+        label=str(path),
+        date=night.dates or None,
     )
+    made = {"calibration": str(path), "calibration_hash": content_hash(calibration)}
+    return calibration, chain, made
 
 
-def _headers(files, instrument, arguments):
-    """Return angles of all frames, places of the star, exposures, and scales of the left beam."""
-    from astropy.table import QTable
+def _check_validity(calibration, path, arguments, night):
+    """Refuse frames for which the calibration does not hold, unless the user wants it."""
+    from astropolcal.calibration.validity import check_frames
 
-    from astropolcal.reduction.beams import beam_scale
-    from astropolcal.reduction.headers import raw_frames
-
-    layout = instrument.files
-    raw = None if arguments.raw is None else raw_frames(arguments.raw, layout)
-    found = _frames(files, layout, raw, arguments.centre)
-    table = QTable()
-    for name in _ANGLES:
-        # an angle that no header has is no column at all
-        values = [frame.values.get(name, np.nan) for frame in found]
-        if np.isfinite(values).any():
-            table[name] = values * u.deg
-    states = [frame.values.get("flc_state", "") for frame in found]
-    if any(states):
-        table["flc_state"] = states
-    if "hwp_true" in table.colnames and not np.isfinite(table["hwp_true"]).all():
-        # an angle that some headers lack follows from the tracking law in all
-        table.remove_column("hwp_true")
-    centres = arguments.centre
-    if centres is None:
-        # (beam, x and y): the star stands still over the slices within a fraction of a pixel
-        centres = [np.median([f.photometry.x, f.photometry.y], axis=2).T for f in found]
-        first = np.asarray(centres)
-        if not np.isfinite(first).all():
-            bad = files[int(np.argmin(np.isfinite(first).all(axis=(1, 2))))]
-            raise ObservationError(f"{bad}: the star was not found; give its place with --centre")
-    # frames of equal exposures need no scale, known or not
-    exposure = np.array([frame.values.get("exposure_time", np.nan) for frame in found])
-    differ = np.isfinite(exposure).all() and np.ptp(exposure) > 1e-6 * exposure.max()
-    left = [beam_scale(file, layout, f.values) for file, f in zip(files, found, strict=True)]
-    return table, centres, exposure / np.median(exposure) if differ else None, left
+    # --filter names the mode as the file does, whatever the headers call it
+    mode = arguments.filter or night.mode
+    frames = [(file, date, mode) for file, date in night.moments.items()]
+    max_age = None if arguments.max_age is None else arguments.max_age * u.yr
+    options = {"max_age": max_age, "ways": _WAYS, "dates": not arguments.any_date}
+    check_frames(calibration, frames, str(path), **options)
 
 
-def _frames(files, layout, raw, centre):
-    """Return what is known of the files; refuse one that cannot be used."""
-    from astropolcal.reduction.frames import check_stars, reduce_frame
-    from astropolcal.reduction.headers import add_pointing, not_of_instrument, read_header
+def _of_library(path, arguments, night, beam, files):
+    """Return the calibration that holds for the first and the last frame."""
+    from astropolcal.calibration.library import Library
 
-    if centre is None:
-        # finds the star, which takes the time of this step
-        frames = [reduce_frame(file, layout, source="star", raw=raw) for file in files]
-        check_stars(frames, layout)
-    else:
-        frames = [read_header(file, layout, raw=raw) for file in files]
-        # whether they are needed depends on the calibration
-        add_pointing(frames, layout, needed=False)
-    for file, frame in zip(files, frames, strict=True):
-        foreign = not_of_instrument(frame.values, layout)
-        if foreign:
-            raise ObservationError(f"{file}: {foreign}")
-        if frame.errors:
-            raw_hint = "; --raw names a folder of raw frames"
-            hint = raw_hint if raw is None and layout.raw_columns else ""
-            raise ObservationError(f"{file}: {'; '.join(frame.errors)}{hint}")
-    return frames
+    # None: the library chooses without a date
+    dates = [None] if arguments.any_date else night.dates
+    if not dates:
+        raise ObservationError(f"{files[0]}: no date in its header to choose a calibration by")
+    library, mode = Library(path), arguments.filter or night.mode
+    wanted = {"mode": mode, "optics_in": arguments.optics_in, "beam": beam}
+    try:
+        found = [library.find(arguments.instrument, date=date, **wanted) for date in dates]
+    except CalibrationFileError as error:
+        # the library names what it needs, a user types options
+        hint = f" ({_OPTIONS[error.argument]})" if error.argument in _OPTIONS else ""
+        raise CalibrationFileError(f"{error}{hint}") from error
+    # a night across the change of a calibration
+    if len({str(entry.path) for entry in found}) > 1:
+        raise AstropolcalError(
+            f"{path}: the frames from {dates[0]} to {dates[-1]} need two calibrations, "
+            f"{found[0].path} and {found[1].path}: correct them apart"
+        )
+    return found[0]
+
+
+# ---- the product ----------------------------------------------------------------------------
 
 
 def _position_angles(table, arguments):
@@ -391,31 +421,24 @@ def _summary(result, star, arguments, n_frames):
         "components": result.components,
         "n_frames": n_frames,
         "north_up": result.north_up,
-        "wavelength_nm": result.wavelength.to_value(u.nm).tolist(),
-        "condition": _plain(result.condition),
+        "wavelength_nm": result.wavelength.to_value(u.nm),
+        "condition": result.condition,
         "poorly_determined": dict((str(i), words) for i, words in enumerate(result.weak) if words),
-        "leakage_q": _plain(result.leakage[:, 1]),
-        "leakage_u": _plain(result.leakage[:, 2]),
+        "leakage_q": result.leakage[:, 1],
+        "leakage_u": result.leakage[:, 2],
         "held": [] if result.systematic is None else result.systematic.held,
-        "aperture": {"radius": _radius(arguments)}
-        | {name: _plain(values) for name, values in spectrum.items()},
+        "aperture": {"radius": _radius(arguments)} | spectrum,
     }
 
 
-def _plain(values):
-    """Return numbers for JSON, None where there is none."""
-    # JSON has no NaN
-    return [float(value) if np.isfinite(value) else None for value in values]
-
-
 def _report(summary, systematic):
-    # None where nothing was determined
-    condition = [value for value in summary["condition"] if value is not None]
+    # not finite where nothing was determined
+    condition = summary["condition"][np.isfinite(summary["condition"])]
     frames = counted(summary["n_frames"], "frame")
     written, calibration = (one_line(summary[key], None) for key in ("output", "calibration"))
     show(f"Written: {written} ({frames}, mode {summary['mode']})")
     show(f"  calibration: {calibration}")
-    if condition:
+    if condition.size:
         show(
             f"  condition number of the solution for {summary['components']}: "
             f"{min(condition):.3g} to {max(condition):.3g}"
@@ -425,27 +448,22 @@ def _report(summary, systematic):
         show(wrapped(line, indent=4))
     aperture = summary["aperture"]
     show(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
-    # JSON has null where it is infinite
     unknown = "infinite" if systematic is not None and systematic.is_open else "not known"
     for name, unit, error, words, scale in (
         ("dolp", " %", "s_p", "degree of linear polarization", 100),
         ("aolp", " deg", "s_chi", "angle of linear polarization", 1),
     ):
-        values = _scaled(aperture[name], scale)
+        values = scale * aperture[name]
         shown = _middle(values, ".2f" if name == "dolp" else ".1f", unit, name == "aolp")
         show(f"    {words}: {shown}")
         for kind, none in (("statistical", "not known"), ("systematic", unknown)):
-            values = _scaled(aperture[f"{error}_{kind}"], scale)
+            values = scale * aperture[f"{error}_{kind}"]
             show(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
-
-
-def _scaled(values, scale):
-    return [None if value is None else scale * value for value in values]
 
 
 def _middle(values, form, unit, turns=False, none="not known"):
     """Return the median of what is known, as text; angles near 0 and 180 deg are neighbours."""
-    known = np.array([value for value in values if value is not None])
+    known = values[np.isfinite(values)]
     if known.size == 0:
         return none
     if turns:

@@ -3,6 +3,8 @@
 
 import math
 
+import astropy.units as u
+
 from astropolcal.exceptions import ParameterError
 from astropolcal.scripts._common import (
     Output,
@@ -17,7 +19,7 @@ from astropolcal.units import plain_number
 from astropolcal.words import counted, did_you_mean
 
 # R, J, H and K, for what a calibration assumes of a star
-_BANDS = (0.65, 1.25, 1.65, 2.2)
+_BANDS = [0.65, 1.25, 1.65, 2.2] * u.um
 # more stars than this make a figure unreadable
 _DRAWN = 5
 # of a night, whose list is ordered by how good a star is, so that its end is of no use
@@ -68,7 +70,10 @@ def run(arguments):
     # text for people, content for machines, nights for the figure
     text, content, seen, total = (_one if arguments.name else _many)(arguments)
     if arguments.plot:
-        _plot(seen, total, arguments.plot)
+        from astropolcal.plotting import plot_observability
+        from astropolcal.plotting._style import save
+
+        save(plot_observability(seen, total=total), arguments.plot)
     if arguments.json:
         write_json(content, arguments.json)
     printer(arguments)(text)
@@ -97,7 +102,7 @@ def _one(arguments):
 
     star = standards.get(arguments.name)
     content = _facts(star)
-    lines = _describe(star)
+    lines = _describe(star, content["known"])
     if arguments.night is None:
         return "\n".join(lines), content, [], 1
     seen = _observability(star.name, arguments)
@@ -108,16 +113,14 @@ def _one(arguments):
 
 
 def _observability(name, arguments):
-    import astropy.units as u
-
     from astropolcal import standards
 
     limit = arguments.min_altitude * u.deg
     return standards.observability(name, _site(arguments.site), arguments.night, min_altitude=limit)
 
 
-def _describe(star):
-    """Return the lines that say what is known of a star."""
+def _describe(star, known):
+    """Return the lines that say what is known of a star, and what a calibration assumes of it."""
     place = star.coord.to_string("hmsdms", sep=":", precision=1)
     lines = [f"{star.name}: {star.kind} standard star"]
     lines.append(f"  position    {place} (ICRS, +-{star.position_error.value:g} arcsec)")
@@ -129,7 +132,7 @@ def _describe(star):
         lines.append(f"  type        {star.spectral_type}")
     if star.note:
         lines.append(wrapped(f"  note        {star.note}", indent=14))
-    lines += [*_law_lines(star), *_known_lines(star)]
+    lines += [*_law_lines(star), *_known_lines(known)]
     if len(star.polarization):
         lines += ["", "  band      um     p (%)         theta (deg)   source"]
     lines += [_measurement(row) for row in star.polarization]
@@ -155,53 +158,18 @@ def _law_lines(star):
     return lines
 
 
-def _known_lines(star):
-    """Say what a calibration assumes of the star: the prior of its polarization."""
-    known = _known(star)
+def _known_lines(known):
     if known is None:
         return []
     lines = ["", "  In a calibration"]
     for row in known["stokes"]:
-        turned, what = "", "q, u"
+        what, turned = "q, u", ""
         if row["theta_deg"] is not None:
-            what, turned = (
-                "p",
-                f", theta {_pair(row['theta_deg'], row['theta_err_deg'], '.1f')} deg",
-            )
+            angle = _pair(row["theta_deg"], row["theta_err_deg"], ".1f")
+            what, turned = "p", f", theta {angle} deg"
         degree = _pair(row["p_percent"], row["p_err_percent"], ".2f")
         lines.append(f"    {row['wavelength_um']:.2f} um   {what} {degree} %{turned}")
     return lines + [wrapped(f"    - {words}", indent=6) for words in known["words"]]
-
-
-def _known(star):
-    """Return degree and angle in a few bands with the errors that a calibration takes, or None."""
-    import astropy.units as u
-    import numpy as np
-
-    try:
-        law = star.stokes(np.array(_BANDS) * u.um)
-        if star.kind == "unpolarized":
-            words = [star.unpolarized_error().words]
-        else:
-            words = list(star.interstellar().assumed)
-    except ParameterError:
-        return None
-    rows = []
-    for i, band in enumerate(_BANDS):
-        light = np.array([law.q[i], law.u[i]])
-        degree, angle = np.hypot(*light), np.arctan2(law.u[i], law.q[i])
-        along = np.array([np.cos(angle), np.sin(angle)])
-        across = np.array([-along[1], along[0]])
-        error, turn = (np.sqrt(d @ law.covariance[i] @ d) for d in (along, across))
-        polarized = degree > 0
-        rows.append({
-            "wavelength_um": float(band),
-            "p_percent": 100 * float(degree),
-            "p_err_percent": 100 * float(error),
-            "theta_deg": float(np.rad2deg(angle / 2) % 180) if polarized else None,
-            "theta_err_deg": float(np.rad2deg(turn / 2 / degree)) if polarized else None,
-        })  # fmt: skip
-    return {"stokes": rows, "words": words}
 
 
 def _measurement(row):
@@ -240,14 +208,16 @@ def _many(arguments):
     from astropolcal import standards
 
     site = None if arguments.site is None else _site(arguments.site)
+    radius = 15.0 if arguments.radius is None else arguments.radius
+    near = arguments.near and {"center": _position(arguments.near), "radius": radius * u.deg}
     found = standards.search(
-        **_where(arguments),
+        **(near or {}),
         kind=arguments.kind,
         band=arguments.band,
         magnitude=_numbers(arguments.magnitude, "--magnitude", 2),
         site=site,
         night=arguments.night,
-        min_altitude=_degrees(arguments.min_altitude),
+        min_altitude=arguments.min_altitude * u.deg,
     )
     if not len(found):
         limit = f" above {arguments.min_altitude:g} deg" if arguments.night else ""
@@ -267,15 +237,6 @@ def _many(arguments):
         lines += ["", f"The figure shows the first {len(best)} of {len(shown)} stars."]
     seen = [_observability(str(name), arguments) for name in best]
     return "\n".join(lines), content, seen, len(shown)
-
-
-def _where(arguments):
-    if arguments.near is None:
-        return {}
-    return {
-        "center": _position(arguments.near),
-        "radius": _degrees(15.0 if arguments.radius is None else arguments.radius),
-    }
 
 
 def _band_lines(shown, arguments):
@@ -350,31 +311,33 @@ def _magnitude(row):
 
 
 def _number(value, form):
-    return "-" if value is None or not math.isfinite(value) else f"{value:{form}}"
+    return f"{value:{form}}" if math.isfinite(value) else "-"
 
 
 # ---- machines -----------------------------------------------------------------------
 
 
 def _facts(star):
+    from astropolcal.standards.priors import assumed_polarization
+
     law = None
     if star.law is not None:
         law = {
-            "p_max_percent": 100 * float(star.law.p_max.value),
-            "lambda_max_um": float(star.law.lambda_max.value),
-            "K": float(star.law.K.value),
-            "theta_deg": float(star.law.theta.value),
+            "p_max_percent": 100 * star.law.p_max.value,
+            "lambda_max_um": star.law.lambda_max.value,
+            "K": star.law.K.value,
+            "theta_deg": star.law.theta.value,
             "reference": star.law_reference,
             "doi": star.law_doi or None,
         }
     return {
         "name": star.name,
         "kind": star.kind,
-        "ra_deg": float(star.coord.ra.deg),
-        "dec_deg": float(star.coord.dec.deg),
-        "magnitudes": {band: float(m.value) for band, m in star.magnitudes.items()},
+        "ra_deg": star.coord.ra.deg,
+        "dec_deg": star.coord.dec.deg,
+        "magnitudes": {band: m.value for band, m in star.magnitudes.items()},
         "law": law,
-        "known": _known(star),
+        "known": assumed_polarization(star, _BANDS),
         "measurements": [_row(row) for row in star.polarization],
         "checked": star.checked,
     }
@@ -384,39 +347,27 @@ _UNITS = {"deg": "deg", "%": "percent", "um": "um", "mag": "", "h": ""}
 
 
 def _row(row):
-    """Return a row of a table for JSON: unit in the name, None for what is not known."""
+    """Return a row of a table for JSON: unit in the name."""
     content = {}
     for name in row.colnames:
         value = row[name]
         unit = _UNITS.get(str(getattr(value, "unit", "")), "")
-        value = getattr(value, "value", value)
-        # numpy scalars are no JSON
-        value = value.item() if hasattr(value, "item") else value
-        if isinstance(value, float) and not math.isfinite(value):
-            value = None
-        content[f"{name}_{unit}" if unit else name] = value
+        content[f"{name}_{unit}" if unit else name] = getattr(value, "value", value)
     return content
 
 
 def _angles(seen):
-    # of 32 frames, as in the table of a night
-    error = seen.information(32).diattenuation
     return {
-        "hours": float(seen.hours.value),
+        "hours": seen.hours.value,
         "transit": seen.transit.iso,
-        "altitude_deg": [float(a) for a in seen.altitude.value],
-        "parallactic_deg": [float(a) for a in seen.parallactic.value],
-        "m3_error": error if math.isfinite(error) else None,
+        "altitude_deg": seen.altitude.value,
+        "parallactic_deg": seen.parallactic.value,
+        # of 32 frames, as in the table of a night
+        "m3_error": seen.information(32).diattenuation,
     }
 
 
 # ---- what the options mean ----------------------------------------------------------
-
-
-def _degrees(value):
-    import astropy.units as u
-
-    return value * u.deg
 
 
 def _numbers(text, option, count):
@@ -432,7 +383,6 @@ def _numbers(text, option, count):
 
 
 def _position(text):
-    import astropy.units as u
     from astropy.coordinates import SkyCoord
 
     try:
@@ -448,7 +398,6 @@ def _position(text):
 
 def _site(text):
     """Return the place, by name or as LON,LAT,HEIGHT."""
-    import astropy.units as u
     from astropy.coordinates import EarthLocation
 
     from astropolcal.standards._sky import SITES, location
@@ -467,10 +416,3 @@ def _site(text):
         return EarthLocation.from_geodetic(lon * u.deg, lat * u.deg, height * u.m)
     except ValueError as error:
         raise ParameterError(f"--site {text}: {error}") from None
-
-
-def _plot(seen, total, path):
-    from astropolcal.plotting import plot_observability
-    from astropolcal.plotting._style import save
-
-    save(plot_observability(seen, total=total), path)

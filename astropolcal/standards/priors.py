@@ -366,3 +366,38 @@ def _line(x, offset, error):
     # bands and sources may disagree by more than their errors
     inverse *= max(np.sum((offset / error - design @ values) ** 2) / (x.size - 2), 1.0)
     return (values, inverse) if inverse[1, 1] < _ROTATION_SCATTER**2 else None
+
+
+# ---- what a calibration assumes -------------------------------------------------------------
+
+
+def assumed_polarization(star, wavelength):
+    """
+    Return what a calibration assumes of a star: a row a wavelength, and the reasons in words.
+
+    Rows have degree (percent) and angle (deg) of polarization with the errors along and across it;
+    of light without polarization there is no angle. None if the polarization is not known.
+    """
+    try:
+        light = star.stokes(wavelength)
+        if star.kind == "unpolarized":
+            words = [star.unpolarized_error().words]
+        else:
+            words = list(star.interstellar().assumed)
+    except ParameterError:
+        return None
+    degree, angle = np.hypot(light.q, light.u), np.arctan2(light.u, light.q)
+    rows = []
+    for i, band in enumerate(wavelength.to_value(u.um)):
+        along = np.array([np.cos(angle[i]), np.sin(angle[i])])
+        across = np.array([-along[1], along[0]])
+        error, turn = (np.sqrt(d @ light.covariance[i] @ d) for d in (along, across))
+        polarized = degree[i] > 0
+        rows.append({
+            "wavelength_um": float(band),
+            "p_percent": 100 * float(degree[i]),
+            "p_err_percent": 100 * float(error),
+            "theta_deg": float(np.rad2deg(angle[i] / 2) % 180) if polarized else None,
+            "theta_err_deg": float(np.rad2deg(turn / 2 / degree[i])) if polarized else None,
+        })  # fmt: skip
+    return {"stokes": rows, "words": words}

@@ -838,7 +838,7 @@ class Described(Reader):
         return binary.mutate_fits(rng, binary.forge_checksums(content))
 
     def read(self, path):
-        from astropolcal.scripts._describing import describe_fits
+        from astropolcal.scripts._info import describe_fits
 
         return describe_fits(path)
 

@@ -108,7 +108,7 @@ def test_complex_shapes_are_refused(small, tmp_path):
 def test_checksums_that_do_not_match_are_found_wherever_files_are_read(small, tmp_path, flat_cube):
     """A bit of the data, or a letter of the header, of cubes, raw frames and any FITS file."""
     from astropolcal.correction.sources import CubeFiles
-    from astropolcal.scripts._describing import describe_fits
+    from astropolcal.scripts._info import describe_fits
 
     path = tmp_path / "CRSA00000001_cube.fits"
     write_cube(path, flat_cube)
