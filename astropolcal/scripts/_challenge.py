@@ -151,7 +151,8 @@ def _options(arguments):
             n_wavelengths=arguments.wavelengths,
             n_derotator=arguments.derotator_angles,
         ),
-        "progress": _progress(arguments),
+        # a bar on a terminal, else lines
+        "progress": not is_quiet(arguments) and (sys.stderr.isatty() or _Progress()),
     }
 
 
@@ -181,13 +182,6 @@ def _workers(count):
             process.terminate()
         raise
     pool.shutdown()
-
-
-def _progress(arguments):
-    """Return what says how far the challenges are: a bar on a terminal, else lines."""
-    if is_quiet(arguments):
-        return False
-    return True if sys.stderr.isatty() else _Progress()
 
 
 class _Progress:

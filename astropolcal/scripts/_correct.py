@@ -40,6 +40,11 @@ examples:
       --rotation pupil --camera-angle 113 --open-directions ignore
 """
 
+# options that `correct` calls the same
+_PASSED_ON = (
+    *("mode", "observable", "components", "max_condition", "open_directions", "seed"),
+    *("workers", "cluster", "interpolate"),
+)
 # by what a library may ask for
 _OPTIONS = {
     "instrument": "--instrument NAME",
@@ -249,22 +254,14 @@ def run(arguments):
     result = correct(
         calibration,
         frames,
-        mode=arguments.mode,
-        observable=arguments.observable,
+        chain=chain,
         brightness="measured" if arguments.brightness == "measured" else "given",
-        components=arguments.components,
         weights="variance" if arguments.weights == "variance" else None,
-        max_condition=arguments.max_condition,
-        open_directions=arguments.open_directions,
         any_date=True,
         n_samples=arguments.samples,
-        seed=arguments.seed,
-        workers=arguments.workers,
-        cluster=arguments.cluster,
         progress=not arguments.quiet,
         provenance=provenance,
-        chain=chain,
-        interpolate=arguments.interpolate,
+        **{name: getattr(arguments, name) for name in _PASSED_ON},
     )
     result.write(arguments.output, overwrite=True)
     # for the report, too, not only for --spectrum

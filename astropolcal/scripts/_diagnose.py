@@ -100,32 +100,27 @@ def run(arguments):
 
     # needs no table
     if arguments.effects == "help":
-        show(_list_of_effects())
+        from astropolcal.gap import EFFECTS
+
+        width = max(map(len, EFFECTS)) + 2
+        for name, effect in EFFECTS.items():
+            show(wrapped(f"{name:<{width}}{effect.title}", indent=width))
         return
     say, progress = printer(arguments), None if is_quiet(arguments) else _Progress()
     check_suffix("--save", arguments.save, ".asdf")
-    _check_page(arguments.report)
-    effects = _effects(arguments.effects)
+    if arguments.report and Path(arguments.report).suffix.lower() not in _PAGES:
+        raise AstropolcalError(
+            f"--report {arguments.report}: the name must end with {' or '.join(_PAGES)}"
+        )
+    options = {"effects": _effects(arguments.effects), "progress": progress}
     nominal, datasets, instrument = _nominal(arguments)
-    diagnosis = diagnose(
-        nominal,
-        datasets,
-        effects=effects,
-        changes=arguments.changes,
-        nested=arguments.nested,
-        progress=progress,
-    )
+    options |= {"changes": arguments.changes, "nested": arguments.nested}
+    diagnosis = diagnose(nominal, datasets, **options)
     # once: page, JSON and summary say the same
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
     written = _write(diagnosis, content, arguments, instrument)
     say(summary(diagnosis, content, written))
-
-
-def _check_page(path):
-    """Raise if the page is called what others take for another format."""
-    if path is not None and Path(path).suffix.lower() not in _PAGES:
-        raise AstropolcalError(f"--report {path}: the name must end with {' or '.join(_PAGES)}")
 
 
 class _Progress:
@@ -153,14 +148,6 @@ def _effects(text):
     for name in names:
         get_effect(name)
     return names
-
-
-def _list_of_effects():
-    from astropolcal.gap import EFFECTS
-
-    width = max(map(len, EFFECTS)) + 2
-    lines = (f"{name:<{width}}{effect.title}" for name, effect in EFFECTS.items())
-    return "\n".join(wrapped(line, indent=width) for line in lines)
 
 
 # ---- the nominal model ------------------------------------------------------------------------
@@ -230,10 +217,9 @@ def _write(diagnosis, content, arguments, instrument):
     if arguments.report:
         from astropolcal.gap.report import write_html
 
-        figures, sizes = _figures(diagnosis), _size_figures(diagnosis, content)
-        write_html(
-            diagnosis, arguments.report, figures=figures, size_figures=sizes, content=content
-        )
+        figures = {"figures": _figures(diagnosis)}
+        figures["size_figures"] = _size_figures(diagnosis, content)
+        write_html(diagnosis, arguments.report, content=content, **figures)
         written.append(arguments.report)
     if arguments.save:
         from astropolcal.gap._numbers import with_causes

@@ -77,9 +77,11 @@ def add_parser(commands):
 
 def run(arguments):
     """Print the table, draw the figure and write what was asked for."""
-    tabulated = _is_table_wanted(arguments)
-    arguments.altitude = _or(arguments.altitude, 60.0)
-    arguments.parallactic = _or(arguments.parallactic, 0.0)
+    asked = (arguments.altitude, arguments.parallactic, arguments.derotator, arguments.wavelength)
+    # a target has its own pointing, not that of the table
+    tabulated = not (arguments.target or arguments.night) or any(a is not None for a in asked)
+    arguments.altitude = 60.0 if arguments.altitude is None else arguments.altitude
+    arguments.parallactic = arguments.parallactic or 0.0
     instrument, chain, grid = _chain(arguments)
     content = _table(arguments, instrument, chain, grid)
     best = None
@@ -90,18 +92,11 @@ def run(arguments):
     if arguments.json:
         write_json(content, arguments.json)
     if not is_quiet(arguments):
-        show(_text(content, tabulated))
+        texts = [_table_text(content)] if tabulated else []
+        if best is not None:
+            texts.append(_best_text(content["best_derotator"], instrument.name))
+        show("\n\n".join(texts))
         say_written(show, [path for path in (arguments.output, arguments.json) if path])
-
-
-def _is_table_wanted(arguments):
-    """Return whether the table is printed: a target has its own pointing, not that of the table."""
-    asked = (arguments.altitude, arguments.parallactic, arguments.derotator, arguments.wavelength)
-    return not (arguments.target or arguments.night) or any(a is not None for a in asked)
-
-
-def _or(value, default):
-    return default if value is None else value
 
 
 def _chain(arguments):
@@ -110,8 +105,8 @@ def _chain(arguments):
 
     if arguments.file is None:
         instrument = instruments.get(arguments.instrument or "charis")
-        grid = instrument.wavelength
-        return instrument, _on_sky(instrument, instrument.published(), grid, arguments), grid
+        chain, grid = instrument.published(), instrument.wavelength
+        return instrument, _on_sky(instrument, chain, grid, arguments), grid
     calibration = Calibration.read(arguments.file)
     name = arguments.instrument or calibration.instrument
     if name is None:
@@ -157,10 +152,10 @@ def _table(arguments, instrument, chain, grid):
     content = {"instrument": instrument.name}
     content |= {f"{key}_deg": a.value for key, a in _pointing(arguments, chain).items()}
     # absent where there is none, not empty
-    content |= {"derotator_deg": derotator.tolist()} if turns else {}
+    content |= {"derotator_deg": derotator} if turns else {}
     return content | {
-        "wavelength_nm": grid.to_value(u.nm)[rows].tolist(),
-        "efficiency": np.atleast_2d(values)[:, rows].tolist(),
+        "wavelength_nm": grid.to_value(u.nm)[rows],
+        "efficiency": np.atleast_2d(values)[:, rows],
     }
 
 
@@ -212,12 +207,12 @@ def _best(arguments, instrument, chain, grid):
     row = int(np.argmax(best.table["least"]))
     return best, {
         "law": best.law,
-        "offset_deg": float(best.offset.to_value(u.deg)),
-        "least": float(best.table["least"][row]),
-        "mean": float(best.table["mean"][row]),
-        "least_of_any_offset": float(np.min(best.table["least"])),
-        "altitude_deg": [float(f(altitude.value)) for f in (np.min, np.max)],
-        "parallactic_deg": [float(f(turned)) for f in (np.min, np.max)],
+        "offset_deg": best.offset.to_value(u.deg),
+        "least": best.table["least"][row],
+        "mean": best.table["mean"][row],
+        "least_of_any_offset": np.min(best.table["least"]),
+        "altitude_deg": [altitude.value.min(), altitude.value.max()],
+        "parallactic_deg": [turned.min(), turned.max()],
     }
 
 
@@ -294,26 +289,13 @@ def _draw(arguments, instrument, chain, grid, best=None):
     save(figure, arguments.output)
 
 
-def _where(content):
-    if "altitude_deg" not in content:
-        return "behind the internal source"
-    return (
-        f"at altitude {content['altitude_deg']:g} deg, parallactic angle "
-        f"{content['parallactic_deg']:g} deg"
-    )
-
-
-def _text(content, tabulated=True):
-    parts = [_table_text(content)] if tabulated else []
-    if "best_derotator" in content:
-        parts.append(_best_text(content["best_derotator"], content["instrument"]))
-    return "\n\n".join(parts)
-
-
 def _table_text(content):
-    turns = "derotator_deg" in content
+    turns, where = "derotator_deg" in content, "behind the internal source"
+    if "altitude_deg" in content:
+        where = f"at altitude {content['altitude_deg']:g} deg, parallactic angle "
+        where += f"{content['parallactic_deg']:g} deg"
     lines = [
-        f"Polarimetric efficiency of {content['instrument']} {_where(content)}",
+        f"Polarimetric efficiency of {content['instrument']} {where}",
         "",
         "derotator" * turns + "".join(f"{lam:8.0f}" for lam in content["wavelength_nm"]) + " nm",
     ]

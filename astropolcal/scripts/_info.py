@@ -247,14 +247,13 @@ def _other_table(path, table):
     lines = [
         f"{path}: {kind}, {counted(len(table), 'row')} x {counted(len(units), 'column')}",
         f"  columns: {columns}",
-        *(f"  {key}: {_text(value)}" for key, value in meta.items()),
+        *(
+            f"  {key}: {', '.join(map(str, value)) if isinstance(value, list) else value}"
+            for key, value in meta.items()
+        ),
     ]
     content = {"file": str(path), "type": kind, "n_rows": len(table), "columns": units}
     return lines, content | {"meta": meta}
-
-
-def _text(value):
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _told(values):

@@ -136,7 +136,11 @@ def run(arguments):
         )
     reduction.write(arguments.output, overwrite=True)
     # after the table, which is what the time went into
-    figures = _quicklook(reduction, arguments.quicklook)
+    figures = []
+    if arguments.quicklook:
+        from astropolcal.plotting.reduction import save_quicklook
+
+        figures = save_quicklook(reduction, arguments.quicklook)
     if arguments.json:
         summary = {"output": str(arguments.output)} | reduction.summary()
         write_json(summary | {"figures": [str(path) for path in figures]}, arguments.json)
@@ -159,14 +163,6 @@ def _options(arguments):
     return given
 
 
-def _quicklook(reduction, folder):
-    if folder is None:
-        return []
-    from astropolcal.plotting.reduction import save_quicklook
-
-    return save_quicklook(reduction, folder)
-
-
 def _report(reduction, arguments, figures):
     """Say what was done on stdout, and what was left out on stderr."""
     for path, why in list(reduction.problems.items())[:_MAX_LISTED]:
@@ -177,7 +173,9 @@ def _report(reduction, arguments, figures):
     if more > 0:
         words = f"{counted(more, 'more file')} (--json lists all)"
         show(f"astropolcal: left out: {words}", file=sys.stderr)
-    for why, count in _by_reason(reduction.doubts).items():
+    # in the order of the files
+    doubts = Counter(reason for reasons in reduction.doubts.values() for reason in reasons)
+    for why, count in doubts.items():
         show(f"astropolcal: doubtful: {counted(count, 'file')}: {why}", file=sys.stderr)
     say, summary = printer(arguments), reduction.summary()
     say(
@@ -188,8 +186,3 @@ def _report(reduction, arguments, figures):
         say(f"  masked, {reason}: {counted(count, 'cell')}")
     if figures:
         say(f"Figures: {one_line(arguments.quicklook, None)} ({counted(len(figures), 'file')})")
-
-
-def _by_reason(doubts):
-    """Return the number of files by what is odd about them, in the order of the files."""
-    return Counter(reason for reasons in doubts.values() for reason in reasons)

@@ -135,12 +135,6 @@ def _check_run(calibration, arguments):
         need("h5py", "a checkpoint")
 
 
-def _in_options(error):
-    """Return an error about an argument of `sample` as one about the option."""
-    words, option = str(error), _OPTIONS.get(error.argument)
-    return FitError(f"{option} {words.removeprefix(f'{error.argument} = ')}" if option else words)
-
-
 def _sample(calibration, arguments):
     from astropolcal.calibration import sample
 
@@ -156,7 +150,10 @@ def _sample(calibration, arguments):
             progress=not arguments.quiet,
         )
     except FitError as error:
-        raise _in_options(error) from error
+        # about the option instead of the argument
+        words, option = str(error), _OPTIONS.get(error.argument)
+        words = f"{option} {words.removeprefix(f'{error.argument} = ')}" if option else words
+        raise FitError(words) from error
     except KeyboardInterrupt:
         if arguments.checkpoint and Path(arguments.checkpoint).exists():
             show(

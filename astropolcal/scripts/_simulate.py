@@ -33,6 +33,9 @@ examples:
       --parallactic 24,30 --derotator 97 --fix star.q=0.01
 """
 
+# of the light in an image
+_LOOKS = ("source", "psf", "fwhm", "halo", "background")
+_DEROTATOR = [45 + 12.5 * i for i in range(8)]
 _PSF = "moffat"
 
 #: Options of ``--cubes`` that are numbers: default, unit and meaning.
@@ -139,20 +142,25 @@ def _add_cubes(add):
 
 def run(arguments):
     """Simulate and write the table, the cubes or both."""
+    from astropolcal import instruments
+
     if not (arguments.output or arguments.cubes):
         raise AstropolcalError("nothing to write: give -o OBS.ecsv, --cubes DIR or both")
     check_suffix("-o", arguments.output, ".ecsv")
     _check_images(arguments)
-    chain, wavelength, meta = _truth(arguments)
+    instrument = instruments.get(arguments.instrument)
+    chain, wavelength, meta = _truth(arguments, instrument)
     # free and prior mean nothing for what is true
     (chain,) = edit_chains([chain], without=arguments.without, fix=arguments.fix)
     frames = _frames(arguments, chain)
     if arguments.flux is None:
-        arguments.flux = _flux(arguments, chain, wavelength, frames)
-    observations = _table(arguments, chain, wavelength, frames, _meta(meta, arguments))
+        arguments.flux = _flux(arguments, instrument, chain, wavelength, frames)
+    # of the set-up, less the optics taken out
+    meta = meta | instrument.meta_without(arguments.without) | {"simulated": True}
+    observations = _table(arguments, instrument, chain, wavelength, frames, meta)
     written = []
     if arguments.cubes:
-        paths = _write_cubes(arguments, chain, wavelength, frames)
+        paths = _write_cubes(arguments, instrument, chain, wavelength, frames)
         written.append(f"{one_line(arguments.cubes, None)} ({counted(len(paths), 'cube')})")
     if arguments.output:
         observations.write(arguments.output, overwrite=True)
@@ -184,7 +192,7 @@ def _frames(arguments, chain):
 
     star = arguments.source == "star"
     hwp = arguments.hwp or (_STAR_CYCLE if star else None)
-    given = {"derotator": arguments.derotator or _derotator_angles()}
+    given = {"derotator": arguments.derotator or _DEROTATOR}
     given |= {"hwp": hwp} if hwp else {}
     frames = half_wave_plate_cycles(**{k: v * u.deg for k, v in given.items()})
     for name in ("altitude", "parallactic"):
@@ -200,78 +208,52 @@ def _frames(arguments, chain):
     return both_states(frames) if "flc_state" in stages(chain) else frames
 
 
-def _flux(arguments, chain, wavelength, frames):
+def _flux(arguments, instrument, chain, wavelength, frames):
     """Return the flux where none is given."""
     if not arguments.cubes:
         return EXAMPLE["flux"]
-    from astropolcal import instruments
     from astropolcal.reduction.cubes import _usual_flux
 
-    return _usual_flux(
-        chain,
-        instruments.get(arguments.instrument),
-        frames,
-        EXAMPLE["flux"],
-        wavelength=wavelength,
-        source=arguments.source,
-        **{name: getattr(arguments, name) for name in ("psf", "fwhm", "halo", "background")},
-    )
+    options = {name: getattr(arguments, name) for name in _LOOKS}
+    return _usual_flux(chain, instrument, frames, EXAMPLE["flux"], wavelength=wavelength, **options)
 
 
-def _table(arguments, chain, wavelength, frames, meta):
+def _table(arguments, instrument, chain, wavelength, frames, meta):
     """Return the table: with noise, or beside cubes the true fluxes."""
-    from astropolcal import instruments
     from astropolcal.reduction.cubes import true_observations
     from astropolcal.simulation import simulate
 
     options = {
-        "flux": arguments.flux,
-        "gain": arguments.gain,
-        "read_noise": arguments.read_noise,
+        **{name: getattr(arguments, name) for name in ("flux", "gain", "read_noise", "seed")},
         # beside cubes the table is the truth that a reduction must find again
         "noise": not (arguments.no_noise or arguments.cubes),
-        "seed": arguments.seed,
         "meta": meta,
         "name": "simulated",
     }
     if arguments.source == "internal":
         return simulate(chain, wavelength, frames, **options)
-    instrument = instruments.get(arguments.instrument)
-    return true_observations(
-        chain, instrument, frames, wavelength=wavelength, source="star", **options
-    )
+    options |= {"wavelength": wavelength, "source": "star"}
+    return true_observations(chain, instrument, frames, **options)
 
 
-def _write_cubes(arguments, chain, wavelength, frames):
-    from astropolcal import instruments
+def _write_cubes(arguments, instrument, chain, wavelength, frames):
     from astropolcal.reduction.cubes import simulate_cubes
 
+    names = ("source", "flux", "psf", "saturate", "seed", *_IMAGES)
     return simulate_cubes(
         arguments.cubes,
         chain,
-        instruments.get(arguments.instrument),
+        instrument,
         frames,
         wavelength=wavelength,
-        source=arguments.source,
-        flux=arguments.flux,
-        psf=arguments.psf,
         noise=not arguments.no_noise,
-        saturate=arguments.saturate,
-        seed=arguments.seed,
         progress=not arguments.quiet,
-        **{name: getattr(arguments, name) for name in _IMAGES},
+        **{name: getattr(arguments, name) for name in names},
     )
 
 
-def _derotator_angles():
-    return [45 + 12.5 * i for i in range(8)]
-
-
-def _truth(arguments):
+def _truth(arguments, instrument):
     """Return the true chain, its wavelengths and the meta that describe its set-up."""
-    from astropolcal import instruments
-
-    instrument = instruments.get(arguments.instrument)
     if arguments.calibration:
         from astropolcal.calibration import Calibration
 
@@ -303,14 +285,6 @@ def _behind_telescope(chain, instrument, wavelength):
     return join([star, *leaves(instrument.on_sky(chain))])
 
 
-def _meta(meta, arguments):
-    """Return the meta of the table: the set-up, less the optics taken out."""
-    from astropolcal import instruments
-
-    absent = instruments.get(arguments.instrument).meta_without(arguments.without)
-    return meta | absent | {"simulated": True}
-
-
 def _summary(observations, arguments):
     return {
         "output": arguments.output and str(arguments.output),
@@ -319,8 +293,5 @@ def _summary(observations, arguments):
         "n_frames": observations.n_frames,
         "n_wavelengths": observations.n_bins,
         "content_hash": observations.content_hash,
-        "seed": arguments.seed,
-        "flux": arguments.flux,
-        "gain": arguments.gain,
-        "read_noise": arguments.read_noise,
+        **{name: getattr(arguments, name) for name in ("seed", "flux", "gain", "read_noise")},
     }

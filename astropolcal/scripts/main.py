@@ -12,11 +12,17 @@ import sys
 import warnings
 from contextlib import nullcontext
 from functools import partial
+from importlib import import_module
 
 from astropolcal.version import version
 
-__all__ = ["build_parser", "main"]
+__all__ = ["main"]
 
+# in the order in which a night is worked through, as the help lists them
+_COMMANDS = (
+    *("reduce", "calibrate", "sample", "diagnose", "correct", "efficiency", "standards"),
+    *("simulate", "challenge", "info"),
+)
 _DESCRIPTION = "Calibrate polarimeters, and say how well their model fits."
 
 
@@ -47,49 +53,12 @@ def _number(kind, text):
 
 
 def build_parser():
-    """
-    Return the parser of the command and its subcommands.
-
-    Returns
-    -------
-    `argparse.ArgumentParser`
-
-    Examples
-    --------
-    >>> from astropolcal.scripts.main import build_parser
-    >>> build_parser().parse_args(["info"]).command
-    'info'
-    """
-    from astropolcal.scripts import (
-        _calibrate,
-        _challenge,
-        _correct,
-        _diagnose,
-        _efficiency,
-        _info,
-        _reduce,
-        _sample,
-        _simulate,
-        _standards,
-    )
-
+    """Return the parser of the command and its subcommands."""
     parser = _OneLineParser(prog="astropolcal", description=_DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"astropolcal {version}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    # in the order in which a night is worked through, as the help lists them
-    for module in (
-        _reduce,
-        _calibrate,
-        _sample,
-        _diagnose,
-        _correct,
-        _efficiency,
-        _standards,
-        _simulate,
-        _challenge,
-        _info,
-    ):
-        module.add_parser(commands)
+    for name in _COMMANDS:
+        import_module(f"astropolcal.scripts._{name}").add_parser(commands)
     return parser
 
 
@@ -143,6 +112,7 @@ def _run(argv):
     """Run the command; return its status unless it is stopped from outside."""
     # here, not above: it loads astropy, and an interruption meanwhile is one of the command
     from astropolcal.exceptions import AstropolcalError
+    from astropolcal.observations.pointings import online
     from astropolcal.scripts._common import check_paths
 
     with warnings.catch_warnings():
@@ -153,7 +123,9 @@ def _run(argv):
         try:
             arguments = build_parser().parse_args(argv)
             check_paths(arguments)
-            with _earth(arguments):
+            # new tables of the Earth's rotation are loaded where that is asked for
+            asked = getattr(arguments, "online", False)
+            with online() if asked else nullcontext():
                 arguments.run(arguments)
         except AstropolcalError as error:
             print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
@@ -163,15 +135,6 @@ def _run(argv):
             print(f"astropolcal: error: not enough memory: {words}", file=sys.stderr)
             return 2
     return 0
-
-
-def _earth(arguments):
-    """Return in what to run a command that may ask for new tables of the Earth's rotation."""
-    if not getattr(arguments, "online", False):
-        return nullcontext()
-    from astropolcal.observations.pointings import online
-
-    return online()
 
 
 def _one_line(message):
