@@ -117,6 +117,17 @@ def draw_line(axes, lam, values, **look):
     return line
 
 
+def draw_band(axes, x, value, error, color, alpha, label=None):
+    """Draw a band of one error to either side of values; it has gaps where the error is NaN."""
+    look = {"color": color, "alpha": alpha, "linewidth": 0, "label": label}
+    axes.fill_between(x, value - error, value + error, **look)
+
+
+def note(axes, text, **look):
+    """Write a sentence where there is nothing to draw."""
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", **look)
+
+
 def clusters(values, gap):
     """Return the number of each value's cluster; clusters are more than ``gap`` apart."""
     order = np.argsort(values, kind="stable")

@@ -20,6 +20,7 @@ from astropolcal.plotting._style import (
     SIGMA,
     VERMILION,
     canvas,
+    draw_band,
     draw_line,
     heading,
     legend_entries,
@@ -455,7 +456,7 @@ def _draw_star(top, bottom, values, key, unit, label, short):
     # a star whose polarization no catalogue has is drawn alone
     if np.isfinite(known).any():
         top.plot(lam, known, color=VERMILION, label="catalogue, with the published errors")
-        top.fill_between(lam, known - spread, known + spread, color=VERMILION, alpha=0.2, lw=0)
+        draw_band(top, lam, known, spread, VERMILION, 0.2)
     bottom.axhline(0, color=GREY, linewidth=1)
     bottom.errorbar(lam, off, yerr=np.nan_to_num(error), **points)
     # of the angle no such error is known

@@ -12,9 +12,11 @@ from astropolcal.plotting._style import (
     PURPLE,
     VERMILION,
     canvas,
+    draw_band,
     legend_outside,
     mean_known,
     nanometres,
+    note,
     style,
     wavelength_label,
 )
@@ -239,15 +241,7 @@ def _values(axes, nm, corrected, name):
     axes.errorbar(nm, value, bars, fmt=_MARKERS[name], color=color, label=label)
     if np.isfinite(systematic).any():
         band = np.where(np.isfinite(systematic), systematic, np.nan)
-        axes.fill_between(
-            nm,
-            value - band,
-            value + band,
-            color=color,
-            alpha=0.25,
-            linewidth=0,
-            label=f"{name}, systematic error",
-        )
+        draw_band(axes, nm, value, band, color, 0.25, f"{name}, systematic error")
 
 
 def _error_lines(axes, nm, corrected):
@@ -268,6 +262,4 @@ def _error_lines(axes, nm, corrected):
         for set_formatter in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
             set_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     else:
-        axes.text(
-            0.5, 0.5, "no errors are known", transform=axes.transAxes, ha="center", va="center"
-        )
+        note(axes, "no errors are known")

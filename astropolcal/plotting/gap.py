@@ -19,6 +19,7 @@ from astropolcal.plotting._style import (
     VERMILION,
     canvas,
     cell_edges,
+    draw_band,
     draw_line,
     legend_outside,
     mean_known,
@@ -569,7 +570,7 @@ def _curve_panel(axes, diagnosis, effect):
         axes.set_xticks(x, labels=["forwards", "backwards"])
         axes.set_xlim(-0.5, 1.5)
     else:
-        axes.fill_between(x, value - error, value + error, color=SKY, alpha=0.5, linewidth=0)
+        draw_band(axes, x, value, error, SKY, 0.5)
         axes.plot(x, value, color=BLUE)
         foot = np.full(len(given), 0.02)
         axes.plot(given, foot, "|", color=GREY, transform=axes.get_xaxis_transform())

@@ -22,6 +22,7 @@ from astropolcal.plotting._style import (
     element_places,
     heading,
     legend_outside,
+    note,
     style,
 )
 from astropolcal.units import angle_to_rad
@@ -367,10 +368,8 @@ def _draw_conditions(axes, finding, angles):
         axes.barh(i, length - _LEFT, left=_LEFT, edgecolor="white", height=0.55, **look)
         text = f" {value:.2g}" if np.isfinite(value) else f" {_INFINITE}: too few angles"
         inside = not np.isfinite(value)
-        axes.text(
-            1.1 if inside else length, i, text, va="center", ha="left",
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1} if inside else None,
-        )  # fmt: skip
+        paper = {"facecolor": "white", "edgecolor": "none", "pad": 1} if inside else None
+        axes.text(1.1 if inside else length, i, text, va="center", ha="left", bbox=paper)
     axes.axvline(_POOR, color=BLACK, linestyle="--", linewidth=1)
     axes.text(_POOR, -0.62, " poor beyond", ha="left", va="center", fontsize=9.5, color=GREY)
     axes.set(xscale="log", xlim=(_LEFT, top * 8), ylim=(len(values) - 0.5, -0.9))
@@ -384,7 +383,7 @@ def _say(axes, text):
     """Write a sentence where there is nothing to draw."""
     axes.set(xticks=[], yticks=[])
     axes.grid(False)
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=9)
+    note(axes, text, fontsize=9)
 
 
 # ---- correlations ---------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from astropolcal.plotting._style import (
     SIGMA,
     SKY,
     canvas,
+    draw_band,
     heading,
     legend_entries,
     legend_outside,
@@ -102,7 +103,7 @@ def _draw_constant(axes, lam, entry, color):
         note = ", not determined alone"
     axes.plot(ends, [value, value], color=color, label=kind + note)
     if np.isfinite(std):
-        axes.fill_between(ends, value - std, value + std, color=color, alpha=0.25, linewidth=0)
+        draw_band(axes, ends, value, std, color, 0.25)
 
 
 # ---- laws in wavelength ----------------------------------------------------------
@@ -121,7 +122,7 @@ def _draw_law(axes, calibration, leaf, known, look):
     label = (_LAW_ALONE if std is None else _LAW) if free else f"law, {_FIXED}"
     axes.plot(lam, value, color=look[0], label=label)
     if std is not None:
-        axes.fill_between(lam, value - std, value + std, color=look[0], alpha=0.3, linewidth=0)
+        draw_band(axes, lam, value, std, look[0], 0.3)
     _draw_stage(axes, calibration, leaf)
     shown = {key: entry for key, entry in own.items() if not entry["fixed"]} or own
     words = [", ".join(row) for row in _in_rows(_words(shown))]
@@ -585,7 +586,7 @@ def _draw_mirror_values(axes, lam, table, key, law):
         label = f"fitted law, with 1{SIGMA} band" if known.all() else _MIRROR_LAW_ALONE
         line = "-" if known.all() else (0, (5, 1))
         axes.plot(lam, value, linewidth=2.2, linestyle=line, label=label, **look)
-        axes.fill_between(lam, value - std, value + std, alpha=0.3, linewidth=0, **look)
+        draw_band(axes, lam, value, std, BLUE, 0.3)
         return
     points = look | {"marker": "o", "linestyle": "none"}
     if known.any():

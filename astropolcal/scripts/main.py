@@ -112,7 +112,6 @@ def _run(argv):
     """Run the command; return its status unless it is stopped from outside."""
     # here, not above: it loads astropy, and an interruption meanwhile is one of the command
     from astropolcal.exceptions import AstropolcalError
-    from astropolcal.observations.pointings import online
     from astropolcal.scripts._common import check_paths
 
     with warnings.catch_warnings():
@@ -123,9 +122,7 @@ def _run(argv):
         try:
             arguments = build_parser().parse_args(argv)
             check_paths(arguments)
-            # new tables of the Earth's rotation are loaded where that is asked for
-            asked = getattr(arguments, "online", False)
-            with online() if asked else nullcontext():
+            with _earth(arguments):
                 arguments.run(arguments)
         except AstropolcalError as error:
             print(f"astropolcal: error: {_one_line(error)}", file=sys.stderr)
@@ -135,6 +132,15 @@ def _run(argv):
             print(f"astropolcal: error: not enough memory: {words}", file=sys.stderr)
             return 2
     return 0
+
+
+def _earth(arguments):
+    """Return in what to run a command that may ask for new tables of the Earth's rotation."""
+    if not getattr(arguments, "online", False):
+        return nullcontext()
+    from astropolcal.observations.pointings import online
+
+    return online()
 
 
 def _one_line(message):
