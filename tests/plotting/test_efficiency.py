@@ -1,19 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""The figure of the polarimetric efficiency."""
+"""The polarimetric efficiency, and standard stars over a night."""
 
 import astropy.units as u
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from astropolcal import instruments, optics
+from astropolcal import instruments, optics, standards
 from astropolcal.calibration import best_derotator, polarimetric_efficiency
 from astropolcal.chain import remove_optic
+from astropolcal.exceptions import ParameterError
 from astropolcal.instruments import SkyLaw
-from astropolcal.plotting.efficiency import (
-    plot_derotator_offsets,
-    plot_polarimetric_efficiency,
-)
+from astropolcal.plotting import efficiency, plot_observability
+from astropolcal.plotting.efficiency import plot_derotator_offsets, plot_polarimetric_efficiency
 
 CHARIS = instruments.get("charis")
 
@@ -104,3 +103,102 @@ def test_offsets_are_those_of_the_table_with_the_best_marked():
     assert set(marked.get_xdata()) == {best.offset.value}
     assert marked.get_label() == f"best offset, {best.offset.value:g}°"
     assert (ax.get_xlabel(), figure.get_suptitle()) == ("derotator offset (deg)", "A night")
+
+
+def test_lines_of_the_efficiency():
+    for shown, names in [
+        (None, ["1200 nm", "1400 nm", "1600 nm", "1800 nm", "2000 nm", "2200 nm"]),
+        # the nearest, each once
+        ([1190, 1210, 2300] * u.nm, ["1200 nm", "2200 nm"]),
+    ]:
+        lam = np.arange(1200.0, 2201, 200)
+        axes = Figure().subplots()
+        values = np.linspace(0, 1, 5)[:, None] * np.ones(lam.size)
+        efficiency._lines(axes, lam, np.arange(5), values, shown)
+        assert [line.get_label() for line in axes.lines] == names, (shown, names)
+        np.testing.assert_allclose(axes.lines[0].get_ydata(), values[:, 0])
+        assert axes.get_ylabel() == "measured share of the polarization", (shown, names)
+
+
+NIGHT = "2025-11-03"
+
+
+@pytest.fixture(scope="module")
+def seen():
+    names = ("HD 293396", "HD 30675", "HD 14069")
+    return [standards.observability(name, "subaru", NIGHT) for name in names]
+
+
+def test_curves_are_the_tables(seen):
+    upper, lower = plot_observability(seen).axes
+    dotted = [line for line in upper.lines if line.get_linestyle() == ":" and len(line.get_xdata())]
+    for line, star in zip(dotted, seen, strict=True):
+        np.testing.assert_allclose(line.get_ydata(), star.table["altitude"].value)
+        hours = line.get_xdata()
+        assert hours[0] == pytest.approx((star.table["time"].mjd[0] % 1) * 24)
+    dotted = [line for line in lower.lines if line.get_linestyle() == ":"]
+    for line, star in zip(dotted, seen, strict=True):
+        np.testing.assert_allclose(line.get_ydata(), star.table["parallactic"].value)
+
+
+def test_thick_curves_are_only_where_the_star_is_observable(seen):
+    upper, _ = plot_observability(seen).axes
+    thick = [line for line in upper.lines if line.get_linewidth() == 2]
+    for line, star in zip(thick, seen, strict=True):
+        drawn = np.isfinite(line.get_ydata())
+        np.testing.assert_array_equal(drawn, star.table["observable"])
+
+
+def test_the_angle_goes_on_beyond_half_a_turn_as_in_the_table(seen):
+    # culminates north of the zenith
+    upper, lower = plot_observability(seen[1:2]).axes
+    values = lower.lines[0].get_ydata()
+    assert np.max(np.abs(np.diff(values))) < 180
+    assert values.max() > 180
+    low, high = lower.get_ylim()
+    assert low <= values.min()
+    assert values.max() <= high
+    # the markers are at the same times in both panels
+    marked = [next(x for x in axes.lines if x.get_linestyle() == "None") for axes in (upper, lower)]
+    np.testing.assert_array_equal(*(line.get_xdata() for line in marked))
+
+
+def test_the_title_says_of_how_many_stars_these_are_the_first(seen):
+    title = plot_observability(seen, total=4).get_suptitle()
+    assert title.startswith("The first 3 of 4 standard stars, night of")
+    assert plot_observability(seen, total=3).get_suptitle().startswith("Standard stars, night of")
+
+
+def test_labels_have_units_and_the_legend_is_outside(seen):
+    figure = plot_observability(seen)
+    upper, lower = figure.axes
+    assert upper.get_ylabel() == "altitude (deg)"
+    assert lower.get_ylabel() == "parallactic angle (deg)"
+    assert lower.get_xlabel() == "time on 2025-11-04 (hours UTC)"
+    assert NIGHT in figure.get_suptitle()
+    assert "\nSubaru, 155.48° W, 19.83° N" in figure.get_suptitle()
+    figure.draw_without_rendering()
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts[:3] == ["HD 293396", "HD 30675", "HD 14069"]
+    box = figure.legends[0].get_window_extent()
+    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
+
+
+def test_stars_differ_in_colour_and_marker(seen):
+    upper, _ = plot_observability(seen).axes
+    marked = [line for line in upper.lines if line.get_linestyle() == "None"]
+    assert len({line.get_color() for line in marked}) == 3
+    assert len({line.get_marker() for line in marked}) == 3
+
+
+def test_what_cannot_be_drawn_together_is_refused(seen):
+    with pytest.raises(ParameterError, match="0 stars"):
+        plot_observability([])
+    with pytest.raises(ParameterError, match="9 stars"):
+        plot_observability(seen * 3)
+    for other in (
+        standards.observability("HD 14069", "paranal", NIGHT),
+        standards.observability("HD 14069", "subaru", "2025-11-04"),
+    ):
+        with pytest.raises(ParameterError, match="different nights or sites"):
+            plot_observability([seen[0], other])

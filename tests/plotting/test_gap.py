@@ -2,6 +2,7 @@
 """Figures of a diagnosis show the numbers of the diagnosis."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import astropy.units as u
 import matplotlib as mpl
@@ -13,9 +14,17 @@ from matplotlib.figure import Figure
 from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic
 from astropolcal.exceptions import ParameterError
-from astropolcal.gap import diagnose, get_effect
+from astropolcal.gap import Cause, diagnose, get_effect
+from astropolcal.gap.cells import Cell
+from astropolcal.gap.effects import EffectParameter
+from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.model import nominal_model
+from astropolcal.plotting import gap as figures
+from astropolcal.plotting._style import BLACK
 from astropolcal.plotting.gap import (
+    _cause_map,
     plot_cause_map,
+    plot_effect_sizes,
     plot_gap_frames,
     plot_gap_maps,
     plot_gap_spectrum,
@@ -54,14 +63,14 @@ def none():
     return make(0.0)
 
 
-@pytest.mark.parametrize("plot", ALL)
-def test_a_figure_without_traces(plot, gap, none):
-    before = dict(mpl.rcParams)
-    for diagnosis in (gap, none):
-        own = Figure()
-        assert plot(diagnosis, figure=own) is own
-        own.canvas.draw()
-    assert dict(mpl.rcParams) == before
+def test_a_figure_without_traces(gap, none):
+    for plot in ALL:
+        before = dict(mpl.rcParams)
+        for diagnosis in (gap, none):
+            own = Figure()
+            assert plot(diagnosis, figure=own) is own, plot
+            own.canvas.draw()
+        assert dict(mpl.rcParams) == before, plot
 
 
 def test_spectrum_shows_the_residuals(gap):
@@ -123,3 +132,226 @@ def check_titles(figure):
         title = axes.title if axes.get_title() else axes._left_title
         extent = title.get_window_extent(renderer)
         assert extent.x1 <= axes.get_window_extent(renderer).x1 + 5
+
+
+NM = np.array([1200.0, 1600.0, 2200.0])
+
+
+def cause(what, probability=1.0, aliases=(), share=1.0):
+    """A cause that is a cell, or a named effect that has none."""
+    cell = what if isinstance(what, Cell) else None
+    effect = CellEffect(what) if cell else get_effect(what)
+    aliases = [(SimpleNamespace(effect=CellEffect(one), cell=one), part) for one, part in aliases]
+    return Cause(effect, cell, probability, aliases, share, 0.0, 0.9)
+
+
+def diagnosis(*causes, verdict="located"):
+    chain = instruments.get("charis").chain(derotator="linear")
+    nominal = SimpleNamespace(chains=[chain])
+    return SimpleNamespace(causes=list(causes), verdict=verdict, nominal=nominal)
+
+
+# ---- the map -------------------------------------------------------------------------------
+
+DRIFT = Cell("in:derotator", "retardance_h", "time")
+
+
+def test_rows_are_places_in_the_order_of_the_light():
+    rows = list(_cause_map(diagnosis()))
+    assert rows == ["source", "in:hwp", "after:hwp", "in:derotator", "after:derotator", "detector"]
+    # a place that the chain of these data does not have
+    assert (
+        list(_cause_map(diagnosis(cause(Cell("telescope", "rotation", "time")))))[-1] == "telescope"
+    )
+
+
+def test_probabilities_are_summed_over_dependences_and_aliases():
+    others = [
+        (Cell("in:derotator", "retardance_d", "step:4"), 0.2),
+        (Cell("after:hwp", "rotation", "time"), 0.3),
+    ]
+    found = _cause_map(diagnosis(cause(DRIFT, 0.9, others, share=0.5)))
+    assert found["in:derotator"]["retardance"] == (pytest.approx(0.63), "along axes")
+    assert found["after:hwp"]["rotation"][0] == pytest.approx(0.27)
+    # of two causes at one place at least one is there
+    found = _cause_map(diagnosis(cause(DRIFT, 0.5), cause(DRIFT, 0.5)))
+    assert found["in:derotator"]["retardance"][0] == pytest.approx(0.75)
+
+
+def test_named_effects_have_a_place_in_the_map():
+    for name, place, family in (
+        ("beam_gain", "detector", "beams, detector"),
+        ("hwp_diattenuation", "in:hwp", "diattenuation"),
+        ("static_retarder", "after:derotator", "other"),
+        ("hwp_encoder_eccentricity", "in:hwp", "other"),
+    ):
+        found = {k: row for k, row in _cause_map(diagnosis(cause(name))).items() if row}
+        assert list(found) == [place]
+        assert family in found[place] or family == "other"
+
+
+def test_cells_that_matter_have_words():
+    axes = plot_cause_map(diagnosis(cause(DRIFT, 0.98), cause("beam_gain", 0.3))).axes[0]
+    assert [text.get_text() for text in axes.texts] == ["98 %", "along axes", "30 %", "named"]
+    # dark words on light ground, and the reverse
+    assert [text.get_color() for text in axes.texts[::2]] == ["white", BLACK]
+    assert not plot_cause_map(diagnosis()).axes[0].texts
+
+
+def test_verdict_as_a_title():
+    for verdict, causes, line in (
+        ("named", ["beam_gain"], "named: beam_gain"),
+        ("located", ["beam_gain", "hwp_tilt"], "located: 2 causes"),
+        ("none", [], "no gap beyond the noise"),
+        ("unexplained", ["beam_gain"], "a real gap that is not explained"),
+    ):
+        own = diagnosis(*map(cause, causes), verdict=verdict)
+        assert figures._verdict_line(own) == line
+
+
+# ---- sizes ---------------------------------------------------------------------------------
+
+
+def sized(sizes, parameters, factor=1.0):
+    """A diagnosis with one cause of these sizes, and the content of its report."""
+    problem = SimpleNamespace(
+        wavelength=NM / 1000,
+        free=SimpleNamespace(by_name={name: SimpleNamespace(factor=factor) for name in sizes}),
+    )
+    found = diagnosis(cause("beam_gain"))
+    model = SimpleNamespace(problem=problem, added={"beam_gain": parameters}, chains=[])
+    found.nominal = found.improved = model
+    return found, {"causes": [{"size": sizes}]}
+
+
+def size(value, std, unit="deg", limit=1.0):
+    return {"value": list(value), "std": list(std), "unit": unit, "limit": limit}
+
+
+def test_a_panel_for_each_size_that_depends_on_the_wavelength():
+    names = ["gap_one.horizontal", "gap_one.horizontal_rate", "gap_one.same", "gap_one.common"]
+    sizes = {name: size([1.0, 2.0, 3.0], [0.01, 0.02, 0.03]) for name in names[:2]}
+    sizes["gap_one.same"] = size([1.0] * 3, [0.01] * 3)
+    sizes["gap_one.common"] = {"value": 1.0, "std": 0.1, "unit": "", "limit": 1.0}
+    found, content = sized(sizes, [EffectParameter(name, 1, 1) for name in names])
+    figure = plot_effect_sizes(found, "beam_gain", content=content)
+    assert [a.get_ylabel() for a in figure.axes] == ["horizontal (deg)", "horizontal rate (deg)"]
+    for axes in figure.axes:
+        line, _, (bars,) = axes.containers[0].lines
+        np.testing.assert_allclose(line.get_xdata(), NM)
+        np.testing.assert_allclose(line.get_ydata(), [1, 2, 3])
+        lengths = [np.ptp(s[:, 1]) / 2 for s in bars.get_segments()]
+        np.testing.assert_allclose(lengths, [0.01, 0.02, 0.03])
+
+
+def test_the_line_is_where_the_effect_is_absent():
+    for name, neutral, factor, unit, line in (
+        ("gap_one.horizontal", None, 1.0, "deg", 0.0),
+        # a share that is retained is one where there is no effect, and drawn in percent
+        ("gap_one.retained_q", None, 1.0, "", 100.0),
+        # an angle that the model held, in degrees though canonical inside
+        ("k.theta", np.pi / 2, np.pi / 180, "deg", 90.0),
+        # a catalogue's polarization, one a wavelength
+        ("star.q", [0.01, 0.02, 0.03], 1.0, "", [1, 2, 3]),
+    ):
+        parameter = EffectParameter(name, 1, 1, neutral=neutral)
+        sizes = {name: size([1.0, 1.0, 1.1], [0.01] * 3, unit)}
+        found, content = sized(sizes, [parameter], factor)
+        (axes,) = plot_effect_sizes(found, "beam_gain", content=content).axes
+        np.testing.assert_allclose(axes.lines[0].get_ydata(), line)
+
+
+def test_wavelengths_without_a_size_are_crosses_at_the_foot():
+    sizes = {"gap_one.horizontal": size([1.0, 2.0, 3.0], [0.01, 0.2, None])}
+    found, content = sized(sizes, [EffectParameter("gap_one.horizontal", 1, 1)])
+    (axes,) = plot_effect_sizes(found, "beam_gain", content=content).axes
+    (crosses,) = [line for line in axes.lines if line.get_marker() == "x"]
+    np.testing.assert_allclose(crosses.get_xdata(), NM[1:])
+    # in shares of the height of the panel
+    assert crosses.get_transform() == axes.get_xaxis_transform()
+    assert axes.get_title(loc="left") == "crosses: not determined"
+
+
+def test_what_has_no_size_is_refused():
+    found, content = sized({}, [])
+    for name, words in (("other", "is no cause; these are: beam_gain"), ("beam_gain", "anything")):
+        with pytest.raises(ParameterError, match=words):
+            plot_effect_sizes(found, name, content=content)
+
+
+def test_a_cell_is_drawn_over_what_it_depends_on():
+    """The curve is that of the model, in degrees, with its error about it."""
+    chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6, 2.2] * u.um)
+    frames = half_wave_plate_cycles(derotator=[45, 70, 95] * u.deg)
+    model = nominal_model([chain], [simulate(chain, NM * u.nm, frames, seed=1)])
+    for dependence, label in (
+        ("time", "share of the run"),
+        ("harmonic:derotator:2", "angle of the derotator (deg)"),
+        ("direction:hwp", "last move of the half-wave plate"),
+    ):
+        cell = Cell("in:derotator", "retardance_h", dependence)
+        own = cause(cell)
+        own.effect = CellEffect(cell, 0)
+        improved = model.with_effect(own.effect)
+        found = SimpleNamespace(nominal=model, improved=improved, causes=[own])
+        (axes,) = plot_effect_sizes(found, own.name).axes
+        assert axes.get_xlabel() == label
+        assert "deg" in axes.get_ylabel()
+        first = next(iter(improved.sizes(own.name).values()))
+        value = np.rad2deg(first[3].basis @ first[0])[0]
+        if dependence == "time":
+            curve = next(line for line in axes.lines if len(line.get_xdata()) == 400)
+            np.testing.assert_allclose(curve.get_ydata()[[0, -1]], [-value, value], rtol=1e-6)
+
+
+# ---- axes of the other figures -------------------------------------------------------------
+
+
+def test_axis_of_percent():
+    for values, scale, limits in [
+        ([1.0, 4.0], "linear", (0, 4.6)),
+        ([1.0, 6.0], "log", (1 / 1.6, 9.6)),
+        # a wavelength that is masked wholly does not count
+        ([1.0, np.nan, 4.0], "linear", (0, 4.6)),
+        ([0.0, 1.0, 40.0], "log", (1 / 1.6, 64)),
+    ]:
+        axes = Figure().subplots()
+        figures._percent_axis(axes, np.array(values))
+        assert axes.get_yscale() == scale, (values, scale, limits)
+        assert axes.get_ylim() == pytest.approx(limits), (values, scale, limits)
+
+
+def test_plain_numbers_on_a_logarithmic_axis():
+    text = figures._plain((1, 2, 5))
+    assert [text(value, 0) for value in (0.02, 0.1, 5.0, 30.0)] == ["0.02", "0.1", "5", ""]
+
+
+def test_frames_are_named_by_their_derotator_angle():
+    for derotator, label, ticks in [
+        (np.repeat([45.0, 70.125, 95.0], 4), "frames by derotator angle (deg)", 3),
+        (np.repeat(np.arange(25) * 7.0, 2), "frames by derotator angle (deg)", 9),
+        # an angle of its own in each frame
+        (np.arange(12) * 3.0, "frame", None),
+        (None, "frame", None),
+    ]:
+        n = 12 if derotator is None else len(derotator)
+        known = [] if derotator is None else ["derotator"]
+        observations = SimpleNamespace(
+            n_frames=n,
+            frames=SimpleNamespace(colnames=known),
+            position=lambda name, angle=derotator: np.deg2rad(angle),
+        )
+        axes = Figure().subplots()
+        figures._frame_axis(axes, observations)
+        assert axes.get_xlabel() == label, (derotator, label, ticks)
+        if ticks:
+            assert len(axes.get_xticks()) == ticks, (derotator, label, ticks)
+            assert axes.get_xticklabels()[0].get_text() == f"{derotator[0]:.4g}", (
+                derotator,
+                label,
+                ticks,
+            )
+            # one line between two angles
+            assert len(axes.lines) == len(set(derotator)) - 1, (derotator, label, ticks)
+        else:
+            assert not axes.lines, (derotator, label, ticks)

@@ -1,15 +1,25 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Figures of parameters: retardances, efficiency, and any other."""
+"""Parameters against wavelength and date, laws, mirrors, and how well each is known."""
 
+import dataclasses
 from dataclasses import replace
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from astropolcal import calibrate, optics
+from astropolcal.calibration import mirror_values
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.measurement import Tie
+from astropolcal.plotting import (
+    parameters,
+    plot_history,
+    plot_mirrors,
+)
+from astropolcal.plotting._style import BLUE
 from astropolcal.plotting.parameters import plot_efficiency, plot_parameters, plot_retardances
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -158,21 +168,6 @@ def scalar():
     return calibrate_scalars(efficiency=True)
 
 
-def test_undetermined_scalar_is_a_line_that_says_so():
-    (axes,) = plot_retardances(calibrate_scalars()).axes
-    assert by_label(axes, "one value for all wavelengths, not determined alone")
-    assert not axes.collections
-
-
-def test_scalar_parameter_is_a_line_with_a_band(scalar):
-    (axes,) = plot_retardances(scalar).axes  # none for a plate fixed at zero
-    entry = scalar.parameter_values()["hwp.retardance"]
-    (line,) = by_label(axes, "one value")
-    np.testing.assert_allclose(line.get_ydata(), [entry["value"]] * 2)
-    heights = axes.collections[0].get_paths()[0].vertices[:, 1]
-    assert np.ptp(heights) / 2 == pytest.approx(float(entry["std"]))
-
-
 def test_tied_parameter_says_what_it_follows():
     chain = (
         optics.LinearPolarizer(name="polarizer")
@@ -200,14 +195,14 @@ def test_chain_without_retarder_is_refused(scalar):
         plot_retardances(bare)
 
 
-@pytest.mark.parametrize("draw", [plot_retardances, plot_efficiency, plot_parameters])
-def test_legend_lies_outside_the_axes(undetermined, draw):
-    figure = draw(undetermined)
-    figure.draw_without_rendering()
-    box = figure.legends[0].get_window_extent()
-    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
-    assert box.y0 >= -1
-    assert len(set(legend_texts(figure))) == len(legend_texts(figure))
+def test_legend_lies_outside_the_axes(undetermined):
+    for draw in [plot_retardances, plot_efficiency, plot_parameters]:
+        figure = draw(undetermined)
+        figure.draw_without_rendering()
+        box = figure.legends[0].get_window_extent()
+        assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes), draw
+        assert box.y0 >= -1, draw
+        assert len(set(legend_texts(figure))) == len(legend_texts(figure)), draw
 
 
 # ---- efficiency --------------------------------------------------------------------
@@ -272,3 +267,307 @@ def test_unknown_parameter_is_refused_with_a_hint(several):
 def test_nothing_to_draw_is_said(scalar):
     with pytest.raises(ChainError, match="nothing to draw"):
         plot_parameters(scalar)
+
+
+NM = np.array([1600.0, 1200.0, 2200.0])
+LOOK = (BLUE, "o")
+
+
+def calibration(**more):
+    return SimpleNamespace(wavelength=NM * u.nm, **more)
+
+
+def entry(value, std, bound=False, fixed=False, tied=None):
+    value = np.asarray(value, float)
+    return {
+        "value": value,
+        "std": np.broadcast_to(np.asarray(std, float), value.shape),
+        "at_bound": np.broadcast_to(bound, value.shape),
+        "fixed": fixed,
+        "tied": tied,
+        "unit": "deg",
+    }
+
+
+def drawn(one):
+    axes = Figure().subplots()
+    parameters._draw_entry(axes, calibration(), one, LOOK)
+    return axes
+
+
+def labels(axes):
+    return [label for label in axes.get_legend_handles_labels()[1]]
+
+
+# ---- values per wavelength -----------------------------------------------------------------
+
+
+def test_kinds_ofparameters_are_told_by_their_shape():
+    axes = drawn(entry([1.0, 2.0, 3.0], [0.1, np.nan, 0.3], [False, False, True]))
+    hollow = [one for one in axes.lines if one.get_markerfacecolor() == "white"]
+    boxes = [one for one in axes.lines if one.get_marker() == "s"]
+    (points,) = axes.containers
+    assert points.lines[0].get_xdata().tolist() == [1600]
+    assert hollow[0].get_xdata().tolist() == [1200, 2200]
+    assert boxes[0].get_xdata().tolist() == [2200]
+    assert set(labels(axes)) == {parameters._DETERMINED, parameters._ALONE, parameters._BOUND}
+
+
+def test_at_a_bound_alone_is_not_called_open():
+    axes = drawn(entry([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], [True, False, False]))
+    assert set(labels(axes)) == {parameters._DETERMINED, parameters._BOUND}
+
+
+# ---- one value -----------------------------------------------------------------------------
+
+
+def test_a_constant_is_a_line_over_the_range():
+    for one, label, band in [
+        (entry(2.0, 0.5), "one value for all wavelengths", (1.5, 2.5)),
+        (entry(2.0, np.nan), "one value for all wavelengths, not determined alone", None),
+        (entry(2.0, np.nan, bound=True), "one value for all wavelengths, at a bound", None),
+        (entry(2.0, np.nan, fixed=True), "fixed", None),
+    ]:
+        axes = drawn(one)
+        (line,) = axes.lines
+        assert line.get_xdata().tolist() == [1200, 2200], (one, label, band)
+        assert line.get_ydata().tolist() == [2, 2], (one, label, band)
+        assert line.get_label() == label, (one, label, band)
+        if band is None:
+            assert not axes.collections, (one, label, band)
+        else:
+            edges = axes.collections[0].get_paths()[0].vertices[:, 1]
+            assert (edges.min(), edges.max()) == pytest.approx(band), (one, label, band)
+
+
+# ---- laws ----------------------------------------------------------------------------------
+
+
+def test_band_of_a_law_is_propagated_from_the_covariance():
+    """Retardance in the thickness of one layer: the slope is exact, as it is proportional."""
+    plate = optics.TwoLayerWaveplate(mount="hwp", name="hwp")
+    lam = np.array([1200.0, 1700.0])
+    sigma = 1e-4
+    covariance = SimpleNamespace(names=["other.x", "hwp.w_sio2"], matrix=np.diag([7.0, sigma**2]))
+    found = parameters._law_std(calibration(covariance=covariance), plate, lam)
+    thicker = plate.with_parameters(w_sio2=(plate.w_sio2.value + 0.1) * u.mm)
+    slope = (parameters._retardance(thicker, lam) - parameters._retardance(plate, lam)) / 0.1
+    np.testing.assert_allclose(found, np.abs(slope) * sigma, rtol=1e-6)
+
+
+def test_a_law_whose_parameters_have_no_error_has_no_band():
+    for covariance in [
+        SimpleNamespace(names=["other.x"], matrix=np.ones((1, 1))),
+        SimpleNamespace(names=["hwp.w_sio2"], matrix=np.full((1, 1), np.nan)),
+    ]:
+        plate = optics.TwoLayerWaveplate(mount="hwp", name="hwp")
+        assert parameters._law_std(calibration(covariance=covariance), plate, NM) is None, (
+            covariance
+        )
+
+
+def test_values_of_a_law_are_words():
+    own = {
+        "w_sio2": entry(1.65, 0.01),
+        "w_mgf2": entry(1.25, np.nan),
+        "many": entry([1.0, 2.0], 0.1),
+    }
+    assert list(parameters._words(own)) == ["w_sio2 = 1.6500 ± 0.0100 deg", "w_mgf2 = 1.2500 deg"]
+    rows = list(parameters._in_rows(["x" * 30, "y" * 30, "z"]))
+    assert rows == [["x" * 30], ["y" * 30, "z"]]
+
+
+def test_legend_says_how_much_is_open():
+    figure = Figure()
+    axes = figure.subplots(1, 2)
+    parameters._draw_entry(axes[0], calibration(), entry([1.0, 2.0, 3.0], np.nan), LOOK)
+    parameters._draw_entry(axes[1], calibration(), entry([1.0, 2.0, 3.0], 0.1), ("red", "s"))
+    for count, words in ((1, "1 combination of parameters"), (2, "2 combinations of parameters")):
+        known = calibration(identifiability=SimpleNamespace(directions=[{}] * count))
+        legend = parameters._legend(figure, axes, known)
+        texts = [text.get_text() for text in legend.get_texts()]
+        # in the order of certainty, each once, and in no panel's colour
+        assert texts[0] == parameters._DETERMINED
+        assert texts[1] == f"{parameters._ALONE} (the data leave {words} open)"
+        assert {handle.get_color() for handle in legend.legend_handles} == {"#000000"}
+
+
+SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+NM_OF_MIRRORS = np.array([1200.0, 1400.0, 1600.0, 1900.0, 2200.0])
+
+
+@pytest.fixture(scope="module")
+def diattenuator(with_mirror):
+    return with_mirror(optics.Diattenuator(diattenuation=np.full(5, 0.012), name="fold"))
+
+
+@pytest.fixture(scope="module")
+def retarder(with_mirror):
+    mirror = optics.DiattenuatorRetarder(
+        diattenuation=np.full(5, 0.012), retardance=np.full(5, 170.0) * u.deg, name="fold"
+    )
+    mirror.retardance.fixed = True
+    return with_mirror(mirror)
+
+
+def lines(axes):
+    return {line.get_label(): line for line in axes.lines}
+
+
+def test_values_have_their_errors(diattenuator):
+    (axes,) = plot_mirrors(diattenuator).axes
+    table = mirror_values(diattenuator, "fold")
+    (drawn,) = axes.containers
+    line, _, (bars,) = drawn.lines
+    assert drawn.get_label() == f"fitted, with 1{SIGMA} error"
+    np.testing.assert_allclose(line.get_xdata(), NM_OF_MIRRORS)
+    np.testing.assert_allclose(line.get_ydata(), table["diattenuation"].to_value(u.percent))
+    lengths = [np.ptp(segment[:, 1]) / 2 for segment in bars.get_segments()]
+    np.testing.assert_allclose(lengths, table["diattenuation_err"].to_value(u.percent))
+    # near the truth of 1.2 percent
+    assert np.all(np.abs(line.get_ydata() - 1.2) < 5 * np.array(lengths))
+
+
+def test_metals_are_drawn_beside_with_looks_of_their_own(diattenuator):
+    figure = plot_mirrors(diattenuator)
+    (axes,) = figure.axes
+    table = mirror_values(diattenuator, "fold")
+    found = {key.split(" ")[0]: line for key, line in lines(axes).items() if "bare" in key}
+    assert set(found) == {"silver", "gold", "aluminium"}
+    for metal, line in found.items():
+        np.testing.assert_allclose(
+            line.get_ydata(), table[f"diattenuation_{metal}"].to_value(u.percent)
+        )
+    assert len({line.get_linestyle() for line in found.values()}) == 3
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    # what was calibrated comes before what it is compared with
+    assert [("bare" in label) for label in labels] == [False, True, True, True]
+
+
+def test_labels_of_a_mirror(diattenuator, retarder):
+    (axes,) = plot_mirrors(diattenuator).axes
+    assert (axes.get_title(), axes.get_ylabel()) == ("fold", "diattenuation (%)")
+    assert axes.get_xlabel() == "wavelength (nm)"
+    top, bottom = plot_mirrors(retarder).axes
+    assert (top.get_ylabel(), bottom.get_ylabel()) == ("diattenuation (%)", "retardance (°)")
+    assert (top.get_xlabel(), bottom.get_xlabel()) == ("", "wavelength (nm)")
+    assert plot_mirrors(retarder).get_suptitle().startswith("Mirrors\n")
+
+
+def test_what_is_held_is_hollow_and_has_no_error(retarder):
+    _, bottom = plot_mirrors(retarder).axes
+    held = lines(bottom)["held, not fitted"]
+    assert held.get_markerfacecolor() == "white"
+    np.testing.assert_allclose(held.get_ydata(), 170)
+    assert not bottom.containers
+
+
+def test_what_is_published_is_drawn_beside(retarder):
+    other = SimpleNamespace(
+        diattenuation=lambda lam: 0.01 * lam.to_value(u.um),
+        retardance=lambda lam: (180 - 10 * lam.to_value(u.um)) * u.deg,
+    )
+    top, bottom = plot_mirrors(retarder, reference={"fold": {"law A": other}}).axes
+    np.testing.assert_allclose(lines(top)["law A"].get_ydata(), NM_OF_MIRRORS / 1000)
+    np.testing.assert_allclose(lines(bottom)["law A"].get_ydata(), 180 - NM_OF_MIRRORS / 100)
+    # of another mirror
+    assert "law A" not in lines(plot_mirrors(retarder, reference={"m3": {"law A": other}}).axes[0])
+
+
+def test_a_law_is_a_line_with_its_band(with_mirror):
+    mirror = optics.MetalMirror(material="silver", incidence=45 * u.deg, name="fold")
+    for key in mirror.param_names:
+        getattr(mirror, key).fixed = key != mirror.param_names[0]
+    calibration = with_mirror(mirror)
+    top = plot_mirrors(calibration).axes[0]
+    label = next(key for key in lines(top) if key.startswith("fitted law"))
+    table = mirror_values(calibration, "fold")
+    expected = table["diattenuation"].to_value(u.percent)
+    np.testing.assert_allclose(lines(top)[label].get_ydata(), expected)
+    (band,) = top.collections
+    std = table["diattenuation_err"].to_value(u.percent)
+    assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx((expected + std).max())
+
+
+def test_no_mirror_and_no_such_mirror(elliptical, diattenuator):
+    with pytest.raises(ChainError, match="has no mirror to draw"):
+        plot_mirrors(elliptical)
+    with pytest.raises(ChainError, match="no mirror 'm3'; the calibration has fold"):
+        plot_mirrors(diattenuator, ["m3"])
+
+
+WAVELENGTH = [1200, 1600, 2200] * u.nm
+
+
+def fit(seed, date, shift=0.0, hold=False):
+    chain = (
+        optics.LinearPolarizer(theta=90 * u.deg, name="polarizer")
+        | optics.TwoLayerWaveplate(mount="hwp", name="hwp")
+        | optics.LinearRetarder(
+            retardance=[-160, -110, -60] * u.deg, mount="derotator", name="derotator"
+        )
+        | optics.WollastonPrism(efficiency=0.98, name="wollaston")
+    )
+    truth = chain.copy()
+    truth["derotator"].retardance = truth["derotator"].retardance.quantity + shift * u.deg
+    frames = half_wave_plate_cycles(derotator=[45, 60, 80, 100] * u.deg)
+    table = simulate(truth, WAVELENGTH, frames, seed=seed, meta={"date": date}, name=date)
+    chain["hwp"].w_sio2.fixed = chain["hwp"].w_mgf2.fixed = hold
+    return calibrate(chain, table, search=False, cross_validate=False)
+
+
+@pytest.fixture(scope="module")
+def years():
+    return [fit(1, "2025-02-01"), fit(2, "2025-10-05"), fit(3, "2026-02-01", 0.5)]
+
+
+def texts(ax):
+    return [text.get_text() for text in ax.texts]
+
+
+def test_panels_labels_and_changes(years):
+    figure = plot_history(years)
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles == ["hwp.w_sio2", "hwp.w_mgf2", "derotator.retardance", "wollaston.efficiency"]
+    panel = dict(zip(titles, figure.axes, strict=True))
+    assert panel["hwp.w_sio2"].get_ylabel() == "value (mm)"
+    assert panel["derotator.retardance"].get_ylabel() == "difference to the mean (deg)"
+    assert all(len(texts(ax)) == 2 for ax in figure.axes)
+    weights = [t.get_fontweight() for t in panel["derotator.retardance"].texts]
+    assert weights == ["normal", "bold"]
+    assert [t.get_text() for t in panel["derotator.retardance"].get_legend().get_texts()] == [
+        "1200 nm", "1600 nm", "2200 nm",
+    ]  # fmt: skip
+
+
+def test_values_are_those_of_the_calibrations(years):
+    (ax,) = plot_history(years, ["hwp.w_sio2"]).axes
+    drawn = ax.lines[0].get_ydata()
+    assert drawn == pytest.approx([c.chain["hwp"].w_sio2.value for c in years])
+
+
+def test_wavelengths_shown(years):
+    figure = plot_history(years, ["derotator.retardance"], shown=2)
+    legend = figure.axes[0].get_legend()
+    assert [t.get_text() for t in legend.get_texts()] == ["1200 nm", "2200 nm"]
+
+
+def test_held_values_are_open_symbols(years):
+    held = fit(4, "2026-03-01", hold=True)
+    (ax,) = plot_history([*years, held], ["hwp.w_sio2"]).axes
+    hollow = [line for line in ax.lines if line.get_markerfacecolor() == "white"]
+    assert [len(line.get_xdata()) for line in hollow] == [1]
+    # no change can be judged against a value that was held
+    assert len(texts(ax)) == 2
+    assert np.isfinite(ax.get_ylim()).all()
+
+
+def test_bad_input(years):
+    record = dataclasses.replace(years[0].datasets[0], meta={})
+    undated = dataclasses.replace(years[0], datasets=[record])
+    with pytest.raises(ParameterError, match="2025-02-01: no date; state one"):
+        plot_history([undated, *years[1:]])
+    with pytest.raises(ParameterError, match="no calibration has a parameter 'm3'"):
+        plot_history(years, ["m3"])
+    with pytest.raises(ParameterError, match="0 parameters to draw"):
+        plot_history(years, ["hwp.theta"])

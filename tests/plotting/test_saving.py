@@ -5,6 +5,7 @@ import subprocess
 import sys
 from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -21,6 +22,7 @@ from astropolcal.plotting import (
     plot_efficiency,
     plot_retardances,
     save_all,
+    saving,
 )
 from astropolcal.plotting.parameters import other_parameters, plot_parameters
 from astropolcal.plotting.residuals import plot_residuals
@@ -45,6 +47,7 @@ def names(paths):
     return [path.name for path in paths]
 
 
+@pytest.mark.slow
 def test_writes_every_figure_as_png(elliptical, tmp_path):
     folder = tmp_path / "new" / "figures"
     paths = save_all(elliptical, folder)
@@ -107,9 +110,10 @@ def test_dataset_without_a_datum_is_left_out(several, tmp_path):
     assert "double_differences_2.png" not in names(save_all(without, tmp_path))
 
 
-@pytest.mark.parametrize("name", ["masked", "undetermined", "single_angle"])
-def test_every_kind_of_calibration_is_drawn(name, request, tmp_path):
-    assert len(save_all(request.getfixturevalue(name), tmp_path)) == 8
+@pytest.mark.slow
+def test_every_kind_of_calibration_is_drawn(request, tmp_path):
+    for name in ["masked", "undetermined", "single_angle"]:
+        assert len(save_all(request.getfixturevalue(name), tmp_path)) == 8, name
 
 
 def with_posterior(calibration, names=None, seed=1):
@@ -144,6 +148,7 @@ def drawn(monkeypatch, unpainted):
     return shown
 
 
+@pytest.mark.slow
 def test_posterior_is_drawn(elliptical, tmp_path):
     pytest.importorskip("corner")
     sampled = with_posterior(elliptical, ["hwp.w_sio2", "hwp.w_mgf2", "wollaston.efficiency[0]"])
@@ -238,36 +243,48 @@ def test_folder_that_is_a_file_is_refused(elliptical, tmp_path):
         save_all(elliptical, path)
 
 
-@pytest.mark.parametrize("draw", DRAW, ids=lambda draw: draw.__name__)
-def test_drawing_leaves_no_state_behind(draw, elliptical):
-    from matplotlib import pyplot as plt
+def test_drawing_leaves_no_state_behind(elliptical):
+    for draw in DRAW:
+        from matplotlib import pyplot as plt
 
-    before = dict(mpl.rcParams)
-    figure = draw(elliptical)
-    assert isinstance(figure, Figure)
-    assert plt.get_fignums() == []
-    assert dict(mpl.rcParams) == before
-
-
-@pytest.mark.parametrize("draw", DRAW, ids=lambda draw: draw.__name__)
-def test_text_is_readable_and_stays_on_the_page(draw, undetermined):
-    figure = draw(undetermined)
-    figure.draw_without_rendering()
-    assert figure.get_layout_engine() is not None
-    sizes = [text.get_fontsize() for axes in figure.axes for text in axes.texts]
-    sizes += [axes.xaxis.label.get_fontsize() for axes in figure.axes]
-    assert min(sizes) >= 10
-    page = figure.bbox
-    title = figure._suptitle.get_window_extent()
-    assert page.x0 <= title.x0
-    assert title.x1 <= page.x1
-    for axes in figure.axes:
-        box = axes.get_tightbbox()
-        assert box.y0 >= page.y0 - 1
-        assert box.y1 <= page.y1 + 1
-        assert box.x0 >= page.x0 - 1
+        before = dict(mpl.rcParams)
+        figure = draw(elliptical)
+        assert isinstance(figure, Figure), draw
+        assert plt.get_fignums() == [], draw
+        assert dict(mpl.rcParams) == before, draw
 
 
+@pytest.mark.slow
+def test_text_is_readable_and_stays_on_the_page(undetermined):
+    for draw in DRAW:
+        figure = draw(undetermined)
+        figure.draw_without_rendering()
+        assert figure.get_layout_engine() is not None, draw
+        sizes = [text.get_fontsize() for axes in figure.axes for text in axes.texts]
+        sizes += [axes.xaxis.label.get_fontsize() for axes in figure.axes]
+        assert min(sizes) >= 10, draw
+        page = figure.bbox
+        title = figure._suptitle.get_window_extent()
+        assert page.x0 <= title.x0, draw
+        assert title.x1 <= page.x1, draw
+        for axes in figure.axes:
+            box = axes.get_tightbbox()
+            assert box.y0 >= page.y0 - 1, draw
+            assert box.y1 <= page.y1 + 1, draw
+            assert box.x0 >= page.x0 - 1, draw
+
+
+@pytest.mark.slow
 def test_importing_the_package_does_not_import_matplotlib():
     code = "import sys, astropolcal.plotting; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_what_does_not_move_is_drawn_first():
+    names = [f"a.x[{i}]" for i in range(4)] + ["hwp.theta"]
+    posterior = SimpleNamespace(
+        names=names, autocorrelation_times=np.array([3.0, np.nan, 9.0, 5.0, 1.0])
+    )
+    assert saving._drawn(posterior, 5, True) == names
+    assert saving._drawn(posterior, 3, True) == ["hwp.theta", "a.x[1]", "a.x[2]"]
+    assert saving._drawn(posterior, 3, False) == ["hwp.theta"]
