@@ -34,7 +34,6 @@ from astropolcal.files import atomic_path
 from astropolcal.gap.challenge import _append, _journal
 from astropolcal.reduction.frames import Frame
 from astropolcal.reduction.journal import Journal
-from astropolcal.scripts._common import write_json
 from tests.fuzz.readers import READERS, Checkpoint, calibration, lab
 
 RECORD = {"kind": "none", "verdict": "none", "result": "right", "snr": 0.0}
@@ -632,14 +631,6 @@ def test_several_processes_write_one_file(tmp_path):
         process.join()
         assert process.exitcode == 0
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_json_is_written_whole(tmp_path):
-    path = tmp_path / "out.json"
-    write_json({"a": 1}, path)
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json({"a": float("nan")}, path)
-    assert json.loads(path.read_text()) == {"a": 1}
 
 
 if __name__ == "__main__":

@@ -211,29 +211,39 @@ def test_targets_by_default_and_by_choice(tables, tmp_path, capsys):
     assert len(row.split()) == 9
 
 
-@pytest.mark.parametrize(
-    ("text", "dolp", "aolp"),
-    [
+def test_spelling_of_targets():
+    for text, dolp, aolp in [
         ("1", 1, None),
         ("30%", 30, None),
         ("0.5,-20", 0.5, -20),
         ("100 %,0.5rad", 100, 28.64788976),
         ("0,0deg", 0, 0),
-    ],
-)
-def test_spelling_of_targets(text, dolp, aolp):
-    found = _target(text)
-    assert found[0].to_value(u.percent) == pytest.approx(dolp)
-    assert found[1] is None if aolp is None else found[1].to_value(u.deg) == pytest.approx(aolp)
+    ]:
+        found = _target(text)
+        assert found[0].to_value(u.percent) == pytest.approx(dolp), (text, dolp, aolp)
+        assert (
+            found[1] is None if aolp is None else found[1].to_value(u.deg) == pytest.approx(aolp)
+        ), (text, dolp, aolp)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "x", "101", "-1", "nan", "1,", "1,x", "1,2,3", "1um", "1,5%", "5,200", "5,-181"]
-)
-def test_impossible_targets_get_one_line(tables, capsys, text):
-    line = complaint(capsys, tables["first"], f"--target={text}")
-    assert f"--target {text}" in line
-    assert "such as 1 or 30,45" in line
+def test_impossible_targets_get_one_line(tables, capsys):
+    for text in [
+        "",
+        "x",
+        "101",
+        "-1",
+        "nan",
+        "1,",
+        "1,x",
+        "1,2,3",
+        "1um",
+        "1,5%",
+        "5,200",
+        "5,-181",
+    ]:
+        line = complaint(capsys, tables["first"], f"--target={text}")
+        assert f"--target {text}" in line, text
+        assert "such as 1 or 30,45" in line, text
 
 
 # ---- gauge -----------------------------------------------------------------------------
@@ -261,20 +271,21 @@ def test_a_prior_on_what_was_fixed_frees_it_again(tables, tmp_path):
     assert summary["parameters"]["hwp.w_sio2"]["fixed"]
 
 
-@pytest.mark.parametrize(
-    ("held", "option", "other"),
-    [
+def test_held_and_free_at_once_is_refused(tables, capsys):
+    for held, option, other in [
         ("hwp.theta", "--free", "hwp.theta"),
         ("hwp.theta=0", "--free", "hwp.theta"),
         ("hwp", "--free", "hwp.theta"),
         ("hwp", "--free", "hwp"),
         ("hwp.theta=0", "--prior", "hwp.theta=0+-0.1deg"),
-    ],
-)
-def test_held_and_free_at_once_is_refused(tables, capsys, held, option, other):
-    line = complaint(capsys, tables["first"], "--fix", held, option, other)
-    name = held.partition("=")[0]
-    assert f"{option} {other} cannot be combined with --fix {name}" in line
+    ]:
+        line = complaint(capsys, tables["first"], "--fix", held, option, other)
+        name = held.partition("=")[0]
+        assert f"{option} {other} cannot be combined with --fix {name}" in line, (
+            held,
+            option,
+            other,
+        )
 
 
 def test_all_of_an_optic_is_freed_but_what_is_held(tables, tmp_path):
@@ -387,16 +398,16 @@ def star_table(tables):
 
 
 @pytest.mark.filterwarnings("ignore:.*frames (masked|left out)")
-@pytest.mark.parametrize("options", [[], ["--strategy", "sequential"], ["--loss", "huber"]])
-def test_lamps_and_star_together(tables, star_table, tmp_path, options):
-    content = run(tmp_path, tables["first"], tables["dark"], star_table, *HELD, *options)
-    assert [one["source"] for one in content["datasets"]] == [
-        "polarized", "unpolarized", "unpolarized standard star",
-    ]  # fmt: skip
-    found = content["parameters"]["m3.diattenuation"]["value"]
-    np.testing.assert_allclose(found, [0.017, 0.014, 0.012], atol=5e-4)
-    # three frames of the first cycle cannot be used
-    assert content["datasets"][2]["n"] == [14, 14, 14]
+def test_lamps_and_star_together(tables, star_table, tmp_path):
+    for options in [[], ["--strategy", "sequential"], ["--loss", "huber"]]:
+        content = run(tmp_path, tables["first"], tables["dark"], star_table, *HELD, *options)
+        assert [one["source"] for one in content["datasets"]] == [
+            "polarized", "unpolarized", "unpolarized standard star",
+        ], options  # fmt: skip
+        found = content["parameters"]["m3.diattenuation"]["value"]
+        np.testing.assert_allclose(found, [0.017, 0.014, 0.012], atol=5e-4)
+        # three frames of the first cycle cannot be used
+        assert content["datasets"][2]["n"] == [14, 14, 14], options
 
 
 @pytest.mark.filterwarnings("ignore:.*frames left out")
@@ -412,15 +423,12 @@ def test_model_of_the_tertiary_mirror(tables, star_table, tmp_path):
     assert free == {"m3.theta", "m3.film_thickness", "m3.n_scale", "m3.k_scale"}
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_unknown_models_get_one_line(tables, capsys):
+    for options, words in [
         (["--m3", "glass"], "m3 = 'glass'; allowed are free, power law, metal"),
         (["--loss", "l3"], "loss = 'l3'; allowed are linear, huber, cauchy, bisquare"),
-    ],
-)
-def test_unknown_models_get_one_line(tables, capsys, options, words):
-    assert words in complaint(capsys, tables["first"], *options)
+    ]:
+        assert words in complaint(capsys, tables["first"], *options), (options, words)
 
 
 # ---- refit of what changed ------------------------------------------------------------------
@@ -437,22 +445,25 @@ def test_start_holds_all_but_what_is_free(tables, tmp_path):
     assert after.settings["restarted"]["free"] == ["Wollaston"]
 
 
-@pytest.mark.parametrize(
-    ("more", "complaint"),
-    [
+def test_start_on_bad_input(tables, tmp_path, capsys):
+    for more, complaint in [
         ([], "say with --free NAME what may change"),
         (["--free", "hwp", "--fix", "hwp.theta"], "--fix cannot be combined with --start"),
         (["--free", "hwp", "--strategy", "two-step"], "--strategy two-step cannot be combined"),
         (["--free", "m9"], "free: no 'm9' in the chains; optics are calibration_polarizer"),
         (["--free", "hwp"], r"old.asdf: no such file"),
-    ],
-)
-def test_start_on_bad_input(tables, tmp_path, capsys, more, complaint):
-    path = tmp_path / "old.asdf"
-    if "m9" in more:
-        assert main(["calibrate", str(tables["first"]), "-q", "-o", str(path)]) == 0
-    assert main(["calibrate", str(tables["second"]), "--start", str(path), *more]) == 2
-    assert complaint in capsys.readouterr().err
+    ]:
+        path = tmp_path / "old.asdf"
+        if "m9" in more:
+            assert main(["calibrate", str(tables["first"]), "-q", "-o", str(path)]) == 0, (
+                more,
+                complaint,
+            )
+        assert main(["calibrate", str(tables["second"]), "--start", str(path), *more]) == 2, (
+            more,
+            complaint,
+        )
+        assert complaint in capsys.readouterr().err, (more, complaint)
 
 
 # ---- nuisance, derotator, stars -----------------------------------------------------------

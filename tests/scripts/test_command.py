@@ -113,13 +113,14 @@ def test_priors_and_gauge(small, tmp_path):
     assert "accident" in json.loads(out.read_text())["gauge"]
 
 
-@pytest.mark.parametrize(
-    ("option", "free"), [(("--derotator", "linear"), 3 * 2 + 5), (("--strategy", "two-step"), 17)]
-)
-def test_models_and_strategies(small, tmp_path, option, free):
-    out = tmp_path / "out.json"
-    assert main(["calibrate", str(small), "-q", "--json", str(out), *option]) == 0
-    assert json.loads(out.read_text())["n_free"] == free
+def test_models_and_strategies(small, tmp_path):
+    for option, free in [(("--derotator", "linear"), 3 * 2 + 5), (("--strategy", "two-step"), 17)]:
+        out = tmp_path / "out.json"
+        assert main(["calibrate", str(small), "-q", "--json", str(out), *option]) == 0, (
+            option,
+            free,
+        )
+        assert json.loads(out.read_text())["n_free"] == free, (option, free)
 
 
 def test_output_and_info_tell_the_same(small, tmp_path, capsys):
@@ -140,9 +141,8 @@ def test_plots_are_saved(small, tmp_path, capsys):
     assert len(list((tmp_path / "figures").glob("*.png"))) >= 4
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
+def test_bad_arguments_get_one_line_and_status_two(capsys, tmp_path, monkeypatch):
+    for arguments, complaint in [
         (["missing.ecsv"], "missing.ecsv: no such file"),
         (["--instrument", "charix"], "unknown instrument 'charix'.*did you mean 'charis'"),
         (["--observable", "ratios"], "unknown observable"),
@@ -162,14 +162,10 @@ def test_plots_are_saved(small, tmp_path, capsys):
         (["-o", "nowhere/cal.asdf"], "no folder"),
         (["--json", "nowhere/out.json"], "no folder"),
         (["--no-such-option"], "unrecognized"),
-    ],
-)
-def test_bad_arguments_get_one_line_and_status_two(
-    capsys, tmp_path, monkeypatch, arguments, complaint
-):
-    monkeypatch.chdir(tmp_path)
-    assert re.search(complaint, _fails(capsys, "calibrate", *arguments))
-    assert list(tmp_path.iterdir()) == []
+    ]:
+        monkeypatch.chdir(tmp_path)
+        assert re.search(complaint, _fails(capsys, "calibrate", *arguments)), (arguments, complaint)
+        assert list(tmp_path.iterdir()) == [], (arguments, complaint)
 
 
 def _spoil(table, how):
@@ -188,27 +184,24 @@ def _spoil(table, how):
     return table
 
 
-@pytest.mark.parametrize(
-    ("how", "complaint"),
-    [
+@pytest.mark.filterwarnings("ignore")
+def test_bad_tables_get_one_line_and_leave_nothing_behind(small, capsys, tmp_path):
+    for how, complaint in [
         ("empty", "empty"),
         ("unpaired", "45"),
         ("masked", "mask"),
         ("infrared", "bad: the refractive index of quartz is known from"),
         ("other instrument", "SPHERE"),
         ("star", "needs its pointing"),
-    ],
-)
-@pytest.mark.filterwarnings("ignore")
-def test_bad_tables_get_one_line_and_leave_nothing_behind(small, capsys, tmp_path, how, complaint):
-    table = _spoil(QTable.read(small), how)
-    path = tmp_path / "bad.ecsv"
-    table.write(path, format="ascii.ecsv")
-    argv = [path, "-o", tmp_path / "cal.asdf", "--json", tmp_path / "out.json"]
-    if how == "other instrument":
-        argv += ["--instrument", "charis"]
-    assert complaint in _fails(capsys, "calibrate", *argv)
-    assert [p.name for p in tmp_path.iterdir()] == ["bad.ecsv"]
+    ]:
+        table = _spoil(QTable.read(small), how)
+        path = tmp_path / "bad.ecsv"
+        table.write(path, format="ascii.ecsv")
+        argv = [path, "-o", tmp_path / "cal.asdf", "--json", tmp_path / "out.json"]
+        if how == "other instrument":
+            argv += ["--instrument", "charis"]
+        assert complaint in _fails(capsys, "calibrate", *argv), (how, complaint)
+        assert [p.name for p in tmp_path.iterdir()] == ["bad.ecsv"], (how, complaint)
 
 
 def test_the_same_table_twice_is_refused(small, capsys):
@@ -256,19 +249,19 @@ def test_simulate_from_a_calibration(small, tmp_path):
     assert Observations.read(tmp_path / "new.ecsv").n_bins == 3
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
+def test_simulate_refuses_nonsense(capsys, tmp_path):
+    for arguments, complaint in [
         (["--flux", "-1"], "flux"),
         (["--gain", "0"], "gain"),
         (["--read-noise", "nan"], "read_noise"),
         (["--hwp", "0,x"], "not a list of angles"),
         (["--calibration", "missing.asdf"], "missing.asdf"),
-    ],
-)
-def test_simulate_refuses_nonsense(capsys, tmp_path, arguments, complaint):
-    assert complaint in _fails(capsys, "simulate", "-o", tmp_path / "x.ecsv", *arguments)
-    assert list(tmp_path.iterdir()) == []
+    ]:
+        assert complaint in _fails(capsys, "simulate", "-o", tmp_path / "x.ecsv", *arguments), (
+            arguments,
+            complaint,
+        )
+        assert list(tmp_path.iterdir()) == [], (arguments, complaint)
 
 
 def test_example_settings_are_the_defaults(tmp_path, capsys):
@@ -302,12 +295,12 @@ def _damage(path, how):
         path.write_text("hello")
 
 
-@pytest.mark.parametrize("how", ["truncated", "not ours", "other version", "text"])
-def test_info_of_a_damaged_calibration(small, capsys, tmp_path, how):
-    path = tmp_path / "cal.asdf"
-    assert main(["calibrate", str(small), "-q", "-o", str(path)]) == 0
-    _damage(path, how)
-    assert "cal.asdf" in _fails(capsys, "info", path)
+def test_info_of_a_damaged_calibration(small, capsys, tmp_path):
+    for how in ["truncated", "not ours", "other version", "text"]:
+        path = tmp_path / "cal.asdf"
+        assert main(["calibrate", str(small), "-q", "-o", str(path)]) == 0, how
+        _damage(path, how)
+        assert "cal.asdf" in _fails(capsys, "info", path), how
 
 
 def test_a_reader_that_goes_away_is_no_error(small):

@@ -3,6 +3,8 @@
 
 import argparse
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
@@ -10,11 +12,23 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from astropolcal import calibrate, instruments
+from astropolcal import Calibration, calibrate, instruments
+from astropolcal.calibration.library import Library
+from astropolcal.calibration.validity import content_hash, with_validity
 from astropolcal.correction import Corrected, engine
-from astropolcal.exceptions import AstropolcalError
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
+from astropolcal.reduction import science
 from astropolcal.reduction.cubes import simulate_cubes
+from astropolcal.reduction.headers import FrameHeader
+from astropolcal.reduction.science import configured, read_night, survey_frames
 from astropolcal.scripts import _correct
+from astropolcal.scripts._correct import (
+    _WAYS,
+    _middle,
+    _point,
+    _position_angles,
+    choose_calibration,
+)
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 Q, U = 0.03, -0.02
@@ -166,9 +180,8 @@ def test_a_frame_without_angles_is_named(night, tmp_path):
     assert not (tmp_path / "out.fits").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
+def test_bad_input(night, tmp_path, monkeypatch):
+    for words, message in [
         (["--optics-in", "dichroic"], "no chain with dichroic; it holds for .* with nbs"),
         (["--optics-in", ""], "no chain no optional optics; it holds for .* with nbs"),
         (["--centre", "300,5"], "outside the image"),
@@ -186,15 +199,13 @@ def test_a_frame_without_angles_is_named(night, tmp_path):
         (["--samples", "20", "--seed", "-1"], "seed = -1; allowed are whole numbers from 0 up"),
         (["-o", "out.asdf"], r"-o out\.asdf: the name must end with \.fits"),
         (["--spectrum", "star.txt"], r"--spectrum star\.txt: the name must end with \.ecsv"),
-    ],
-)
-def test_bad_input(night, tmp_path, words, message, monkeypatch):
-    monkeypatch.setattr(engine, "_TIMEOUT", 1)
-    if "--centre" not in words:
-        words = [*words, "--centre", "69.9,84.7"]
-    out = ["-o", tmp_path / "out.fits", "-q", "--size", "5"]
-    with pytest.raises(AstropolcalError, match=message):
-        command(night / "cubes", "--calibration", night / "charis.asdf", *out, *words)
+    ]:
+        monkeypatch.setattr(engine, "_TIMEOUT", 1)
+        if "--centre" not in words:
+            words = [*words, "--centre", "69.9,84.7"]
+        out = ["-o", tmp_path / "out.fits", "-q", "--size", "5"]
+        with pytest.raises(AstropolcalError, match=message):
+            command(night / "cubes", "--calibration", night / "charis.asdf", *out, *words)
 
 
 def test_too_few_angles(night, tmp_path):
@@ -222,9 +233,8 @@ def changed(night, folder, *keywords):
     return paths
 
 
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
+def test_frames_of_another_set_up(night, tmp_path):
+    for keywords, message in [
         ([("FILTNAME", "J", "K")], "is in mode 'J', .* in 'K': correct apart"),
         ([("FILTNAME", "J")], "in mode 'J', but .*charis.asdf holds for .*--filter 'broadband"),
         ([("MJD", 60950.5, 60800.5)], "nbs was in the beam in .*, and not in "),
@@ -232,17 +242,358 @@ def changed(night, folder, *keywords):
             [("MJD", 60800.5), ("FILTNAME", "broadband JHK")],
             "switcher was installed between the data",
         ),
-    ],
-)
-def test_frames_of_another_set_up(night, tmp_path, keywords, message):
-    from astropolcal import Calibration
-    from astropolcal.calibration.validity import with_validity
+    ]:
+        from astropolcal import Calibration
+        from astropolcal.calibration.validity import with_validity
 
-    calibration = Calibration.read(night / "charis.asdf")
-    stated = with_validity(calibration, mode="broadband JHK", valid_from="2025-01-01")
-    stated.write(tmp_path / "charis.asdf")
-    with pytest.raises(AstropolcalError, match=message):
-        command(
-            *changed(night, tmp_path, *keywords), "--calibration", tmp_path / "charis.asdf",
-            "-o", tmp_path / "o.fits", "-q", "--centre", "69.9,84.7",
-        )  # fmt: skip
+        calibration = Calibration.read(night / "charis.asdf")
+        stated = with_validity(calibration, mode="broadband JHK", valid_from="2025-01-01")
+        stated.write(tmp_path / "charis.asdf")
+        with pytest.raises(AstropolcalError, match=message):
+            command(
+                *changed(night, tmp_path, *keywords), "--calibration", tmp_path / "charis.asdf",
+                "-o", tmp_path / "o.fits", "-q", "--centre", "69.9,84.7",
+            )  # fmt: skip
+
+
+CHARIS = instruments.get("charis")
+
+
+@pytest.fixture
+def told(monkeypatch):
+    """Function that returns what is made of headers with these values."""
+
+    def tell(*frames, centre=(70.0, 85.0)):
+        files = [f"CRSA{i:08d}_cube.fits" for i in range(len(frames))]
+        known = dict(zip(files, frames, strict=True))
+        monkeypatch.setattr(
+            science, "_read", lambda *_: [FrameHeader(f, values=dict(known[f])) for f in files]
+        )
+        return survey_frames(files, CHARIS.files, centre=centre)
+
+    return tell
+
+
+# ---- headers ---------------------------------------------------------------------------
+
+
+def test_angles_that_some_frame_knows_are_columns(told):
+    table, centres, scale, left = told({"hwp": 0.0, "altitude": 60.0}, {"hwp": 45.0})
+    assert table["hwp"].to_value(u.deg).tolist() == [0.0, 45.0]
+    assert np.isnan(table["altitude"].value).tolist() == [False, True]
+    assert set(table.colnames) == {"hwp", "altitude"}
+    assert centres == (70.0, 85.0)
+    assert scale is None
+    # one file holds both beams
+    assert left == [1.0, 1.0]
+
+
+def test_true_plate_angle_is_used_of_all_frames_or_of_none(told):
+    both = told({"hwp": 0.0, "hwp_true": 10.0}, {"hwp": 45.0, "hwp_true": 55.0})[0]
+    assert both["hwp_true"].to_value(u.deg).tolist() == [10.0, 55.0]
+    assert "hwp_true" not in told({"hwp": 0.0, "hwp_true": 10.0}, {"hwp": 45.0})[0].colnames
+
+
+def test_states_of_a_modulator(told):
+    table = told({"hwp": 0.0, "flc_state": "A"}, {"hwp": 0.0, "flc_state": "B"})[0]
+    assert table["flc_state"].tolist() == ["A", "B"]
+
+
+def test_frames_are_as_bright_as_their_exposures(told):
+    for seconds, scale in [
+        ((10.0, 10.0, 10.0), None),
+        # rounding of a header
+        ((10.0, 10.000001, 10.0), None),
+        ((10.0, 20.0, 10.0), [1.0, 2.0, 1.0]),
+        ((5.0, 10.0, 20.0), [0.5, 1.0, 2.0]),
+        # what one header does not say is not guessed
+        ((10.0, None, 20.0), None),
+    ]:
+        frames = [{"hwp": 0.0} | ({} if s is None else {"exposure_time": s}) for s in seconds]
+        found = told(*frames)[2]
+        assert found is None if scale is None else found.tolist() == scale, (seconds, scale)
+
+
+def test_star_that_is_not_found_names_the_file(monkeypatch):
+    def frame(file):
+        x = np.full((2, 3), np.nan if "1_cube" in file else 70.0)
+        found = FrameHeader(file, values={"hwp": 0.0})
+        found.photometry = SimpleNamespace(x=x, y=x + 15.0)
+        return found
+
+    monkeypatch.setattr(science, "_read", lambda files, *_: [frame(file) for file in files])
+    files = [f"CRSA0000000{i}_cube.fits" for i in range(3)]
+    words = "CRSA00000001_cube.fits: the star was not found; give its place with --centre"
+    with pytest.raises(ObservationError, match=words):
+        survey_frames(files, CHARIS.files, ways=_WAYS)
+    centres = survey_frames([files[0], files[2]], CHARIS.files)[1]
+    # x and y in the right and in the left beam
+    assert [c.tolist() for c in centres] == [[[70.0, 85.0]] * 2] * 2
+
+
+# ---- options -----------------------------------------------------------------------------
+
+
+def test_position_angle_of_the_camera():
+    for rotation, camera, angles in [
+        ("none", 12.0, None),
+        ("fixed", 12.0, [12.0, 12.0]),
+        ("pupil", 12.0, [32.0, 36.0]),
+        ("pupil", -90.0, [-70.0, -66.0]),
+    ]:
+        table = QTable({"parallactic": [20.0, 24.0] * u.deg})
+        arguments = SimpleNamespace(rotation=rotation, camera_angle=camera)
+        found = _position_angles(table, arguments)
+        assert found is None if angles is None else found.to_value(u.deg).tolist() == angles, (
+            rotation,
+            camera,
+            angles,
+        )
+
+
+def test_pupil_needs_the_parallactic_angle():
+    arguments = SimpleNamespace(rotation="pupil", camera_angle=0.0)
+    with pytest.raises(ObservationError, match="--rotation pupil needs the parallactic angle of"):
+        _position_angles(QTable({"hwp": [0.0] * u.deg}), arguments)
+
+
+def test_place_of_a_star():
+    for text, place in [("70,85", (70.0, 85.0)), ("69.9, 1e2", (69.9, 100.0))]:
+        assert _point(text) == place, (text, place)
+
+
+# ---- the report --------------------------------------------------------------------------
+
+
+def test_middle_of_angles():
+    for values, words in [
+        ([1.0, 2.0, 30.0], "2.0 deg"),
+        ([1.0, None, 3.0], "2.0 deg"),
+        # neighbours across 180 deg, whose plain median would be 90
+        ([179.0, 1.0], "0.0 deg"),
+        ([178.0, 179.0, 2.0], "179.0 deg"),
+        ([178.0, 2.0, 3.0], "2.0 deg"),
+        # rounds to half a turn, which is none
+        ([179.97, 179.97], "0.0 deg"),
+        ([-0.01, -0.01], "0.0 deg"),
+        ([89.0, 91.0], "90.0 deg"),
+        ([None, None], "not known"),
+        ([], "not known"),
+    ]:
+        assert _middle(np.array(values, dtype=float), ".1f", " deg", turns=True) == words, (
+            values,
+            words,
+        )
+
+
+def test_middle_of_numbers():
+    for values, words in [([0.01, 0.03], "0.0200"), ([None, 0.5], "0.5000"), ([None], "not known")]:
+        assert _middle(np.array(values, dtype=float), ".4f", "") == words, (values, words)
+
+
+def test_report_has_units(capsys):
+    for systematic, words in [
+        (None, "not known"),
+        (SimpleNamespace(is_open=False), "not known"),
+        (SimpleNamespace(is_open=True), "infinite"),
+    ]:
+        aperture = {"radius": 10.0, "dolp": np.array([0.0099]), "aolp": np.array([30.0])}
+        aperture |= {"s_p_statistical": np.array([0.0012]), "s_chi_statistical": np.array([2.0])}
+        aperture |= {"s_p_systematic": np.array([np.nan]), "s_chi_systematic": np.array([np.inf])}
+        summary = {
+            "output": "o.fits", "n_frames": 4, "mode": "stokes", "calibration": "c.asdf",
+            "components": "IQU", "condition": np.array([1.5, np.nan, 1.6]), "poorly_determined": {},
+            "aperture": aperture,
+        }  # fmt: skip
+        _correct._report(summary, systematic)
+        lines = capsys.readouterr().out.splitlines()
+        assert "  condition number of the solution for IQU: 1.5 to 1.6" in lines, (
+            systematic,
+            words,
+        )
+        assert "    degree of linear polarization: 0.99 %" in lines, (systematic, words)
+        assert "      statistical error: 0.12 %" in lines, (systematic, words)
+        assert "    angle of linear polarization: 30.0 deg" in lines, (systematic, words)
+        assert "      statistical error: 2 deg" in lines, (systematic, words)
+        assert lines.count(f"      systematic error: {words}") == 2, (systematic, words)
+
+
+OLD = Path(__file__).parents[1] / "calibration" / "data" / "calibration-1.0.0.asdf"
+CHARIS_OF_CHOOSING = instruments.get("charis")
+
+
+@pytest.fixture
+def night_of_choosing(tmp_path):
+    """Function that writes headers, one a call of keywords, and returns the files."""
+
+    def write(*headers):
+        files = []
+        for i, changes in enumerate(headers):
+            cards = {
+                "INSTRUME": "CHARIS_OF_CHOOSING",
+                "RET-ANG1": 0.0,
+                "D_IMRANG": 45.0,
+                "MJD": 60982.5,
+            }
+            cards["FILTNAME"] = "broadband JHK"
+            header = fits.Header({k: v for k, v in (cards | changes).items() if v is not None})
+            files.append(tmp_path / f"CRSA{i + 1:08d}_cube.fits")
+            fits.PrimaryHDU(header=header).writeto(files[-1])
+        return files
+
+    return write
+
+
+def chosen(calibration, files, **options):
+    """Return the provenance of what is chosen, with the options of the command."""
+    known = {"calibration": str(calibration), "instrument": None, "optics_in": None}
+    known |= {"any_date": False, "filter": None, "max_age": None} | options
+    return choose_calibration(SimpleNamespace(**known), files)[2]
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """Two calibrations that follow each other on 2025-12-01."""
+    folder = tmp_path_factory.mktemp("library")
+    known, base = Library(folder), Calibration.read(OLD)
+    known.add(base, name="a.asdf", valid_from="2025-10-01", valid_until="2025-12-01")
+    known.add(base, name="b.asdf", valid_from="2025-12-01")
+    return folder
+
+
+# ---- what headers tell -----------------------------------------------------------------
+
+
+def test_first_and_last_date_whatever_the_order(night_of_choosing):
+    files = night_of_choosing({"MJD": 60983.0}, {"MJD": 60982.5}, {"MJD": 60982.75})
+    found = read_night(files, CHARIS_OF_CHOOSING)
+    assert [date[:16] for date in found.dates] == ["2025-11-03T12:00", "2025-11-04T00:00"]
+
+
+def test_one_date_is_named_once(night_of_choosing):
+    assert len(read_night(night_of_choosing({}, {}), CHARIS_OF_CHOOSING).dates) == 1
+
+
+def test_frames_without_date_or_mode_say_nothing(night_of_choosing):
+    found = read_night(night_of_choosing({"MJD": None, "FILTNAME": None}), CHARIS_OF_CHOOSING)
+    assert (found.dates, found.mode) == ([], None)
+
+
+def test_frames_of_two_modes_are_refused(night_of_choosing):
+    files = night_of_choosing({"FILTNAME": "Broadband"}, {"FILTNAME": "J"}, {"FILTNAME": None})
+    words = r"1_cube.fits is in mode 'Broadband', .*2_cube.fits in 'J': correct apart"
+    with pytest.raises(ObservationError, match=words):
+        read_night(files, CHARIS_OF_CHOOSING)
+    assert read_night(files[1:], CHARIS_OF_CHOOSING).mode == "J"
+
+
+def test_instrument_without_file_layout_is_refused(night_of_choosing):
+    bare = SimpleNamespace(name="bare", files=None)
+    with pytest.raises(AstropolcalError, match="bare: it is not known how its files look"):
+        read_night(night_of_choosing({}), bare)
+
+
+def test_files_that_cannot_be_read_leave_the_instrument_as_it_is():
+    for files in [[], ["nowhere.fits"], [__file__]]:
+        assert configured(CHARIS_OF_CHOOSING, files) is CHARIS_OF_CHOOSING, files
+
+
+# ---- a single calibration --------------------------------------------------------------
+
+
+def test_file_that_holds_is_taken_with_its_hash(night_of_choosing):
+    found = chosen(OLD, night_of_choosing({}), optics_in=["nbs"])
+    assert found["calibration"] == str(OLD)
+    assert found["calibration_hash"] == content_hash(Calibration.read(OLD))
+
+
+def test_file_for_another_date_is_taken_if_that_is_wanted(night_of_choosing):
+    assert chosen(OLD, night_of_choosing({"MJD": 60500.0}), any_date=True, optics_in=["nbs"])
+
+
+def test_file_for_another_date_is_refused(night_of_choosing):
+    words = r"was taken 2024-07-09, but .* holds for .*; --any-date takes it all the same"
+    with pytest.raises(AstropolcalError, match=words):
+        chosen(OLD, night_of_choosing({"MJD": 60500.0}, {"MJD": 60500.5}), optics_in=["nbs"])
+
+
+def test_another_mode_is_refused_unless_it_is_the_same(night_of_choosing, tmp_path):
+    path = tmp_path / "c.asdf"
+    with_validity(Calibration.read(OLD), mode="Broadband").write(path)
+    files = night_of_choosing({"FILTNAME": "J"}, {"FILTNAME": "BROADBAND"})
+    words = r"in mode 'J', but .*c.asdf holds for .*; if it is the same by .* --filter 'Broadband'"
+    with pytest.raises(AstropolcalError, match=words):
+        chosen(path, files[:1], optics_in=["nbs"])
+    assert chosen(path, files[:1], optics_in=["nbs"], filter="Broadband")
+    # the spelling of a mode does not matter
+    assert chosen(path, files[1:], optics_in=["nbs"])
+
+
+def test_mode_that_is_stated_is_that_of_the_file(night_of_choosing, tmp_path):
+    path = tmp_path / "c.asdf"
+    with_validity(Calibration.read(OLD), mode="broadband JHK").write(path)
+    files = night_of_choosing({"FILTNAME": "J"})
+    with pytest.raises(AstropolcalError, match=r"mode 'foo', but .*--filter 'broadband JHK'"):
+        chosen(path, files, optics_in=["nbs"], filter="foo")
+    assert chosen(path, files, optics_in=["nbs"], filter="Broadband  jhk")
+
+
+def test_mode_is_not_compared_where_the_file_holds_for_any(night_of_choosing, monkeypatch):
+    from astropolcal.calibration import validity
+
+    monkeypatch.setattr(validity, "validity_of", lambda _: validity.Validity("charis"))
+    assert chosen(OLD, night_of_choosing({"FILTNAME": "J"}), optics_in=["nbs"], filter="foo")
+
+
+def test_frames_that_do_not_say_enough(night_of_choosing, tmp_path):
+    bare = {"MJD": None, "FILTNAME": None}
+    for lacking, option in (
+        ({"MJD"}, {"any_date": True}),
+        ({"FILTNAME"}, {"filter": "broadband JHK"}),
+    ):
+        (file,) = night_of_choosing({key: value for key, value in bare.items() if key in lacking})
+        with pytest.raises(AstropolcalError, match=r"cube.fits: its \w+ is not known, .*--(an|fi)"):
+            chosen(OLD, [file], optics_in=["nbs"])
+        assert chosen(OLD, [file], optics_in=["nbs"], **option)
+        file.unlink()
+
+
+def test_calibration_that_is_old(night_of_choosing):
+    early, late = night_of_choosing({"MJD": 60990.0}, {"MJD": 61313.5})
+    with pytest.raises(AstropolcalError, match=r"M3 was coated anew between .*--any-date"):
+        chosen(OLD, [early, late], optics_in=["nbs"])
+    with pytest.warns(AstropolcalWarning, match="0.1 yr from the data"):
+        chosen(OLD, [early], optics_in=["nbs"], max_age=0.01)
+
+
+# ---- a library -------------------------------------------------------------------------
+
+
+def test_library_gives_what_holds_for_the_date(night_of_choosing, library):
+    for mjd, name in [(60982.5, "a.asdf"), (61050.0, "b.asdf")]:
+        found = chosen(library, night_of_choosing({"MJD": mjd}), optics_in=["nbs"])
+        assert Path(found["calibration"]).name == name, (mjd, name)
+
+
+def test_night_across_a_change_is_refused(night_of_choosing, library):
+    files = night_of_choosing({"MJD": 60982.5}, {"MJD": 61050.0})
+    words = r"the frames from 2025-11-03.* to 2026-01-10.* need two calibrations, .*a.asdf and .*b"
+    with pytest.raises(AstropolcalError, match=words):
+        chosen(library, files, optics_in=["nbs"])
+
+
+def test_library_needs_a_date(night_of_choosing, library):
+    with pytest.raises(ObservationError, match="no date in its header to choose a calibration by"):
+        chosen(library, night_of_choosing({"MJD": None}), optics_in=["nbs"])
+
+
+def test_options_are_named_where_a_library_needs_to_know_more(night_of_choosing, tmp_path):
+    for mode in ("J", "H"):
+        with_validity(Calibration.read(OLD), mode=mode).write(tmp_path / f"{mode}.asdf")
+    with pytest.raises(AstropolcalError, match=r"say which mode is meant \(--filter MODE\)"):
+        chosen(tmp_path, night_of_choosing({"FILTNAME": None}), optics_in=["nbs"])
+
+
+def test_choosing_no_calibration_holds_for_the_date(night_of_choosing, library):
+    with pytest.raises(AstropolcalError, match="2020"):
+        chosen(library, night_of_choosing({"MJD": 59000.0}), optics_in=["nbs"])

@@ -76,14 +76,12 @@ def test_best_offset_for_a_night(capsys):
     assert first < -180 < last < first + 180
 
 
-@pytest.mark.parametrize(
-    "words", [["--altitude", "60"], ["--parallactic", "0"], ["--derotator", "90"]]
-)
-def test_table_is_printed_beside_a_target_if_it_is_asked_for(words, capsys):
-    run("--target", "72.7,28.3", "--night", NIGHT, *words)
-    table, best = capsys.readouterr().out.strip().split("\n\nTarget")
-    assert table.startswith("Polarimetric efficiency of charis at altitude 60 deg")
-    assert "Best derotator offset" in best
+def test_table_is_printed_beside_a_target_if_it_is_asked_for(capsys):
+    for words in [["--altitude", "60"], ["--parallactic", "0"], ["--derotator", "90"]]:
+        run("--target", "72.7,28.3", "--night", NIGHT, *words)
+        table, best = capsys.readouterr().out.strip().split("\n\nTarget")
+        assert table.startswith("Polarimetric efficiency of charis at altitude 60 deg"), words
+        assert "Best derotator offset" in best, words
 
 
 def test_json_has_the_table_whatever_is_printed(capsys):
@@ -121,9 +119,8 @@ def test_unknown_format_of_the_figure_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("argv", "error", "words"),
-    [
+def test_bad_input_is_one_error():
+    for argv, error, words in [
         (["--target", "72.7,28.3"], ParameterError, "--target and --night belong together"),
         (["--target", "x", "--night", NIGHT], ParameterError, "write RA,DEC in degree"),
         (["--target", "1,2", "--night", "yesterday"], ParameterError, "START/END"),
@@ -157,11 +154,9 @@ def test_unknown_format_of_the_figure_is_refused(tmp_path):
         (["--instrument", "nothing"], InstrumentError, "unknown instrument 'nothing'"),
         (["-o", "/nowhere/x.png"], AstropolcalError, "there is no folder"),
         (["missing.asdf"], AstropolcalError, "missing.asdf"),
-    ],
-)
-def test_bad_input_is_one_error(argv, error, words):
-    with pytest.raises(error, match=words):
-        run(*argv)
+    ]:
+        with pytest.raises(error, match=words):
+            run(*argv)
 
 
 def test_file_of_another_instrument_is_refused(calibration):

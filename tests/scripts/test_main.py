@@ -63,16 +63,16 @@ def test_interruption_while_the_commands_are_loaded(monkeypatch, capsys):
     assert capsys.readouterr().err == "astropolcal: interrupted\n"
 
 
-@pytest.mark.parametrize(
-    ("said", "words"),
-    [
+def test_no_memory_is_one_line(running, capsys):
+    for said, words in [
         ("Unable to allocate 21 GiB", "Unable to allocate 21 GiB"),
         ("", "give it less to do at a time"),
-    ],
-)
-def test_no_memory_is_one_line(running, capsys, said, words):
-    assert running(lambda: fail(MemoryError(said))) == 2
-    assert capsys.readouterr().err == f"astropolcal: error: not enough memory: {words}\n"
+    ]:
+        assert running(lambda said=said: fail(MemoryError(said))) == 2, (said, words)
+        assert capsys.readouterr().err == f"astropolcal: error: not enough memory: {words}\n", (
+            said,
+            words,
+        )
 
 
 def test_errors_that_are_bugs_are_not_hidden(running):
@@ -104,9 +104,8 @@ def test_a_reader_that_has_gone_is_no_error(running, tmp_path, monkeypatch):
     assert (tmp_path / "out").read_text() == ""
 
 
-@pytest.mark.parametrize(
-    ("argv", "words"),
-    [
+def test_options_that_cannot_be_understood(capsys):
+    for argv, words in [
         ([], "the following arguments are required: COMMAND (see astropolcal --help)"),
         (["calibrat"], "invalid choice: 'calibrat'"),
         (["reduce", "x.fits"], "required: -o/--output (see astropolcal reduce --help)"),
@@ -119,21 +118,18 @@ def test_a_reader_that_has_gone_is_no_error(running, tmp_path, monkeypatch):
         (["sample", "c", "t", "--burn", "x"], "argument --burn: 'x' is neither a number nor auto"),
         (["reduce", "c", "-o", "x", "--meta", "=in"], "argument --meta: '=in' is not KEY=VALUE"),
         (["simulate", "--source", "sun"], "argument --source: invalid choice: 'sun'"),
-    ],
-)
-def test_options_that_cannot_be_understood(argv, words, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main(argv)
-    assert caught.value.code == 2
-    err = capsys.readouterr().err
-    assert err.startswith("astropolcal: error: ")
-    assert err.count("\n") == 1
-    assert words in err
+    ]:
+        with pytest.raises(SystemExit) as caught:
+            main(argv)
+        assert caught.value.code == 2, (argv, words)
+        err = capsys.readouterr().err
+        assert err.startswith("astropolcal: error: "), (argv, words)
+        assert err.count("\n") == 1, (argv, words)
+        assert words in err, (argv, words)
 
 
-@pytest.mark.parametrize(
-    ("argv", "name", "value"),
-    [
+def test_negative_values_are_values():
+    for argv, name, value in [
         (["simulate", "--parallactic", "-30,40"], "parallactic", [-30, 40]),
         (["simulate", "--parallactic=-30,40"], "parallactic", [-30, 40]),
         (["simulate", "--derotator", "-45,0,45", "-q"], "derotator", [-45, 0, 45]),
@@ -146,17 +142,15 @@ def test_options_that_cannot_be_understood(argv, words, capsys):
         (["efficiency", "--derotator", "0", "-4.5e1", "--altitude", "5"], "derotator", [0, -45]),
         (["efficiency", "--parallactic", "-30", "x.asdf"], "parallactic", -30),
         (["correct", "x", "--calibration", "c", "-o", "o", "--centre", "-1,5"], "centre", (-1, 5)),
-    ],
-)
-def test_negative_values_are_values(argv, name, value):
-    assert getattr(build_parser().parse_args(argv), name) == value
+    ]:
+        assert getattr(build_parser().parse_args(argv), name) == value, (argv, name, value)
 
 
-@pytest.mark.parametrize("argv", [["info", "-x"], ["simulate", "--seed", "-q"], ["info", "-x1"]])
-def test_words_that_look_like_options_are_no_values(argv, capsys):
-    with pytest.raises(SystemExit):
-        build_parser().parse_args(argv)
-    assert "astropolcal: error: " in capsys.readouterr().err
+def test_words_that_look_like_options_are_no_values(capsys):
+    for argv in [["info", "-x"], ["simulate", "--seed", "-q"], ["info", "-x1"]]:
+        with pytest.raises(SystemExit):
+            build_parser().parse_args(argv)
+        assert "astropolcal: error: " in capsys.readouterr().err, argv
 
 
 def test_no_option_looks_like_a_negative_number():
@@ -203,39 +197,41 @@ def refused(capsys, words):
     return err
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_no_output_is_an_input_or_another_output(command, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    inputs, outputs = files_of(command, Input), files_of(command, Output)
-    for action in [*inputs, *outputs]:
-        if action.type is not Folder:
-            (tmp_path / f"{action.dest}.txt").write_text(action.dest)
-    before = {path: path.read_text() for path in tmp_path.iterdir()}
-    for action in outputs:
-        others = [other for other in [*inputs, *outputs] if other is not action]
-        # samples are added to a calibration
-        may = COMMANDS[command].get_default("may_replace") or {}
-        for other in (a for a in others if may.get(action.dest) != a.dest):
-            same = f"{other.dest}.txt"
-            given = {action.dest: same, other.dest: same}
-            assert same in refused(capsys, words_of(command, given))
-    assert {path: path.read_text() for path in tmp_path.iterdir()} == before
+def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch, capsys):
+    for command in COMMANDS:
+        monkeypatch.chdir(tmp_path)
+        inputs, outputs = files_of(command, Input), files_of(command, Output)
+        for action in [*inputs, *outputs]:
+            if action.type is not Folder:
+                (tmp_path / f"{action.dest}.txt").write_text(action.dest)
+        before = {path: path.read_text() for path in tmp_path.iterdir()}
+        for action in outputs:
+            others = [other for other in [*inputs, *outputs] if other is not action]
+            # samples are added to a calibration
+            may = COMMANDS[command].get_default("may_replace") or {}
+            for other in (a for a in others if may.get(action.dest) != a.dest):
+                same = f"{other.dest}.txt"
+                given = {action.dest: same, other.dest: same}
+                assert same in refused(capsys, words_of(command, given)), command
+        assert {path: path.read_text() for path in tmp_path.iterdir()} == before, command
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
-@pytest.mark.parametrize("command", COMMANDS)
-def test_nothing_is_read_that_is_no_regular_file(command, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    os.mkfifo("pipe")
-    for action in files_of(command, (Input, Continued)):
-        assert "pipe: is a pipe" in refused(capsys, words_of(command, {action.dest: "pipe"}))
-    for action in files_of(command, Input):
-        err = refused(capsys, words_of(command, {action.dest: "/dev/zero"}))
-        assert "/dev/zero: is a device" in err
-    for action in files_of(command, (Input, Output)):
-        for name in ("n" * 256, "a\0b"):
-            err = refused(capsys, words_of(command, {action.dest: name}))
-            assert "too long" in err or "no name of a file" in err
+def test_nothing_is_read_that_is_no_regular_file(tmp_path, monkeypatch, capsys):
+    for command in COMMANDS:
+        monkeypatch.chdir(tmp_path)
+        os.mkfifo("pipe")
+        for action in files_of(command, (Input, Continued)):
+            assert "pipe: is a pipe" in refused(capsys, words_of(command, {action.dest: "pipe"})), (
+                command
+            )
+        for action in files_of(command, Input):
+            err = refused(capsys, words_of(command, {action.dest: "/dev/zero"}))
+            assert "/dev/zero: is a device" in err, command
+        for action in files_of(command, (Input, Output)):
+            for name in ("n" * 256, "a\0b"):
+                err = refused(capsys, words_of(command, {action.dest: name}))
+                assert "too long" in err or "no name of a file" in err, command
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -280,11 +276,11 @@ def test_commands_that_do_something_can_be_quiet():
     assert set(QUIET) == set(COMMANDS)
 
 
-@pytest.mark.parametrize("command", QUIET)
-def test_quiet_means_the_same_everywhere(command):
-    action = COMMANDS[command]._option_string_actions["--quiet"]
-    assert action is COMMANDS[command]._option_string_actions["-q"]
-    assert action.help == "print nothing but warnings and errors"
+def test_quiet_means_the_same_everywhere():
+    for command in QUIET:
+        action = COMMANDS[command]._option_string_actions["--quiet"]
+        assert action is COMMANDS[command]._option_string_actions["-q"], command
+        assert action.help == "print nothing but warnings and errors", command
 
 
 @pytest.fixture(scope="module")
@@ -309,9 +305,8 @@ def call(folder, words):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    "words",
-    [
+def test_quiet_commands_print_nothing(desk, capsys):
+    for words in [
         "simulate -o again.ecsv --derotator 45",
         "simulate --cubes few --derotator 45 --hwp 0,45",
         "calibrate run.ecsv --derotator linear",
@@ -324,11 +319,9 @@ def call(folder, words):
         "info run.ecsv",
         "info --instruments",
         "standards --kind unpolarized --json stars.json",
-    ],
-)
-def test_quiet_commands_print_nothing(words, desk, capsys):
-    assert call(desk, f"{words} -q") == 0
-    assert capsys.readouterr().out == ""
+    ]:
+        assert call(desk, f"{words} -q") == 0, words
+        assert capsys.readouterr().out == "", words
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -39,24 +39,27 @@ def test_every_command_has_a_section(sections):
     assert set(sections) == set(COMMANDS)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_option_is_in_its_section(sections, command):
-    named = set(re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", sections[command]))
-    missing = options(COMMANDS[command]) - named
-    assert not missing, f"docs/command_line.rst, {command}: describe {', '.join(sorted(missing))}"
+def test_every_option_is_in_its_section(sections):
+    for command in COMMANDS:
+        named = set(re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", sections[command]))
+        missing = options(COMMANDS[command]) - named
+        assert not missing, (
+            f"docs/command_line.rst, {command}: describe {', '.join(sorted(missing))}"
+        )
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"info"}))
-def test_the_table_has_no_option_that_is_gone(sections, command):
-    named = set(re.findall(r"--[a-z][a-z0-9-]*", table_of(sections[command])))
-    assert named
-    unknown = named - options(COMMANDS[command]) - {"--quiet"}
-    assert not unknown, f"docs/command_line.rst, {command}: {', '.join(sorted(unknown))} is gone"
+def test_the_table_has_no_option_that_is_gone(sections):
+    for command in sorted(set(COMMANDS) - {"info"}):
+        named = set(re.findall(r"--[a-z][a-z0-9-]*", table_of(sections[command])))
+        assert named, command
+        unknown = named - options(COMMANDS[command]) - {"--quiet"}
+        assert not unknown, (
+            f"docs/command_line.rst, {command}: {', '.join(sorted(unknown))} is gone"
+        )
 
 
-@pytest.mark.parametrize(
-    ("command", "option", "stated"),
-    [
+def test_stated_defaults_are_those_of_the_parser(sections):
+    for command, option, stated in [
         ("simulate", "--seed", "(20251005)"),
         ("simulate", "--fwhm", "(5)"),
         ("sample", "--steps", "by default 5000"),
@@ -64,10 +67,8 @@ def test_the_table_has_no_option_that_is_gone(sections, command):
         ("correct", "--size", "by default 51"),
         ("correct", "--max-condition", "by default 30"),
         ("challenge", "-n", "by default 20"),
-    ],
-)
-def test_stated_defaults_are_those_of_the_parser(sections, command, option, stated):
-    (row,) = re.findall(rf"^``{option} .*(?:\n {{27}}.*)*", sections[command], re.MULTILINE)
-    assert stated in " ".join(row.split())
-    default = COMMANDS[command].get_default(option.strip("-").replace("-", "_"))
-    assert float(re.search(r"\d[\d.e]*", stated).group()) == default
+    ]:
+        (row,) = re.findall(rf"^``{option} .*(?:\n {{27}}.*)*", sections[command], re.MULTILINE)
+        assert stated in " ".join(row.split()), (command, option, stated)
+        default = COMMANDS[command].get_default(option.strip("-").replace("-", "_"))
+        assert float(re.search(r"\d[\d.e]*", stated).group()) == default, (command, option, stated)

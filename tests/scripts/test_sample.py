@@ -186,12 +186,14 @@ def test_all_free_parameters_by_default(calibration, table, tmp_path):
     assert again.posterior.chain.shape[1] == max(2 * len(again.covariance), 24)
 
 
-@pytest.mark.parametrize(("text", "expected"), [("17", 17), ("auto", 30)])
-def test_burn_in(calibration, table, tmp_path, text, expected):
+def test_burn_in(calibration, table, tmp_path):
     """A run as short as this leaves out half of itself."""
-    out = tmp_path / "out.asdf"
-    assert main(["sample", calibration, table, *RUN, "-q", "-o", str(out), "--burn", text]) == 0
-    assert Calibration.read(out).posterior.convergence.burn_in == expected
+    for text, expected in [("17", 17), ("auto", 30)]:
+        out = tmp_path / "out.asdf"
+        assert (
+            main(["sample", calibration, table, *RUN, "-q", "-o", str(out), "--burn", text]) == 0
+        ), (text, expected)
+        assert Calibration.read(out).posterior.convergence.burn_in == expected, (text, expected)
 
 
 def test_reader_that_goes_away_does_not_cost_the_samples(calibration, table, tmp_path, monkeypatch):
@@ -319,9 +321,8 @@ def test_table_that_is_missing(capsys, tmp_path):
     assert "give that table" in complaint
 
 
-@pytest.mark.parametrize(
-    ("options", "complaint"),
-    [
+def test_bad_options_get_one_line_and_status_two(calibration, table, capsys, tmp_path, monkeypatch):
+    for options, complaint in [
         (["--parameters", "hwp.tilt"], "no free parameter 'hwp.tilt'"),
         (["--parameters", "derotator.theta"], "no free parameter 'derotator.theta'"),
         (["--walkers", "3"], "need a whole number from"),
@@ -338,14 +339,10 @@ def test_table_that_is_missing(capsys, tmp_path):
         (["--json", "nowhere/out.json"], "no folder"),
         (["--checkpoint", "nowhere/run.h5"], "no folder"),
         (["--plots", __file__], "is a file, not a folder"),
-    ],
-)
-def test_bad_options_get_one_line_and_status_two(
-    calibration, table, capsys, tmp_path, monkeypatch, options, complaint
-):
-    monkeypatch.chdir(tmp_path)
-    assert complaint in fails(capsys, calibration, table, *options)
-    assert list(tmp_path.iterdir()) == []
+    ]:
+        monkeypatch.chdir(tmp_path)
+        assert complaint in fails(capsys, calibration, table, *options), (options, complaint)
+        assert list(tmp_path.iterdir()) == [], (options, complaint)
 
 
 def test_files_that_are_none(calibration, table, capsys, tmp_path):

@@ -82,9 +82,8 @@ def test_calibration_of_the_internal_source_serves_for_a_star(tmp_path):
     assert Observations.read(table).n_bins == 22
 
 
-@pytest.mark.parametrize(
-    ("argv", "words"),
-    [
+def test_nonsense_is_refused_with_one_line(tmp_path, monkeypatch, capsys):
+    for argv, words in [
         ([], "nothing to write"),
         (["-o", "x.ecsv", "--source", "star", "--altitude", "60"], "needs --parallactic"),
         (["-o", "x.ecsv", *STAR, "--altitude", "1,2,3"], "needs --altitude"),
@@ -100,14 +99,12 @@ def test_calibration_of_the_internal_source_serves_for_a_star(tmp_path):
         (["--cubes", "cubes", *TWO, "--halo", "2"], "halo = 2"),
         (["--cubes", "cubes", *TWO, "--fwhm", "0"], "fwhm = 0"),
         (["--cubes", "cubes", *STAR, "--flux", "-1"], "flux"),
-    ],
-)
-def test_nonsense_is_refused_with_one_line(tmp_path, monkeypatch, capsys, argv, words):
-    monkeypatch.chdir(tmp_path)
-    assert simulated(*argv) == 2
-    (complaint,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
-    assert words in complaint
-    assert not list(tmp_path.iterdir())
+    ]:
+        monkeypatch.chdir(tmp_path)
+        assert simulated(*argv) == 2, (argv, words)
+        (complaint,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+        assert words in complaint, (argv, words)
+        assert not list(tmp_path.iterdir()), (argv, words)
 
 
 def test_cubes_are_not_written_over_others(tmp_path, capsys):
@@ -119,27 +116,38 @@ def test_cubes_are_not_written_over_others(tmp_path, capsys):
 
 # an internal source and an unpolarized star do not tell where north is
 @pytest.mark.filterwarnings("ignore:the calibration leaves open")
-@pytest.mark.parametrize(
-    ("name", "derotator"), [("charis", "50,65,80,95"), ("vampires", "45,60,90")]
-)
-def test_the_defaults_of_one_command_are_good_input_for_the_next(
-    tmp_path, monkeypatch, name, derotator
-):
-    monkeypatch.chdir(tmp_path)
-    cycle, own = ["--hwp", "0,45,22.5,67.5"], ["--instrument", name]
-    raw = {"charis": lambda folder: ["--raw", f"{folder}/raw"]}.get(name, lambda folder: [])
-    assert simulated("--cubes", "lamp", *own, *cycle, "--derotator", derotator) == 0
-    assert main(["reduce", "lamp", *raw("lamp"), *own, "-o", "lamp.ecsv"]) == 0
-    assert simulated("--cubes", "star", *own, *STAR, "--derotator", "97") == 0
-    assert main(["reduce", "star", *raw("star"), *own, "--source", "star", "-o", "star.ecsv"]) == 0
-    layout = instruments.get(name).files
-    for source in ("lamp", "star"):
-        assert not Observations.read(f"{source}.ecsv").mask.any()
-        cubes = Path(source).glob("*.fits")
-        brightest = max(np.nanmax(fits.getdata(path, layout.cube_extension)) for path in cubes)
-        # of a star the noise of the brightest pixel is a percent
-        assert brightest < 0.55 * layout.saturation
-    assert main(["calibrate", "lamp.ecsv", "star.ecsv", "--json", "c.json", "-o", "cal.asdf"]) == 0
-    assert json.loads(Path("c.json").read_text())["converged"]
-    raw = raw("star")
-    assert main(["correct", "star", *raw, *own, "--calibration", "cal.asdf", "-o", "c.fits"]) == 0
+def test_the_defaults_of_one_command_are_good_input_for_the_next(tmp_path, monkeypatch):
+    for name, derotator in [("charis", "50,65,80,95"), ("vampires", "45,60,90")]:
+        monkeypatch.chdir(tmp_path)
+        cycle, own = ["--hwp", "0,45,22.5,67.5"], ["--instrument", name]
+        raw = {"charis": lambda folder: ["--raw", f"{folder}/raw"]}.get(name, lambda folder: [])
+        assert simulated("--cubes", "lamp", *own, *cycle, "--derotator", derotator) == 0, (
+            name,
+            derotator,
+        )
+        assert main(["reduce", "lamp", *raw("lamp"), *own, "-o", "lamp.ecsv"]) == 0, (
+            name,
+            derotator,
+        )
+        assert simulated("--cubes", "star", *own, *STAR, "--derotator", "97") == 0, (
+            name,
+            derotator,
+        )
+        assert (
+            main(["reduce", "star", *raw("star"), *own, "--source", "star", "-o", "star.ecsv"]) == 0
+        ), (name, derotator)
+        layout = instruments.get(name).files
+        for source in ("lamp", "star"):
+            assert not Observations.read(f"{source}.ecsv").mask.any(), (name, derotator)
+            cubes = Path(source).glob("*.fits")
+            brightest = max(np.nanmax(fits.getdata(path, layout.cube_extension)) for path in cubes)
+            # of a star the noise of the brightest pixel is a percent
+            assert brightest < 0.55 * layout.saturation, (name, derotator)
+        assert (
+            main(["calibrate", "lamp.ecsv", "star.ecsv", "--json", "c.json", "-o", "cal.asdf"]) == 0
+        ), (name, derotator)
+        assert json.loads(Path("c.json").read_text())["converged"], (name, derotator)
+        raw = raw("star")
+        assert (
+            main(["correct", "star", *raw, *own, "--calibration", "cal.asdf", "-o", "c.fits"]) == 0
+        ), (name, derotator)
