@@ -34,6 +34,7 @@ from astropolcal.files import atomic_path
 from astropolcal.gap.challenge import _append, _journal
 from astropolcal.reduction.frames import Frame
 from astropolcal.reduction.journal import Journal
+from astropolcal.scripts._common import write_json
 from tests.fuzz.readers import READERS, Checkpoint, calibration, lab
 
 RECORD = {"kind": "none", "verdict": "none", "result": "right", "snr": 0.0}

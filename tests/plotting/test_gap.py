@@ -346,11 +346,7 @@ def test_frames_are_named_by_their_derotator_angle():
         assert axes.get_xlabel() == label, (derotator, label, ticks)
         if ticks:
             assert len(axes.get_xticks()) == ticks, (derotator, label, ticks)
-            assert axes.get_xticklabels()[0].get_text() == f"{derotator[0]:.4g}", (
-                derotator,
-                label,
-                ticks,
-            )
+            assert axes.get_xticklabels()[0].get_text() == f"{derotator[0]:.4g}", derotator
             # one line between two angles
             assert len(axes.lines) == len(set(derotator)) - 1, (derotator, label, ticks)
         else:

@@ -223,7 +223,7 @@ def test_spelling_of_targets():
         assert found[0].to_value(u.percent) == pytest.approx(dolp), (text, dolp, aolp)
         assert (
             found[1] is None if aolp is None else found[1].to_value(u.deg) == pytest.approx(aolp)
-        ), (text, dolp, aolp)
+        ), text
 
 
 def test_impossible_targets_get_one_line(tables, capsys):
@@ -281,11 +281,7 @@ def test_held_and_free_at_once_is_refused(tables, capsys):
     ]:
         line = complaint(capsys, tables["first"], "--fix", held, option, other)
         name = held.partition("=")[0]
-        assert f"{option} {other} cannot be combined with --fix {name}" in line, (
-            held,
-            option,
-            other,
-        )
+        assert f"{option} {other} cannot be combined with --fix {name}" in line, held
 
 
 def test_all_of_an_optic_is_freed_but_what_is_held(tables, tmp_path):
@@ -334,6 +330,7 @@ def test_exchanged_beams_are_not_usable(tmp_path, capsys):
     assert "astropolcal diagnose" in lines[4]
 
 
+@pytest.mark.slow
 def test_what_is_printed_fits_a_terminal_and_tells_what_is_hidden(tables, tmp_path, capsys):
     cal, figures, out = tmp_path / "cal.asdf", tmp_path / "figures", tmp_path / "cal.json"
     files = [tables["first"]]
@@ -398,6 +395,7 @@ def star_table(tables):
 
 
 @pytest.mark.filterwarnings("ignore:.*frames (masked|left out)")
+@pytest.mark.slow
 def test_lamps_and_star_together(tables, star_table, tmp_path):
     for options in [[], ["--strategy", "sequential"], ["--loss", "huber"]]:
         content = run(tmp_path, tables["first"], tables["dark"], star_table, *HELD, *options)
@@ -451,18 +449,12 @@ def test_start_on_bad_input(tables, tmp_path, capsys):
         (["--free", "hwp", "--fix", "hwp.theta"], "--fix cannot be combined with --start"),
         (["--free", "hwp", "--strategy", "two-step"], "--strategy two-step cannot be combined"),
         (["--free", "m9"], "free: no 'm9' in the chains; optics are calibration_polarizer"),
-        (["--free", "hwp"], r"old.asdf: no such file"),
+        (["--free", "hwp"], r"none.asdf: no such file"),
     ]:
-        path = tmp_path / "old.asdf"
+        path = tmp_path / ("none.asdf" if "no such file" in complaint else "old.asdf")
         if "m9" in more:
-            assert main(["calibrate", str(tables["first"]), "-q", "-o", str(path)]) == 0, (
-                more,
-                complaint,
-            )
-        assert main(["calibrate", str(tables["second"]), "--start", str(path), *more]) == 2, (
-            more,
-            complaint,
-        )
+            assert main(["calibrate", str(tables["first"]), "-q", "-o", str(path)]) == 0, more
+        assert main(["calibrate", str(tables["second"]), "--start", str(path), *more]) == 2, more
         assert complaint in capsys.readouterr().err, (more, complaint)
 
 

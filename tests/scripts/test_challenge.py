@@ -27,6 +27,7 @@ def command():
     return call
 
 
+@pytest.mark.slow
 def test_it_prints_rates_and_writes_what_is_asked_for(command, tmp_path, capsys):
     names = ("c.jsonl", "s.json", "f.png", "r.png")
     checkpoint, summary, figure, reliability = (tmp_path / name for name in names)

@@ -116,10 +116,7 @@ def test_priors_and_gauge(small, tmp_path):
 def test_models_and_strategies(small, tmp_path):
     for option, free in [(("--derotator", "linear"), 3 * 2 + 5), (("--strategy", "two-step"), 17)]:
         out = tmp_path / "out.json"
-        assert main(["calibrate", str(small), "-q", "--json", str(out), *option]) == 0, (
-            option,
-            free,
-        )
+        assert main(["calibrate", str(small), "-q", "--json", str(out), *option]) == 0, option
         assert json.loads(out.read_text())["n_free"] == free, (option, free)
 
 
@@ -196,7 +193,7 @@ def test_bad_tables_get_one_line_and_leave_nothing_behind(small, capsys, tmp_pat
     ]:
         table = _spoil(QTable.read(small), how)
         path = tmp_path / "bad.ecsv"
-        table.write(path, format="ascii.ecsv")
+        table.write(path, format="ascii.ecsv", overwrite=True)
         argv = [path, "-o", tmp_path / "cal.asdf", "--json", tmp_path / "out.json"]
         if how == "other instrument":
             argv += ["--instrument", "charis"]
@@ -258,8 +255,7 @@ def test_simulate_refuses_nonsense(capsys, tmp_path):
         (["--calibration", "missing.asdf"], "missing.asdf"),
     ]:
         assert complaint in _fails(capsys, "simulate", "-o", tmp_path / "x.ecsv", *arguments), (
-            arguments,
-            complaint,
+            arguments
         )
         assert list(tmp_path.iterdir()) == [], (arguments, complaint)
 

@@ -87,6 +87,8 @@ def test_good_places_for_files(tmp_path, monkeypatch):
 
 
 def test_bad_places_for_files(tmp_path, locked):
+    (tmp_path / "note.txt").write_text("")
+    (tmp_path / "to_locked.json").symlink_to("locked/new.json")
     for place, words in [
         ("no/x.json", "no/x.json: there is no folder .*no"),
         (".", "is a folder, not a file"),
@@ -96,8 +98,6 @@ def test_bad_places_for_files(tmp_path, locked):
         ("n" * 256, "nnn: cannot be written: File name too long"),
         ("a\0b", "cannot be written: it is no name of a file .embedded null byte"),
     ]:
-        (tmp_path / "note.txt").write_text("")
-        (tmp_path / "to_locked.json").symlink_to("locked/new.json")
         with pytest.raises(AstropolcalError, match=words):
             check(Output(tmp_path / "good.json"), Output(tmp_path / place))
 
@@ -414,7 +414,7 @@ def test_numbers_with_and_without_unit(chains):
     ]:
         assert _value("hwp.theta", parameter(chains[0], "hwp.theta"), text) == pytest.approx(
             value
-        ), (text, value)
+        ), text
 
 
 def test_what_is_no_number_of_that_unit(chains):

@@ -70,6 +70,7 @@ def complaint(capsys, *arguments):
     return line
 
 
+@pytest.mark.slow
 def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys):
     tables = [folder / "polarized.ecsv", folder / "unpolarized.ecsv"]
     report, saved = tmp_path / "gap.html", tmp_path / "improved.asdf"
@@ -120,6 +121,7 @@ def test_model_of_a_calibration(folder, cal, tmp_path):
     assert edited["n_free"] == content["n_free"] - 1
 
 
+@pytest.mark.slow
 def test_edits_of_the_model(folder, tmp_path):
     table = folder / "polarized.ecsv"
     elliptical = run(tmp_path, table, *FEW)

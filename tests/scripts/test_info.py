@@ -212,18 +212,15 @@ def test_plate_that_is_nowhere_it_should_be_is_doubtful(tmp_path, capsys):
     for true, doubtful in [(45.0, False), (125.0, False), (60.0, True)]:
         angles = {"RET-ANG1": 45.0, "RET-POS1": true, "PARANG": 20.0, "ALTITUDE": 70.0}
         header = fits.Header({"INSTRUME": "CHARIS"} | angles)
-        fits.PrimaryHDU(header=header).writeto(tmp_path / "CRSA00000001.fits")
+        fits.PrimaryHDU(header=header).writeto(tmp_path / "CRSA00000001.fits", overwrite=True)
         text, _ = told(tmp_path / "CRSA00000001.fits", capsys)
-        assert ("doubtful: RET-ANG1 and RET-POS1 agree neither" in text) == doubtful, (
-            true,
-            doubtful,
-        )
+        assert ("doubtful: RET-ANG1 and RET-POS1 agree neither" in text) == doubtful, true
 
 
 def test_any_fits_file_is_listed(tmp_path, capsys):
     for name in ["x.fits", "x.fits.gz", "x.bin"]:
         hdus = [fits.PrimaryHDU(np.zeros((2, 3))), fits.ImageHDU(np.zeros(5, "i2"), name="SPEC")]
-        fits.HDUList(hdus).writeto(tmp_path / "plain.fits")
+        fits.HDUList(hdus).writeto(tmp_path / "plain.fits", overwrite=True)
         path = tmp_path / name
         if name.endswith("gz"):
             fits.HDUList(hdus).writeto(path)
@@ -244,7 +241,9 @@ def test_files_of_another_kind_are_bad_input(tmp_path, capsys):
         ("x.png", b"\x89PNG\r\n", "x.png: info takes a calibration (.asdf), a folder"),
         ("x.txt", None, "x.txt: no such file"),
     ]:
-        if content is not None:
+        if content is None:
+            (tmp_path / name).unlink()
+        else:
             (tmp_path / name).write_bytes(content)
         assert words in refused(tmp_path / name, capsys), (name, content, words)
 
@@ -270,11 +269,10 @@ def test_tables_are_known_by_their_columns(tmp_path, capsys):
         (["a", "b"], "table"),
     ]:
         table = Table({name: [1.0] for name in columns}, meta={"list": [1, "x"], "n": 2, "x": 0.5})
-        table.write(tmp_path / "t.ecsv", format="ascii.ecsv")
+        table.write(tmp_path / "t.ecsv", format="ascii.ecsv", overwrite=True)
         text, content = told(tmp_path / "t.ecsv", capsys)
         assert f"{kind}, 1 row x {len(columns)} columns columns: {', '.join(columns)}" in text, (
-            columns,
-            kind,
+            columns
         )
         assert "list: 1, x" in text, (columns, kind)
         assert content == {
@@ -287,5 +285,5 @@ def test_a_bad_observation_table_is_not_described_as_another(tmp_path, capsys):
     for missing in ["hwp", "flux_left", "wavelength"]:
         table = QTable(example_table())
         table.remove_column(missing)
-        table.write(tmp_path / "run.ecsv", format="ascii.ecsv")
+        table.write(tmp_path / "run.ecsv", format="ascii.ecsv", overwrite=True)
         assert f"missing column {missing}" in refused(tmp_path / "run.ecsv", capsys), missing

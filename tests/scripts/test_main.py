@@ -69,10 +69,7 @@ def test_no_memory_is_one_line(running, capsys):
         ("", "give it less to do at a time"),
     ]:
         assert running(lambda said=said: fail(MemoryError(said))) == 2, (said, words)
-        assert capsys.readouterr().err == f"astropolcal: error: not enough memory: {words}\n", (
-            said,
-            words,
-        )
+        assert capsys.readouterr().err == f"astropolcal: error: not enough memory: {words}\n", said
 
 
 def test_errors_that_are_bugs_are_not_hidden(running):
@@ -218,9 +215,9 @@ def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
 def test_nothing_is_read_that_is_no_regular_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
     for command in COMMANDS:
-        monkeypatch.chdir(tmp_path)
-        os.mkfifo("pipe")
         for action in files_of(command, (Input, Continued)):
             assert "pipe: is a pipe" in refused(capsys, words_of(command, {action.dest: "pipe"})), (
                 command
@@ -235,6 +232,7 @@ def test_nothing_is_read_that_is_no_regular_file(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_names_are_shown_without_what_a_terminal_acts_on(desk, capsys):
     odd = "\x1b[31m\r\x07\u202eodd\nastropolcal: error: forged"
     calls = [
@@ -305,6 +303,7 @@ def call(folder, words):
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_quiet_commands_print_nothing(desk, capsys):
     for words in [
         "simulate -o again.ecsv --derotator 45",

@@ -84,6 +84,7 @@ def fails(capsys, *argv):
 # ---- what comes out ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_samples_stay_with_the_calibration(sampled, calibration):
     again = Calibration.read(sampled / "out.asdf")
     assert again.posterior.names == NAMES
@@ -192,7 +193,7 @@ def test_burn_in(calibration, table, tmp_path):
         out = tmp_path / "out.asdf"
         assert (
             main(["sample", calibration, table, *RUN, "-q", "-o", str(out), "--burn", text]) == 0
-        ), (text, expected)
+        ), text
         assert Calibration.read(out).posterior.convergence.burn_in == expected, (text, expected)
 
 
@@ -230,6 +231,7 @@ def test_info_of_a_file_with_samples(sampled, capsys):
     assert "Calibration of charis from small" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_missing_corner_costs_one_figure(calibration, table, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "corner", None)
     folder = tmp_path / "p"
