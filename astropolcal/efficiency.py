@@ -22,7 +22,7 @@ from astropolcal.observations.pointings import horizontal, tracked
 from astropolcal.optics import COORDINATES, Rotator
 from astropolcal.units import angle_to_rad
 
-__all__ = []
+__all__ = ["BestDerotator", "best_derotator", "polarimetric_efficiency"]
 
 #: Derotator angle = offset + f * parallactic angle + g * altitude, as (f, g), where no instrument
 #: is given.

@@ -22,8 +22,7 @@ from scipy.optimize import least_squares
 from timing import interleaved, report
 
 from astropolcal import Calibration, calibrate, instruments
-from astropolcal.calibration.fit import search_branches
-from astropolcal.calibration.fit.strategies import BinProblem
+from astropolcal.calibration.fit.strategies import BinProblem, search_branches
 from astropolcal.chain import leaves, system_mueller
 from astropolcal.measurement import Measurement
 from astropolcal.pipeline import Library, library

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from astropolcal import calibrate, instruments, optics
 from astropolcal.calibration import compare
-from astropolcal.calibration.result import comparison_text
+from astropolcal.calibration.result.comparison import comparison_text
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ParameterError

@@ -465,7 +465,7 @@ def test_prior_of_an_unknown_kind_is_refused(change, message):
 
 def test_unreadable_date_of_an_older_file_is_refused(content, path, monkeypatch):
     """Such files could be written once; they would hold from any date on."""
-    from astropolcal.calibration.result import validity_of
+    from astropolcal.calibration.result.validity import validity_of
     from astropolcal.converters import calibration as converter
     from astropolcal.pipeline import Library
 

@@ -9,7 +9,7 @@ import pytest
 from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, LMLSQFitter, TRFLSQFitter
 
 from astropolcal.calibration import Calibration, calibrate
-from astropolcal.calibration.fit import search_branches
+from astropolcal.calibration.fit.strategies import search_branches
 from astropolcal.calibration.result.summary import to_dict
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError, FitError

@@ -11,12 +11,13 @@ from astropy.time import Time
 
 from astropolcal import instruments, optics
 from astropolcal.calibration import with_validity
-from astropolcal.calibration.result import Validity, validity_of
 from astropolcal.calibration.result.validity import (
+    Validity,
     beam_words,
     instrument_of,
     optics_sets,
     optics_words,
+    validity_of,
 )
 from astropolcal.calibration.system import at_bins, match_wavelengths, split_chain
 from astropolcal.chain import leaves

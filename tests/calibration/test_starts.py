@@ -8,8 +8,7 @@ from scipy.optimize import least_squares
 
 from astropolcal import optics
 from astropolcal.calibration import calibrate
-from astropolcal.calibration.fit import search_branches
-from astropolcal.calibration.fit.strategies import BinProblem
+from astropolcal.calibration.fit.strategies import BinProblem, search_branches
 from astropolcal.measurement import Measurement, Normal
 
 N_BINS = 22

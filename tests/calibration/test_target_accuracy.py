@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.calibration import Calibration, calibrate, four_accuracies
-from astropolcal.calibration.noise.scatter import GROUPS, leave_out_groups
-from astropolcal.calibration.validation import groups_by, paper_accuracies, target_accuracy
+from astropolcal.calibration.noise.scatter import GROUPS, groups_by, leave_out_groups
+from astropolcal.calibration.validation import paper_accuracies, target_accuracy
 from astropolcal.calibration.validation.cross_validation import cross_validated_residuals
 from astropolcal.calibration.validation.held_out import add_standard
 from astropolcal.calibration.validation.targets import absolute_accuracy, propagate_accuracy

@@ -34,7 +34,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, parameter_table
 
-__all__ = ["search_branches"]
+__all__ = []
 
 _SCAN_STEP = np.deg2rad(15.0)
 _N_VALLEYS = 4

@@ -36,7 +36,7 @@ from astropolcal.calibration.identifiability.sky import (
 from astropolcal.chain import leaves
 from astropolcal.optics import Rotator
 
-__all__ = ["examine"]
+__all__ = ["Identifiability", "examine"]
 
 # a direction that is a parameter of its own is that parameter by all but this
 _OWN = 1e-9

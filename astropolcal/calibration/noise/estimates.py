@@ -21,7 +21,7 @@ from astropy.table import QTable
 from astropolcal.exceptions import FitError
 from astropolcal.units import angle_to_rad
 
-__all__ = ["noise_from_errors", "noise_from_null_channel", "noise_from_replicates"]
+__all__ = ["NoiseEstimate", "noise_from_errors", "noise_from_null_channel", "noise_from_replicates"]
 
 
 @dataclass(frozen=True)

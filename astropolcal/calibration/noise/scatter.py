@@ -25,7 +25,7 @@ import numpy as np
 from astropolcal.exceptions import FitError
 from astropolcal.observations import cycle_numbers, is_star
 
-__all__ = ["groups_by"]
+__all__ = []
 
 #: What may make a group, and what groups of it are called.
 GROUPS = {

@@ -4,4 +4,7 @@
 from astropolcal.calibration.posterior.sampler import LogPosterior
 from astropolcal.calibration.posterior.samples import Posterior
 
-__all__ = ["LogPosterior", "Posterior"]
+__all__ = [
+    "LogPosterior",
+    "Posterior",
+]

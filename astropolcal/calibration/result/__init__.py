@@ -1,8 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The calibration as an object: values, validity, verdict, summary, comparison."""
 
-from astropolcal.calibration.result.comparison import comparison_text
-from astropolcal.calibration.result.validity import Validity, validity_of
+from astropolcal.calibration.result.validity import Validity
 from astropolcal.calibration.result.verdict import Verdict
 
-__all__ = ["Validity", "Verdict", "comparison_text", "validity_of"]
+__all__ = [
+    "Validity",
+    "Verdict",
+]

@@ -14,7 +14,7 @@ from astropolcal.instruments import Instrument
 from astropolcal.mueller import diattenuation_vector, retardance_vector
 from astropolcal.optics import COORDINATES
 
-__all__ = ["compare", "comparison_text"]
+__all__ = ["compare"]
 
 # an optic turned by 180 deg is the same: half a turn is all there is
 _TURN = np.arange(0, 180, 5.0) * u.deg

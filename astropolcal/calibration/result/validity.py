@@ -12,7 +12,7 @@ from astropolcal.exceptions import (
 from astropolcal.observations.reading import stated_date
 from astropolcal.units import iso_date
 
-__all__ = ["Validity", "validity_of", "with_validity"]
+__all__ = ["Validity", "with_validity"]
 
 _STATED = ("mode", "valid_from", "valid_until", "optics_in")
 

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Covariances, derived quantities with errors, and refits: bootstrap, profiles, sandwich errors."""
 
+from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.calibration.uncertainty.derived import (
     Derived,
     derived_data,
@@ -9,10 +10,18 @@ from astropolcal.calibration.uncertainty.derived import (
     derived_retardance,
     derived_sky,
 )
-from astropolcal.calibration.uncertainty.refits import robust_covariance, standard_errors
+from astropolcal.calibration.uncertainty.refits import (
+    Profile,
+    Resampled,
+    robust_covariance,
+    standard_errors,
+)
 
 __all__ = [
+    "Covariance",
     "Derived",
+    "Profile",
+    "Resampled",
     "derived_data",
     "derived_efficiency",
     "derived_mueller",

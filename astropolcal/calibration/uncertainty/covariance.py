@@ -24,7 +24,7 @@ from astropolcal.calibration.noise.weighting import Weighting, around, weighting
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor
 
-__all__ = []
+__all__ = ["Covariance"]
 
 # share of both standard errors by which a covariance may differ from its transpose: far above
 # rounding, and too little to change anything

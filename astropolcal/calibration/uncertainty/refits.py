@@ -42,7 +42,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.simulation import check_seed
 from astropolcal.units import to_unit
 
-__all__ = ["bootstrap", "profile", "robust_covariance", "standard_errors"]
+__all__ = ["Profile", "Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
 
 _FEWEST_BLOCKS = 3
 _MAX_EVALUATIONS = 100

@@ -26,7 +26,7 @@ from astropolcal.calibration.noise.weighting import weighting_of
 from astropolcal.calibration.uncertainty.covariance import prior_noise
 from astropolcal.exceptions import FitError
 
-__all__ = ["lack_of_fit"]
+__all__ = ["LackOfFit", "lack_of_fit"]
 
 # a datum that moves by less than this share of the largest slope does not move
 _STILL = 1e-6

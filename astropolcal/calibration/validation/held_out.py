@@ -12,7 +12,7 @@ from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.observations import SAME_WAVELENGTH
 from astropolcal.optics import PolarizedSource
 
-__all__ = ["add_standard", "standard_accuracy"]
+__all__ = ["add_standard"]
 
 # what a step of a degree may add to the errors of a prediction before it is worth a word
 _WORTH_A_WORD = 0.1
