@@ -69,7 +69,7 @@ def mueller_table(calibration, header=None, *, positions=None, light="sky", wave
     >>> import astropy.units as u
     >>> from astropolcal import calibrate, instruments
 
-    >>> from astropolcal.pipeline.loading import load
+    >>> from astropolcal.pipeline import load, mueller_table
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -159,6 +159,7 @@ def write_mueller(table, path, overwrite=False):
 
     Examples
     --------
+    >>> from astropolcal.pipeline import write_mueller
     >>> import astropy.units as u
     >>> import numpy as np
     >>> from astropy.table import QTable

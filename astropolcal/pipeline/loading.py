@@ -72,6 +72,7 @@ class SystemMueller:
 
     Examples
     --------
+    >>> from astropolcal.pipeline import SystemMueller
     >>> import astropy.units as u
     >>> import numpy as np
 
@@ -176,6 +177,7 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.pipeline import load
     >>> from astropolcal import calibrate, instruments
 
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -255,6 +257,7 @@ class LoadedCalibration:
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.pipeline import load
     >>> from astropolcal import calibrate, instruments
 
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate

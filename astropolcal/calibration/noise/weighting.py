@@ -1,15 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Robust fits, and the frames that are at odds with a calibration.
-
-A robust loss lets data that depart far from the model count less, by iterated weights: a
-datum with residual r has the noise that a least-squares fit would need to give it the
-weight of the loss. Nothing is dropped; `outlying_data` says which frames depart.
-
+"""
 One noise for all who need it: fit, errors, gauge, tests and sampler.
 
-The noise of a datum is its weight in the fit, the scale of all errors, and the
-width of the likelihood. So that these agree, it is worked out here only, for
-every choice of ``weights``, and stays with the fitted measurement.
+The noise of a datum is its weight in the fit, the scale of all errors, and the width of the
+likelihood. So that these agree, it is worked out here only, for every choice of ``weights``, and
+stays with the fitted measurement.
+
+A robust loss lets data that depart far from the model count less, by iterated weights: a datum with
+residual r has the noise that a least-squares fit would need to give it the weight of the loss.
+Nothing is dropped; `outlying_data` says which frames depart.
 """
 
 from dataclasses import dataclass
@@ -45,40 +44,7 @@ LOSSES = {
 
 
 def robust_sigma(measurement, loss):
-    """
-    Return the noise of every datum that gives it the weight of a robust loss.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        At the values of a fit.
-    loss : str
-        One of `LOSSES`.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_data,).
-
-    Raises
-    ------
-    FitError
-        If the loss is unknown.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
-    >>> data = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> sigma = robust_sigma(Measurement(charis.chain(), data), "huber")
-    >>> bool((sigma < 0.01).all())
-    True
-    """
+    """Return the noise of every datum that gives it the weight of a loss, one of `LOSSES`."""
     if loss not in LOSSES:
         raise FitError(f"loss = {loss!r}; allowed are {', '.join(LOSSES)}")
     residuals = measurement.residuals()
@@ -130,6 +96,7 @@ def outlying_data(calibration, limit=_FAR):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.noise import outlying_data
     >>> from astropolcal import calibrate, instruments
 
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -200,28 +167,11 @@ _LARGEST = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Weighting:
-    """
-    Noise that a fit assumes of its data.
+    """Noise that a fit assumes of its data.
 
-    Parameters
-    ----------
-    choice : {None, "wavelength", "errors", "given"}
-        Where the noise comes from: one level from the residuals of all data,
-        one a dataset and wavelength from theirs, the errors of the table, or
-        the user.
-    sigma : `~numpy.ndarray`
-        Standard deviation of every datum, shape (n_data,); NaN as long as no
-        fit has told it.
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> equal = Weighting(None, np.full(4, 0.02))
-    >>> print(equal.weight, equal.level)
-    None 0.02
-    >>> Weighting("errors", np.array([0.5, 0.25])).weight.tolist()
-    [2.0, 4.0]
+    ``choice`` says where it comes from: None for one level from all residuals, "wavelength",
+    "errors" of the table, or "given"; ``sigma`` is that of every datum, NaN as long as no fit has
+    told it.
     """
 
     choice: str | None
@@ -261,8 +211,7 @@ class Weighting:
         return Weighting(self.choice, np.full(measurement.n_data, level))
 
     def updated(self, measurement, whitened=None):
-        """
-        Return the noise that the residuals of a fit with this noise show.
+        """Return the noise that the residuals of a fit with this noise show.
 
         ``whitened`` is the linear problem of the measurement with this noise, if at hand.
         """
@@ -317,50 +266,10 @@ def first_weighting(measurement, weights):
 
 
 def noise_of(measurement, weights=None):
-    """
-    Return the noise of every datum for a choice of weights.
+    """Return the noise of every datum for a choice of weights, as `calibrate` takes it.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement; where the noise comes from residuals, its current
-        values are those of a fit.
-    weights : {None, "wavelength", "errors"}, NoiseEstimate, Weighting or array_like
-        As for `calibrate`. ``"wavelength"`` is the restricted maximum
-        likelihood of one level for each wavelength of each dataset [1]_.
-
-    Returns
-    -------
-    Weighting
-        That of the fit, if `calibrate` fitted the measurement with the same choice.
-
-    Raises
-    ------
-    FitError
-        If the choice is unknown, the table has no errors, or the residuals
-        tell no noise.
-    ParameterError
-        If the noise given has the wrong shape or is not positive.
-
-    References
-    ----------
-    .. [1] Patterson, H. D. & Thompson, R. 1971, "Recovery of inter-block
-       information when block sizes are unequal", Biometrika 58, 545,
-       doi:10.1093/biomet/58.3.545
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> equal, own = (noise_of(cal.measurement, w).sigma for w in (None, "wavelength"))
-    >>> len(set(equal.round(9))), len(set(own.round(9)))
-    (1, 22)
+    "wavelength" is the restricted maximum likelihood of one level per wavelength of each dataset
+    (Patterson & Thompson 1971, Biometrika 58, 545, doi:10.1093/biomet/58.3.545).
     """
     fitted = measurement.weighting
     same = isinstance(weights, str) or weights is None
@@ -377,36 +286,7 @@ def noise_of(measurement, weights=None):
 
 
 def weighting_of(calibration):
-    """
-    Return the noise that a calibration assumes of its data.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        A calibration with its data.
-
-    Returns
-    -------
-    Weighting
-
-    Raises
-    ------
-    CalibrationFileError
-        If the calibration was read from a file, which holds no data.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> bool(weighting_of(cal).level < 0.01)
-    True
-    """
+    """Return the noise that a calibration, which needs its data, assumes of them."""
     measurement, settings = calibration.live_measurement(), calibration.settings
     if measurement.weighting is None:
         given = settings.get("weights") == GIVEN
@@ -463,51 +343,11 @@ def _rms(values):
 
 
 def residual_noise(measurement, vector=None):
-    r"""
-    Return the noise of every datum as the scatter of a fit's residuals.
+    r"""Return the noise of every datum as the scatter of a fit's residuals, per wavelength.
 
-    One level for each wavelength of each dataset,
-    :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)`, where the leverage
-    :math:`h_i`, the derivative of a fitted to its observed datum, sums up to
-    the number of parameters determined: data that the parameters follow
-    closely scatter less than their noise [1]_. The leverages are those of a
-    fit with equal weights; see `noise_of` for others.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    vector : array_like, optional
-        Fitted canonical values, by default the measurement's.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_data,); at least a tenth of the median of the dataset.
-
-    Raises
-    ------
-    FitError
-        If at some wavelength no datum is left over by the parameters, or the
-        residuals are zero.
-
-    References
-    ----------
-    .. [1] Hoaglin, D. C. & Welsch, R. E. 1978, "The Hat Matrix in Regression
-       and ANOVA", The American Statistician 32, 17, doi:10.2307/2683469
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> bool(residual_noise(cal.measurement).max() < 0.01)
-    True
+    :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)` with the leverages h of a fit with equal weights
+    (Hoaglin & Welsch 1978, The American Statistician 32, 17); at least a tenth of the median of the
+    dataset.
     """
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
     equal = Weighting(None, np.full(measurement.n_data, np.nan))

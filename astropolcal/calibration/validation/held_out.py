@@ -19,36 +19,7 @@ _WORTH_A_WORD = 0.1
 
 
 def refuse_fitted(calibration, observations):
-    """
-    Refuse observations that took part in the fit.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    observations : Observations
-        What is to be an independent standard.
-
-    Raises
-    ------
-    FitError
-        If the content is that of a fitted dataset.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> observations = simulate(chain, charis.wavelength, frames, seed=2)
-    >>> refuse_fitted(calibrate(chain, observations), observations)
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.FitError: simulated is no independent standard: ...
-    """
+    """Refuse observations with the content of a fitted dataset."""
     seen = {record.content_hash: record.name for record in calibration.datasets}
     if observations.content_hash in seen:
         raise FitError(
@@ -58,60 +29,9 @@ def refuse_fitted(calibration, observations):
 
 
 def standard_accuracy(calibration, chain, observations, positions=None):
-    r"""
-    Return how well a calibration predicts a dataset that its fit never saw.
+    """Return how well a calibration predicts a dataset that its fit never saw.
 
-    Nothing is fitted. Optics of the chain that the calibration has, by name, take
-    its values; the others keep theirs.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; one read from a file will do.
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        Chain of the standard.
-    observations : Observations
-        The standard: a source, a night or settings that did not take part in the
-        fit.
-    positions : dict of str to `~numpy.ndarray`, optional
-        Position of every stage in radian, shape (n_frames,).
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-        Columns ``wavelength``; ``n``, the number of data; ``s_standard``, rms of the
-        errors of prediction; ``bias``, their mean; ``scatter``, their standard
-        deviation about it; ``s_cv``, that of the calibration's data of the same source,
-        or of all of them; and ``chi``, the ratio ``s_standard / s_cv``: 1 where the
-        standard is predicted as well as settings left out of the fit. Meta ``name``,
-        ``source``, ``content_hash``, ``n_frames``, ``words``; ``open_percent``: by how
-        much the prediction moves, at most, for one degree, micrometre or percent along
-        what the calibration leaves open; and ``not_calibrated``: optics whose values are
-        those of the chain.
-
-    Raises
-    ------
-    FitError
-        If the observations took part in the fit, or the chain has free parameters
-        of optics that were not calibrated.
-    ChainError
-        If an optic is of another kind than that of the same name.
-    ObservationError
-        If a wavelength is none of the calibration's.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> table = standard_accuracy(cal, chain, simulate(chain, charis.wavelength, frames, seed=3))
-    >>> bool((abs(table["bias"]) < table["s_standard"]).all())
-    True
+    The table of `add_standard`, which keeps it with the calibration.
     """
     refuse_fitted(calibration, observations)
     rows = rows_on_grid(calibration, observations)
@@ -312,6 +232,7 @@ def add_standard(calibration, chain, observations, positions=None):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration import add_standard
     >>> from astropolcal import calibrate, instruments
 
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
