@@ -90,6 +90,7 @@ class Validity:
 
 
 def optics_words(sets):
+    """Return the words for sets of optics that can be taken out of the beam."""
     if sets is None:
         return "optics in the beam not known"
     return " or ".join(f"with {' + '.join(s)}" if s else "no optional optics" for s in sets)
