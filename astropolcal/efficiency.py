@@ -129,7 +129,6 @@ def polarimetric_efficiency(
     >>> import astropy.units as u
     >>> from astropolcal.efficiency import polarimetric_efficiency
     >>> from astropolcal import instruments
-
     >>> charis = instruments.get("charis")
     >>> chain = charis.on_sky(charis.published())
     >>> efficiency = polarimetric_efficiency(chain, charis.wavelength, derotator=[45, 90] * u.deg,
@@ -262,7 +261,6 @@ class BestDerotator:
     >>> from astropolcal.efficiency import BestDerotator
     >>> import astropy.units as u
     >>> from astropy.table import QTable
-
     >>> BestDerotator(65 * u.deg, QTable(), "pupil").offset
     <Quantity 65. deg>
     """
@@ -324,7 +322,6 @@ def best_derotator(
     >>> import astropy.units as u
     >>> from astropolcal.efficiency import best_derotator
     >>> from astropolcal import instruments
-
     >>> charis = instruments.get("charis")
     >>> best = best_derotator(charis.on_sky(charis.published()), charis.wavelength,
     ...                       [60, 65] * u.deg, [-30, -20] * u.deg,

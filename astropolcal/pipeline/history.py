@@ -81,7 +81,6 @@ def parameter_history(calibrations, parameters=None):
     >>> import astropy.units as u
     >>> from astropolcal.pipeline import parameter_history
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -362,7 +361,6 @@ def changes(calibrations, parameters=None):
     >>> import astropy.units as u
     >>> from astropolcal.pipeline import changes
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -457,7 +455,6 @@ def restart(calibration, observations, free, *, chain=None, positions=None, **op
     >>> import astropy.units as u
     >>> from astropolcal.pipeline import restart
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

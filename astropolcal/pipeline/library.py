@@ -142,7 +142,6 @@ class Library:
     --------
     >>> from astropolcal.pipeline import Library
     >>> import tempfile
-
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     len(Library(folder))
     0

@@ -24,7 +24,7 @@ import numpy as np
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.noise.scatter import kind_of_source
-from astropolcal.calibration.noise.weighting import Weighting, around
+from astropolcal.calibration.noise.weighting import around
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, parameter_table
@@ -232,7 +232,8 @@ def two_step(measurement, weighting, joint, run, options):
     stages = []
 
     # in the first step each wavelength has its own retardance, also of a plate that follows a law
-    loose = [_loosened(chain, measurement.wavelength * u.um) for chain in measurement.chains]
+    grid = measurement.wavelength * u.um
+    loose = [join(leaf.loosened(grid) for leaf in leaves(c.copy())) for c in measurement.chains]
     first = _step_of(loose, single, parts, ties, options)
     outcome, weighting = joint(first, weighting)
     outcomes = [outcome]
@@ -342,10 +343,6 @@ def _step_of(chains, held, parts, ties, options):
     return Measurement(_held(chains, held | (set(ties) - set(live))), parts, ties=live, **options)
 
 
-def _loosened(chain, wavelength):
-    return join(leaf.loosened(wavelength) for leaf in leaves(chain.copy()))
-
-
 def _held(chains, names):
     """Return copies of the chains with more parameters fixed."""
     copies = [chain.copy() for chain in chains]
@@ -390,25 +387,12 @@ _OPEN = 1e-3
 _SILENT = 1e-12
 
 
-def settle(problem, weight, origin):
+def settled(problem, weighting, origin):
     """Move a solution along the directions that neither data nor priors see, to the minimal gauge.
 
-    ``origin`` is where the fit started. Returns the names common to all wavelengths that were left
-    open.
+    ``origin`` is where the fit started. Returns the parameters that were left open, and the linear
+    problem around the new solution.
     """
-    measurement = problem.measurement
-    weighting = weight if isinstance(weight, Weighting) else _weighting(measurement, weight)
-    return settled(problem, weighting, origin)[0]
-
-
-def _weighting(measurement, weight):
-    if weight is None:
-        return Weighting(None, np.full(measurement.n_data, np.nan))
-    return Weighting("given", 1 / np.asarray(weight, dtype=float))
-
-
-def settled(problem, weighting, origin):
-    """Settle; return the open parameters and the linear problem around the new solution."""
     measurement = problem.measurement
     vector = measurement.vector()
     scale, leaders = physical_scale(measurement.free), _leaders(measurement.free)
@@ -432,7 +416,9 @@ def settled(problem, weighting, origin):
 
 def open_parameters(free, whitened):
     """Return the parameters common to all wavelengths that data and priors leave open."""
-    return _open(free, whitened.together.null)
+    null = whitened.together.null
+    moving = [slot for slot in free.slots if np.abs(null[:, slot.slice]).max(initial=0) > _OPEN]
+    return [s.name for s in moving if not s.per_wavelength] or [s.name for s in moving]
 
 
 def hold_silent(measurement, origin):
@@ -451,12 +437,6 @@ def hold_silent(measurement, origin):
             vector = trial
     if still.any():
         measurement.parameters = vector
-
-
-def _open(free, null):
-    """Return the names of what moves along the open directions, leaders first."""
-    moving = [slot for slot in free.slots if np.abs(null[:, slot.slice]).max(initial=0) > _OPEN]
-    return [s.name for s in moving if not s.per_wavelength] or [s.name for s in moving]
 
 
 def _leaders(free):

@@ -132,13 +132,8 @@ _FEW = 64
 _SAME_DATA = "all retardances with the other sign (circular ones keep theirs) give the same data"
 
 
-def mirror_solutions(measurement, vector):
-    """Return the mirror solutions of a fit within its bounds, one sentence each."""
-    return [branch["words"] for branch in _within_bounds(measurement, vector)]
-
-
 def mirror_branches(measurement, vector, view):
-    """Return the mirror solutions as dicts: ``words``, and ``sky`` as in `sky_consequences`.
+    """Return the mirror solutions as dicts: ``words``, and ``sky`` as in `consequences_along`.
 
     With them the other hand of the whole instrument, if only bounds or models exclude it and it
     matters on sky.

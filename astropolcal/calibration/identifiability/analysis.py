@@ -62,7 +62,7 @@ class Identifiability:
         Whether each parameter is determined, shape (n_free,).
     directions : list of dict
         For each null direction its ``words``, the ``parameters`` that move, and
-        what it does to the ``sky``, see `sky_consequences`.
+        what it does to the ``sky``: changes of AoLP and DoLP of ``targets``.
     sampling : list of str
         Harmonics that the half-wave-plate angles cannot separate, and what stars leave open
         of the telescope.
@@ -82,7 +82,6 @@ class Identifiability:
     --------
     >>> from astropolcal.calibration.identifiability import Identifiability
     >>> import numpy as np
-
     >>> Identifiability(["a.theta"], 1, np.ones(1), np.zeros((0, 1)), np.ones(1, bool)).n_free
     1
     """
@@ -125,16 +124,6 @@ def null_space(free, jacobian):
     In steps of a degree, micrometre or percent; ``jacobian`` is whitened, (n_free, n_data).
     """
     return decompose((jacobian * physical_scale(free)[:, None]).T).null
-
-
-def analyse(free, jacobian, held=None, priors=None):
-    """Return what the data alone determine, and the canonical covariance for unit noise.
-
-    ``jacobian`` (n_free, n_data) is whitened. ``priors`` (n_free, n_priors) enter the covariance,
-    not the rank. The covariance is NaN for what is ``held`` or what data and priors leave open.
-    """
-    whitened = Whitened(jacobian, physical_scale(free), priors, held)
-    return finding_of(free, whitened), whitened.covariance()
 
 
 def finding_of(free, whitened):
@@ -257,9 +246,11 @@ def telescope_words(finding, measurement):
         for direction in (*finding.directions, *finding.near_null)
         for name in direction["parameters"]
     }
-    held = measurement.free.at_bounds(measurement.vector()) if measurement.datasets else []
     # what ran to a bound is as open as what drifts
-    at_bound = [n for n, stuck in zip(_names(measurement), held, strict=True) if stuck]
+    at_bound = []
+    if measurement.datasets:
+        held = measurement.free.at_bounds(measurement.vector())
+        at_bound = [measurement.free.names[i] for i in np.flatnonzero(held)]
     words = []
     for mirror in sorted(_mirrors(measurement)):
         own = sorted(n for n in {*open_names, *at_bound} if n.startswith(f"{mirror}."))
@@ -271,10 +262,6 @@ def telescope_words(finding, measurement):
                 "a measured film or index (a prior) does the rest"
             )
     return words
-
-
-def _names(measurement):
-    return measurement.free.names if measurement.datasets else []
 
 
 def _mirrors(measurement):

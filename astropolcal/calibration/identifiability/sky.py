@@ -236,19 +236,12 @@ _NOTHING = 0.005
 _MATTERS = {"aolp_deg": 0.1, "dolp_change_percent": 1.0}
 
 
-def sky_consequences(measurement, vector, directions, instrument=None):
-    """Return how AoLP and DoLP change along canonical directions, (n_directions, n_free).
+def consequences_along(view, directions):
+    """Return how AoLP and DoLP change for small steps along canonical directions, to first order.
 
     For each a dict with ``targets``, an entry for sources of 30, 1 and 0.1 % (``dolp_percent``):
-    least and largest change ``aolp_deg`` and ``dolp_change_percent``, to first order; None without
-    a half-wave plate.
+    least and largest change ``aolp_deg`` and ``dolp_change_percent``; None without a view.
     """
-    view = view_of_measurement(measurement, vector, instrument)
-    return consequences_along(view, directions)
-
-
-def consequences_along(view, directions):
-    """Return the consequences of small steps; None for each direction without a view."""
     if view is None or not len(directions):
         return [None] * len(directions)
     return [_consequences(change[view.good], _small) for change in view.along(directions)]

@@ -134,7 +134,6 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     Examples
     --------
     >>> import numpy as np
-
     >>> from astropolcal.calibration.noise import noise_from_errors
     >>> from astropolcal import optics
     >>> from astropolcal.measurement import Measurement
@@ -234,7 +233,6 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.noise import noise_from_replicates
     >>> from astropolcal import instruments
-
     >>> from astropolcal.measurement import Measurement
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
@@ -361,7 +359,6 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.noise import noise_from_null_channel
     >>> from astropolcal import instruments
-
     >>> from astropolcal.measurement import Measurement
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
@@ -449,14 +446,3 @@ def _null_design(observations, frames, null_model):
 
 def _harmonics(angle):
     return np.cos(angle), np.sin(angle)
-
-
-def estimate_noise(measurement, vector=None, *, null_model="constant"):
-    """Return the noise of replicates where every wavelength has some, else of the null channel."""
-    try:
-        noise = noise_from_replicates(measurement, vector)
-    except FitError:
-        return noise_from_null_channel(measurement, vector, null_model=null_model)
-    if (noise.dof > 0).all():
-        return noise
-    return noise_from_null_channel(measurement, vector, null_model=null_model)

@@ -403,8 +403,8 @@ def model_error(measurement, scatter):
     return found
 
 
-def kind_of_source(source, chain=None):
-    """Return "polarized", "unpolarized" or "star", from the table's word or the chain's front."""
+def kind_of_source(source):
+    """Return "polarized", "unpolarized" or "star", from the words of a table."""
     if is_star(source):
         return "star"
     return "unpolarized" if "unpolarized" in (source or "").lower() else "polarized"

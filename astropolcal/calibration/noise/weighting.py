@@ -21,12 +21,11 @@ from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength
 from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.observations import brightness
 from astropolcal.observations.quality import MAD_TO_SIGMA
 
 __all__ = ["outlying_data"]
 
-# noise of a wavelength is at least this share of the median of its dataset
-_ROBUST_FLOOR = 0.1
 # robust standard deviations beyond which a frame is at odds with the model
 _FAR = 4.0
 # smallest weight, so that no datum is lost altogether
@@ -60,7 +59,7 @@ def _scales(measurement, residuals):
     for row in rows:
         scale[row] = MAD_TO_SIGMA * np.median(np.abs(residuals[row])) if np.size(row) else 0.0
     for where in measurement.segments:
-        least = _ROBUST_FLOOR * np.median(scale[where]) if scale[where].size else 0.0
+        least = _FLOOR * np.median(scale[where]) if scale[where].size else 0.0
         scale[where] = np.maximum(scale[where], max(least, 1e-12))
     return scale
 
@@ -98,7 +97,6 @@ def outlying_data(calibration, limit=_FAR):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.noise import outlying_data
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -114,16 +112,12 @@ def outlying_data(calibration, limit=_FAR):
         rows += _outliers(part, residuals[where], scaled[where], limit)
     rows.sort(key=lambda row: -row[3])
     names = ("dataset", "frames", "residual", "sigma", "brightness")
-    units = {"residual": "percent"}
     table = QTable(rows=rows or None, names=names, dtype=(str, str, float, float, float))
-    for name, unit in units.items():
-        table[name].unit = unit
+    table["residual"].unit = "percent"
     return QTable(table)
 
 
 def _outliers(part, residuals, scaled, limit):
-    from astropolcal.observations import brightness
-
     groups = np.unique(part.group_of_datum)
     members = [part.group_of_datum == g for g in groups]
     # one number a pair of frames, the median over its wavelengths
@@ -219,7 +213,7 @@ class Weighting:
             return self
         whitened = around(measurement, self) if whitened is None else whitened
         if self.choice == "wavelength":
-            sigma = _by_wavelength(measurement, measurement.vector(), whitened.leverage)
+            sigma = _by_wavelength(measurement, whitened.leverage)
             return Weighting(self.choice, sigma)
         freedom = measurement.n_data - whitened.n_taken
         total = np.sum(measurement.residuals() ** 2)
@@ -298,8 +292,6 @@ def weighting_of(calibration):
 def _from_settings(measurement, settings):
     """Return a noise given to a fit of the same data, as far as `describe` has kept it."""
     if settings.get("loss", "linear") != "linear":
-        # robust imports the noise, as this module does
-
         return Weighting(GIVEN, robust_sigma(measurement, settings["loss"]))
     _, _, rows = data_by_wavelength(measurement)
     kept = [value for part in settings["noise"] for value in part["sigma_percent"]]
@@ -342,21 +334,13 @@ def _rms(values):
 # ---- from residuals ---------------------------------------------------------------------
 
 
-def residual_noise(measurement, vector=None):
-    r"""Return the noise of every datum as the scatter of a fit's residuals, per wavelength.
+def _by_wavelength(measurement, leverage):
+    r"""Return one level a dataset and wavelength, not below the floor.
 
-    :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)` with the leverages h of a fit with equal weights
-    (Hoaglin & Welsch 1978, The American Statistician 32, 17); at least a tenth of the median of the
-    dataset.
+    :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)` with the leverages h (Hoaglin & Welsch 1978, The
+    American Statistician 32, 17).
     """
-    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    equal = Weighting(None, np.full(measurement.n_data, np.nan))
-    return _by_wavelength(measurement, vector, around(measurement, equal, vector).leverage)
-
-
-def _by_wavelength(measurement, vector, leverage):
-    """Return one level a dataset and wavelength, not below the floor."""
-    squares, spare = measurement.residuals(vector) ** 2, 1 - leverage
+    squares, spare = measurement.residuals() ** 2, 1 - leverage
     numbers, wavelength, rows = data_by_wavelength(measurement)
     sigma, levels = np.empty(measurement.n_data), np.full(len(rows), np.nan)
     for i, row in enumerate(rows):

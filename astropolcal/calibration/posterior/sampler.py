@@ -62,7 +62,6 @@ class LogPosterior:
     >>> import astropy.units as u
     >>> from astropolcal.calibration.posterior import LogPosterior
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

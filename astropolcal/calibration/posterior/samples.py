@@ -272,7 +272,6 @@ class Posterior:
     >>> from astropolcal.calibration.posterior import Posterior
     >>> import astropy.units as u
     >>> import numpy as np
-
     >>> chain = np.random.default_rng(1).normal(3.0, 0.1, size=(4000, 4, 1))
     >>> posterior = Posterior(["hwp.theta"], [u.deg], chain, np.zeros((4000, 4)))
     >>> posterior.quantile("hwp.theta", 0.5).round(1)

@@ -251,28 +251,3 @@ def _filters(instrument, wavelength):
         str(names[i]) if off[i] <= _SAME_FILTER else ""
         for off, i in zip(nearest, nearest.argmin(axis=1), strict=True)
     ]
-
-
-def comparison_text(table):
-    """Return the table of `compare` as text, one line per member and wavelength, with errors."""
-    lines = [["label", "filter", "wavelength", *_COMPARED]]
-    for row in table:
-        wavelength = f"{row['wavelength'].to_value(u.nm):.1f}"
-        words = [_words(key, row[key], row[f"{key}_std"]) for key in _COMPARED]
-        lines.append([str(row["label"]), str(row["filter"]) or "-", wavelength, *words])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    padded = ([f"{word:<{n}}" for word, n in zip(line, widths, strict=True)] for line in lines)
-    return "\n".join("  ".join(line).rstrip() for line in padded)
-
-
-def _words(key, value, std):
-    """Return a value with its error, to two digits of the error."""
-    # degrees, percent, and shares of one; as exact as optics are known where there is no error
-    scale, digits = (1, 1) if key.endswith("_retardance") else (100, 2)
-    value, std = (scale * float(getattr(x, "value", x)) for x in (value, std))
-    if np.isnan(value):
-        return "-"
-    if not np.isfinite(std):
-        return f"{value:.{digits}f}" + (" ± inf" if np.isinf(std) else "")
-    digits = int(np.clip(1 - np.floor(np.log10(std)), 0, 6))
-    return f"{value:.{digits}f} ± {std:.{digits}f}"

@@ -62,7 +62,6 @@ class Covariance:
     --------
     >>> from astropolcal.calibration.uncertainty import Covariance
     >>> import astropy.units as u
-
     >>> covariance = Covariance(["hwp.theta"], [u.deg], [[0.04]])
     >>> covariance.std("hwp.theta")
     <Quantity 0.2 deg>
@@ -226,7 +225,6 @@ class Covariance:
         >>> from astropolcal.calibration.uncertainty import Covariance
         >>> import astropy.units as u
         >>> import numpy as np
-
         >>> covariance = Covariance(["a.theta", "b.theta"], [u.deg, u.deg],
         ...                         np.full((2, 2), np.nan), factor=[[0.1, 0.1]], null=[[1, -1]])
         >>> float(covariance.propagate([1, 1]).round(3)), float(covariance.propagate([1, 0]))

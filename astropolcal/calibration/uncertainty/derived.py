@@ -73,7 +73,6 @@ class Derived:
     --------
     >>> from astropolcal.calibration.uncertainty import Derived
     >>> import numpy as np
-
     >>> Derived(np.array([0.9]), np.array([0.01]), lambda: np.array([[1e-4]])).is_determined
     array([ True])
     """
@@ -261,7 +260,6 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import derived_retardance
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -325,7 +323,6 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import derived_efficiency
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -420,7 +417,6 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import derived_mueller
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -507,7 +503,6 @@ def derived_data(calibration, observations=None, dataset=0):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import derived_data
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -580,7 +575,6 @@ def derived_sky(
     >>> import astropy.units as units
     >>> from astropolcal.calibration.uncertainty import derived_sky
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

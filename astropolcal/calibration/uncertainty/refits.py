@@ -134,7 +134,6 @@ class Profile:
     --------
     >>> from astropolcal.calibration.uncertainty import Profile
     >>> import numpy as np
-
     >>> made = Profile("wollaston.efficiency", 0.9, np.array([0.8, 0.9, 1.0]),
     ...                np.array([4.0, 0.0, 4.0]), np.zeros((3, 1)))
     >>> [round(end, 3) for end in made.interval()]
@@ -348,7 +347,6 @@ class Resampled:
     --------
     >>> from astropolcal.calibration.uncertainty import Resampled
     >>> import numpy as np
-
     >>> made = Resampled(["wollaston.efficiency"], [None], np.array([[0.97], [0.99]]), "pair", 8, 0)
     >>> float(made.stds[0].round(4))
     0.0141
@@ -605,7 +603,6 @@ def standard_errors(calibration, method=None, groups=None):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import standard_errors
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -702,7 +699,6 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.uncertainty import robust_covariance
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

@@ -229,7 +229,6 @@ class LackOfFit:
     --------
     >>> from astropolcal.calibration.validation import LackOfFit
     >>> from astropy.table import QTable
-
     >>> LackOfFit(QTable(), 12.0, 10.0, 0.285, "the residuals agree with the noise").p_value
     0.285
     """
@@ -292,7 +291,6 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     >>> import astropy.units as u
     >>> from astropolcal.calibration.validation import lack_of_fit
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

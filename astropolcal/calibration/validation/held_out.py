@@ -37,6 +37,7 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     rows = rows_on_grid(calibration, observations)
     predicted = _calibrated_chain(calibration, chain, rows, observations.name)
     known = parameter_table([predicted])
+    fitted = {leaf.name for item in calibration.chains for leaf in leaves(item)}
     measurement = Measurement(
         predicted,
         observations,
@@ -54,7 +55,7 @@ def standard_accuracy(calibration, chain, observations, positions=None):
         "content_hash": observations.content_hash,
         "n_frames": int(observations.n_frames),
         "open_percent": _moved_by_open(calibration, measurement, rows),
-        "not_calibrated": _not_calibrated(calibration, chain),
+        "not_calibrated": [leaf.name for leaf in leaves(chain) if leaf.name not in fitted],
     }
     table.meta["words"] = _words(table, bool(_of_source(calibration, observations.source)))
     return table
@@ -91,7 +92,10 @@ def _calibrated_chain(calibration, chain, rows, name, sources=False):
         if is_source:
             pass
         elif own is None:
-            unknown += [f"{leaf.name}.{key}" for key in leaf.param_names if _is_open(leaf, key)]
+            parameters = ((key, getattr(leaf, key)) for key in leaf.param_names)
+            # free, and nothing is known of it
+            is_open = (k for k, p in parameters if not p.fixed and p.prior is None)
+            unknown += [f"{leaf.name}.{key}" for key in is_open]
         elif type(own) is not type(leaf):
             raise ChainError(
                 f"{name}: {leaf.name} is of class {type(leaf).__name__}, but that of the "
@@ -105,17 +109,6 @@ def _calibrated_chain(calibration, chain, rows, name, sources=False):
             "optics; hold them at known values"
         )
     return join(train)
-
-
-def _is_open(leaf, key):
-    """Return whether a parameter is free and nothing is known of it."""
-    parameter = getattr(leaf, key)
-    return not parameter.fixed and parameter.prior is None
-
-
-def _not_calibrated(calibration, chain):
-    fitted = {leaf.name for item in calibration.chains for leaf in leaves(item)}
-    return [leaf.name for leaf in leaves(chain) if leaf.name not in fitted]
 
 
 def _at_rows(leaf, source, rows, grid, free=False):
@@ -215,26 +208,42 @@ def add_standard(calibration, chain, observations, positions=None):
     Parameters
     ----------
     calibration : Calibration
-        The calibration; it is changed.
-    chain, observations, positions
-        As for `standard_accuracy`.
+        The calibration, which is changed; one read from a file will do.
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        Chain of the standard. Nothing is fitted: optics that the calibration has, by name, take
+        its values; the others keep theirs.
+    observations : Observations
+        The standard: a source, a night or settings that did not take part in the fit.
+    positions : dict of str to `~numpy.ndarray`, optional
+        Position of every stage in radian, shape (n_frames,).
 
     Returns
     -------
     `~astropy.table.QTable`
-        As `standard_accuracy` gives it.
+        Columns ``wavelength``; ``n``, the number of data; ``s_standard``, rms of the errors of
+        prediction; ``bias``, their mean; ``scatter``, their standard deviation about it; ``s_cv``,
+        that of the calibration's data of the same source, or of all; and ``chi``, the ratio
+        ``s_standard / s_cv``: 1 where the standard is predicted as well as settings left out of
+        the fit. Meta ``name``, ``source``, ``content_hash``, ``n_frames``, ``words``;
+        ``open_percent``: by how much the prediction moves, at most, for one degree, micrometre or
+        percent along what the calibration leaves open; and ``not_calibrated``: optics whose values
+        are those of the chain.
 
     Raises
     ------
-    FitError, ChainError, ObservationError
-        As `standard_accuracy`.
+    FitError
+        If the observations took part in the fit, or the chain has free parameters of optics that
+        were not calibrated.
+    ChainError
+        If an optic is of another kind than that of the same name.
+    ObservationError
+        If a wavelength is none of the calibration's.
 
     Examples
     --------
     >>> import astropy.units as u
     >>> from astropolcal.calibration import add_standard
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

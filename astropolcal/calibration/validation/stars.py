@@ -64,7 +64,6 @@ def star_stokes(calibration, chain, observations, positions=None):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.validation import star_stokes
     >>> from astropolcal import calibrate, instruments, optics
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> lam = [1.2, 1.6, 2.2] * u.um
@@ -170,7 +169,6 @@ def star_accuracy(table, q=0.0, u_=0.0):
     >>> import astropy.units as u
     >>> import numpy as np
     >>> from astropy.table import QTable
-
     >>> table = QTable({"wavelength": [1.6] * u.um, "q": [1] * u.percent, "u": [0] * u.percent,
     ...                 "q_cycles": [[0.9, 1.1]] * u.percent,
     ...                 "u_cycles": [[0.1, -0.1]] * u.percent})
@@ -226,7 +224,6 @@ def fitted_stars(calibration):
     >>> import numpy as np
     >>> from astropolcal.calibration import fitted_stars
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.observations import Observations
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")

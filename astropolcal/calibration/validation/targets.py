@@ -308,7 +308,6 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     >>> from astropolcal.calibration.validation import target_accuracy
     >>> import astropy.units as u
     >>> from astropy.table import QTable
-
     >>> lam = [1.2, 1.6] * u.um
     >>> lamp = QTable({"wavelength": lam, "s_mean": [0.10, 0.05] * u.percent})
     >>> star = QTable({"wavelength": lam, "s_mean": [0.03, 0.02] * u.percent})
@@ -406,7 +405,6 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     >>> import astropy.units as u
     >>> from astropolcal.calibration.validation import paper_accuracies
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
