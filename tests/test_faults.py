@@ -242,10 +242,10 @@ def test_folder_without_permission(writer, tmp_path):
     tmp_path.chmod(0o700)
 
 
-@pytest.mark.parametrize("name", ["", ".", "a\0b"])
-def test_what_is_no_name_of_a_file(name):
-    with pytest.raises(AstropolcalError, match="no name of a file"), atomic_path(name):
-        pass
+def test_what_is_no_name_of_a_file():
+    for name in ["", ".", "a\0b"]:
+        with pytest.raises(AstropolcalError, match="no name of a file"), atomic_path(name):
+            pass
 
 
 def test_long_names_can_be_written(tmp_path):
