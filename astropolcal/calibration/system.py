@@ -1,8 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Rows of the measurement matrix of a chain, and how the Stokes parameters found with it change.
-
-Pieces of a system Mueller matrix: where a chain begins, its wavelengths, its errors.
-"""
+"""Rows of the system Mueller matrix of a chain: values, derivatives and errors."""
 
 import astropy.units as u
 import numpy as np
@@ -33,40 +30,15 @@ class Rows:
         self._shape = len(lam), self._light[0].shape[1] // len(self._nodes)
 
     def rows(self, vector=None, n=4):
-        """
-        Return the rows of both beams.
-
-        Parameters
-        ----------
-        vector : `~numpy.ndarray`, optional
-            Free parameters of the calibration in canonical units; by default its own values.
-        n : int
-            For how many of I, Q, U, V.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Shape (2, n_wavelengths, n_frames, n), the right beam first.
-        """
+        """Return the rows of both beams, right first, (2, n_wavelengths, n_frames, n)."""
         values = self._values(vector)
         fluxes = [np.stack(light.fluxes(values)) for light in self._light[:n]]
         return np.stack([self._over_nodes(flux) for flux in fluxes], axis=-1)
 
     def derivatives(self, n=4):
-        """
-        Return how the rows change with each free parameter of the chain.
+        """Return derivatives of the rows, ``"optic.parameter"`` to array, per canonical unit.
 
-        Parameters
-        ----------
-        n : int
-            For how many of I, Q, U, V.
-
-        Returns
-        -------
-        dict of str to `~numpy.ndarray`
-            ``"optic.parameter"`` to derivative per canonical unit (radian, micrometre or 1), of
-            the shape of `rows`; for a parameter given per wavelength, to the value at that
-            wavelength.
+        Of a parameter given per wavelength it is that to the value at the wavelength of the row.
         """
         wanted = self._wanted()
         if not wanted:
@@ -86,18 +58,9 @@ class Rows:
         return result
 
     def spread(self, slopes):
-        """
-        Lay derivatives by name out over the calibration's free parameters.
+        """Lay derivatives by name, per canonical unit, out over the free parameters on a last axis.
 
-        Parameters
-        ----------
-        slopes : dict of str to `~numpy.ndarray`
-            Derivatives per canonical unit, the first axis that of the wavelengths.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Derivatives per declared unit, with a last axis for the free parameters.
+        The first axis is that of the wavelengths; the result is per declared unit.
         """
         shape = next(iter(slopes.values())).shape if slopes else self._shape
         result = np.zeros((*shape, self.free.size))
@@ -113,24 +76,11 @@ class Rows:
         return result
 
     def changes(self, gain, n=3, scale=1.0):
-        r"""
-        Return how the Stokes parameters that a solution finds change with the free parameters.
+        r"""Return how the Stokes parameters that a solution finds change with the free parameters.
 
-        :math:`\delta\hat{\mathbf S} = -G\,\delta A\,\mathbf S`
-
-        Parameters
-        ----------
-        gain : `~numpy.ndarray`
-            What turns fluxes into Stokes parameters, (n_wavelengths, n_found, 2, n_frames).
-        n : int
-            How many of I, Q, U, V the light has.
-        scale : `~numpy.ndarray` or float
-            What multiplies the rows.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Per declared unit, (n_wavelengths, n_found, n, n_free).
+        :math:`\delta\hat S = -G\,\delta A\,S`, per declared unit, (n_wavelengths, n_found, n,
+        n_free); ``gain`` G turns fluxes into Stokes parameters, (n_wavelengths, n_found, 2,
+        n_frames).
         """
         slopes = {
             # dS = -G dA S; b: beams, f: frames, s: components of the light
@@ -184,13 +134,10 @@ class Rows:
 
 
 def model_error(fit, lam, n=3):
-    """
-    Return what the model lacks, as further directions of the Stokes parameters.
+    """Return what the model lacks, as directions (n_directions, n_wavelengths, n, n) of Stokes.
 
-    Shape (n_directions, n_wavelengths, n, n), from ``model_error`` of what a calibration knows of
-    its fit: each of q and u errs in proportion to q and to u, and by a share of the intensity.
-    At all wavelengths together, as what the model lacks is smooth; between those that are known
-    the errors are interpolated.
+    From ``model_error`` of `Calibration.fit`: each of q and u errs in proportion to q and u, and by
+    a share of the intensity, at all wavelengths together, as what the model lacks is smooth.
     """
     known = (fit or {}).get("model_error")
     if not known:

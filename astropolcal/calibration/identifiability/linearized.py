@@ -1,8 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Derivatives of data and priors in units of the noise, decomposed once for all who ask.
-
-Directions in the space of the parameters, in words.
-"""
+"""The linear problem around a solution, decomposed once for all who ask, and its directions."""
 
 from functools import cached_property
 from typing import NamedTuple
@@ -48,11 +45,7 @@ class Directions(NamedTuple):
 
 
 def decompose(rows):
-    """
-    Decompose rows of derivatives, shape (n_rows, n_columns).
-
-    All right vectors are there even if there are fewer rows than columns.
-    """
+    """Decompose rows of derivatives, with all right vectors however few rows."""
     n_rows, n_columns = rows.shape
     # null directions need all right vectors; with more rows than columns they are there anyway
     _, singular, right = np.linalg.svd(rows, full_matrices=n_rows < n_columns)
@@ -63,19 +56,10 @@ def decompose(rows):
 
 
 class Whitened:
-    """
-    The problem around a solution, linear, with steps of a degree, micrometre or percent.
+    """The linear problem around a solution, in steps of a degree, micrometre or percent.
 
-    Parameters
-    ----------
-    data : `~numpy.ndarray`
-        Derivative of the data times their weights, shape (n_free, n_data).
-    scale : `~numpy.ndarray`
-        Step of each parameter, shape (n_free,).
-    priors : `~numpy.ndarray`, optional
-        Derivative of the priors' residuals times their weight, shape (n_free, n_priors).
-    held : `~numpy.ndarray`, optional
-        True for parameters that count as known.
+    ``data`` (n_free, n_data) and ``priors`` (n_free, n_priors) are derivatives in units of the
+    noise, ``scale`` the step of each parameter; parameters that are ``held`` count as known.
     """
 
     def __init__(self, data, scale, priors=None, held=None):
@@ -139,11 +123,7 @@ class Whitened:
         return out
 
     def covariance(self):
-        """
-        Return the covariance for unit noise, canonical, shape (n_free, n_free).
-
-        NaN in the rows and columns of what is held or not determined.
-        """
+        """Return the canonical covariance for unit noise; NaN for what is held or open."""
         out = np.full((self.scale.size, self.scale.size), np.nan)
         # a pseudo-inverse would give a small number for what is open; it gets none
         known = self.errors.determined
@@ -173,11 +153,9 @@ _EQUAL = 1e-6
 
 
 def ranked(values, equal=None):
-    """
-    Return the indices of values, largest first; equal ones keep their order.
+    """Return the indices of values, largest first; equal ones keep their order.
 
-    Which of two that are equal comes out larger hangs on the processor. Equal are by default
-    those that differ by rounding.
+    Which of two that are equal up to rounding comes out larger hangs on the processor.
     """
     values = np.asarray(values, dtype=float)
     if equal is None:
@@ -319,12 +297,11 @@ def plain(moved):
 
 
 def near_null_directions(free, whitened, level, sky_of):
-    """
-    Say what data and priors determine so badly that it hardly counts as determined.
+    """Say what data and priors determine so badly that it hardly counts as determined.
 
-    Of the principal directions of the errors those along which some parameter
-    is uncertain by more than `LARGE`, or whose singular value is 1e4 times
-    smaller than the largest. ``sky_of`` returns what canonical changes do on sky.
+    Principal directions of the errors along which some parameter is uncertain by more than `LARGE`,
+    or with a singular value 1e4 times smaller than the largest; ``sky_of`` gives what they do on
+    sky.
     """
     found = whitened.errors
     # each row is a principal direction, as long as its standard error at the noise of the fit

@@ -1,13 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Covariance of calibrated parameters, with their names and units.
+"""
+Covariance of calibrated parameters, with names and units, and errors at a bound.
 
-The matrix has no number for a parameter that the data leave open. What the
-data do know of such parameters (a sum of two angles, say) is kept beside it:
-the determined directions with their errors (``factor``) and the open ones
-(``null``). With these, the error of anything derived from the parameters is
-right: finite where the open directions do not move it, infinite where they do.
-
-Errors at a bound, and next to one.
+The matrix has no number for a parameter that the data leave open. What the data do know of such
+parameters (a sum of two angles, say) is kept beside it: the determined directions with their errors
+(``factor``) and the open ones (``null``). With these, the error of anything derived from the
+parameters is right: finite where the open directions do not move it, infinite where they do.
 
 A parameter at its bound has no standard error: chi-square still falls beyond. How far it may go
 inward is known, and is its one-sided error. The errors of all others include that it may; where
@@ -62,8 +60,8 @@ class Covariance:
 
     Examples
     --------
+    >>> from astropolcal.calibration.uncertainty import Covariance
     >>> import astropy.units as u
-
     >>> covariance = Covariance(["hwp.theta"], [u.deg], [[0.04]])
     >>> covariance.std("hwp.theta")
     <Quantity 0.2 deg>
@@ -179,6 +177,7 @@ class Covariance:
 
         Examples
         --------
+        >>> from astropolcal.calibration.uncertainty import Covariance
         >>> one = Covariance(["wollaston.efficiency"], [None], [[1e-4]])
         >>> float(one.std("wollaston.efficiency"))
         0.01
@@ -223,9 +222,9 @@ class Covariance:
         --------
         Of two angles the data know the sum only:
 
+        >>> from astropolcal.calibration.uncertainty import Covariance
         >>> import astropy.units as u
         >>> import numpy as np
-
         >>> covariance = Covariance(["a.theta", "b.theta"], [u.deg, u.deg],
         ...                         np.full((2, 2), np.nan), factor=[[0.1, 0.1]], null=[[1, -1]])
         >>> float(covariance.propagate([1, 1]).round(3)), float(covariance.propagate([1, 0]))
@@ -321,33 +320,9 @@ class _Spread:
 
 
 def full_covariance(calibration):
-    """
-    Return the covariance of a calibration with its determined and open directions.
+    """Return the covariance of a calibration with its determined and open directions.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration. One read from a file gives the directions only if the
-        file holds them; otherwise errors are known for what depends on
-        determined parameters, and the rest is NaN or infinite.
-
-    Returns
-    -------
-    Covariance
-        With the matrix of ``calibration.covariance``, ``factor`` and ``null``.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> full_covariance(cal).factor.shape
-    (49, 49)
+    From an old file without directions only what depends on determined parameters has an error.
     """
     known = calibration.covariance
     if known.factor is not None:
@@ -361,27 +336,11 @@ def full_covariance(calibration):
 
 
 def covariance_around(measurement, whitened, weighting, scatter=None):
-    """
-    Return the covariance with its directions, of a problem that is decomposed once.
+    """Return the covariance with its directions, of a problem that is decomposed once.
 
-    It is the sandwich (White 1980, Econometrica 48, 817) of how the residuals scatter and hang
-    together at the wavelengths, pairs and settings of each dataset; where residuals do not tell
-    it, that of independent data. What is at a bound may go inward by its one-sided error.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    whitened : Whitened
-        The problem around its solution.
-    weighting : Weighting
-        The noise; without any there is no error.
-    scatter : Scatter, optional
-        Of the residuals, if it is at hand.
-
-    Returns
-    -------
-    Covariance
+    It is the sandwich (White 1980, Econometrica 48, 817) of how residuals scatter and hang
+    together; where they do not tell, that of independent data. What is at a bound may go inward by
+    its error.
     """
     scatter = Scatter(measurement, weighting, whitened) if scatter is None else scatter
     if not scatter.is_known:
@@ -403,8 +362,7 @@ def white_covariance(measurement, whitened, weighting):
 
 
 def sandwich(measurement, whitened, middle, slack=None):
-    """
-    Return the covariance from that of the pulls on the determined directions.
+    """Return the covariance from that of the pulls on the determined directions.
 
     ``slack`` has further directions, each one standard error long, in the steps of the problem.
     """
@@ -479,47 +437,10 @@ _UNIFORM = 1 / np.sqrt(12)
 
 
 def errors_at_bounds(measurement, whitened):
-    r"""
-    Return one-sided errors of parameters at a bound, and what they do to the other errors.
+    """Return one-sided errors at bounds (``inward``) and what they do to others (``released``).
 
-    In the linear problem around the solution, with all others refitted, chi-square in units of the
-    noise rises inward by :math:`2 g t + t^2 / s^2`: *g* is the gradient that pushes the parameter
-    against its bound, *s* its error were there no bound. The one-sided error is where that is one.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The fitted measurement, with its ``weighting``.
-    whitened : Whitened
-        The linear problem around its solution.
-
-    Returns
-    -------
-    dict
-        ``inward``: name to the one-sided error in the parameter's unit, infinite where the data do
-        not limit it before the opposite bound. ``released``: name of every other parameter whose
-        error grows by more than a tenth without the bounds, to the ratio of the two errors,
-        ``times``, with the bound as exact in the smaller one; the names of those at a bound that
-        matter, ``by``; and what they add to its error in its unit, as far as they may go inward,
-        ``slack``, and if there were no bounds, ``without``.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.calibration.noise.weighting import around
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> data = simulate(chain, charis.wavelength, frames, seed=2)
-    >>> polarizer = chain["calibration_polarizer"]
-    >>> polarizer.theta, polarizer.theta.bounds = 91 * u.deg, (90.2, 95)
-    >>> cal = calibrate(chain, data, fix={"hwp.theta": None, "derotator.theta": None})
-    >>> problem = around(cal.measurement, cal.measurement.weighting)
-    >>> list(errors_at_bounds(cal.measurement, problem)["inward"])
-    ['calibration_polarizer.theta']
+    With all others refitted, chi-square rises inward by 2 g t + t^2 / s^2: g is the gradient that
+    pushes against the bound, s the error were there none. The one-sided error is where that is one.
     """
     if not whitened.held.any():
         return {"inward": {}, "released": {}}
@@ -539,29 +460,9 @@ def errors_at_bounds(measurement, whitened):
 
 
 def slack_of_bounds(measurement, whitened):
-    """
-    Return how the parameters move while one at its bound goes inward by its one-sided error.
+    """Return how parameters move while one at its bound goes inward by its one-sided error.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The fitted measurement, with its ``weighting``.
-    whitened : Whitened
-        The linear problem around its solution.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_held, n_free), in steps of a degree, micrometre or percent.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> import numpy as np
-
-    >>> nothing = SimpleNamespace(held=np.zeros(3, dtype=bool), scale=np.ones(3))
-    >>> slack_of_bounds(None, nothing).shape
-    (0, 3)
+    Shape (n_held, n_free), in steps of a degree, micrometre or percent.
     """
     if not whitened.held.any():
         return np.zeros((0, whitened.scale.size))
@@ -667,32 +568,10 @@ def _released(names, whitened, held, columns, response):
 
 
 def status_of(entry):
-    """
-    Say of each element of a parameter whether it can be trusted.
+    """Return one of `STATUSES` for each element of an entry of `Calibration.parameter_values`.
 
-    Parameters
-    ----------
-    entry : dict
-        As `~astropolcal.calibration.Calibration.parameter_values` has it: ``std``,
-        ``std_released``, ``unit``, ``bounds``, ``fixed``, ``tied``, ``at_bound``,
-        ``identifiable``.
-
-    Returns
-    -------
-    `~numpy.ndarray` of str
-        One of `STATUSES` each, of the shape of ``std``. Badly determined is what has an error of
-        more than 5 deg, 0.05 mm or 0.05, or larger than that of something anywhere between its
-        bounds.
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> entry = {"std": np.array([0.01, 0.2]), "std_released": np.full(2, np.nan), "unit": None}
-    >>> entry |= {"fixed": False, "tied": None, "at_bound": np.zeros(2, dtype=bool)}
-    >>> entry |= {"bounds": (0, 1), "identifiable": np.ones(2, dtype=bool)}
-    >>> status_of(entry).tolist()
-    ['determined', 'badly determined']
+    Badly determined is an error of more than 5 deg, 0.05 mm or 0.05, or larger than that of a value
+    anywhere between the bounds.
     """
     shape = np.shape(entry["std"])
     if entry["fixed"] or entry["tied"]:

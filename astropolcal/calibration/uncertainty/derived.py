@@ -1,14 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Quantities that follow from a calibration, with their errors.
+"""
+Quantities that follow from a calibration, with their errors.
 
-To first order: with g the derivative of a quantity to the parameters and C
-their covariance, the variance is g C g. A quantity that moves along a
-direction which the data leave open has an infinite error, however small the
-change: no pseudo-inverse hides it.
-
-Retardances, efficiencies, matrices, predictions and sky Stokes parameters with their errors.
-
-Diattenuation and retardance of calibrated mirrors, beside those of bare metals.
+To first order: with g the derivative of a quantity to the parameters and C their covariance, the
+variance is g C g. A quantity that moves along a direction which the data leave open has an infinite
+error, however small the change: no pseudo-inverse hides it.
 """
 
 from dataclasses import dataclass, field
@@ -75,8 +71,8 @@ class Derived:
 
     Examples
     --------
+    >>> from astropolcal.calibration.uncertainty import Derived
     >>> import numpy as np
-
     >>> Derived(np.array([0.9]), np.array([0.01]), lambda: np.array([[1e-4]])).is_determined
     array([ True])
     """
@@ -262,8 +258,8 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import derived_retardance
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -325,8 +321,8 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import derived_efficiency
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -419,8 +415,8 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import derived_mueller
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -505,8 +501,8 @@ def derived_data(calibration, observations=None, dataset=0):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import derived_data
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -577,8 +573,8 @@ def derived_sky(
     Examples
     --------
     >>> import astropy.units as units
+    >>> from astropolcal.calibration.uncertainty import derived_sky
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -623,11 +619,9 @@ def _sky_chain(chain):
 
 
 def _double_difference_rows(chain, lam, positions, modulator):
-    """
-    Return rows of difference and sum of the four beams, and their derivatives.
+    """Return rows of difference and sum of the four beams (``""``), and their derivatives.
 
-    Two dicts, ``""`` for the rows and ``"optic.parameter"`` for derivatives, of
-    shape (n_pairs, n_wavelengths, 4).
+    Two dicts of arrays of shape (n_pairs, n_wavelengths, 4).
     """
     if modulator not in positions:
         raise ChainError(f"no position of {modulator!r}; positions has {sorted(positions)}")
@@ -672,80 +666,20 @@ _MIRRORS = (Diattenuator, DiattenuatorRetarder, MetalMirror, PowerLawMirror)
 
 
 def mirror_names(calibration):
-    """
-    Return the names of the mirrors, and of other diattenuators, of a calibration.
+    """Return the names of mirrors and other diattenuators, in the order of the light.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-
-    Returns
-    -------
-    list of str
-        In the order the light travels; without those that are fixed and do nothing.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, optics
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = (optics.Diattenuator(diattenuation=[0.01] * 3, name="fold_mirror")
-    ...          | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
-    ...          | optics.WollastonPrism(fixed={"efficiency": True}, name="wollaston"))
-    >>> chain["hwp"].retardance.fixed = True
-    >>> data = simulate(chain, [1.2, 1.6, 2.2] * u.um, half_wave_plate_cycles(), seed=2)
-    >>> cal = calibrate(chain, data)
-    >>> mirror_names(cal)
-    ['fold_mirror']
+    Those that are fixed and do nothing are left out.
     """
     found = {leaf.name: leaf for chain in calibration.chains for leaf in leaves(chain)}
     return [name for name, leaf in found.items() if isinstance(leaf, _MIRRORS)]
 
 
 def mirror_values(calibration, name, incidence=45 * u.deg):
-    """
-    Return diattenuation and retardance of a mirror, with errors, beside those of metals.
+    """Return diattenuation and retardance of a mirror per wavelength, beside those of metals.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; one read from a file will do.
-    name : str
-        The mirror, see `mirror_names`.
-    incidence : `~astropy.units.Quantity`
-        Angle of incidence for the metals.
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-        One row a wavelength: ``wavelength``; ``diattenuation`` and its error; ``retardance`` and
-        its error, where the optic has one (0 to 360 deg, 180 of an ideal mirror); and of each
-        metal, bare, with the indices of Rakić et al. (1998), ``diattenuation_silver``,
-        ``retardance_silver`` and so on. Errors are NaN where the data do not determine a
-        value alone, and where it is held. Meta ``name``, and ``held``: whether the retardance is.
-
-    Raises
-    ------
-    ChainError
-        If there is no such mirror.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, optics
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = (optics.Diattenuator(diattenuation=[0.01] * 3, name="fold_mirror")
-    ...          | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
-    ...          | optics.WollastonPrism(fixed={"efficiency": True}, name="wollaston"))
-    >>> chain["hwp"].retardance.fixed = True
-    >>> data = simulate(chain, [1.2, 1.6, 2.2] * u.um, half_wave_plate_cycles(), seed=2)
-    >>> cal = calibrate(chain, data)
-    >>> table = mirror_values(cal, "fold_mirror")
-    >>> table["diattenuation"][0].round(2), table["diattenuation_gold"][0].round(2)
-    (<Quantity 1. %>, <Quantity 0.94 %>)
+    Retardance is 0 to 360 deg, 180 of an ideal mirror. Metals are bare, with the indices of Rakic
+    et al. (1998). Errors are NaN where the data do not determine a value alone, and where it is
+    held.
     """
     known = mirror_names(calibration)
     if name not in known:

@@ -1,24 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Quick fits from a known solution: with other weights, or with parameters held.
+"""
+Errors of parameters that do not come from one covariance: refits, and robust estimates.
 
-Profile likelihood: chi-square along one parameter, all others refitted.
+Profile: where a parameter enters the model non-linearly, the interval in which chi-square rises by
+one, all others refitted, is a better statement than a standard error, and need not be symmetric.
+Where the data leave a parameter open the profile is flat.
 
-Where a parameter enters the model non-linearly, the interval in which the
-profile rises by one is a better statement than a standard error, and need not
-be symmetric. Where the data leave a parameter open the profile is flat.
+Bootstrap: frames of one half-wave-plate cycle share what the model lacks (a lamp that drifts, a
+derotator that stands slightly wrong), so their residuals are not independent, and errors from the
+Jacobian are too small. Drawing whole cycles with replacement keeps that dependence (Kuensch 1989,
+Ann. Statist. 17, 1217, https://doi.org/10.1214/aos/1176347265).
 
-Bootstrap over blocks of frames: errors that do not trust the noise model.
-
-Frames of one half-wave-plate cycle share what the model lacks (a lamp that
-drifts, a derotator that stands slightly wrong), so their residuals are not
-independent, and errors from the Jacobian are too small. Drawing whole cycles
-with replacement keeps that dependence (Kuensch 1989, Ann. Statist. 17, 1217,
-https://doi.org/10.1214/aos/1176347265).
-
-Standard errors of parameters: of the full covariance, robust, and as published ones are.
-
-The sandwich estimate reads from the residuals of whole groups of data how far each
-group pulls the parameters (White 1980; Liang & Zeger 1986).
+Sandwich: the residuals of whole groups of data tell how far each group pulls the parameters (White
+1980; Liang & Zeger 1986).
 """
 
 from dataclasses import dataclass
@@ -74,11 +68,9 @@ class Refit:
         return np.concatenate([data, priors], axis=1).T
 
     def fit(self, start, counts=None, held=()):
-        """
-        Fit from a start.
+        """Return the vector, chi-square, and whether the fit arrived.
 
-        ``counts`` tells how often each datum occurs, ``held`` which elements
-        stay as they are. Returns the vector, chi-square, and whether it arrived.
+        ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are.
         """
         from scipy.optimize import least_squares
 
@@ -140,8 +132,8 @@ class Profile:
 
     Examples
     --------
+    >>> from astropolcal.calibration.uncertainty import Profile
     >>> import numpy as np
-
     >>> made = Profile("wollaston.efficiency", 0.9, np.array([0.8, 0.9, 1.0]),
     ...                np.array([4.0, 0.0, 4.0]), np.zeros((3, 1)))
     >>> [round(end, 3) for end in made.interval()]
@@ -353,8 +345,8 @@ class Resampled:
 
     Examples
     --------
+    >>> from astropolcal.calibration.uncertainty import Resampled
     >>> import numpy as np
-
     >>> made = Resampled(["wollaston.efficiency"], [None], np.array([[0.97], [0.99]]), "pair", 8, 0)
     >>> float(made.stds[0].round(4))
     0.0141
@@ -609,8 +601,8 @@ def standard_errors(calibration, method=None, groups=None):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import standard_errors
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -705,8 +697,8 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import robust_covariance
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
