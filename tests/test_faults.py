@@ -33,7 +33,7 @@ from astropolcal.exceptions import AstropolcalError, CalibrationFileError, FitEr
 from astropolcal.files import atomic_path
 from astropolcal.gap.challenge import _append, _journal
 from astropolcal.reduction.frames import Frame
-from astropolcal.reduction.journal import Journal
+from astropolcal.reduction.run import Journal
 from astropolcal.scripts._common import write_json
 from tests.fuzz.readers import READERS, Checkpoint, calibration, lab
 

@@ -6,7 +6,7 @@ Groups of data that cross-validation leaves out together.
 import numpy as np
 
 from astropolcal.exceptions import FitError
-from astropolcal.observations import cycle_numbers
+from astropolcal.observations.quality import cycle_numbers
 
 __all__ = ["GROUPS", "groups_by", "leave_out_groups", "what_is_left_out"]
 

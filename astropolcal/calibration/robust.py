@@ -145,7 +145,7 @@ def outlying_data(calibration, limit=_FAR):
 
 
 def _outliers(part, residuals, scaled, limit):
-    from astropolcal.observations import brightness
+    from astropolcal.observations.quality import brightness
 
     groups = np.unique(part.group_of_datum)
     members = [part.group_of_datum == g for g in groups]

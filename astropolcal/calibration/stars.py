@@ -12,7 +12,7 @@ from astropolcal.calibration.standards import predicted_chain
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, ObservationError
 from astropolcal.measurement import Measurement
-from astropolcal.observations import cycle_numbers
+from astropolcal.observations.quality import cycle_numbers
 from astropolcal.optics import PolarizedSource, StarSource
 
 __all__ = ["fitted_stars", "star_accuracy", "star_stokes"]

@@ -15,7 +15,7 @@ import numpy as np
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.observations import is_star
+from astropolcal.observations.quality import is_star
 
 __all__ = ["copy_fitted", "kind_of_source", "sequential", "telescope_alone", "two_step"]
 

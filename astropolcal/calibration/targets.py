@@ -18,7 +18,7 @@ from astropolcal.calibration.groups import GROUPS, groups_by
 from astropolcal.calibration.standards import refuse_fitted
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import LinearPolarizer
 from astropolcal.units import angle_to_rad
 

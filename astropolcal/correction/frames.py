@@ -9,14 +9,15 @@ from astropy.table import QTable
 
 from astropolcal.calibration._header import describe
 from astropolcal.chain import stages
-from astropolcal.correction.brightness import frame_brightness
+from astropolcal.correction.solve import frame_brightness
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.fitscheck import primary_header
-from astropolcal.observations import Observations, pair_frames
+from astropolcal.observations import Observations
+from astropolcal.observations.pairing import pair_frames
 from astropolcal.optics import COORDINATES
 
-__all__ = ["ScienceFrames", "frame_positions"]
+__all__ = ["ScienceFrames"]
 
 
 @dataclass
@@ -388,43 +389,10 @@ def _in_files(centres, layout):
 
 def frame_positions(instrument, table, chain, names=None):
     """
-    Return the position of every stage in each frame, from what the headers give.
+    Return the position of every stage of a chain in each frame, radian, (n_frames,), by name.
 
-    Parameters
-    ----------
-    instrument : Instrument
-        That knows how stages follow the sky.
-    table : `~astropy.table.QTable`
-        One row a frame with the angles of the headers, and the state of a modulator, A or B, as
-        ``flc_state`` if the chain has one.
-    chain : `~astropy.modeling.CompoundModel`
-        From the sky to the detector.
-    names : sequence of str, optional
-        What to call the frames.
-
-    Returns
-    -------
-    dict of str to `~numpy.ndarray`
-        Radian, shape (n_frames,).
-
-    Raises
-    ------
-    ObservationError
-        If an angle or a state is missing; the message names the frame.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropy.table import QTable
-    >>> from astropolcal import instruments
-    >>> from astropolcal.correction import frame_positions
-    >>> charis = instruments.get("charis")
-    >>> table = QTable({"hwp": [45] * u.deg, "derotator": [60] * u.deg,
-    ...                 "parallactic": [20] * u.deg, "altitude": [67] * u.deg})
-    >>> positions = frame_positions(charis, table, charis.on_sky(charis.published()))
-    >>> np.rad2deg(positions["hwp"])
-    array([122.])
+    ``table`` has one row a frame with the angles of the headers, and ``flc_state``, A or B, if the
+    chain has a modulator; ``names`` are those of the frames in messages.
     """
     table = QTable(table, copy=True)
     names = [f"frame {i}" for i in range(len(table))] if names is None else list(map(str, names))

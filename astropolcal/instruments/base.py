@@ -13,18 +13,15 @@ from astropolcal.instruments._choices import check_choice
 from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
 from astropolcal.instruments.telescope import as_exact, behind_telescope, star_options
-from astropolcal.observations import (
-    common_wavelengths,
+from astropolcal.observations.pointings import angle_change, location_of, sky_angles, sky_positions
+from astropolcal.observations.quality import (
     is_star,
     mask_incomplete_cycles,
     mask_saturated,
     mask_unstable_lamp,
-    sky_angles,
-    sky_positions,
+    plain_source,
 )
-from astropolcal.observations.coordinates import angle_change
-from astropolcal.observations.pointings import location_of
-from astropolcal.observations.quality import plain_source
+from astropolcal.observations.reading import common_wavelengths
 
 __all__ = ["Instrument"]
 

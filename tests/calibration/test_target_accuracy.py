@@ -26,7 +26,7 @@ from astropolcal.calibration.groups import GROUPS
 from astropolcal.calibration.standards import add_standard
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Measurement
-from astropolcal.observations import get_observable
+from astropolcal.observations.observables import get_observable
 
 LAM = [1.2, 1.6, 2.2] * u.um
 PERCENT = st.floats(0, 5)

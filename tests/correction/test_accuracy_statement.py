@@ -9,14 +9,10 @@ import pytest
 
 from astropolcal.calibration import target_accuracies
 from astropolcal.calibration._sky_view import view_of_calibration
-from astropolcal.correction import (
-    RowModel,
-    ScienceFrames,
-    correct,
-    estimator,
-    linear_systematic,
-    sampled_systematic,
-)
+from astropolcal.correction import ScienceFrames, correct
+from astropolcal.correction.rows import RowModel
+from astropolcal.correction.solve import estimator
+from astropolcal.correction.systematic import linear_systematic, sampled_systematic
 from astropolcal.exceptions import ParameterError
 
 LACKING = {"wavelength_nm": [1100.0, 2400.0], "relative_percent": [0.2, 0.4],

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import optics
-from astropolcal.correction import frame_brightness, measurement_rows
+from astropolcal.correction import measurement_rows
+from astropolcal.correction.solve import frame_brightness
 from astropolcal.exceptions import ObservationError
 
 HWP = np.array([0, 45, 22.5, 67.5, 0, 45, 22.5, 67.5])

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.correction.channels import CHANNELS, Channels
+from astropolcal.correction.solve import CHANNELS, Channels
 from astropolcal.exceptions import ObservationError, ParameterError
 
 #: Right and left beam of four frames.

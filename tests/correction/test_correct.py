@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from astropolcal import Observations, calibrate
 from astropolcal.calibration import fitted_stars, with_validity
-from astropolcal.correction import ScienceFrames, correct, derotate, sky_chain
+from astropolcal.correction import ScienceFrames, correct
+from astropolcal.correction.geometry import derotate
+from astropolcal.correction.rows import sky_chain
 from astropolcal.exceptions import (
     AstropolcalWarning,
     CalibrationFileError,
@@ -140,7 +142,7 @@ def test_pulls_of_noise(disk_frames, sky, charis):
 
 def test_pulls_of_the_calibration(calibration, star, charis, seen, track):
     """Systematic errors alone, noise off: each true instrument differs from the calibrated."""
-    from astropolcal.correction import RowModel
+    from astropolcal.correction.rows import RowModel
     from astropolcal.correction.systematic import _draws
 
     hwp, positions = track()
@@ -339,7 +341,8 @@ def test_brightness_that_cannot_be_measured_is_said(star, sky, charis):
 
 
 def test_a_dark_frame_has_no_brightness(star, sky, charis):
-    from astropolcal.correction import frame_brightness, measurement_rows
+    from astropolcal.correction import measurement_rows
+    from astropolcal.correction.solve import frame_brightness
 
     rows = measurement_rows(sky, star.positions, charis.wavelength)
     fluxes = np.stack([star.right, star.left])

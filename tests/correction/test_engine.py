@@ -9,8 +9,9 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from astropolcal.correction import ScienceFrames, correct, frame_positions
-from astropolcal.correction.engine import run_blocks
+from astropolcal.correction import ScienceFrames, correct
+from astropolcal.correction.correcting import run_blocks
+from astropolcal.correction.frames import frame_positions
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError
 
@@ -51,7 +52,7 @@ def cubes_of_stars(sky, charis, track, tmp_path):
 
 def test_a_cluster_that_does_not_answer(star, sky, charis, monkeypatch):
     pytest.importorskip("distributed", reason="distributed is not installed")
-    from astropolcal.correction import engine
+    from astropolcal.correction import correcting as engine
 
     monkeypatch.setattr(engine, "_TIMEOUT", 0.5)
     frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)

@@ -12,7 +12,8 @@ from astropy.table import MaskedColumn, QTable
 from astropy.utils.masked import Masked
 
 from astropolcal import instruments, optics
-from astropolcal.correction import ScienceFrames, frame_positions, measurement_rows
+from astropolcal.correction import ScienceFrames, measurement_rows
+from astropolcal.correction.frames import frame_positions
 from astropolcal.exceptions import ObservationError, ParameterError
 
 LAM = [1.2, 1.6] * u.um

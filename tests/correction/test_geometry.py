@@ -7,8 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.correction import azimuthal, derotate, derotate_variance, position_angles
-from astropolcal.correction.geometry import azimuthal_variances
+from astropolcal.correction.geometry import (
+    azimuthal,
+    azimuthal_variances,
+    derotate,
+    derotate_variance,
+    position_angles,
+)
 from astropolcal.exceptions import ParameterError
 
 SIZE = 41

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.correction.polarization import fractions, polarization
+from astropolcal.correction.result import fractions, polarization
 from astropolcal.stokes import debias_dolp
 
 STOKES = np.array([1000.0, 30.0, -40.0, 15.0])

@@ -7,7 +7,8 @@ import pytest
 
 from astropolcal import calibrate, optics
 from astropolcal.chain import find_optic, insert_optic, leaves, system_mueller, with_beam
-from astropolcal.correction import RowModel, check_optics, measurement_rows, sky_chain
+from astropolcal.correction import measurement_rows
+from astropolcal.correction.rows import RowModel, check_optics, sky_chain
 from astropolcal.exceptions import (
     AstropolcalWarning,
     ChainError,

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import optics
-from astropolcal.correction import estimator, measurement_rows
-from astropolcal.correction.channels import CHANNELS, Channels
+from astropolcal.correction import measurement_rows
+from astropolcal.correction.solve import CHANNELS, Channels, estimator
 from astropolcal.exceptions import ObservationError, ParameterError
 
 
@@ -20,7 +20,7 @@ def ideal(hwp, wavelengths=1):
 
 
 def pairs_of(hwp):
-    from astropolcal.observations import pair_frames
+    from astropolcal.observations.pairing import pair_frames
 
     return pair_frames(hwp)
 

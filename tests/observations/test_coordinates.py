@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations import Observations, example_table
-from astropolcal.observations.coordinates import clock, frame_coordinate
+from astropolcal.observations.pointings import clock, frame_coordinate
 from astropolcal.optics import COORDINATES, FluxGain
 
 MINUTES = np.array([12.0, 3.0, 0.0, 7.5])

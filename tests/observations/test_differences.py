@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from astropolcal.observations import (
+from astropolcal.observations.observables import (
     double_difference,
     double_sum,
     single_difference,

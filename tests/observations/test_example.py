@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from astropolcal.observations import Observations, example_table, get_observable
+from astropolcal.observations import Observations, example_table
+from astropolcal.observations.observables import get_observable
 
 
 def measure(obs):

@@ -6,7 +6,7 @@ import pytest
 from astropy.table import MaskedColumn, QTable
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.masking import mask_missing, mask_rows
+from astropolcal.observations.grid import mask_missing, mask_rows
 
 
 def judged(right, left, errors=None, reasons=None):

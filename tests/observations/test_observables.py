@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.observations import (
-    OBSERVABLES,
+from astropolcal.observations import OBSERVABLES, Observable
+from astropolcal.observations.observables import (
     NormalizedDoubleDifference,
-    Observable,
     double_difference,
     double_sum,
     get_observable,

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations import pair_frames
+from astropolcal.observations.pairing import pair_frames
 
 CYCLE = [0.0, 45.0, 22.5, 67.5]
 

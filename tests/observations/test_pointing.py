@@ -10,16 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations import (
-    Observations,
-    example_table,
-    motion,
-    pointing,
-    sky_angles,
-    sky_positions,
-    smeared,
-    tracked,
-)
+from astropolcal.observations import Observations, example_table, pointing
+from astropolcal.observations.pointings import motion, sky_angles, sky_positions, smeared, tracked
 
 SUBARU = EarthLocation(lon=-155.4761 * u.deg, lat=19.8255 * u.deg, height=4139 * u.m)
 STAR = SkyCoord(80 * u.deg, -1 * u.deg)

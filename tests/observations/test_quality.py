@@ -9,8 +9,8 @@ import pytest
 
 from astropolcal import instruments
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations import (
-    Observations,
+from astropolcal.observations import Observations
+from astropolcal.observations.quality import (
     brightness,
     cycle_numbers,
     is_star,

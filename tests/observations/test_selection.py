@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from astropolcal.exceptions import ObservationError
 from astropolcal.observations import Observations, example_table
 from astropolcal.observations.grid import build_grid
-from astropolcal.observations.selection import masked_grid, some_bins, some_frames
+from astropolcal.observations.table import masked_grid, some_bins, some_frames
 
 ARRAYS = ("flux_right", "flux_left")
 

@@ -10,7 +10,8 @@ from astropy.table import QTable, Table
 from astropy.time import Time
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations import Observations, example_table, get_observable
+from astropolcal.observations import Observations, example_table
+from astropolcal.observations.observables import get_observable
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 CHARIS = SHARED / "data" / "charis"

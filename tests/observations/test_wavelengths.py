@@ -11,8 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.observations import SAME_WAVELENGTH, Observations, common_wavelengths
-from astropolcal.observations.wavelengths import filter_wavelength, stated_wavelength
+from astropolcal.observations import Observations
+from astropolcal.observations.reading import (
+    SAME_WAVELENGTH,
+    common_wavelengths,
+    filter_wavelength,
+    stated_wavelength,
+)
 
 
 def at(*wavelengths, unit=u.um):
