@@ -68,7 +68,7 @@ def correct(
     mode : {"stokes", "ip"}
         ``"stokes"`` inverts the Mueller matrices of the frames. ``"ip"`` removes only the
         instrumental polarization that the calibration predicts, and takes the instrument for
-        ideal in everything else (see `ideal_chain`); for comparison.
+        ideal in everything else, as `~astropolcal.correction.ideal_chain` makes it; for comparison.
     observable : {"intensity", "single", "double"}, optional
         What is fitted: the beams, or their single or double differences and sums. The
         last are blind to what is the same in both frames of a pair, such as a gain that differs
@@ -76,32 +76,35 @@ def correct(
         ones. Frames that have no pairs are fitted by their intensities, with a warning; frames
         that belong to no pair are left out, with a warning.
     brightness : {"measured", "given"}, optional
-        How bright the frames were: as their light says (`frame_brightness`), or ``frames.scale``
-        and else all the same. By default measured where there is no ``frames.scale``. It is also
+        How bright the frames were: as their light says, or ``frames.scale`` and else all the same. By default measured where there is no ``frames.scale``. It is also
         taken as given, with a warning, where there is too little light.
     components : {"IQU", "IQUV"}
         Without V it is taken as zero. With V it is solved for where the frames determine it.
     weights : array_like or "variance", optional
-        As for `estimator`; or by the variances of each pixel.
+        Inverse variances of the fluxes, (n_frames,), (n_wavelengths, n_frames) or (2,
+        n_wavelengths, n_frames); or by the variances of each pixel.
     max_condition : float
         A combination of Stokes parameters is left out if its singular value is smaller than the
-        largest by more than this, see `estimator`.
+        largest by more than this.
     chain : `~astropy.modeling.CompoundModel`, optional
         All optics from the sky to the detector, with optics named as the calibrated ones; by
-        default that of `sky_chain`.
+        default that of a star that was calibrated, or the instrument's from the sky.
     interpolate : bool
         Whether parameters known at the calibrated wavelengths only are interpolated linearly
         between them; else each wavelength of the frames must be one of the calibrated.
     open_directions : {"infinite", "ignore"} or float
-        See `linear_systematic`.
+        Errors along directions that the calibration leaves open: infinite; zero, as if the choice
+        that it made were true; or the standard deviation of the parameter that each direction is
+        named after (``calibration.identifiability.directions``), in degrees of an angle, micrometres
+        of a thickness, percent of anything else. All that cannot be told from it moves along.
     max_age : `~astropy.units.Quantity`, optional
         Time between the data of the calibration and the frames from which on there is a warning;
         by default that of the instrument, see `~astropolcal.calibration.load`.
     any_date : bool
         Take the calibration whatever the date of the frames.
     n_samples : int
-        If above zero, systematic errors are sampled, see `sampled_systematic`; else they are
-        linearized.
+        If above zero, systematic errors are those of solving anew for so many samples of the
+        calibration's posterior, or covariance; else they are linearized.
     seed : int, optional
         Of the samples.
     workers : int, optional
@@ -348,14 +351,10 @@ def correct_block(source, solution, start, stop, by_variance=False):
         # a NaN in any frame makes the sum NaN; such pixels are fitted alone, from the other frames
         if bad.any() and known[i, :3].all():
             out[:, i, bad] = _pixel_by_pixel(source, solution, w, bad, n_out, by_variance)
-        for kept, column in _columns(n, n_out):
+        # the components, then their covariances
+        for kept, column in enumerate([(c,) for c in range(n)] + covariance_index(n)[: n_out - n]):
             out[kept, i] = out[kept, i] if known[i, list(column)].all() else np.nan
     return out.reshape(n_out, stop - start, *source.image_shape)
-
-
-def _columns(n, n_out):
-    """Yield what the planes of the result are about."""
-    yield from enumerate([(i,) for i in range(n)] + covariance_index(n)[: n_out - n])
 
 
 def _linear(source, solution, wavelengths, n_out, n_pixels):
@@ -419,15 +418,12 @@ def _unit(source, channels, frames, w, pixels):
     """Return the channels of one unit and their variances, of some pixels at a wavelength."""
 
     def read(method):
-        return [
-            [method(beam, slice(f, f + 1), slice(w, w + 1)).reshape(-1)[pixels] for beam in (0, 1)]
-            for f in frames
-        ]
+        cells = [slice(f, f + 1) for f in frames]
+        found = [[method(b, cell, slice(w, w + 1)) for cell in cells] for b in (0, 1)]
+        return np.array(found).reshape(2, len(cells), -1)[..., pixels]
 
-    data = channels.of_unit(read(source.fluxes))
-    variance = None
-    if source.has_variances:
-        variance = channels.variance_of_unit(read(source.variances))
+    data = channels.one(read(source.fluxes))
+    variance = channels.one(read(source.variances), True) if source.has_variances else None
     return data, variance
 
 

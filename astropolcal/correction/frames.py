@@ -27,12 +27,13 @@ class ScienceFrames:
 
     Attributes
     ----------
-    source : ArraySource, TurnedSource or CubeFiles
-        The fluxes.
+    source : object
+        The fluxes of both beams, in memory or in files.
     wavelength : `~astropy.units.Quantity`
         Shape (n_wavelengths,).
     positions : dict
-        Position of every stage of the chain, (n_frames,), see `RowModel`.
+        Position of every stage of the chain, (n_frames,), or (nodes, n_frames) at the
+        Gauss-Legendre nodes of the exposures; without a unit in radian.
     pairs : `~numpy.ndarray` or None
         Frames of the pairs of double differences.
     scale : `~numpy.ndarray` or None
@@ -124,9 +125,10 @@ class ScienceFrames:
         Parameters
         ----------
         rows : `~numpy.ndarray`
-            As `measurement_rows` gives them.
+            As `~astropolcal.correction.measurement_rows` gives them.
         **settings
-            As for `frame_brightness`.
+            ``components``, ``observable``, ``pairs`` and ``weights``, as for
+            `~astropolcal.correction.correct`.
 
         Returns
         -------
@@ -184,16 +186,25 @@ class ScienceFrames:
 
         Parameters
         ----------
-        right, left, variance_right, variance_left, names, batch
-            As for ``ArraySource``; images or spectra.
+        right, left, variance_right, variance_left : array_like
+            Images or spectra in memory, mapped from disk, or of dask, and their variances, shape
+            (n_frames, n_wavelengths, ...); NaN where there is none.
+        names : sequence of str, optional
+            What to call the frames.
+        batch : int, optional
+            Frames that are read at a time.
         wavelength, positions
             As the attributes.
         hwp : `~astropy.units.Quantity`, optional
             Commanded angles of the half-wave plate, by which frames are paired.
         position_angle : `~astropy.units.Quantity`, optional
             Of the +y axis of every frame; the images are then turned north up.
-        centre, mirrored, order
-            As for `derotate`.
+        centre : (float, float), optional
+            0-based x and y of the star; by default the middle.
+        mirrored : bool
+            Whether east is to the right of north.
+        order : int
+            Of the spline, 0 to 5.
         **settings
             More attributes: ``pairs``, ``scale``, ``unit``, ``pixel_scale``, ``date``, ``mode``,
             ``meta``.
@@ -274,16 +285,20 @@ class ScienceFrames:
             star ``parallactic`` and ``altitude``, and ``hwp_true`` if it is known; ``flc_state`` if
             the chain has a modulator.
         chain : `~astropy.modeling.CompoundModel`
-            From the sky to the detector, see `sky_chain`.
+            From the sky to the detector.
         wavelength : `~astropy.units.Quantity`, optional
             Of the slices; by default the instrument's.
         centres : array_like, optional
-            As for ``CubeFiles``, in both images side by side where each beam has files of its own,
-            shape (2, 2) or (n_frames, 2, 2); or of the left beam only, shape
-            (2,) or (n_frames, 2), with the right beam where the layout says; by default in the
-            middle of the field.
-        size, position_angle, mirrored, order, left_scale
-            As for ``CubeFiles``.
+            Place of the star in the right and the left beam, 0-based x and y, side by side also
+            where each beam has files of its own, shape (2, 2) or (n_frames, 2, 2); or of the left
+            beam only, shape (2,) or (n_frames, 2), with the right beam where the layout says; by
+            default in the middle of the field.
+        size : int
+            Rows and columns that are cut out about it.
+        position_angle, mirrored, order
+            As for `from_arrays`.
+        left_scale : array_like
+            By what the left beam is multiplied, one number or one a frame.
         **settings
             More attributes. Without ``date`` and ``mode`` the headers of the files tell.
 

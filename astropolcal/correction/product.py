@@ -46,7 +46,8 @@ def write_product(corrected, path, *, overwrite=False, maps=True):
     hdus += _errors(corrected)
     if maps:
         hdus += _maps(corrected)
-    hdus.append(_frames(corrected))
+    names = [_printable(name) for name in corrected.provenance.get("frames", [])] or ["unknown"]
+    hdus.append(fits.BinTableHDU(Table({"frame": np.array(names, dtype=str)}), name="FRAMES"))
     with atomic_path(path, ObservationError) as temporary, open(temporary, "wb") as stream:
         fits.HDUList(hdus).writeto(stream, checksum=True)
 
@@ -165,11 +166,6 @@ def _maps(corrected):
         found = corrected.azimuthal()
         hdus.append(_image("QPHI", np.stack(list(found.values())), *found))
     return hdus
-
-
-def _frames(corrected):
-    names = [_printable(name) for name in corrected.provenance.get("frames", [])] or ["unknown"]
-    return fits.BinTableHDU(Table({"frame": np.array(names, dtype=str)}), name="FRAMES")
 
 
 def read_product(path):

@@ -39,7 +39,7 @@ class Corrected:
     stokes : `~numpy.ndarray`
         Shape (n_components, n_wavelengths, ...); NaN where not determined.
     covariance : `~numpy.ndarray` or None
-        Statistical, of the pairs of components (II, IQ, IU, QQ, ...), (n_pairs, n_wavelengths, ...).
+        Statistical, of the pairs II, IQ, IU, QQ, ..., (n_pairs, n_wavelengths, ...).
     systematic : Systematic or None
         What the errors of the calibration do; None without a calibration.
     condition : `~numpy.ndarray`

@@ -112,8 +112,18 @@ def measurement_rows(calibration, positions, wavelength, *, chain=None, interpol
 
     Parameters
     ----------
-    calibration, positions, wavelength, chain, interpolate
-        As for `RowModel`, which also has the derivatives.
+    calibration : Calibration or `~astropy.modeling.CompoundModel`
+        The calibration, or a chain with known values.
+    positions : dict of str to `~astropy.units.Quantity` or `~numpy.ndarray`
+        Position of every stage in each frame, shape (n_frames,), or (nodes, n_frames) at the
+        Gauss-Legendre nodes of the exposures. Angles without a unit are in radian.
+    wavelength : `~astropy.units.Quantity`
+        Of the science data.
+    chain : `~astropy.modeling.CompoundModel`, optional
+        From the sky to the detector, with optics named as the calibrated ones.
+    interpolate : bool
+        Whether parameters known at the calibrated wavelengths only are interpolated linearly
+        between them. Else each wavelength must be one of the calibrated.
 
     Returns
     -------

@@ -60,29 +60,16 @@ class Channels:
         # (X+ - X-) / 2 and (I+ + I-) / 2, the half differences and sums of the paper
         return np.stack([plus[0] - minus[0], plus[1] + minus[1]]) / 2
 
-    def of_unit(self, beams):
-        """Return the two channels of one unit from the beams of its frames, [(right, left)...]."""
-        fluxes = np.stack([np.stack(beam) for beam in zip(*beams, strict=True)])
-        if self.observable == "intensity":
-            return fluxes[:, 0]
-        both = fluxes[0] - fluxes[1], fluxes[0] + fluxes[1]
-        if self.pairs is None:
-            return np.stack([both[0][0], both[1][0]])
-        return np.stack([both[0][0] - both[0][1], both[1][0] + both[1][1]]) / 2
-
-    def variance_of_unit(self, beams):
-        """Return the variances of the two channels of one unit from those of the beams."""
-        fluxes = np.stack([np.stack(beam) for beam in zip(*beams, strict=True)])
-        if self.observable == "intensity":
-            return fluxes[:, 0]
-        # var(r - l) = var(r + l) = var(r) + var(l); halving the pair divides it by four
-        total = fluxes.sum(axis=(0, 1)) / (1 if self.pairs is None else 4)
-        return np.stack([total, total])
+    def one(self, fluxes, variance=False):
+        """Return the channels, or their variances, of one unit from its frames, (2, k, ...)."""
+        alone = Channels(self.observable, fluxes.shape[1], [(0, 1)])
+        return (alone.variances if variance else alone.combine)(fluxes)[:, 0]
 
     def variances(self, variances):
         """Return variances of channels, without their correlations; shapes as in `combine`."""
         if self.observable == "intensity":
             return variances
+        # var(r - l) = var(r + l) = var(r) + var(l); halving the pair divides it by four
         total = variances.sum(axis=0)
         if self.pairs is not None:
             total = (total[self.pairs[:, 0]] + total[self.pairs[:, 1]]) / 4
@@ -199,7 +186,10 @@ def estimator(
         raise ParameterError(f"max_condition = {max_condition}; it must be above 1")
     shape = rows.shape[1:3]
     channels = Channels(observable, shape[1], pairs)
-    weights = _weights(weights, shape)
+    if weights is None:
+        weights = np.ones((2, *shape))
+    else:
+        weights = np.broadcast_to(_positive("weights", weights, shape, beams=True), (2, *shape))
     if scale is not None:
         scale = _positive("scale", scale, shape)
         rows = rows * scale[None, :, :, None]
@@ -297,12 +287,6 @@ def _leakage(gain, rows, components):
         leakage[assumed] = np.einsum("wkbf,bwf->wk", gain, rows[..., 3])[assumed]
         return leakage
     return np.einsum("wkbf,bwf->wk", gain, rows[..., 3])
-
-
-def _weights(weights, shape):
-    if weights is None:
-        return np.ones((2, *shape))
-    return np.broadcast_to(_positive("weights", weights, shape, beams=True), (2, *shape))
 
 
 def _positive(name, value, shape, beams=False):

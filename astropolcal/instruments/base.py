@@ -543,8 +543,7 @@ class Instrument(ABC):
         Return the position of every stage of the chain in each frame, in radian.
 
         In a chain with stages "parallactic" or "altitude" the half-wave plate follows the sky, by
-        the instrument's law or as the column ``hwp_true`` tells, see
-        `~astropolcal.observations.sky_positions`; elsewhere the columns count.
+        the instrument's law or as the column ``hwp_true`` tells; elsewhere the columns count.
 
         Parameters
         ----------
@@ -553,8 +552,9 @@ class Instrument(ABC):
         chain : Optic or `~astropy.modeling.CompoundModel`
             The chain.
         **exposure
-            ``nodes``, ``when`` and ``duty`` of `~astropolcal.observations.sky_positions`, for
-            the motion during an exposure.
+            For the motion during an exposure: the number of Gauss-Legendre ``nodes``, ``when`` in
+            it the angles hold ("start", "middle", "end"), and ``duty``, the share of the time in
+            which light is collected.
 
         Returns
         -------

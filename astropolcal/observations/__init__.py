@@ -3,7 +3,7 @@
 The observation layer: tables of beam fluxes, pairs of frames, observables.
 
 A calibration starts from `Observations`, a validated table of the two beam
-fluxes of every frame and wavelength. `pair_frames` finds the frames taken 45
+fluxes of every frame and wavelength. It pairs the frames taken 45
 degrees of half-wave plate apart, and an `Observable` turns their fluxes into
 the quantity that is fitted, with its derivative and its error.
 """

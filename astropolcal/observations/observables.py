@@ -30,7 +30,7 @@ class Observable(ABC):
     Attributes
     ----------
     name : str
-        The name by which `get_observable` finds it.
+        The name by which `OBSERVABLES` and ``observable=`` find it.
     description : str
         One line for reports.
     frames_per_datum : int
@@ -113,9 +113,9 @@ class Observable(ABC):
         Examples
         --------
         >>> import numpy as np
-        >>> from astropolcal.observations.observables import get_observable
+        >>> from astropolcal.observations import OBSERVABLES
         >>> flux = np.full((2, 1, 1), 100.0)
-        >>> x = get_observable("normalized_double_difference")
+        >>> x = OBSERVABLES["normalized_double_difference"]
         >>> round(float(x.variance(flux, flux, flux, flux)[0, 0]), 6)
         0.0025
         """
@@ -150,9 +150,9 @@ class Observable(ABC):
         Two data that share their minus frame have half of their noise in common:
 
         >>> import numpy as np
-        >>> from astropolcal.observations.observables import get_observable
+        >>> from astropolcal.observations import OBSERVABLES
         >>> flux = np.full((2, 1, 2), 100.0)
-        >>> x = get_observable("normalized_double_difference")
+        >>> x = OBSERVABLES["normalized_double_difference"]
         >>> c = x.frame_covariance(flux, flux, flux, flux, 0.0, np.array([[0, 1], [2, 1]]))
         >>> round(float(c[0, 0, 1] / c[0, 0, 0]), 6)
         0.5
@@ -343,28 +343,3 @@ def get_observable(name):
     raise ObservationError(
         f"unknown observable {name!r}; allowed are {', '.join(OBSERVABLES)}{hint}"
     )
-
-
-# ---- differences (Sec. 2.2 of the CHARIS recalibration paper) ------------------------------------
-
-
-def single_difference(right, left):
-    """Return X = R - L."""
-    return right - left
-
-
-def single_sum(right, left):
-    """Return I = R + L."""
-    return right + left
-
-
-def double_difference(right, left):
-    """Return (X+ - X-) / 2 of fluxes of shape (2, ...), the plus frame first."""
-    difference = right - left
-    return 0.5 * (difference[0] - difference[1])
-
-
-def double_sum(right, left):
-    """Return (I+ + I-) / 2 of fluxes of shape (2, ...), the plus frame first."""
-    total = right + left
-    return 0.5 * (total[0] + total[1])

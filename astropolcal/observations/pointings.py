@@ -316,7 +316,24 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
 
 
 def location_of(site):
-    """Return the `~astropy.coordinates.EarthLocation` of (longitude, latitude, height), or None."""
+    """
+    Return the place of a telescope.
+
+    Parameters
+    ----------
+    site : tuple of float
+        Longitude and latitude in degree, height in metre; empty if it is not known.
+
+    Returns
+    -------
+    `~astropy.coordinates.EarthLocation` or None
+
+    Examples
+    --------
+    >>> from astropolcal.observations import location_of
+    >>> location_of((-155.4761, 19.8255, 4139.0)).lat.deg.round(4)
+    np.float64(19.8255)
+    """
     from astropy.coordinates import EarthLocation
 
     if not len(site):

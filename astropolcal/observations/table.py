@@ -434,8 +434,10 @@ class Observations:
         Returns
         -------
         `~numpy.ndarray` of int
-            Frame indices (plus, minus), shape (P, 2); read only, found once and
-            kept. See `~astropolcal.observations.pair_frames` for the rules.
+            Frame indices (plus, minus), shape (P, 2); read only, found once and kept. The plus
+            frame is the one whose angle modulo 90 deg lies in [0, 45). The frames agree in the
+            derotator angle and in the state of a modulator; among several partners the nearest
+            in time is taken.
 
         Raises
         ------

@@ -191,7 +191,7 @@ def simulate_cubes(
     >>> import astropy.units as u
     >>> from astropy.io import fits
     >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.cubes import simulate_cubes
+    >>> from astropolcal.reduction import simulate_cubes
     >>> from astropolcal.simulation import half_wave_plate_cycles
     >>> charis = instruments.get("charis")
     >>> frames = half_wave_plate_cycles(hwp=[0, 45] * u.deg)
@@ -352,7 +352,7 @@ def true_observations(
     --------
     >>> import astropy.units as u
     >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.cubes import true_observations
+    >>> from astropolcal.reduction import true_observations
     >>> from astropolcal.simulation import half_wave_plate_cycles
     >>> charis = instruments.get("charis")
     >>> true_observations(charis.published(), charis, half_wave_plate_cycles()).n_frames
@@ -415,7 +415,7 @@ def both_states(frames):
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal.reduction.cubes import both_states
+    >>> from astropolcal.reduction import both_states
     >>> from astropolcal.simulation import half_wave_plate_cycles
     >>> both_states(half_wave_plate_cycles(hwp=[0, 45] * u.deg))["flc_state"].tolist()
     [0.0, 1.0, 0.0, 1.0]

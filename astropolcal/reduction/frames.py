@@ -4,7 +4,7 @@
 import hashlib
 import warnings
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from astropolcal.exceptions import ObservationError
 from astropolcal.fitscheck import open_fits, readable_fits
 from astropolcal.reduction.headers import (
+    FrameHeader,
     add_pointing,
     not_of_instrument,
     observation_time,
@@ -33,16 +34,9 @@ _NEEDED = {"internal": ("hwp", "derotator"), "star": ("hwp", "derotator")}
 
 
 @dataclass
-class Frame:
+class Frame(FrameHeader):
     """What is known of one file."""
 
-    path: str
-    number: int | None = None
-    # of the header, see `read_header`
-    values: dict = field(default_factory=dict)
-    # why it cannot be used, and what is odd
-    errors: list = field(default_factory=list)
-    doubts: list = field(default_factory=list)
     # of the fluxes
     unit: str = ""
     photometry: Photometry | None = None
@@ -112,12 +106,9 @@ def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
     result = frame.photometry
     frame.digest = hashlib.sha256(np.ascontiguousarray(result.flux).tobytes()).hexdigest()[:24]
     if result.failed.all():
-        frame.errors.append(f"no slice can be used: {_most(result.reasons)}")
+        most = max(set(result.reasons), key=result.reasons.count)
+        frame.errors.append(f"no slice can be used: {most}")
     return frame
-
-
-def _most(reasons):
-    return max(set(reasons), key=reasons.count)
 
 
 @contextmanager
@@ -204,7 +195,8 @@ def _check_header(frame, layout, source):
     frame.errors += [
         f"no keyword {layout.keywords[column]} in its header"
         for column in _NEEDED[source]
-        if column not in values and not _complained(frame, layout.keywords[column])
+        if column not in values
+        and not any(error.startswith(layout.keywords[column]) for error in frame.errors)
     ]
     _add_time(values)
     # of stars `check_stars` looks
@@ -214,10 +206,6 @@ def _check_header(frame, layout, source):
             f"{layout.keywords['hwp_true']} and {layout.keywords['hwp']} differ by more than "
             f"{layout.tracking_tolerance:g} deg, though the plate does not follow the sky"
         )
-
-
-def _complained(frame, keyword):
-    return any(error.startswith(keyword) for error in frame.errors)
 
 
 def _add_time(values):

@@ -45,7 +45,7 @@ class Reduction:
         Whose files they are.
     source : {"internal", "star"}
         The photometry.
-    frames : list of Frame
+    frames : list
         The files in the table, in the order they were taken.
     problems : dict of str to list of str
         File to why it is not in the table.
@@ -112,6 +112,7 @@ class Reduction:
 
     def summary(self):
         """Return what was reduced and what was not, as plain numbers and texts (dict)."""
+        plain = (str, int, float, bool)
         cells = sum(len(frame.photometry.reasons) for frame in self.frames)
         return {
             "instrument": self.instrument.name,
@@ -123,12 +124,8 @@ class Reduction:
             "flags": self.flags,
             "problems": self.problems,
             "doubts": self.doubts,
-            "meta": {key: value for key, value in self.meta.items() if _is_plain(value)},
+            "meta": {key: value for key, value in self.meta.items() if isinstance(value, plain)},
         }
-
-
-def _is_plain(value):
-    return isinstance(value, str | int | float | bool)
 
 
 def reduce_cubes(files, instrument, **options):
@@ -212,7 +209,20 @@ def reduce_run(
         Whether frames of an internal source are kept whose half-wave plate stands
         90 deg from that of another frame at the same derotator angle.
     **options
-        For `measure_internal` or `measure_stars`.
+        Of the photometry of an internal source:
+
+        ``background`` ("none", or "outside": the median of the pixels clear of both beams is
+        subtracted; the light of the source fills the field stop, so use it only if the pixels
+        outside show the same background as those inside) and ``max_masked`` (largest part of an
+        aperture that may lack values, 0.2).
+
+        Of stars: ``radius`` of the aperture ("fwhm": ``factor`` (3) times the width, at most
+        ``max_radius`` (45 pixels); "growth": where the curve of growth of the mean image reaches
+        99 %; or pixels), ``annulus`` (width of the ring of the background, 5 pixels),
+        ``aperture_correction`` (whether fluxes are scaled to all of the star's light, by a
+        profile of its wings; or "growth", to what circles of ``max_radius`` have), ``companion``
+        (a second star brighter than this fraction of the first, 0.1, spoils a frame) and
+        ``max_masked`` (0.1).
 
     Returns
     -------
@@ -263,7 +273,9 @@ def reduce_run(
     if not frames:
         raise ObservationError(_nothing(len(files), reduction.problems) + _hint(task, reduction))
     reduction.frames = frames
-    _doubt_light(frames)
+    for frame in frames:
+        if frame.values.get("light") == "uneven":
+            frame.doubts.append("the light in the rectangles is uneven, as that of a star")
     reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
     reduction.meta = _meta(frames, instrument, source, meta or {})
     return reduction
@@ -409,12 +421,6 @@ def _pool(workers):
 
 
 # --- what is said of the run -------------------------------------------------------
-
-
-def _doubt_light(frames):
-    for frame in frames:
-        if frame.values.get("light") == "uneven":
-            frame.doubts.append("the light in the rectangles is uneven, as that of a star")
 
 
 def _meta(frames, instrument, source, given):

@@ -88,7 +88,10 @@ def measure_stars(
         _correct(result, *_growth_shares(result, run, max_radius))
     elif aperture_correction:
         found = wing_shares(cube, good, result, level_variance, detector, layout, reach=max_radius)
-        _correct(result, *_spread_out(found, usable))
+        if found is None:
+            result.flag(True, "no aperture correction")
+        else:
+            _correct(result, found.values, found.covariance, usable)
     return result
 
 
@@ -325,12 +328,6 @@ def _growth_shares(result, cube, reach):
         spread[k] = share[k] * np.sqrt(beyond) / total
     known = np.isfinite(share)
     return share[known], np.diag(spread[known] ** 2), known
-
-
-def _spread_out(found, usable):
-    if found is None:
-        return np.empty(0), np.empty((0, 0)), np.zeros_like(usable)
-    return found.values, found.covariance, usable
 
 
 def _correct(result, share, covariance, known):

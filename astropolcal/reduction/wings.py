@@ -57,18 +57,17 @@ def wing_shares(cube, good, photometry, level_variance, detector, layout, *, rea
     """
     Return which part of a star's light the apertures of both beams have.
 
-    None if too little of the wings is seen. Rings up to 1.5 times ``reach`` are used. ``level_variance`` (2, W) is what the noise of the
-    background adds to the variance of a flux. The surface brightness at the distance r from the
-    star is
+    None if too little of the wings is seen. Rings up to 1.5 times ``reach`` are used.
+    ``level_variance`` (2, W) is what the noise of the background adds to the variance of a flux.
+    With the flux F in the aperture the surface brightness at the distance r from the star is
 
-    B + F [A (beta - 1) / (pi alpha^2) (1 + r^2 / alpha^2)^-beta + H (5/6) / (pi alpha_h^2) (1 + r^2
-    / alpha_h^2)^-11/6]
+        B + F [A (beta - 1) / (pi alpha^2) (1 + r^2 / alpha^2)^-beta
+               + H (5 / 6) / (pi alpha_h^2) (1 + r^2 / alpha_h^2)^(-11 / 6)].
 
-    with the flux F in the aperture. One exponent beta and one radius alpha_h hold for all slices,
-    ln(alpha), A and H are linear in the number of the slice, B is free in each. The Gaussian is the
-    limit of large exponents. The halo is taken to be as wide as the seeing, 0.5 arcsec within 35 %,
-    unless the rings say otherwise. The rectangles of ``internal_apertures`` lie inside the field
-    stop; without them there is no stop, and each beam has light of the other's image.
+    One exponent beta and one radius alpha_h hold for all slices, ln(alpha), A and H are linear in
+    the number of the slice, B is free in each. The Gaussian is the limit of large exponents. The
+    halo is as wide as the seeing, 0.5 arcsec within 35 %, unless the rings say otherwise. Without
+    ``internal_apertures`` there is no field stop, and each beam has light of the other's image.
     """
     if photometry.failed.all():
         return None

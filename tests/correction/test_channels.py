@@ -49,16 +49,6 @@ def test_images_are_combined_pixel_by_pixel(channels):
     assert found.shape == (2, len(channels.units), 3, 5, 6)
 
 
-def test_a_unit_alone_is_that_of_all_frames(channels):
-    """Bad pixels are solved unit by unit; both ways must agree."""
-    together = channels.combine(FLUX)
-    spread = channels.variances(FLUX)
-    for i, frames in enumerate(channels.units):
-        beams = [(FLUX[0, f : f + 1], FLUX[1, f : f + 1]) for f in frames]
-        np.testing.assert_array_equal(channels.of_unit(beams)[:, 0], together[:, i])
-        np.testing.assert_array_equal(channels.variance_of_unit(beams)[:, 0], spread[:, i])
-
-
 def test_variances_are_the_diagonal_of_the_propagated_covariance(channels):
     """For independent beams: diag(M V M^T)."""
     m, variances = matrix(channels), np.array([[4.0, 1.0, 9.0, 2.0], [3.0, 5.0, 7.0, 6.0]])

@@ -240,7 +240,6 @@ def test_unknown_coordinate():
 def test_documentation_names_all():
     for name in COORDINATES:
         assert f'"{name}"' in Observations.position.__doc__
-        assert f'"{name}"' in frame_coordinate.__doc__
 
 
 # ---- the state of a modulator ------------------------------------------------------------

@@ -11,8 +11,6 @@ from astropolcal.exceptions import ObservationError
 from astropolcal.observations import OBSERVABLES, Observable
 from astropolcal.observations.observables import (
     NormalizedDoubleDifference,
-    double_difference,
-    double_sum,
     get_observable,
     single_difference,
     single_sum,
@@ -46,21 +44,6 @@ def test_first_pair_of_dataset_1_by_hand():
     value = get_observable("normalized_double_difference").evaluate(right, left)
     assert value.shape == (1, 1)
     assert value[0, 0] == pytest.approx(16093510.3566 / 34842424.6578, rel=1e-10)
-
-
-def test_plain_differences_and_sums():
-    right, left = np.array([[5.0], [1.0]]), np.array([[2.0], [7.0]])
-    assert single_difference(right, left).tolist() == [[3.0], [-6.0]]
-    assert single_sum(right, left).tolist() == [[7.0], [8.0]]
-    assert double_difference(right, left).tolist() == [4.5]
-    assert double_sum(right, left).tolist() == [7.5]
-
-
-@given(fluxes, fluxes)
-def test_plain_functions_make_the_default_observable(right, left):
-    ratio = double_difference(right, left) / double_sum(right, left)
-    value = NormalizedDoubleDifference().evaluate(right, left)
-    np.testing.assert_allclose(value, ratio, rtol=1e-12, atol=1e-15)
 
 
 @given(fluxes, fluxes, gains, gains, gains)
