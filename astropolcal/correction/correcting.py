@@ -76,8 +76,9 @@ def correct(
         ones. Frames that have no pairs are fitted by their intensities, with a warning; frames
         that belong to no pair are left out, with a warning.
     brightness : {"measured", "given"}, optional
-        How bright the frames were: as their light says, or ``frames.scale`` and else all the same. By default measured where there is no ``frames.scale``. It is also
-        taken as given, with a warning, where there is too little light.
+        How bright the frames were: as their light says, or ``frames.scale`` and else all the same.
+        By default measured where there is no ``frames.scale``. It is also taken as given, with a
+        warning, where there is too little light.
     components : {"IQU", "IQUV"}
         Without V it is taken as zero. With V it is solved for where the frames determine it.
     weights : array_like or "variance", optional
@@ -95,8 +96,9 @@ def correct(
     open_directions : {"infinite", "ignore"} or float
         Errors along directions that the calibration leaves open: infinite; zero, as if the choice
         that it made were true; or the standard deviation of the parameter that each direction is
-        named after (``calibration.identifiability.directions``), in degrees of an angle, micrometres
-        of a thickness, percent of anything else. All that cannot be told from it moves along.
+        named after (``calibration.identifiability.directions``), in degrees of an angle,
+        micrometres of a thickness, percent of anything else. All that cannot be told from it
+        moves along.
     max_age : `~astropy.units.Quantity`, optional
         Time between the data of the calibration and the frames from which on there is a warning;
         by default that of the instrument, see `~astropolcal.calibration.load`.
