@@ -86,16 +86,13 @@ def test_pairs_do_not_matter_where_none_are_used():
     assert Channels("intensity", 4, [(7, 9)]).pairs is None
 
 
-@pytest.mark.parametrize(
-    ("observable", "pairs", "error", "words"),
-    [
+def test_what_cannot_be():
+    for observable, pairs, error, words in [
         ("triple", PAIRS, ParameterError, r"'triple'; allowed are intensity, single, double"),
         ("double", None, ObservationError, "need pairs of frames, and there is none"),
         ("double", [], ObservationError, "need pairs of frames, and there is none"),
         ("double", [(0, 4)], ObservationError, r"frames 0 to 4; there are 0 to 3"),
         ("double", [(-1, 2)], ObservationError, r"frames -1 to 2; there are 0 to 3"),
-    ],
-)
-def test_what_cannot_be(observable, pairs, error, words):
-    with pytest.raises(error, match=words):
-        Channels(observable, 4, pairs)
+    ]:
+        with pytest.raises(error, match=words):
+            Channels(observable, 4, pairs)
