@@ -16,7 +16,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import Context, adapted, tracking_laws
 from astropolcal.gap.model import nominal_calibration, nominal_model
-from astropolcal.observations import common_wavelengths
+from astropolcal.observations.reading import common_wavelengths
 
 __all__ = ["starting_model", "thinned"]
 

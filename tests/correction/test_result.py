@@ -5,8 +5,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal.correction import Corrected, Systematic, azimuthal
-from astropolcal.correction.engine import covariance_index
+from astropolcal.correction import Corrected, Systematic
+from astropolcal.correction.correcting import covariance_index
+from astropolcal.correction.geometry import azimuthal
 from astropolcal.exceptions import ParameterError
 
 LAM = [1.2, 1.6] * u.um

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import optics
-from astropolcal.correction import estimator, measurement_rows
-from astropolcal.correction.channels import CHANNELS, Channels
+from astropolcal.correction import measurement_rows
+from astropolcal.correction.solve import CHANNELS, Channels, estimator
 from astropolcal.exceptions import ObservationError, ParameterError
 
 
@@ -20,7 +20,7 @@ def ideal(hwp, wavelengths=1):
 
 
 def pairs_of(hwp):
-    from astropolcal.observations import pair_frames
+    from astropolcal.observations.pairing import pair_frames
 
     return pair_frames(hwp)
 
@@ -182,10 +182,8 @@ def test_gains_of_beams_are_those_of_channels(observable, seed):
     gain = rng.normal(size=combined.shape[:2])
     direct = np.einsum("cu,cup->p", gain, combined)
     np.testing.assert_allclose(np.einsum("bf,bfp->p", channels.to_beams(gain), fluxes), direct)
-    units = [
-        channels.of_unit([(fluxes[0, f], fluxes[1, f]) for f in unit]) for unit in channels.units
-    ]
+    units = [channels.one(fluxes[:, unit]) for unit in channels.units]
     np.testing.assert_allclose(np.stack(units, axis=1), combined)
     variances = rng.uniform(1, 2, size=(2, 4))
-    each = [channels.variance_of_unit([tuple(variances[:, f]) for f in x]) for x in channels.units]
+    each = [channels.one(variances[:, unit], True) for unit in channels.units]
     np.testing.assert_allclose(np.stack(each, axis=1), channels.variances(variances))

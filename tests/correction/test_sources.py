@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from astropolcal.correction import derotate, derotate_variance
+from astropolcal.correction.geometry import derotate, derotate_variance
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import ObservationError, ParameterError
 

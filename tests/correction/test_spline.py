@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import affine_transform
 
-from astropolcal.correction import _spline, derotate
+from astropolcal.correction import geometry as _spline
+from astropolcal.correction.geometry import derotate
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from astropy.time import Time
 from astropolcal import instruments
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.reduction._cube_files import file_names, header_of, write_cube
+from astropolcal.reduction.cubes import file_names, header_of, write_cube
 from astropolcal.reduction.headers import read_header
 
 CHARIS = instruments.get("charis").files

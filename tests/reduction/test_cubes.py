@@ -23,7 +23,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.reduction import _images
+from astropolcal.reduction import images as _images
 from astropolcal.reduction.cubes import _usual_flux, simulate_cubes, true_observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.instruments.readout import ReadOut
-from astropolcal.reduction.errors import (
+from astropolcal.reduction.photometry import (
     Detector,
     detector_of,
     flux_variance,

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.reduction.gaussians import _model, _sane, _step, fit_gaussians
+from astropolcal.reduction.finding import _model, _sane, _step, fit_gaussians
 
 SIZE = 25
 GRID = tuple(axis.ravel().astype(float) for axis in np.indices((SIZE, SIZE))[::-1])

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from astropolcal import instruments
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.reduction._images import Detector, Scene, gaussian, moffat, rectangle
 from astropolcal.reduction.cubes import simulate_cubes
+from astropolcal.reduction.images import Detector, Scene, gaussian, moffat, rectangle
 from astropolcal.simulation import half_wave_plate_cycles
 
 # two upright rectangles of 20 x 16 pixels, side by side

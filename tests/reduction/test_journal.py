@@ -9,8 +9,8 @@ import pytest
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.reduction.frames import Frame
-from astropolcal.reduction.journal import Journal
 from astropolcal.reduction.photometry import Photometry
+from astropolcal.reduction.run import Journal
 
 
 @pytest.fixture

@@ -13,12 +13,14 @@ from photutils.aperture import CircularAperture, aperture_photometry
 from reduction_lab import Small, expose, pair, star_image
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
-from astropolcal.reduction import measure_internal, measure_stars
-from astropolcal.reduction.apertures import rectangles
-from astropolcal.reduction.errors import detector_of, shared_pixels
-from astropolcal.reduction.finding import find_pair
-from astropolcal.reduction.gaussians import fit_gaussians
-from astropolcal.reduction.stars import choose_radius, curve_of_growth
+from astropolcal.reduction.finding import find_pair, fit_gaussians
+from astropolcal.reduction.photometry import (
+    detector_of,
+    measure_internal,
+    rectangles,
+    shared_pixels,
+)
+from astropolcal.reduction.stars import choose_radius, curve_of_growth, measure_stars
 
 LAYOUT = Small.files
 DETECTOR = detector_of(LAYOUT)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from astropolcal.instruments.layout import FileLayout
-from astropolcal.reduction._rings import Rings, Star
 from astropolcal.reduction.photometry import Photometry
+from astropolcal.reduction.wings import Rings, Star
 
 SHAPE = (81, 161)
 OPEN = FileLayout({}, (3, *SHAPE), star_offset=(80.0, 0.0))

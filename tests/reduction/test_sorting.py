@@ -9,14 +9,14 @@ import pytest
 from astropolcal import instruments
 from astropolcal.exceptions import ObservationError
 from astropolcal.reduction import Reduction
-from astropolcal.reduction._sorting import (
+from astropolcal.reduction.frames import Frame
+from astropolcal.reduction.photometry import Photometry
+from astropolcal.reduction.run import (
     consistent,
     replace_angles,
     set_aside,
     without_repeats,
 )
-from astropolcal.reduction.frames import Frame
-from astropolcal.reduction.photometry import Photometry
 
 LAYOUT = instruments.get("charis").files
 

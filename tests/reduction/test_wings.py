@@ -11,11 +11,10 @@ from reduction_lab import Small, expose, pair, star_image
 from scipy.integrate import quad
 
 from astropolcal.instruments import CHARIS
-from astropolcal.reduction import measure_stars
 from astropolcal.reduction import wings as module
-from astropolcal.reduction._images import Detector, Scene
-from astropolcal.reduction.errors import detector_of
-from astropolcal.reduction.photometry import Photometry
+from astropolcal.reduction.images import Detector, Scene
+from astropolcal.reduction.photometry import Photometry, detector_of
+from astropolcal.reduction.stars import measure_stars
 from astropolcal.reduction.wings import wing_shares
 
 N = 8

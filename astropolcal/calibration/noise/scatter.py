@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.exceptions import FitError
-from astropolcal.observations import cycle_numbers, is_star
+from astropolcal.observations.quality import cycle_numbers, is_star
 
 __all__ = []
 

@@ -22,7 +22,7 @@ from astropolcal.calibration.validation.cross_validation import (
 from astropolcal.calibration.validation.held_out import refuse_fitted
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import LinearPolarizer
 from astropolcal.units import angle_to_rad
 

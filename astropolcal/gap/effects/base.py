@@ -201,8 +201,7 @@ def tracking_laws(observations):
     Returns
     -------
     tuple of (float, float)
-        Factors of parallactic angle and altitude; those of
-        `~astropolcal.observations.tracked` for tables of no known instrument.
+        Factors of parallactic angle and altitude; 0.5 and 1 for tables of no known instrument.
 
     Examples
     --------
