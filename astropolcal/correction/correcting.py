@@ -8,7 +8,6 @@ from uuid import uuid4
 
 import numpy as np
 
-from astropolcal.calibration.validity import check_frames
 from astropolcal.correction.result import Corrected
 from astropolcal.correction.rows import RowModel, ideal_chain
 from astropolcal.correction.solve import covariance_index, estimator
@@ -20,6 +19,7 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.observations import OBSERVABLES
+from astropolcal.pipeline.headers import check_frames
 
 __all__ = ["correct"]
 
@@ -101,7 +101,7 @@ def correct(
         moves along.
     max_age : `~astropy.units.Quantity`, optional
         Time between the data of the calibration and the frames from which on there is a warning;
-        by default that of the instrument, see `~astropolcal.calibration.load`.
+        by default that of the instrument, see `~astropolcal.pipeline.load`.
     any_date : bool
         Take the calibration whatever the date of the frames.
     n_samples : int
