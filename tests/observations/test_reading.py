@@ -472,8 +472,8 @@ def test_bad_cells_are_masked_with_a_reason():
         ("flux_left_err", 0.0, "error not positive"),
     ]:
         # rows 5 and 8: frames 1 and 2, bin 1
+        table = example_table()
         for row in (4, 7):
-            table = example_table()
             table = set_row(table, name, row, value)
         match = (
             rf"night: 2 cells masked, {reason} \(first: row 5: .*{re.escape(f'{name} = {value:g}')}"
@@ -545,7 +545,7 @@ def test_wrong_values_end_in_an_error_or_a_sound_table(tmp_path):
     for seed in range(3):
         table = example_table()
         path, copy = tmp_path / "night.ecsv", tmp_path / "copy.ecsv"
-        Table(table).write(path, format="ascii.ecsv")
+        Table(table).write(path, format="ascii.ecsv", overwrite=True)
         head, body = path.read_text().split("\nframe")
         rows = [line.split(" ") for line in body.splitlines()]
         rng = np.random.default_rng(seed)
@@ -600,7 +600,7 @@ def test_damaged_files_end_in_one_kind_of_error(tmp_path):
             table = example_table()
             table["file"] = [f"cube{frame}.fits" for frame in table["frame"]]
             path = tmp_path / "night.ecsv"
-            Table(table).write(path, format="ascii.ecsv")
+            Table(table).write(path, format="ascii.ecsv", overwrite=True)
             content = path.read_bytes()
             start = content.index(b"\nframe") if part == "rows" else 0
             rng = np.random.default_rng(seed)
