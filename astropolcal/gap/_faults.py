@@ -18,16 +18,7 @@ _TAKEN_UP = 0.02
 
 
 class Fault:
-    """
-    What a simulated calibration has and its nominal model lacks.
-
-    Parameters
-    ----------
-    bench : Bench
-        The instrument.
-    told : dict
-        What the key says of it; what is missing is drawn.
-    """
+    """What a simulated calibration has and its nominal model lacks."""
 
     def __init__(self, bench, told):
         self.bench, self.told = bench, dict(told)

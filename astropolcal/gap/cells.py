@@ -19,8 +19,7 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import insert_optic, leaves
-from astropolcal.gap._bases import law_basis
-from astropolcal.gap.problem import GapProblem
+from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.optics import GENERATORS, Dependence
 from astropolcal.optics.perturbations import split_run
 from astropolcal.optics.positions import COORDINATES

@@ -13,14 +13,12 @@ from scipy.linalg import null_space, qr, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
 from astropolcal.chain import Train, leaves
-from astropolcal.gap._bases import law_basis, orthonormal
-from astropolcal.gap._noise import expected_fluxes, noise, settings
-from astropolcal.gap.channels import Channels
+from astropolcal.gap.channels import Channels, expected_fluxes, noise, orthonormal, settings
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
 from astropolcal.optics import StarSource
 
-__all__ = ["Fit", "GapProblem", "law_basis", "orthonormal"]
+__all__ = []
 
 #: A direction whose singular value is below this share of the largest is open; a
 #: coefficient with more than that of its length in such a direction is open too.
@@ -66,47 +64,15 @@ def _mounted(chains):
 
 
 class GapProblem:
-    """
-    Chains against all frames of their datasets, whitened by the noise.
+    """Chains against all frames of their datasets, whitened by the noise.
 
-    Parameters
-    ----------
-    chains : sequence
-        The chain of each dataset.
-    observations : sequence of Observations
-        The datasets.
-    ties : dict of str to Tie, optional
-        Parameters that follow others.
-    laws : dict of str to `~numpy.ndarray`, optional
-        Basis (W, k) of parameters given per wavelength, ``"optic.parameter"``.
-    priors : dict of str to float, optional
-        Standard deviation (canonical) of a normal prior on the coefficients of
-        a parameter.
-    neutral : dict of str to float, optional
-        Value (canonical) about which a parameter's prior and limits are, by
-        default 0: that at which an effect is absent.
-    limits : dict of str to float, optional
-        The most (canonical) by which a parameter may differ from that value. A
-        parameter that follows a law is not held to it, but to the bounds of its optic.
-    like : GapProblem, optional
-        Another problem of the same data whose noise, lamp and fluxes are taken
-        over; by default `settle_noise` must be called.
-    copy : bool
-        Whether to copy the chains; without it values are put back into those given.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.problem import GapProblem
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> problem = GapProblem([charis.chain()], [observations])
-    >>> problem.settle_noise()
-    >>> bool(problem.fit().chi2 < 1.2 * problem.n_rows)
-    True
+    ``laws``: Basis (W, k) of parameters given per wavelength, ``"optic.parameter"``. ``priors``:
+    Standard deviation (canonical) of a normal prior on the coefficients of a parameter.
+    ``neutral``: Value (canonical) about which a parameter's prior and limits are, by default 0:
+    that at which an effect is absent. ``limits``: The most (canonical) by which a parameter may
+    differ from that value. A parameter that follows a law is not held to it, but to the bounds of
+    its optic. ``like``: Another problem of the same data whose noise, lamp and fluxes are taken
+    over; by default `settle_noise` must be called.
     """
 
     def __init__(
@@ -294,25 +260,9 @@ class GapProblem:
     # ---- fit -------------------------------------------------------------------------
 
     def fit(self, start=None, rows=None, held=None, steps=_MAX_STEPS, share=_ARRIVED_SHARE):
-        """
-        Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
+        """Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
 
-        Parameters
-        ----------
-        start : `~numpy.ndarray`, optional
-            Coefficients to start from.
-        rows : `~numpy.ndarray` of bool, optional
-            Rows that take part, shape (n_rows,).
-        held : `~numpy.ndarray` of bool, optional
-            Coefficients that stay.
-        steps : int
-            The most steps.
-        share : float
-            A step that lowers chi-square by less than this share of it is the last.
-
-        Returns
-        -------
-        Fit
+        ``rows``: Rows that take part, shape (n_rows,).
         """
         q = self._inside(self.start if start is None else start)
         live = np.ones(self.size, dtype=bool) if held is None else ~held
@@ -490,25 +440,7 @@ def _triangle(matrix, target):
 
 
 class Fit:
-    """
-    Outcome of a fit.
-
-    Parameters
-    ----------
-    coefficients : `~numpy.ndarray`
-        The solution.
-    chi2 : float
-        Sum of squares of the whitened residuals.
-    converged : bool
-        Whether the last step changed next to nothing.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.gap.problem import Fit
-    >>> Fit(np.zeros(1), 12.0, True).chi2
-    12.0
-    """
+    """Outcome of a fit."""
 
     def __init__(self, coefficients, chi2, converged):
         self.coefficients, self.chi2, self.converged = coefficients, chi2, converged
@@ -526,3 +458,16 @@ def _positions(chain, observations, fluxes):
         "previous_flux": fluxes / before,
     }
     return found | {stage: expected[stage] for stage in expected.keys() & found.keys()}
+
+
+def law_basis(wavelength, degree):
+    """Return the basis of a polynomial law in wavelength.
+
+    ``wavelength``: Micrometre, shape (W,). ``degree``: Degree of the polynomial (Legendre, over the
+    range of the wavelengths); None for one value a wavelength. Returns: Shape (W, k).
+    """
+    n = len(wavelength)
+    if degree is None or degree >= n - 1:
+        return np.eye(n)
+    middle, half = (wavelength.max() + wavelength.min()) / 2, np.ptp(wavelength) / 2
+    return np.polynomial.legendre.legvander((wavelength - middle) / half, degree)

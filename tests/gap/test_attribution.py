@@ -11,7 +11,7 @@ from scipy import stats
 from astropolcal.gap.attribution import NAMED, Candidate, false_discovery, scan
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import EFFECTS, get_effect
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import effect_tangent
 
 SMOOTH = [effect for effect in EFFECTS.values() if effect.kind != "discrete"]

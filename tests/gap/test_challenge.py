@@ -16,7 +16,7 @@ from astropolcal.exceptions import GapError
 from astropolcal.gap import challenge
 from astropolcal.gap._bench import ACTIONS, Bench
 from astropolcal.gap._faults import Fault
-from astropolcal.gap._outcome import wilson
+from astropolcal.gap.challenge import wilson
 from astropolcal.gap.challenge import (
     KINDS,
     ChallengeResult,

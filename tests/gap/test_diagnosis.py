@@ -14,7 +14,7 @@ from star_data import WAVELENGTH, observe_star, star_chain
 from astropolcal import Calibration, calibrate, instruments
 from astropolcal.exceptions import GapError
 from astropolcal.gap import EFFECTS, alternatives, diagnose
-from astropolcal.gap.alternatives import thinned
+from astropolcal.gap.model import thinned
 from astropolcal.gap.cells import Cell
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.simulation import half_wave_plate_cycles, simulate

@@ -28,7 +28,7 @@ from astropolcal.gap.effects._laws import (
     lagging,
     retardance_slopes,
 )
-from astropolcal.gap.effects.base import label_of
+from astropolcal.gap.effects.effect import label_of
 from astropolcal.observations import Observations, example_table
 
 GRID = np.array([1.2, 1.4, 1.7, 2.0, 2.2])

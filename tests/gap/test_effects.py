@@ -41,9 +41,10 @@ from astropolcal.gap.effects import (
     time,
 )
 from astropolcal.gap.effects._laws import Held
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import Model, effect_tangent
-from astropolcal.gap.problem import Fit, GapProblem, orthonormal
+from astropolcal.gap.problem import Fit, GapProblem
+from astropolcal.gap.channels import orthonormal
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 from astropolcal.units import canonical_factor
@@ -699,11 +700,11 @@ def test_effects_of_ones_own():
     """Declared ones at every sort of place, with every sort of dependence, and inserted ones."""
     chains, data = clean("beam_gain")
     some = [
-        Effect("a", "a", after("hwp"), "diattenuation", harmonic("derotator", 1), limit=0.1),
+        Effect("a", "a", after("hwp"), "diattenuation", "harmonic:derotator:1", limit=0.1),
         Effect("a", "a", inside("derotator"), "retardance", time(), limit=10 * u.deg),
-        Effect("a", "a", inside("hwp"), "orientation", harmonic("hwp", 4), "number"),
+        Effect("a", "a", inside("hwp"), "orientation", "harmonic:hwp:4", "number"),
         Effect("a", "a", source(), "depolarization_linear", step(7), 0),
-        Effect("a", "a", detector(), "gain", harmonic("hwp", 3), None),
+        Effect("a", "a", detector(), "gain", "harmonic:hwp:3", None),
         Effect("a", "a", before("wollaston"), ("rotation", "retardance_d"), degree=1),
         Effect.insert(optics.Diattenuator(name="a"), before="wollaston", limit=0.1),
         Effect.insert(optics.LinearRetarder(retardance=0 * u.deg, name="a"), inside="derotator"),
@@ -714,7 +715,7 @@ def test_effects_of_ones_own():
         if effect.kinds:
             assert len(effect.cells(chains)) == len(effect.kinds) * (1 + effect.around)
     assert not Effect("a", "a", telescope(), "rotation").applies(chains)
-    assert not Effect("a", "a", after("hwp"), "rotation", harmonic("other", 1)).applies(chains)
+    assert not Effect("a", "a", after("hwp"), "rotation", "harmonic:other:1").applies(chains)
 
 
 def test_registration():

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from astropolcal.gap.patterns import (
+from astropolcal.gap.residuals import (
     SAME_ANGLE,
     _condition,
     _harmonics,

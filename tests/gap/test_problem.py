@@ -8,7 +8,8 @@ import pytest
 
 from astropolcal.gap.channels import Channels
 from astropolcal.gap.effects import get_effect
-from astropolcal.gap.problem import GapProblem, law_basis, orthonormal
+from astropolcal.gap.problem import GapProblem, law_basis
+from astropolcal.gap.channels import orthonormal
 from astropolcal.measurement import Measurement
 
 

@@ -12,7 +12,7 @@ from scipy import stats
 from astropolcal.gap.remainders import outlying_frames, remainder
 
 # its package has a function of the same name
-shapes = import_module("astropolcal.gap.remainders")
+shapes = import_module("astropolcal.gap.frames")
 WAVELENGTH = np.array([2.0, 1.2, 1.4, 1.6, 1.8])
 
 

@@ -21,7 +21,7 @@ from scipy import stats
 from astropolcal import optics
 from astropolcal.chain import insert_optic
 from astropolcal.exceptions import GapError
-from astropolcal.gap.patterns import badly_separated, frame_blocks, frame_patterns
+from astropolcal.gap.residuals import badly_separated, frame_blocks, frame_patterns
 from astropolcal.gap.remainders import _chance, outlying_frames, remainder
 from astropolcal.gap.residuals import Where, _simplest, locate
 from astropolcal.observations import Observations

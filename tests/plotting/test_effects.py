@@ -15,7 +15,7 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.gap import Cause, get_effect
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import EffectParameter
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.residuals import Where
 from astropolcal.plotting import effects, gap

@@ -31,9 +31,9 @@ from astropolcal.gap.effects._laws import (
     without_constant,
 )
 from astropolcal.gap.effects.effect import NUMBER, Effect
-from astropolcal.gap.effects.where import Where, before, harmonic, telescope, time
+from astropolcal.gap.effects.where import Where, before, telescope
 
-__all__ = ["LIBRARY"]
+__all__ = []
 
 _BRYAN = "Bryan et al. 2010, doi:10.1364/AO.49.006313"
 _HARRINGTON_2019 = "Harrington et al. 2019, doi:10.1117/1.JATIS.5.3.038001"
@@ -92,7 +92,7 @@ def _encoder(name, n, place, optic, like, shows):
         name, f"angle of the {optic} wrong {how}", place, "orientation",
         optics.HarmonicRotator(harmonic=n), _WAVES, _size(0.1, 5, u.deg), shows,
         f"geometry of an eccentric scale; compare {like}", degree=NUMBER,
-        dependence=harmonic("own", n), words=f"stage of the {optic}", category="parameter",
+        dependence=f"harmonic:own:{n}", words=f"stage of the {optic}", category="parameter",
     )  # fmt: skip
 
 
@@ -102,7 +102,7 @@ def _transmission(name, n, title):
         name, title, _PLATE, (), optics.HarmonicGain(harmonic=n), _WAVES, _size(0.003, 0.1),
         f"harmonic {n} of the plate angle in sums, none in differences",
         "Essinger-Hileman et al. 2016, doi:10.1063/1.4962023", degree=NUMBER,
-        dependence=harmonic("own", n), near=(Where("source"), ("diattenuation_h",)), **_ON_PLATE,
+        dependence=f"harmonic:own:{n}", near=(Where("source"), ("diattenuation_h",)), **_ON_PLATE,
     )  # fmt: skip
 
 
@@ -155,7 +155,7 @@ _PLATE_EFFECTS = [
         _DETECTOR, "gain", optics.HarmonicGain(differential=True, mount="hwp"), _WAVES,
         _size(0.003, 0.1), "harmonic 1 of the plate angle in differences of all sources",
         "Tinyanont et al. 2019, doi:10.1088/1538-3873/aaef0f",
-        degree=NUMBER, dependence=harmonic("hwp", 1), when=lambda roles: roles.plate is not None,
+        degree=NUMBER, dependence="harmonic:hwp:1", when=lambda roles: roles.plate is not None,
         **_AT_DETECTOR,
     ),
     # its retardance depends on whether the fast axis lies along the tilt or across: twice a turn
@@ -164,7 +164,7 @@ _PLATE_EFFECTS = [
         _PLATE, "retardance_h", optics.HarmonicRetarder(harmonic=2), _WAVES,
         _size(0.5, 20, u.deg), "harmonics 2, 4, 6 and 8 of the plate angle",
         "Patanchon et al. 2024, doi:10.1088/1475-7516/2024/01/074",
-        degree=NUMBER, dependence=harmonic("own", 2), **_ON_PLATE,
+        degree=NUMBER, dependence="harmonic:own:2", **_ON_PLATE,
     ),
     _encoder(
         "hwp_encoder_eccentricity", 1, _PLATE, "half-wave plate", "Millar-Blanchaer et al. 2016",
@@ -342,7 +342,7 @@ _SOURCE_EFFECTS = [
         _POLARIZER, "rotation", optics.DriftRotator(mount="sequence"), "rate",
         _size(0.1, 10, u.deg), "phase of harmonic 4 of the plate angle, with time",
         "Harrington et al. 2023, drift terms of DKIST",
-        degree=NUMBER, dependence=time(), words="source", category="source",
+        degree=NUMBER, dependence="time", words="source", category="source",
     ),
     # behind a polarizer a leak is an equal loss of all, whatever the axes
     _effect(

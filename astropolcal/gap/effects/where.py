@@ -1,65 +1,38 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Places in a chain, and dependences on the frame, of which effects are declared."""
+"""Places of effects in a chain, told by its optics and by what these are for."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from astropolcal.chain import Train
+from astropolcal import optics
+from astropolcal.chain import Train, leaves
 from astropolcal.gap.cells import Place, places
+from astropolcal.optics import COORDINATES
 
-__all__ = [
-    "Where",
-    "after",
-    "before",
-    "detector",
-    "direction",
-    "harmonic",
-    "inside",
-    "move",
-    "source",
-    "step",
-    "telescope",
-    "time",
-]
+__all__ = []
+
+#: Roles of which a chain may have several optics.
+SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
+# positions that are not those of a stage which carries a retarder
+_NO_STAGES = ("parallactic", "altitude", *COORDINATES)
+_BEHIND, _BEHIND_PLATE = "behind the derotator", "behind the half-wave plate"
 
 
 @dataclass(frozen=True)
 class Where:
-    """
-    A place in chains, told by an optic.
+    """A place in chains, told by an optic."""
 
-    Parameters
-    ----------
-    relation : {"after", "before", "inside", "source", "telescope", "detector"}
-        Inside is the frame that turns with the optic.
-    optic : str or None
-        Its name, or its role.
-    is_role : bool
-        Whether only the role counts, see `Roles`.
-    in_front : bool
-        Whether what is inside an optic stands in front of it.
-    turned : float
-        Orientation to that of the optic, degree.
-    otherwise : Where or None
-        The place of chains that lack the optic.
-
-    See Also
-    --------
-    after, before, inside, source, telescope, detector : make one.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import Where
-    >>> Where("inside", "hwp").words
-    'hwp'
-    """
-
+    #: Inside is the frame that turns with the optic.
     relation: str
     optic: str | None = None
+    #: Whether only the role counts, see `Roles`.
     is_role: bool = False
+    #: Whether what is inside an optic stands in front of it.
     in_front: bool = False
+    #: Orientation to that of the optic, degree.
     turned: float | None = None
+    #: The place of chains that lack the optic.
     otherwise: object = None
 
     @property
@@ -197,80 +170,163 @@ def detector():
     return Where("detector")
 
 
-# ---- dependences -------------------------------------------------------------------------------
+def is_held(parameter):
+    """Return whether a parameter is fixed, or as good as that: known beforehand."""
+    return bool(parameter.fixed or parameter.prior is not None)
 
 
-def harmonic(stage, n):
+class Roles:
     """
-    Return the dependence on cosine and sine of n times the angle of a stage.
+    The optics of a chain by what they are for.
+
+    There may be several of a kind. The plates are the retarders on the stage ``hwp``, and those
+    on a stage in front of it; the derotators are retarders on a stage behind the plate, whatever
+    it is called; the telescope's mirrors stand between the rotation by the parallactic angle and
+    the plate.
 
     Parameters
     ----------
-    stage : str
-        Its name.
-    n : int
-        Periods in a turn.
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+    **chosen
+        Role to the name of the optic that has it, where that is not the first of its kind.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import Roles
+    >>> roles = Roles(instruments.get("charis").chain())
+    >>> roles.plate.name, roles.derotator.name, roles.splitter.name
+    ('hwp', 'derotator', 'wollaston')
+    >>> irdis = Roles(instruments.get("irdis").chain("star"))
+    >>> [mirror.name for mirror in irdis.all("telescope_mirror")]
+    ['ut', 'm4']
+    """
+
+    def __init__(self, chain, **chosen):
+        self.leaves = leaves(chain)
+        # what an effect has added stands for nothing else
+        self._own = [o for o in self.leaves if o.name and not o.name.startswith("gap_")]
+        self._kinds = {
+            "polarizer": [o for o in self._own if isinstance(o, optics.LinearPolarizer)],
+            "mirror": self._source_mirrors(),
+            **self._turning(),
+        }
+        self._kinds["telescope_mirror"] = self._telescope_mirrors()
+        for role, found in self._kinds.items():
+            name = chosen.get(role)
+            own = (o for o in found if name in (None, o.name))
+            setattr(self, role, next(own, None))
+        #: Rotations by the parallactic angle and the altitude, and the star in front of them.
+        self.parallactic = self.altitude = self.star = None
+        self._look_at_the_sky()
+        self.splitter = next((o for o in self._own if isinstance(o, optics.WollastonPrism)), None)
+        #: What static optics of the relay stand behind.
+        self.relay = self.derotator or self.plate
+        #: The plate, where the model has nothing in front of it that could polarize.
+        self.entrance = self.plate if self._is_entrance() else None
+
+    def _look_at_the_sky(self):
+        turns = [o if isinstance(o, optics.Rotator) else None for o in self.leaves]
+        first = next((i for i, o in enumerate(turns) if o and o.stage == "parallactic"), None)
+        # without a rotation by the parallactic angle the light is that of an internal source
+        if first is None:
+            return
+        self.parallactic = turns[first]
+        self.altitude = next((o for o in turns[first:] if o and o.stage == "altitude"), None)
+        stars = (o for o in self.leaves[:first] if isinstance(o, optics.PolarizedSource))
+        self.star = next(stars, None)
+
+    def all(self, role):
+        """Return all optics of a role, in the order in which light meets them."""
+        return self._kinds.get(role, [])
+
+    def _source_mirrors(self):
+        """Return what stands in the place of the polarizer for unpolarized light."""
+        first = self.leaves[0]
+        kinds = (optics.Diattenuator, optics.DiattenuatorRetarder)
+        return [first] if isinstance(first, kinds) and first.stage is None else []
+
+    def _turning(self):
+        """Return plates and derotators."""
+        found = [o for o in self._own if _retards(o) and o.stage not in (None, *_NO_STAGES)]
+        names = [o.stage for o in found]
+        middle = names.index("hwp") if "hwp" in names else -1
+        plates = [o for o in found if o.stage == "hwp"]
+        plates += found[: max(middle, 0)]
+        behind = [o for o in found if not any(o is plate for plate in plates)]
+        return {"plate": plates, "derotator": sorted(behind, key=lambda o: o.stage != "derotator")}
+
+    def _in_front(self):
+        """Return what stands between the rotation by the parallactic angle and the plate."""
+        names = [o.stage for o in self._own]
+        start = names.index("parallactic") + 1 if "parallactic" in names else len(names)
+        plate = self._kinds["plate"]
+        end = next((i for i, o in enumerate(self._own) if plate and o is plate[0]), start)
+        return [o for o in self._own[start:end] if not isinstance(o, optics.Rotator)]
+
+    def _telescope_mirrors(self):
+        return [o for o in self._in_front() if hasattr(o, "diattenuation")]
+
+    def _is_entrance(self):
+        if self.plate is None:
+            return False
+        if self._own[0] is self.plate:
+            return True
+        on = {o.stage for o in self._own}
+        if "parallactic" not in on or "altitude" in on:
+            return False
+        # the sky turns, and the instrument with the telescope
+        return all(is_held(getattr(o, key)) for o in self._in_front() for key in o.param_names)
+
+
+def _retards(optic):
+    kinds = (
+        optics.LinearRetarder,
+        optics.EllipticalRetarder,
+        optics.TwoLayerWaveplate,
+        optics.DiattenuatorRetarder,
+        optics.KMirror,
+    )
+    return isinstance(optic, kinds)
+
+
+def adapted(effects, chains):
+    """
+    Return the effects of a library that chains have a place for, one for each optic of a kind.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        The library.
+    chains : sequence
+        One a dataset.
 
     Returns
     -------
-    str
+    list of Effect
+        An effect that acts on one kind of optic comes once for each such optic: under its own name
+        for the first, as ``"name:optic"`` for the others. Where there is no derotator, the words
+        of what stands behind it name the half-wave plate.
 
     Examples
     --------
-    >>> from astropolcal.gap.effects import harmonic
-    >>> harmonic("derotator", 1)
-    'harmonic:derotator:1'
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import EFFECTS, adapted
+    >>> chain = instruments.get("irdis").chain("star")
+    >>> chain["ut"].diattenuation.fixed = chain["m4"].diattenuation.fixed = True
+    >>> [effect.name for effect in adapted([EFFECTS["m3_diattenuation"]], [chain])]
+    ['m3_diattenuation', 'm3_diattenuation:m4']
     """
-    return f"harmonic:{stage}:{n}"
+    chains = list(chains)
+    found = [one for effect in effects for one in effect.per_optic(chains)]
+    found = [one for one in found if one.applies(chains)]
+    if any(Roles(chain).derotator is not None for chain in chains):
+        return found
+    return [_reworded(one) for one in found]
 
 
-def time():
-    """
-    Return the dependence on time, a trend through the run.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import time
-    >>> time()
-    'time'
-    """
-    return "time"
-
-
-def step(frame):
-    """
-    Return the dependence of what is there from a frame on.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import step
-    >>> step(24)
-    'step:24'
-    """
-    return f"step:{frame}"
-
-
-def direction(stage):
-    """
-    Return the dependence on whether the last move of a stage was backwards.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import direction
-    >>> direction("hwp")
-    'direction:hwp'
-    """
-    return f"direction:{stage}"
-
-
-def move(stage):
-    """
-    Return the dependence on how far a stage was moved last.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import move
-    >>> move("derotator")
-    'move:derotator'
-    """
-    return f"move:{stage}"
+def _reworded(effect):
+    words = {"title": effect.title, "place": effect.place}
+    new = {key: text.replace(_BEHIND, _BEHIND_PLATE) for key, text in words.items()}
+    return effect if new == words else effect.changed(**new)
