@@ -6,9 +6,7 @@ Where the two differ, which effect that the model lacks causes it, how far the
 gap shrinks once the effect is in, and what stays unexplained.
 """
 
-from astropolcal.gap.diagnosis import Cause
-from astropolcal.gap.diagnosis import Diagnosis
-from astropolcal.gap.diagnosis import diagnose
+from astropolcal.gap.diagnosis import Cause, Diagnosis, diagnose
 from astropolcal.gap.effects import EFFECTS, Effect, check_effect, get_effect, register_effect
 
 __all__ = [

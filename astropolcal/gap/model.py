@@ -26,10 +26,6 @@ from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 __all__ = []
 
 _ROUNDS, _MORE = 3, 3
-# directions in which a size at its limit does less than this to the data, in units of the
-# noise, are not looked at; nor those of which the model takes up all but this share
-_VISIBLE = 1.0
-_ABSORBED = 1e-6
 # a size so near to its limit, in units of that, is at it; the share of the wavelengths at
 # which the data may leave a size there
 _AT_LIMIT = 1e-6
@@ -390,43 +386,6 @@ def nominal_calibration(chains, observations):
         # a model that lacks something is expected to fit badly; the report says how badly
         warnings.simplefilter("ignore", AstropolcalWarning)
         return calibrate(list(chains), list(observations), cross_validate=False)
-
-
-def effect_tangent(model, effect, nominal, context=None):
-    """Return the directions in the data that an effect adds to a model.
-
-    ``nominal``: Orthonormal basis of what the model can do already, (n_rows, rank). Returns:
-    Orthonormal, shape (n_rows, k). Directions are left out in which even an effect at its physical
-    limit would change the data by less than their noise.
-    """
-    edit = effect.edit(model.held_chains, context or model.context)
-    names = {p.name for p in edit.parameters}
-    problem = GapProblem(
-        edit.chains,
-        model.observations,
-        ties={name: tie for name, tie in edit.ties.items() if tie.source in names},
-        laws=edit.laws,
-        like=model.problem,
-        copy=False,
-    )
-    if not problem.size:
-        return np.zeros((problem.n_rows, 0))
-    priors = edit.priors
-    size = np.concatenate(
-        [
-            np.full(problem.slices[n].stop - problem.slices[n].start, priors[n])
-            for n in problem.slices
-        ]
-    )
-    # each column is what a size at the brink of the possible would do
-    slopes = problem.jacobian(problem.start) * size
-    left = slopes - nominal @ (nominal.T @ slopes)
-    # twice is enough to be orthogonal to rounding
-    left -= nominal @ (nominal.T @ left)
-    basis, singular, _ = np.linalg.svd(left, full_matrices=False)
-    # a column is what half the limit does: singular values are in units of the noise
-    floor = max(_VISIBLE, _ABSORBED * np.linalg.norm(slopes, axis=0).max())
-    return basis[:, singular > floor]
 
 
 def _held(chain):

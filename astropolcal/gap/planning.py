@@ -19,10 +19,10 @@ from scipy.linalg import cho_factor, cho_solve
 
 from astropolcal.calibration._directions import ranked
 from astropolcal.chain import Train, join, leaves, stages
-from astropolcal.exceptions import GapError, ParameterError
+from astropolcal.exceptions import ParameterError
 from astropolcal.gap._words import listed
 from astropolcal.gap.channels import orthonormal
-from astropolcal.gap.effects import Roles, get_effect
+from astropolcal.gap.effects import Roles
 from astropolcal.gap.problem import OPEN, GapProblem
 from astropolcal.gap.selection import REMAINDER
 from astropolcal.optics import COORDINATES, Dependence
@@ -49,6 +49,16 @@ _TIMED = ("time", "time2", "step", "frame")
 _APART = np.log(10)
 # a dataset is repeated so many times to know its noise
 _REPEATS = 3
+MODULATOR, STATES = "flc_state", ("A", "B")
+#: What cannot be seen to one standard deviation is not worth an exposure.
+LEAST_GAIN = 1.0
+# a change of this size (radian or relative) has to be seen
+_WANTED = 0.01
+# nearer to a bound is at it
+_AT_BOUND = 1e-9
+# keeps open directions where they are, of columns of unit length; sizes are known within this
+# factor of the usual one
+_HOLD, _WIDE = 1e-10, 3.0
 
 
 @dataclass(frozen=True)
@@ -208,31 +218,28 @@ def _in_order(run, order, what):
 # ---- the plan ----------------------------------------------------------------------------------
 
 
-def plan(found, members=(), *, candidates=None, limit=4):
-    """Propose exposures for every question that is open.
+def plan(diagnosis, candidates=None, limit=4):
+    """
+    Return exposures that answer the questions that a diagnosis leaves open, a list of dict.
 
-    Returns: ``words``; ``question``, ``"cause"``, ``"structure"`` or ``"parameters"``;
+    Keys are ``words``; ``question``, ``"cause"``, ``"structure"`` or ``"parameters"``;
     ``separates``, the causes, or the parameters of the open direction that is seen best; ``gain``,
     the standard deviations at which they come apart, or at which a change of that direction by 0.01
     (rad) shows, 0 where no exposure tells them apart; ``probability_now`` and
     ``probability_after``, that the true one is expected to have, None for parameters. The questions
     are in the order of the causes.
     """
-    model = getattr(found, "improved", found)
-    groups = _groups(found) if model is not found else [_given(model, members)] * bool(members)
-    lines = [] if model is found else _repetitions(found)
+    model, groups, lines = diagnosis.improved, _groups(diagnosis), _repetitions(diagnosis)
     forecast = Forecast(model, [recipe for group in groups for _, recipe, _ in group])
     # a member may have lost its place to another one
     groups = [[one for one in group if one[0] in forecast.own] for group in groups]
     groups = [group for group in groups if len(group) > 1]
     directions = forecast.open_directions()
-    asked = [*groups, None] if directions[2].shape[1] else groups
-    if not asked:
+    if not groups and not directions[2].shape[1]:
         return lines[:limit]
     if candidates is None:
         used = {s for chain in forecast.chains for s in stages(chain)}
         candidates = exposures(model, flux_matters=bool(used & {"flux", "total_flux"}))
-    _check(list(candidates), model)
     foreseen = []
     for one in candidates:
         try:
@@ -243,20 +250,10 @@ def plan(found, members=(), *, candidates=None, limit=4):
             if error.argument != "chain":
                 raise
     for group in groups:
-        lines.insert(len(lines) - (not groups), _telling_apart(forecast, group, foreseen))
+        lines.append(_telling_apart(forecast, group, foreseen))
     if directions[2].shape[1]:
         lines += _fixing(forecast, directions, foreseen)
     return _merged(lines)[:limit]
-
-
-def _given(model, members):
-    found = []
-    for one, share in members:
-        effect = get_effect(one)
-        if effect.name not in model.added and not effect.applies(model.trains):
-            raise GapError(f"effect {effect.name!r} has no place in these chains")
-        found.append((effect.name, (effect, None), float(share)))
-    return found
 
 
 def _groups(diagnosis):
@@ -280,7 +277,8 @@ def _telling_apart(forecast, group, foreseen):
     """Return the line on the exposure that tells the members of an alias group apart best."""
     names, recipes, shares = zip(*group, strict=True)
     weights = np.array(shares) / sum(shares)
-    titles = {effect.name: _titled(effect) for effect, _ in recipes}
+    # what a cell is called says no more than its title
+    titles = {e.name: e.title + f" ({e.name})" * (e.kind != "cell") for e, _ in recipes}
     hypotheses, now = forecast.foreseen(names), float(np.sum(weights**2))
     best, value = None, -np.inf
     # a short block is no run: how far a drift would come in it is not known
@@ -308,7 +306,7 @@ def _telling_apart(forecast, group, foreseen):
             words = (
                 f"Take {exposure.words}: tells {first} from {few} at {_sigmas(gain)} "
                 f"standard deviations; the probability of the true one should rise from "
-                f"{now:.0%} to {_percent(after)}"
+                f"{now:.0%} to {'over 99%' if after > 0.99 else f'{after:.0%}'}"
             )
             told = [names[0], *(names[j] for j in other)]
             more = {"separates": told, "gain": float(gain), "probability_after": after}
@@ -375,51 +373,11 @@ def _merged(lines):
     return list(found.values())
 
 
-def _titled(effect):
-    # what a cell is called says no more than its title
-    is_cell = effect.kind == "cell"
-    return effect.title if is_cell else f"{effect.title} ({effect.name})"
-
-
-def _percent(probability):
-    return "over 99%" if probability > 0.99 else f"{probability:.0%}"
-
-
 def _sigmas(gain):
     return f"{gain:.2g}" if gain < 100 else f"{gain:.0f}"
 
 
-def _check(candidates, model):
-    n = len(model.observations)
-    for one in candidates:
-        if not 0 <= one.dataset < n:
-            raise GapError(f"exposure of dataset {one.dataset}; there are {n}, from 0")
-        modulated = MODULATOR in stages(model.trains[one.dataset])
-        wrong = {
-            f"half-wave-plate angles {one.hwp}: finite ones are needed": (
-                len(one.hwp) == 0 or not np.all(np.isfinite(one.hwp))
-            ),
-            f"lamp = {one.lamp}: it must be positive": not (np.isfinite(one.lamp) and one.lamp > 0),
-            f"states {one.states}: allowed are {', '.join(STATES)}": not set(one.states)
-            <= {*STATES},
-            f"states {one.states}: they are needed where the chain has a modulator, and nowhere "
-            "else": bool(one.states) != modulated,
-        }
-        for words, is_wrong in wrong.items():
-            if is_wrong:
-                raise GapError(f"exposure with {words}")
-
-
-MODULATOR, STATES = "flc_state", ("A", "B")
-#: What cannot be seen to one standard deviation is not worth an exposure.
-LEAST_GAIN = 1.0
-# a change of this size (radian or relative) has to be seen
-_WANTED = 0.01
-# nearer to a bound is at it
-_AT_BOUND = 1e-9
-# keeps open directions where they are, of columns of unit length; sizes are known within this
-# factor of the usual one
-_HOLD, _WIDE = 1e-10, 3.0
+# ---- what exposures would tell ------------------------------------------------------------------
 
 
 class Forecast:
@@ -589,10 +547,7 @@ def _set_up(chain, exposure):
     """Return copies of the optics of a chain as the exposure needs them."""
     train = Train(leaf.copy() for leaf in leaves(chain) if leaf.name not in exposure.without)
     if exposure.polarizer_turned:
-        polarizer = Roles(train).polarizer
-        if polarizer is None:
-            raise GapError("no polarizer to turn in the chain of this dataset")
-        theta, angle = polarizer.theta, exposure.polarizer_turned
+        theta, angle = Roles(train).polarizer.theta, exposure.polarizer_turned
         theta.bounds = tuple(None if b is None else b + angle for b in theta.bounds)
         theta.value = theta.value + angle
     return train

@@ -100,8 +100,8 @@ def to_dict(diagnosis):
         "nested_percent": diagnosis.nested.percent if diagnosis.nested else None,
         "unlisted_probability": diagnosis.settings.get("unlisted"),
         "frames": [fault.to_dict() for fault in diagnosis.frames],
-        "where": _where(diagnosis.nominal),
-        "where_left": [] if same or noisy else _where(diagnosis.improved),
+        "where": locate(diagnosis.nominal),
+        "where_left": [] if same or noisy else locate(diagnosis.improved),
         "left_share": 0.0 if noisy else _left_share(diagnosis),
         "causes": causes,
         "changes": changed,
@@ -109,7 +109,7 @@ def to_dict(diagnosis):
         "n_effects": len(diagnosis.scan.candidates),
         "accuracy_before": before,
         "accuracy_after": after,
-        "next_observations": _next(diagnosis),
+        "next_observations": plan(diagnosis),
     }
     names = [o.name for o in diagnosis.improved.observations]
     asked = diagnosis.settings.get("changes", False)
@@ -201,22 +201,10 @@ def _score(one):
     }
 
 
-def _where(model):
-    """Return where the gap of a model lies: what it follows, then where it is large."""
-    found = locate(model)
-    kinds = map(str, found.told["kind"])
-    return [e | {"kind": kind} for e, kind in zip(found.entries, kinds, strict=True)]
-
-
 def _left_share(diagnosis):
     """Return the share of the excess over the noise that the improved model leaves."""
     old, new = (m.fit.chi2 - m.problem.n_data for m in (diagnosis.nominal, diagnosis.improved))
     return float(np.clip(new / old, 0, 1)) if old > 0 else 1.0
-
-
-def _next(diagnosis):
-    """Return the exposures that answer what is open."""
-    return plan(diagnosis)
 
 
 def _plain(value):

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from astropy.table import QTable
 from scipy import stats
 
 from astropolcal.calibration._directions import ranked
@@ -42,65 +41,27 @@ _LEAST_SHARE = 0.01
 _OF = {"difference": "differences", "sum": "sums"}
 
 
-@dataclass
-class Where:
-    """Shares of the gap, by axis."""
+def locate(model):
+    """
+    Return where the gap of a fitted model lies, a list of dict, the most telling patterns first.
 
-    #: All looks: ``axis``, ``detail``, ``kind`` ("pattern" or "place"), ``share`` of the excess
-    #: over the noise, ``p_single`` and ``p_value``, the latter corrected for the number of looks.
-    table: QTable
-    #: Sum of squares of the whitened residuals, less its expectation by noise.
-    excess: float
-    n_freedom: int
-    #: False discovery rate below which a look counts.
-    alpha: float = ALPHA
-
-    @property
-    def entries(self):
-        """Rows of `told` as dicts with axis, detail, share and p_value."""
-        return [
-            {
-                "axis": str(row["axis"]),
-                "detail": str(row["detail"]),
-                "share": float(row["share"]),
-                "p_value": float(row["p_value"]),
-            }
-            for row in self.told
-        ]
-
-    @property
-    def told(self):
-        """Rows of the table that are significant and not minute."""
-        table = self.table
-        return table[(table["p_value"] < self.alpha) & (table["share"] > _LEAST_SHARE)]
-
-    @property
-    def words(self):
-        """One sentence on the most telling pattern and place."""
-        told = self.told
-        if not told:
-            return "No axis stands out from the noise."
-        parts = []
-        for kind, verb in (("pattern", "follows"), ("place", "lies in")):
-            row = next((r for r in told if r["kind"] == kind), None)
-            if row is not None:
-                share = f"{100 * row['share']:.0f} % of the gap"
-                parts.append(f"{share} {verb} {row['detail']}")
-        return "; ".join(parts) + "."
+    Keys are ``axis``, ``detail``, ``share`` of the excess over the noise, ``p_value``, corrected
+    for the number of looks (Benjamini & Yekutieli 2001, doi:10.1214/aos/1013699998), and ``kind``,
+    ``"pattern"`` or ``"place"``: of the looks that are significant and not minute.
+    """
+    keys = ("axis", "detail", "share", "p_value", "kind")
+    told = [one for one in looks(model) if one["p_value"] < ALPHA and one["share"] > _LEAST_SHARE]
+    return [{key: one[key] for key in keys} for one in told]
 
 
-def locate(model, *, alpha=ALPHA):
-    """Divide the gap of a fitted model among wavelength, angles, time, beams and datasets."""
+def looks(model):
+    """Return all looks as `locate` gives those that count, with ``p_single`` of each alone."""
     data = _Whitened(model)
-    patterns, null = _sequence(data, *_terms(model), alpha)
+    patterns, null = _sequence(data, *_terms(model))
     found = [one for look in places(model) for one in most_uneven(data, *look)]
     rows = [*patterns, *sorted(found, key=lambda row: -row["evidence"]), null]
     corrected = false_discovery([row["p_single"] for row in rows])
-    for row, p in zip(rows, corrected, strict=True):
-        row["p_value"] = p
-    names = ("axis", "detail", "kind", "share", "p_single", "p_value")
-    table = QTable({name: [row[name] for row in rows] for name in names})
-    return Where(table, data.excess, data.n_freedom, alpha)
+    return [row | {"p_value": p} for row, p in zip(rows, corrected, strict=True)]
 
 
 class _Whitened:
@@ -220,7 +181,7 @@ def _flux(problem):
     return _Term("flux", "the flux, in the differences", 0, parts)
 
 
-def _sequence(data, terms, null, alpha):
+def _sequence(data, terms, null):
     """Take in patterns while they are significant; return one row a pattern, and the null's."""
     # normal equations once: taking a term in is then a sweep of a small matrix, no fit
     gram, target, slices = _normal_equations(data, [*terms, null])
@@ -231,9 +192,9 @@ def _sequence(data, terms, null, alpha):
     while left:
         tested = {i: _test(gram, target, slices[i], total, freedom) for i in left}
         best = _simplest(terms, tested, max(left, key=lambda i: tested[i].evidence))
-        looks = false_discovery([tested[i].p_single for i in left])
+        rates = false_discovery([tested[i].p_single for i in left])
         small = tested[best].excess < _LEAST_SHARE * data.scale
-        if len(taken) == _MOST_TERMS or looks[left.index(best)] >= alpha or small:
+        if len(taken) == _MOST_TERMS or rates[left.index(best)] >= ALPHA or small:
             break
         one = tested[best]
         taken.append((terms[best], one))
@@ -542,12 +503,7 @@ def places(model):
         label = _labels(
             problem, lambda o, s: _on(np.searchsorted(edges, np.arange(s[2]), "right") - 1, s, 1)
         )
-        yield (
-            "time",
-            label,
-            [(a, b - 1) for a, b in pairwise(edges)],
-            "frames",
-        )
+        yield ("time", label, [(a, b - 1) for a, b in pairwise(edges)], "frames")
 
 
 def _labels(problem, rule):

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from astropolcal.gap.problem import law_basis
 from astropolcal.gap.channels import orthonormal
+from astropolcal.gap.problem import law_basis
 
 GRID = np.array([1.15, 1.3, 1.37, 1.6, 1.9, 2.2, 2.39])
 

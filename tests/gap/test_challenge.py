@@ -16,7 +16,6 @@ from astropolcal.exceptions import GapError
 from astropolcal.gap import challenge
 from astropolcal.gap._bench import ACTIONS, Bench
 from astropolcal.gap._faults import Fault
-from astropolcal.gap.challenge import wilson
 from astropolcal.gap.challenge import (
     KINDS,
     ChallengeResult,
@@ -26,6 +25,7 @@ from astropolcal.gap.challenge import (
     run_challenge,
     score_answer,
     score_cases,
+    wilson,
 )
 
 SMALL = Setup(n_wavelengths=5, n_derotator=3)

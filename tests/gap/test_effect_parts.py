@@ -384,7 +384,6 @@ def test_fringes_have_a_sine_and_a_cosine_in_the_wavenumber():
     phase = 2 * np.pi * 12 / GRID
     np.testing.assert_allclose(law, np.stack([np.cos(phase), np.sin(phase)], axis=1))
     assert get_effect("fringes_12_um").law(Context(GRID[:4])) is None
-    assert get_effect("fringes").variants(Context(GRID[:4])) == [get_effect("fringes")]
 
 
 def test_law_of_a_shifted_wavelength_scale_is_the_slope_of_the_plate():

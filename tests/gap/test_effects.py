@@ -14,6 +14,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from gap_data import effect_basis
 from sky_data import sky_track
 
 from astropolcal import Calibration, calibrate, instruments, optics
@@ -21,6 +22,7 @@ from astropolcal.chain import insert_optic, leaves, remove_optic
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import scan
 from astropolcal.gap.cells import places
+from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import (
     EFFECTS,
     KINDS,
@@ -32,19 +34,15 @@ from astropolcal.gap.effects import (
     check_effect,
     detector,
     get_effect,
-    harmonic,
     inside,
     register_effect,
     source,
-    step,
     telescope,
-    time,
 )
 from astropolcal.gap.effects._laws import Held
 from astropolcal.gap.effects.effect import CellEffect
-from astropolcal.gap.model import Model, effect_tangent
+from astropolcal.gap.model import Model
 from astropolcal.gap.problem import Fit, GapProblem
-from astropolcal.gap.channels import orthonormal
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 from astropolcal.units import canonical_factor
@@ -524,28 +522,10 @@ def test_absorbed_effects_add_no_direction():
         chains, data, _ = simulated([name])
         model = fitted(chains, data)
         nominal = model.problem.tangent(model.fit.coefficients)
-        assert effect_tangent(model, EFFECTS[name], nominal).shape[1] == 0
+        assert effect_basis(model, EFFECTS[name], nominal).shape[1] == 0
         optic, key = EFFECTS[name].absorbed_by.split(".")
         assert not getattr(chains[0][optic], key).fixed
         assert_noise_is_left(model)
-
-
-def test_variants_of_fringes_cover_the_band():
-    fringes = get_effect("fringes")
-    found = fringes.variants(Context(np.geomspace(1.16, 2.37, 22)))
-    thickness = [one.thickness for one in found]
-    assert len({one.name for one in found}) == len(found) >= 6
-    assert np.allclose(np.diff(thickness), thickness[0], rtol=1e-6)
-    assert fringes.variants(Context(np.array([1.2, 1.6]))) == [fringes]
-    assert EFFECTS["beam_gain"].variants(None) == [EFFECTS["beam_gain"]]
-
-
-def test_data_choose_among_the_variants_of_fringes():
-    chains, data, _ = simulated(["fringes_4_um"])
-    model = fitted(chains, data)
-    variants = EFFECTS["fringes"].variants(model.context)
-    best = scan(model, variants, cells=False).best.effect
-    assert abs(best.thickness - 4) < variants[0].thickness
 
 
 # ---- several at once ------------------------------------------------------------------------
@@ -701,9 +681,9 @@ def test_effects_of_ones_own():
     chains, data = clean("beam_gain")
     some = [
         Effect("a", "a", after("hwp"), "diattenuation", "harmonic:derotator:1", limit=0.1),
-        Effect("a", "a", inside("derotator"), "retardance", time(), limit=10 * u.deg),
+        Effect("a", "a", inside("derotator"), "retardance", "time", limit=10 * u.deg),
         Effect("a", "a", inside("hwp"), "orientation", "harmonic:hwp:4", "number"),
-        Effect("a", "a", source(), "depolarization_linear", step(7), 0),
+        Effect("a", "a", source(), "depolarization_linear", "step:7", 0),
         Effect("a", "a", detector(), "gain", "harmonic:hwp:3", None),
         Effect("a", "a", before("wollaston"), ("rotation", "retardance_d"), degree=1),
         Effect.insert(optics.Diattenuator(name="a"), before="wollaston", limit=0.1),

@@ -10,11 +10,10 @@ from gap_data import WAVELENGTH, chain, fitted, frames, observed, with_effect
 
 from astropolcal import instruments
 from astropolcal.exceptions import GapError
-from astropolcal.gap.planning import Forecast, expected
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import Context, get_effect
 from astropolcal.gap.effects.effect import CellEffect
-from astropolcal.gap.planning import Exposure, exposures, plan
+from astropolcal.gap.planning import Exposure, Forecast, expected, exposures, plan
 from astropolcal.observations import Observations
 from astropolcal.reduction.cubes import both_states
 from astropolcal.simulation import half_wave_plate_cycles, simulate

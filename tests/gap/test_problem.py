@@ -6,10 +6,9 @@ import gap_data as data
 import numpy as np
 import pytest
 
-from astropolcal.gap.channels import Channels
+from astropolcal.gap.channels import Channels, orthonormal
 from astropolcal.gap.effects import get_effect
 from astropolcal.gap.problem import GapProblem, law_basis
-from astropolcal.gap.channels import orthonormal
 from astropolcal.measurement import Measurement
 
 

@@ -14,8 +14,7 @@ from astropolcal.exceptions import GapError, ParameterError
 from astropolcal.gap import diagnose
 from astropolcal.gap.cells import Cell, Probes, dependences
 from astropolcal.gap.effects import Context
-from astropolcal.gap.effects.effect import label_of
-from astropolcal.gap.effects.effect import CellEffect
+from astropolcal.gap.effects.effect import CellEffect, label_of
 from astropolcal.gap.report import summary, to_dict
 from astropolcal.gap.runs import changes, distinct, paragraph
 from astropolcal.optics import Dependence, LinearRetarder, Perturbation

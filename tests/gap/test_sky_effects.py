@@ -20,10 +20,10 @@ from test_effects import (
 from astropolcal import calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, leaves, replace_optic
 from astropolcal.gap.attribution import scan
+from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import EFFECTS, Roles, get_effect
 from astropolcal.gap.model import Model
 from astropolcal.gap.problem import GapProblem
-from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.selection import ENOUGH, select
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.observations import Observations, sky_angles, tracked
