@@ -18,6 +18,20 @@ __all__ = []
 BEAM_DEGREE = 2
 # a direction of which the nominal model takes up all but this share is not seen
 _SEEN = 1e-6
+# the angles that are tried, and how often the best of them are refined (radian)
+_STEP = np.deg2rad(1.0)
+_ZOOMS, _POINTS = 6, 13
+_MINIMA = 4
+# minima that differ by less are alike: the one nearest to the table counts
+_ALIKE = 9.0
+# what the size of an angle's error or of a factor may be: log-uniform between these
+_ANGLES = np.deg2rad([0.005, 90.0])
+_FACTORS = np.array([1e-4, 2.0])
+_NEWTON = 8
+# differences that are wrong for no known reason, wavelength by wavelength
+_ANY = 0.3
+_TINY = 1e-6
+_BEAMS = {1: "right", -1: "left"}
 
 
 def angle_stages(chain):
@@ -235,22 +249,6 @@ def kept_rows(problem, out):
             for channel, o in zip(problem.channels, out, strict=True)
         ]
     )
-
-
-# the angles that are tried, and how often the best of them are refined (radian)
-_STEP = np.deg2rad(1.0)
-_ZOOMS, _POINTS = 6, 13
-_MINIMA = 4
-# minima that differ by less are alike: the one nearest to the table counts
-_ALIKE = 9.0
-# what the size of an angle's error or of a factor may be: log-uniform between these
-_ANGLES = np.deg2rad([0.005, 90.0])
-_FACTORS = np.array([1e-4, 2.0])
-_NEWTON = 8
-# differences that are wrong for no known reason, wavelength by wavelength
-_ANY = 0.3
-_TINY = 1e-6
-_BEAMS = {1: "right", -1: "left"}
 
 
 @dataclass

@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from astropy.stats import binom_conf_interval
 from astropy.table import QTable
 from tqdm import tqdm
 
@@ -44,6 +45,13 @@ _INVISIBLE = 3.0
 _ENOUGH, _HALF = 0.9, 0.5
 # a step this many frames from another one is the same
 _STEP = 4
+#: What an answer may be; what is wrong is confidently wrong.
+RESULTS = ("right", "silent", "wrong")
+# Okabe & Ito (2008), distinct for all kinds of colour vision, and in grey
+_COLORS = {"right": "#0072B2", "silent": "#D9D9D9", "wrong": "#D55E00"}
+_WORDS = {"right": "right", "silent": "silent", "wrong": "confidently wrong"}
+_SNR_EDGES = np.array([0, 3, 10, 20, 40, 80, np.inf])
+_EDGES = np.array([0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 1])
 
 
 def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
@@ -450,15 +458,6 @@ def _append(path, content):
         append_line(path, json.dumps(content), GapError)
 
 
-#: What an answer may be; what is wrong is confidently wrong.
-RESULTS = ("right", "silent", "wrong")
-# Okabe & Ito (2008), distinct for all kinds of colour vision, and in grey
-_COLORS = {"right": "#0072B2", "silent": "#D9D9D9", "wrong": "#D55E00"}
-_WORDS = {"right": "right", "silent": "silent", "wrong": "confidently wrong"}
-_SNR_EDGES = np.array([0, 3, 10, 20, 40, 80, np.inf])
-_EDGES = np.array([0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 1])
-
-
 class ChallengeResult:
     """
     Outcome of many challenges.
@@ -508,7 +507,7 @@ class ChallengeResult:
         count : int
         """
         found = [record["result"] for record in self.of(*kinds, **limits)]
-        return (*wilson(found.count(result), len(found)), len(found))
+        return (*_wilson(found.count(result), len(found)), len(found))
 
     @property
     def rates(self):
@@ -536,7 +535,7 @@ class ChallengeResult:
         which = np.searchsorted(_EDGES, claims[:, 0], side="right").clip(1, len(_EDGES) - 1)
         bins = [claims[which == i] for i in range(1, len(_EDGES))]
         rows = [
-            (low, high, len(b), b[:, 0].mean(), *wilson(int(b[:, 1].sum()), len(b)))
+            (low, high, len(b), b[:, 0].mean(), *_wilson(int(b[:, 1].sum()), len(b)))
             for (low, high), b in zip(pairwise(_EDGES), bins, strict=True)
             if len(b)
         ]
@@ -673,15 +672,11 @@ def _percent(value, low, high):
     return f"{100 * value:.0f} ({100 * low:.0f} to {100 * high:.0f})"
 
 
-def wilson(right, n, z=1.0):
-    """Return a share and its interval; Wilson (1927, doi:10.1080/01621459.1927.10502953)."""
+def _wilson(right, n):
+    """Return a share and its interval at 68 % by Wilson (1927)."""
     if not n:
         return np.nan, np.nan, np.nan
-    # the ends e solve |p - e| = z sqrt(e (1 - e) / n), and stay within 0 to 1
-    p = right / n
-    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
-    half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    return p, max(middle - half, 0.0), min(middle + half, 1.0)
+    return right / n, *map(float, binom_conf_interval(right, n, interval="wilson"))
 
 
 def check_record(record):

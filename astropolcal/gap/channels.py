@@ -24,6 +24,8 @@ _LARGEST_DEGREE = 6
 _LARGEST_COLOR = 2
 # a flicker below this is not told to what depends on the flux
 _LARGE_FLICKER = 0.1
+# the share of the frames' freedom that harmonics may take from the measure of the noise
+_MOST_TURNING = 0.7
 
 
 class Channels:
@@ -89,8 +91,9 @@ class Channels:
         self.lamp = _Lamp(residual[1], weight[1], self.sequence, saturating)
         # the flicker makes the sums of a frame correlated: its inverse root is a rank-one change
         self._whitening = weight, self.lamp.shrink(weight[1])
+        design = self._sum_whitened(self.lamp.design(self.valid))
         #: Orthonormal directions of the sums that the lamp takes up, (W * F, n).
-        self.nuisance = _orthonormal(self._sum_whitened(self.lamp.design(self.valid)))
+        self.nuisance = orthonormal(design.reshape(len(design), -1).T)
 
     def whiten(self, array):
         """Divide by the noise and take the lamp out.
@@ -229,27 +232,12 @@ def _best_degree(sequence, values, seen):
     return degree
 
 
-def _orthonormal(columns):
-    """Return an orthonormal basis of the columns, shape (n, rank)."""
-    flat = columns.reshape(len(columns), -1).T
-    norms = np.linalg.norm(flat, axis=0)
-    flat = flat[:, norms > 0] / norms[norms > 0]
-    u, s, _ = np.linalg.svd(flat, full_matrices=False)
-    return u[:, s > 1e-9 * s.max(initial=0.0)]
-
-
-# the share of the frames' freedom that harmonics may take from the measure of the noise
-_MOST_TURNING = 0.7
-
-
 def _by_state(waves, angles):
     """Return the waves, and for a modulator with two states those that change sign with them."""
     state = angles.get("flc_state", np.zeros(1))
-    return (
-        waves
-        if np.ptp(state) == 0
-        else [w for wave in waves for w in (wave, wave * (1 - 2 * state))]
-    )
+    if np.ptp(state) == 0:
+        return waves
+    return [w for wave in waves for w in (wave, wave * (1 - 2 * state))]
 
 
 def settings(angles, n):
@@ -270,9 +258,7 @@ def settings(angles, n):
     # frames
     columns += [np.exp(1j * k * plate) for k in (1, 3, 6, 8)]
     columns = _by_state(columns, angles)[: n // 6]
-    return np.stack([part(c) for c in columns for part in (np.real, np.imag)], axis=1).reshape(
-        n, -1
-    )
+    return np.array([part(c) for c in columns for part in (np.real, np.imag)]).reshape(-1, n).T
 
 
 def noise(channel, residual, angles):

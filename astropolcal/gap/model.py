@@ -32,6 +32,24 @@ _AT_LIMIT = 1e-6
 _MOST_PRESSED = 0.1
 # share by which optics may seem to measure more polarization than there is
 _MORE_LIGHT = 1e-3
+# alternatives are tried where double differences are off by more than this
+_WRONG_SIGN = 0.02
+# or by more than this share of the signal and so many times the noise, as those of stars are
+_WRONG_SHARE, _ABOVE_NOISE = 0.3, 3.0
+# an alternative must lower the residuals to this share, and those within a tenth are aliases
+_FAR_BETTER, _ALIKE = 0.5, 1.1
+# fits of what gives the same data end with misfits that differ by a smaller share
+_EQUAL = 1e-3
+_FEW = 5
+#: A fit whose residuals are less probable than this may sit in a wrong minimum
+NOISE = 1e-3
+# a second difference above this share of the first one is tried at finite size
+_BENT = 1.0
+# wavelengths with a mean square above so many medians may sit in a wrong branch; another one has to
+# leave less than this share, and is sought in so many steps
+_CONSPICUOUS, _FAR_LESS, _FEW_STEPS = 3.0, 0.7, 8
+# square of the bend (radian) that another sign has to be worth
+_OTHER_SIGN = 0.01
 
 
 @dataclass
@@ -57,7 +75,11 @@ class Model:
     @cached_property
     def held_chains(self):
         """Copies of the optics of the chains with every parameter fixed."""
-        return [_held(train) for train in self.trains]
+        held = [train.copy() for train in self.trains]
+        for leaf in (leaf for train in held for leaf in leaves(train)):
+            for key in leaf.param_names:
+                getattr(leaf, key).fixed = True
+        return held
 
     @property
     def observations(self):
@@ -81,10 +103,6 @@ class Model:
         problem = GapProblem([self.trains[i]], [self.observations[i]], ties=mine.ties, like=noise)
         return Model(problem, problem.fit(problem.start))
 
-    def degrees_of_freedom(self, tangent):
-        """Return the number of data less that of the directions fitted."""
-        return self.problem.n_data - tangent.shape[1]
-
     @property
     def mean_square(self):
         """Mean square of the whitened residuals: 1 where noise is all that is left."""
@@ -94,7 +112,7 @@ class Model:
     def p_value(self):
         """Probability of the residuals by noise alone."""
         tangent = self.problem.tangent(self.fit.coefficients)
-        return float(stats.chi2.sf(self.fit.chi2, self.degrees_of_freedom(tangent)))
+        return float(stats.chi2.sf(self.fit.chi2, self.problem.n_data - tangent.shape[1]))
 
     def edited(self, effect, context=None):
         """Return the problem of the chains with an effect at zero, and its parameters."""
@@ -247,14 +265,19 @@ class Model:
         What makes polarization larger may be a change of an optic that makes it smaller, or of one
         behind it, but all optics together never measure more than there is.
         """
-        vector, own = None, {p.name.partition(".")[0] for p in self.added[name]}
+        own = {p.name.partition(".")[0] for p in self.added[name]}
         for dataset in self.problem.datasets:
             optics = dataset.propagator.leaves
-            found = [i for i, leaf in enumerate(optics) if leaf.name in own and _depolarizes(leaf)]
+            found = [
+                i
+                for i, leaf in enumerate(optics)
+                if leaf.name in own
+                and isinstance(leaf, Perturbation)
+                and leaf.kind.startswith("depolarization")
+            ]
             if not found:
                 continue
-            vector = self.problem.vector(self.fit.coefficients) if vector is None else vector
-            sweep = dataset.forward(vector)
+            sweep = dataset.forward(self.problem.vector(self.fit.coefficients))
             # rotators, which stand between an optic and what turns with it, change no length
             front = [i for i in range(found[0]) if not isinstance(optics[i], Rotator)][-1:]
             one, none = np.ones(sweep.fluxes[0].shape), np.zeros(sweep.fluxes[0].shape)
@@ -278,10 +301,6 @@ class Model:
         slots = [self.problem.free.by_name[p.name] for p in self.added.get(name) or ()]
         return sum(int(np.sum(at[slot.slice])) for slot in slots)
 
-    def impossible(self):
-        """Return the names of the effects whose fitted values are out of their limits."""
-        return {name for name in self.added if not self.is_physical(name)}
-
 
 @dataclass
 class Linear:
@@ -303,10 +322,6 @@ class Linear:
         """Mean square of the residuals: 1 where noise is all that is left."""
         freedom = self.model.problem.n_data - self.tangent.shape[1]
         return self.chi2 / max(freedom, 1)
-
-
-def _depolarizes(leaf):
-    return isinstance(leaf, Perturbation) and leaf.kind.startswith("depolarization")
 
 
 def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):
@@ -360,20 +375,6 @@ def _no_convergence():
     )
 
 
-class _AsGiven:
-    """What stands for a calibration where every parameter is held: the chains as they are."""
-
-    converged = True
-
-    def __init__(self, measurement):
-        self.measurement = measurement
-
-    @property
-    def chains(self):
-        """The chains."""
-        return self.measurement.chains
-
-
 def nominal_calibration(chains, observations):
     """Calibrate chains without cross-validation, for a diagnosis.
 
@@ -381,31 +382,12 @@ def nominal_calibration(chains, observations):
     """
     measurement = Measurement(chains, observations)
     if not measurement.free.size:
-        return _AsGiven(measurement)
+        # every parameter is held: the chains as they are
+        return SimpleNamespace(converged=True, measurement=measurement, chains=measurement.chains)
     with warnings.catch_warnings():
         # a model that lacks something is expected to fit badly; the report says how badly
         warnings.simplefilter("ignore", AstropolcalWarning)
         return calibrate(list(chains), list(observations), cross_validate=False)
-
-
-def _held(chain):
-    """Return a copy of the chain with every parameter fixed."""
-    copy = chain.copy()
-    for leaf in leaves(copy):
-        for key in leaf.param_names:
-            getattr(leaf, key).fixed = True
-    return copy
-
-
-# alternatives are tried where double differences are off by more than this
-_WRONG_SIGN = 0.02
-# or by more than this share of the signal and so many times the noise, as those of stars are
-_WRONG_SHARE, _ABOVE_NOISE = 0.3, 3.0
-# an alternative must lower the residuals to this share, and those within a tenth are aliases
-_FAR_BETTER, _ALIKE = 0.5, 1.1
-# fits of what gives the same data end with misfits that differ by a smaller share
-_EQUAL = 1e-3
-_FEW = 5
 
 
 def starting_model(calibration, observations, library, say):
@@ -505,17 +487,6 @@ def _picked(leaf, keep, size):
         if parameter.shape == (size,):
             values[key] = parameter.value[keep] * (parameter.unit or 1)
     return leaf.with_parameters(**values) if values else leaf.copy()
-
-
-#: A fit whose residuals are less probable than this may sit in a wrong minimum
-NOISE = 1e-3
-# a second difference above this share of the first one is tried at finite size
-_BENT = 1.0
-# wavelengths with a mean square above so many medians may sit in a wrong branch; another one has to
-# leave less than this share, and is sought in so many steps
-_CONSPICUOUS, _FAR_LESS, _FEW_STEPS = 3.0, 0.7, 8
-# square of the bend (radian) that another sign has to be worth
-_OTHER_SIGN = 0.01
 
 
 def off_extremum(problem, start, parameters):

@@ -39,6 +39,21 @@ _DOUBT = 0.5
 # a pattern with a smaller share than this is not worth a sentence
 _LEAST_SHARE = 0.01
 _OF = {"difference": "differences", "sum": "sums"}
+# harmonics in the order of who gives a name to what the angles cannot tell apart
+_PLATE = (0, 4, 2, 8, 1, 3, 5, 6, 7, 12)
+_DEROTATOR = (2, 4, 1)
+# condition number of a constant, harmonic 4 and another one, beyond which they are hardly told
+_POOR = 10.0
+_ORDER = "the order of frames within a block at one derotator angle"
+_SAME_ORDER = "the plate angles come in the same order in every block"
+_NOTE = "these angles hardly tell it from a constant and harmonic 4"
+#: Angles closer than this (radian) are the same.
+SAME_ANGLE = np.deg2rad(0.5)
+# chi-square tables drawn under the null; fewer than _RELIABLE beyond a value tell no probability
+_DRAWS = 1000
+_RELIABLE = 20
+# runs grow as the square of the labels: 24 give 300 at the most
+_MOST_BLOCKS = 24
 
 
 def locate(model):
@@ -309,18 +324,6 @@ def _row(term, tested, scale):
     }
 
 
-# harmonics in the order of who gives a name to what the angles cannot tell apart
-_PLATE = (0, 4, 2, 8, 1, 3, 5, 6, 7, 12)
-_DEROTATOR = (2, 4, 1)
-# condition number of a constant, harmonic 4 and another one, beyond which they are hardly told
-_POOR = 10.0
-_ORDER = "the order of frames within a block at one derotator angle"
-_SAME_ORDER = "the plate angles come in the same order in every block"
-_NOTE = "these angles hardly tell it from a constant and harmonic 4"
-#: Angles closer than this (radian) are the same.
-SAME_ANGLE = np.deg2rad(0.5)
-
-
 def frame_patterns(observations):
     """Return patterns over the frames of a dataset.
 
@@ -458,13 +461,6 @@ def frame_blocks(observations):
     step = np.abs(np.diff(observations.position("derotator"), prepend=np.nan)) > SAME_ANGLE
     step[0] = False
     return np.cumsum(step)
-
-
-# chi-square tables drawn under the null; fewer than _RELIABLE beyond a value tell no probability
-_DRAWS = 1000
-_RELIABLE = 20
-# runs grow as the square of the labels: 24 give 300 at the most
-_MOST_BLOCKS = 24
 
 
 def places(model):

@@ -15,8 +15,8 @@ from astropolcal.gap.channels import (
     _Lamp,
     _left_over,
     _mean,
-    _orthonormal,
     _residual_square,
+    orthonormal,
 )
 from astropolcal.measurement import Measurement
 
@@ -206,7 +206,7 @@ def test_color_is_a_drift_of_each_wavelength_for_itself(degree):
 def test_design_holds_any_lamp_of_its_degrees():
     x = np.linspace(-1, 1, F)
     lamp = lamp_of(0.3 * x**3)
-    columns = _orthonormal(lamp.design(np.ones((W, F), dtype=bool)))
+    columns = orthonormal(lamp.design(np.ones((W, F), dtype=bool)).reshape(-1, W * F).T)
     some = np.arange(W)[:, None] + 0.2 * x**3 - 0.4 * x
     left = some.ravel() - columns @ (columns.T @ some.ravel())
     np.testing.assert_allclose(left, 0, atol=1e-10)

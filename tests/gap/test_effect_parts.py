@@ -19,7 +19,6 @@ from astropolcal.gap.effects import (
     Roles,
     adapted,
     get_effect,
-    tracking_laws,
 )
 from astropolcal.gap.effects._laws import (
     able_to_hold,
@@ -28,7 +27,7 @@ from astropolcal.gap.effects._laws import (
     lagging,
     retardance_slopes,
 )
-from astropolcal.gap.effects.effect import label_of
+from astropolcal.gap.effects.effect import label_of, tracking_laws
 from astropolcal.observations import Observations, example_table
 
 GRID = np.array([1.2, 1.4, 1.7, 2.0, 2.2])

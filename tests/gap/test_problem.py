@@ -89,7 +89,7 @@ def test_lamp_is_no_gap(seed):
     lamp = 1 + 0.02 * x - 0.01 * x**2 + 0.002 * rng.normal(size=n)
     model = data.fitted(data.observed(seed=seed, lamp=lamp))
     nominal = model.problem.tangent(model.fit.coefficients)
-    freedom = model.degrees_of_freedom(nominal)
+    freedom = model.problem.n_data - nominal.shape[1]
     assert abs(model.fit.chi2 - freedom) < 5 * np.sqrt(2 * freedom)
     found = model.problem.channels[0].lamp.flicker
     assert 0.001 < found < 0.004

@@ -48,6 +48,7 @@ __all__ = [
 #: Every effect by name.
 EFFECTS = {}
 _NEEDED = ("name", "title", "kind", "place", "shows", "reference")
+_TAKEN = "an effect {!r} is registered already; give yours another name"
 # of the largest flux: far above rounding, far below any noise
 _SAME = 1e-10
 # step of the differences, in units of the size to expect, and error that they may have
@@ -88,15 +89,11 @@ def register_effect(effect):
     >>> removed = EFFECTS.pop("fringes_15_um")
     """
     one = effect() if isinstance(effect, type) else effect
-    check_declared(one)
+    _check_declared(one)
     if one.name in EFFECTS:
-        raise _taken(one.name)
+        raise GapError(_TAKEN.format(one.name))
     EFFECTS[one.name] = one
     return effect
-
-
-def _taken(name):
-    return GapError(f"an effect {name!r} is registered already; give yours another name")
 
 
 def check_effect(effect, chains, observations):
@@ -134,11 +131,11 @@ def check_effect(effect, chains, observations):
     >>> check_effect("hwp_tilt", [charis.chain()], [observations])
     """
     one = effect() if isinstance(effect, type) else get_effect(effect)
-    check_declared(one)
+    _check_declared(one)
     # the registered effect itself may be checked, a namesake may not
     if one.name in EFFECTS and type(EFFECTS[one.name]) is not type(one):
-        raise _taken(one.name)
-    check_against(one, chains, observations)
+        raise GapError(_TAKEN.format(one.name))
+    _check_against(one, chains, observations)
 
 
 def get_effect(name):
@@ -181,7 +178,7 @@ def get_effect(name):
     )
 
 
-def check_declared(effect):
+def _check_declared(effect):
     """Check that an effect has its attributes and is of a known kind."""
     if not isinstance(effect, Effect):
         raise GapError(f"{effect!r} is no Effect")
@@ -194,7 +191,7 @@ def check_declared(effect):
         )
 
 
-def check_against(effect, chains, observations):
+def _check_against(effect, chains, observations):
     """Check identity at zero, names and derivatives of an effect on chains and data."""
     chains, observations = list(chains), list(observations)
     if not effect.applies(chains):
@@ -207,16 +204,29 @@ def check_against(effect, chains, observations):
         edit = effect.edit(chains, Context.of(nominal.wavelength, observations))
     except AstropolcalError as error:
         raise _failed(effect, f"cannot edit the chains: {error}") from error
-    if len(edit.chains) != len(chains):
-        raise _failed(effect, f"gives {len(edit.chains)} chains for {len(chains)}")
-    if any(_state(chain) != state for chain, state in zip(chains, before, strict=True)):
-        raise _failed(effect, "changes the chains that it is given; edit copies of the optics")
-    if effect.kind == "discrete":
-        _check_discrete(effect, edit, observations)
-        return
-    problem = _edited(effect, edit, nominal, observations)
-    _check_names(effect, edit, problem, nominal)
-    _check_identity(effect, problem, nominal)
+    names = [parameter.name for parameter in edit.parameters]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    discrete = effect.kind == "discrete"
+    wrong = {
+        f"gives {len(edit.chains)} chains for {len(chains)}": len(edit.chains) != len(chains),
+        "changes the chains that it is given; edit copies of the optics": (
+            [_state(chain) for chain in chains] != before
+        ),
+        "is discrete and has parameters; make it another kind": discrete and names,
+        "adds no parameter": not discrete and not names,
+        f"names the parameter {next(iter(twice), None)} twice": twice,
+    }
+    for words, is_wrong in wrong.items():
+        if is_wrong:
+            raise _failed(effect, words)
+    like = None if discrete else nominal
+    try:
+        problem = GapProblem(edit.chains, observations, ties=edit.ties, laws=edit.laws, like=like)
+    except AstropolcalError as error:
+        raise _failed(effect, f"gives chains that cannot be fitted: {error}") from error
+    if not discrete:
+        _check_names(effect, edit, problem, nominal)
+        _check_identity(effect, problem, nominal)
     for parameter in edit.parameters:
         _check_derivative(effect, problem, parameter)
 
@@ -227,40 +237,12 @@ def _failed(effect, words):
 
 def _state(chain):
     """Return all that an edit could change in a chain."""
-    return [
-        (
-            leaf.name,
-            leaf.mount,
-            [
-                (np.array(p.value).tolist(), bool(p.fixed), tuple(p.bounds))
-                for p in (getattr(leaf, key) for key in leaf.param_names)
-            ],
-        )
-        for leaf in leaves(chain)
-    ]
-
-
-def _check_discrete(effect, edit, observations):
-    if edit.parameters:
-        raise _failed(effect, "is discrete and has parameters; make it another kind")
-    _built(effect, edit, observations)
-
-
-def _edited(effect, edit, nominal, observations):
-    if not edit.parameters:
-        raise _failed(effect, "adds no parameter")
-    names = [parameter.name for parameter in edit.parameters]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise _failed(effect, f"names the parameter {twice[0]} twice")
-    return _built(effect, edit, observations, nominal)
-
-
-def _built(effect, edit, observations, like=None):
-    try:
-        return GapProblem(edit.chains, observations, ties=edit.ties, laws=edit.laws, like=like)
-    except AstropolcalError as error:
-        raise _failed(effect, f"gives chains that cannot be fitted: {error}") from error
+    found = []
+    for leaf in leaves(chain):
+        found += [leaf.name, leaf.mount]
+        for one in (getattr(leaf, key) for key in leaf.param_names):
+            found.append((np.array(one.value).tolist(), bool(one.fixed), tuple(one.bounds)))
+    return found
 
 
 def _check_names(effect, edit, problem, nominal):

@@ -44,6 +44,11 @@ _SEVERAL = {
 NUMBER = "number"
 # largest change of an optic's Mueller matrix from the identity that is none
 _SAME = 1e-9
+_SETTINGS = (
+    *("name", "title", "where", "dependence", "scale", "limit", "shows", "reference", "words"),
+    *("category", "inserted", "free", "equal", "when", "near", "absorbed_by", "flux"),
+    *("components", "change"),
+)
 
 
 @dataclass(frozen=True)
@@ -628,13 +633,6 @@ class Effect:
 
     def __repr__(self):
         return f"<Effect {self.name}: {self.title}>"
-
-
-_SETTINGS = (
-    *("name", "title", "where", "dependence", "scale", "limit", "shows", "reference", "words"),
-    *("category", "inserted", "free", "equal", "when", "near", "absorbed_by", "flux"),
-    *("components", "change"),
-)
 
 
 def _plain(size):
