@@ -156,10 +156,6 @@ def _carried(fault, cause):
     return max(_share(fault, one) for one in [cause, *(cause.get("aliases") or [])])
 
 
-def _visible(case):
-    return [fault for fault in case["faults"] if not fault["absorbed"]]
-
-
 def _probability(cause):
     # a tool that gives no probabilities is sure
     given = 1.0 if cause.get("probability") is None else float(cause["probability"])
@@ -208,7 +204,7 @@ def score_answer(case, answer):
 def _score(case, answer):
     """Return the score, and of each cause its probability and whether it is right."""
     verdict, causes = answer.get("verdict"), answer.get("causes") or []
-    faults = _visible(case)
+    faults = [fault for fault in case["faults"] if not fault["absorbed"]]
     best = [max((_carried(fault, cause) for fault in faults), default=0.0) for cause in causes]
     claims = [[_probability(c), s >= _ENOUGH] for c, s in zip(causes, best, strict=True)]
     if not faults:
@@ -513,18 +509,18 @@ class ChallengeResult:
     def rates(self):
         """Table of the rates: all, by kind, and by SNR of what has a fault to be seen."""
         kinds = sorted({record["kind"] for record in self.records})
-        rows = [("all", (), {}), *((kind, (kind,), {}) for kind in kinds)]
+        groups = [("all", (), {}), *((kind, (kind,), {}) for kind in kinds)]
         for low, high in pairwise(_SNR_EDGES):
             name = f"SNR {low:g} to {high:g}" if np.isfinite(high) else f"SNR over {low:g}"
-            rows.append((name, (), {"least": low or 1e-9, "below": high}))
-        rows = [row for row in rows if self.of(*row[1], **row[2])]
-        table = QTable({"challenges": [row[0] for row in rows]})
-        rates = {r: np.array([self.rate(r, *k, **s) for _, k, s in rows]) for r in RESULTS}
-        table["n"] = rates["right"].reshape(-1, 4)[:, 3].astype(int)
-        for name, values in rates.items():
-            for key, column in zip(("", "_low", "_high"), values.reshape(-1, 4).T, strict=False):
-                table[name + key] = column
-        return table
+            groups.append((name, (), {"least": low or 1e-9, "below": high}))
+        rows = []
+        for name, kinds, limits in groups:
+            rates = [self.rate(result, *kinds, **limits) for result in RESULTS]
+            if n := rates[0][3]:
+                rows.append((name, n, *(x for rate in rates for x in rate[:3])))
+        names = [result + end for result in RESULTS for end in ("", "_low", "_high")]
+        dtype = [str, int, *[float] * len(names)]
+        return QTable(rows=rows or None, names=("challenges", "n", *names), dtype=dtype)
 
     @property
     def reliability(self):
@@ -661,11 +657,8 @@ def _figure(figure, size):
 
 
 def _rows(table):
-    return [{name: _plain(row[name]) for name in table.colnames} for row in table]
-
-
-def _plain(value):
-    return value.item() if isinstance(value, np.generic) else value
+    """Return the rows of a table as JSON takes them."""
+    return [dict(zip(table.colnames, row, strict=True)) for row in table.as_array().tolist()]
 
 
 def _percent(value, low, high):

@@ -29,15 +29,9 @@ from astropolcal.gap.effects import (
     Context,
     Effect,
     Roles,
-    after,
-    before,
     check_effect,
-    detector,
     get_effect,
-    inside,
     register_effect,
-    source,
-    telescope,
 )
 from astropolcal.gap.effects._laws import Held
 from astropolcal.gap.effects.effect import CellEffect
@@ -605,7 +599,7 @@ def tinted(degrees=0.0, kind=optics.LinearRetarder, **settings):
     """Return a retarder behind the derotator as an effect."""
     optic = kind(retardance=degrees * u.deg, theta=45 * u.deg, name="test_tinted")
     settings = {"title": "a test", "limit": 10 * u.deg, "name": "test_tinted"} | settings
-    return Effect(place=after("derotator"), inserted=optic, **settings)
+    return Effect(place="after:derotator", inserted=optic, **settings)
 
 
 class Crooked(optics.LinearRetarder):
@@ -635,7 +629,7 @@ class Vandal(Effect):
 
 def refused():
     """Yield effects that are not right, and what is said of them."""
-    known = {"title": "a test", "limit": 10 * u.deg, "place": after("derotator")}
+    known = {"title": "a test", "limit": 10 * u.deg, "place": "after:derotator"}
     optic = optics.LinearRetarder(retardance=0 * u.deg, name="test")
     yield tinted(kind=Crooked), "test_tinted: derivative to .* differs .* by (1|1\\.0.*) %"
     yield tinted(1.0), "at zero parameters"
@@ -661,13 +655,13 @@ def test_check_refuses():
 
 def test_declarations_that_are_refused():
     with pytest.raises(GapError, match="kind 'diattenuatoin'; did you mean 'diattenuation'"):
-        Effect("x", "x", after("hwp"), "diattenuatoin")
+        Effect("x", "x", "after:hwp", "diattenuatoin")
     with pytest.raises(GapError, match="effect x: dependence = 'clock'"):
-        Effect("x", "x", after("hwp"), "diattenuation", "clock")
-    with pytest.raises(GapError, match=r"place = 'hwp' is none; say after\(optic\)"):
+        Effect("x", "x", "after:hwp", "diattenuation", "clock")
+    with pytest.raises(GapError, match="place = 'hwp'; allowed are 'after:OPTIC'"):
         Effect("x", "x", "hwp", "diattenuation")
     with pytest.raises(GapError, match="no setting 'limits'; did you mean 'limit'"):
-        Effect("x", "x", after("hwp"), "diattenuation", limits=3)
+        Effect("x", "x", "after:hwp", "diattenuation", limits=3)
     with pytest.raises(GapError, match="it must do nothing"):
         Effect.insert(optics.LinearRetarder(retardance=9 * u.deg, name="x"), after="hwp")
     with pytest.raises(GapError, match="no parameter of ParityFlip is free"):
@@ -680,12 +674,12 @@ def test_effects_of_ones_own():
     """Declared ones at every sort of place, with every sort of dependence, and inserted ones."""
     chains, data = clean("beam_gain")
     some = [
-        Effect("a", "a", after("hwp"), "diattenuation", "harmonic:derotator:1", limit=0.1),
-        Effect("a", "a", inside("derotator"), "retardance", "time", limit=10 * u.deg),
-        Effect("a", "a", inside("hwp"), "orientation", "harmonic:hwp:4", "number"),
-        Effect("a", "a", source(), "depolarization_linear", "step:7", 0),
-        Effect("a", "a", detector(), "gain", "harmonic:hwp:3", None),
-        Effect("a", "a", before("wollaston"), ("rotation", "retardance_d"), degree=1),
+        Effect("a", "a", "after:hwp", "diattenuation", "harmonic:derotator:1", limit=0.1),
+        Effect("a", "a", "in:derotator", "retardance", "time", limit=10 * u.deg),
+        Effect("a", "a", "in:hwp", "orientation", "harmonic:hwp:4", "number"),
+        Effect("a", "a", "source", "depolarization_linear", "step:7", 0),
+        Effect("a", "a", "detector", "gain", "harmonic:hwp:3", None),
+        Effect("a", "a", "before:wollaston", ("rotation", "retardance_d"), degree=1),
         Effect.insert(optics.Diattenuator(name="a"), before="wollaston", limit=0.1),
         Effect.insert(optics.LinearRetarder(retardance=0 * u.deg, name="a"), inside="derotator"),
         Effect.insert(optics.BeamGain(name="a"), after="wollaston", degree="number"),
@@ -694,8 +688,8 @@ def test_effects_of_ones_own():
         check_effect(effect, chains, data)
         if effect.kinds:
             assert len(effect.cells(chains)) == len(effect.kinds) * (1 + effect.around)
-    assert not Effect("a", "a", telescope(), "rotation").applies(chains)
-    assert not Effect("a", "a", after("hwp"), "rotation", "harmonic:other:1").applies(chains)
+    assert not Effect("a", "a", "telescope", "rotation").applies(chains)
+    assert not Effect("a", "a", "after:hwp", "rotation", "harmonic:other:1").applies(chains)
 
 
 def test_registration():

@@ -11,16 +11,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, GapError
 from astropolcal.gap.effects.effect import KINDS, Context, Edit, Effect, EffectParameter
 from astropolcal.gap.effects.library import LIBRARY
-from astropolcal.gap.effects.where import (
-    Roles,
-    adapted,
-    after,
-    before,
-    detector,
-    inside,
-    source,
-    telescope,
-)
+from astropolcal.gap.effects.where import Roles, adapted
 from astropolcal.gap.problem import GapProblem
 from astropolcal.units import canonical_factor, to_unit
 from astropolcal.words import did_you_mean
@@ -34,15 +25,9 @@ __all__ = [
     "EffectParameter",
     "Roles",
     "adapted",
-    "after",
-    "before",
     "check_effect",
-    "detector",
     "get_effect",
-    "inside",
     "register_effect",
-    "source",
-    "telescope",
 ]
 
 #: Every effect by name.

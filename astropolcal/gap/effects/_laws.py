@@ -181,7 +181,7 @@ class BandAverage(Effect):
 
     def retarder(self, roles):
         """Return the derotator, or the steepest retarder behind it that stands still."""
-        if self.where.relation == "inside" or roles.derotator is None:
+        if self.where.relation == "in" or roles.derotator is None:
             return roles.derotator
         names = [leaf.name for leaf in roles.leaves]
         behind = roles.leaves[names.index(roles.derotator.name) + 1 :]
@@ -403,7 +403,7 @@ class Alternative(Effect):
     change = None
 
     def __init__(self, name, title, words, role, change, **settings):
-        where = Where("inside", role, True) if isinstance(role, str) else role
+        where = Where("in", role, True) if isinstance(role, str) else role
         super().__init__(name, title, where, words=words, change=change, **settings)
 
     def cells(self, chains):

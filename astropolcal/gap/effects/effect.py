@@ -251,8 +251,10 @@ class Effect:
         Identifier.
     title : str
         What it is, for a reader.
-    place : Where
-        Such as ``after("hwp")``.
+    place : str
+        ``"after:OPTIC"``, ``"before:OPTIC"``, ``"in:OPTIC"`` (the frame that turns with it),
+        ``"source"``, ``"telescope"`` (in front of the half-wave plate) or ``"detector"``; an optic
+        by its name or its role.
     kind : str or tuple of str
         Key of `~astropolcal.optics.GENERATORS`; ``"diattenuation"`` and ``"retardance"`` are of
         any axis; ``"orientation"`` is an error of the orientation of the optic inside which it is.
@@ -298,9 +300,9 @@ class Effect:
     Examples
     --------
     >>> from astropolcal import instruments
-    >>> from astropolcal.gap.effects import Effect, after
+    >>> from astropolcal.gap.effects import Effect
     >>> flexure = Effect("flexure", "mirror that bends as the derotator turns",
-    ...                  place=after("hwp"), kind="diattenuation",
+    ...                  place="after:hwp", kind="diattenuation",
     ...                  dependence="harmonic:derotator:1", limit=0.05)
     >>> flexure.cell([instruments.get("charis").chain()]).title
     'diattenuation along the axes behind the half-wave plate that changes once in a turn of the derotator'
@@ -337,7 +339,12 @@ class Effect:
 
     def _check(self):
         if self.where is not None and not isinstance(self.where, Where):
-            raise GapError(f"effect {self.name}: place = {self.where!r} is none; say after(optic)")
+            given, self.where = self.where, Where.of(str(self.where))
+            if self.where is None:
+                raise GapError(
+                    f"effect {self.name}: place = {given!r}; allowed are 'after:OPTIC', "
+                    "'before:OPTIC', 'in:OPTIC', 'source', 'telescope' and 'detector'"
+                )
         known = (*GENERATORS, *_SEVERAL)
         for one in self.kinds if self.inserted is None else ():
             if one not in known:
@@ -381,7 +388,7 @@ class Effect:
         >>> Effect.insert(film, before="wollaston", limit=0.1, degree=1)
         <Effect film: Diattenuator in front of the wollaston>
         """
-        given = {"after": after, "before": before, "inside": inside}
+        given = {"after": after, "before": before, "in": inside}
         told = [Where(key, value) for key, value in given.items() if value is not None]
         name = settings.pop("name", optic.name)
         if len(told) != 1:
@@ -605,7 +612,7 @@ class Effect:
         if self.flux is not None:
             one.reference = self.flux * context.flux
         where = self.where
-        inside = where.relation == "inside" and _has_axes(one)
+        inside = where.relation == "in" and _has_axes(one)
         if anchor is not None and (inside or where.turned is not None):
             one.theta = (anchor.theta.value + (where.turned or 0.0)) * u.deg
         for key in one.param_names:
@@ -659,12 +666,11 @@ class CellEffect(Effect):
     """An effect that is one cell: a perturbation of some kind at some place."""
 
     def __init__(self, cell, degree=2):
-        relation, _, optic = cell.place.partition(":")
         everywhere = "constant" if cell.run is None else f"dataset:{cell.run}"
         super().__init__(
             cell.name,
             cell.title,
-            Where({"in": "inside"}.get(relation, relation), optic or None),
+            cell.place,
             # what only a detector has is put in by itself, see `edit`
             *((cell.kind, cell.dependence) if cell.kind in GENERATORS else ("gain", everywhere)),
             degree,

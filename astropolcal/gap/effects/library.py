@@ -31,7 +31,7 @@ from astropolcal.gap.effects._laws import (
     without_constant,
 )
 from astropolcal.gap.effects.effect import NUMBER, Effect
-from astropolcal.gap.effects.where import Where, before, telescope
+from astropolcal.gap.effects.where import Where
 
 __all__ = []
 
@@ -44,8 +44,8 @@ _PATAT = "Patat & Romaniello 2006, doi:10.1086/497581"
 _SIGNS = "McIntosh et al. 2026, Sec. 6.1; van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
 _THART = "'t Hart et al. 2021, doi:10.1117/12.2594962"
 
-_PLATE = Where("inside", "plate", True, in_front=True)
-_DEROTATOR = Where("inside", "derotator", True)
+_PLATE = Where("in", "plate", True, in_front=True)
+_DEROTATOR = Where("in", "derotator", True)
 _RELAY = Where("after", "relay", True)
 _POLARIZER = Where("after", "polarizer", True)
 _MIRROR = Where("after", "mirror", True)
@@ -54,15 +54,13 @@ _DETECTOR = Where("detector")
 _ENTRANCE = Where("before", "entrance", True)
 _SKY = Where("before", "parallactic", True)
 # behind the mirror: small diattenuations of one plane add up in any order
-_M3 = Where(
-    "inside", "telescope_mirror", True, turned=0.0, otherwise=Where("before", "altitude", True)
-)
+_M3 = Where("in", "telescope_mirror", True, turned=0.0, otherwise=Where("before", "altitude", True))
 
 _ON_PLATE = {"words": "half-wave plate"}
 _AT_DETECTOR = {"words": "detector", "category": "detector"}
 _BEHIND = {"words": "relay behind the derotator"}
 _IN_TELESCOPE = {
-    kind: {"words": "tertiary mirror", "near": (telescope(), (f"{kind}_h", f"{kind}_d"))}
+    kind: {"words": "tertiary mirror", "near": (Where("telescope"), (f"{kind}_h", f"{kind}_d"))}
     for kind in ("diattenuation", "retardance")
 }
 
@@ -520,7 +518,7 @@ _ALTERNATIVES = [
     Alternative(
         "mirror_flip_before_plate",
         "odd number of reflections in front of the half-wave plate that the model lacks",
-        "in front of the half-wave plate", before("plate"), flipped_before, shows=_TURNED,
+        "in front of the half-wave plate", Where("before", "plate"), flipped_before, shows=_TURNED,
     ),
     Alternative("hwp_sign", _SIGN.format("half-wave plate"), _PLATE_WORDS, "plate", other_sign,
                 shows=_TURNED),

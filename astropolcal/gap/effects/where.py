@@ -23,7 +23,8 @@ _BEHIND, _BEHIND_PLATE = "behind the derotator", "behind the half-wave plate"
 class Where:
     """A place in chains, told by an optic."""
 
-    #: Inside is the frame that turns with the optic.
+    #: ``"after"``, ``"before"`` or ``"in"`` an optic, the latter in the frame that turns with it;
+    #: ``"source"``, ``"telescope"`` or ``"detector"``.
     relation: str
     optic: str | None = None
     #: Whether only the role counts, see `Roles`.
@@ -35,6 +36,13 @@ class Where:
     #: The place of chains that lack the optic.
     otherwise: object = None
 
+    @classmethod
+    def of(cls, place):
+        """Return the place of a text such as ``"after:hwp"``, None where it is no place."""
+        relation, _, optic = place.partition(":")
+        known = ("after", "before", "in") if optic else ("source", "telescope", "detector")
+        return cls(relation, optic or None) if relation in known else None
+
     @property
     def words(self):
         """The place in words."""
@@ -44,7 +52,7 @@ class Where:
     @property
     def follows(self):
         """Whether the orientation is that of the optic, whatever that is."""
-        return self.relation == "inside" and self.turned is None
+        return self.relation == "in" and self.turned is None
 
     def anchor(self, roles):
         """Return the optic by which the place is told, None where there is none."""
@@ -66,7 +74,7 @@ class Where:
         in_front = self.in_front or self.relation == "before"
         side = {"before" if in_front else "after": optic.name}
         theta, mount = 0.0, None
-        if self.relation == "inside" or self.turned is not None:
+        if self.relation == "in" or self.turned is not None:
             theta = np.deg2rad(np.mean(optic.theta.value) + (self.turned or 0.0))
             mount = optic.mount
         return Place(self.cell_place(roles, optic), mount=mount, theta=float(theta), **side)
@@ -76,7 +84,7 @@ class Where:
         optic = self.anchor(roles) if optic is None else optic
         if optic is None:
             return self.relation if self.optic is None else "source"
-        if self.relation == "inside" and optic.stage is not None:
+        if self.relation == "in" and optic.stage is not None:
             return f"in:{optic.name}"
         index = {o.name: i for i, o in enumerate(roles.leaves)}
         mine = index[optic.name] + (not (self.in_front or self.relation == "before"))
@@ -90,84 +98,6 @@ class Where:
     def in_front_of(self, roles):
         """Return the name of the place in front of the optic."""
         return Where("before", self.optic, self.is_role).cell_place(roles)
-
-
-def after(optic):
-    """
-    Return the place behind an optic, by its name or role, in the frame that stands still.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import after
-    >>> after("hwp").words
-    'behind the hwp'
-    """
-    return Where("after", optic)
-
-
-def before(optic):
-    """
-    Return the place in front of an optic, in the frame that stands still.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import before
-    >>> before("wollaston").words
-    'in front of the wollaston'
-    """
-    return Where("before", optic)
-
-
-def inside(optic):
-    """
-    Return the place of an optic, in the frame that turns with it.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import inside
-    >>> inside("derotator").words
-    'derotator'
-    """
-    return Where("inside", optic)
-
-
-def source():
-    """
-    Return the place behind the source.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import source
-    >>> source().words
-    'source'
-    """
-    return Where("source")
-
-
-def telescope():
-    """
-    Return the place behind the telescope, in front of the half-wave plate.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import telescope
-    >>> telescope().words
-    'telescope'
-    """
-    return Where("telescope")
-
-
-def detector():
-    """
-    Return the place behind the beam splitter.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import detector
-    >>> detector().words
-    'detector'
-    """
-    return Where("detector")
 
 
 def is_held(parameter):
