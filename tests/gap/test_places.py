@@ -59,21 +59,21 @@ def test_less_than_elsewhere_is_no_place():
     assert found[0, 1] > 0
 
 
-@pytest.mark.parametrize(("template", "expected"), [("{} nm", "20-30 nm"), (None, "20")])
-def test_the_place_is_the_run_that_stands_out(template, expected):
-    label = np.repeat(np.arange(6), 200)
-    sigma = np.array([1, 1.6, 1.6, 1, 1, 1])[label]
-    residual = sigma * np.random.default_rng(2).normal(size=label.size)
-    names = [10, 20, 30, 40, 50, 60]
-    (row,) = residuals.most_uneven(whitened(residual), "wavelength", label, names, template)
-    # without a template labels have no neighbours
-    assert row["detail"].startswith(expected[:2])
-    assert row["detail"] == expected or template is None
-    assert row["kind"] == "place"
-    assert row["p_single"] < 1e-9
-    inside = (label == 1) | (label == 2) if template else label == int(row["detail"]) / 10 - 1
-    excess = np.sum(residual[inside] ** 2) - inside.sum()
-    assert row["share"] == pytest.approx(excess / (residual @ residual - residual.size))
+def test_the_place_is_the_run_that_stands_out():
+    for template, expected in [("{} nm", "20-30 nm"), (None, "20")]:
+        label = np.repeat(np.arange(6), 200)
+        sigma = np.array([1, 1.6, 1.6, 1, 1, 1])[label]
+        residual = sigma * np.random.default_rng(2).normal(size=label.size)
+        names = [10, 20, 30, 40, 50, 60]
+        (row,) = residuals.most_uneven(whitened(residual), "wavelength", label, names, template)
+        # without a template labels have no neighbours
+        assert row["detail"].startswith(expected[:2])
+        assert row["detail"] == expected or template is None
+        assert row["kind"] == "place"
+        assert row["p_single"] < 1e-9
+        inside = (label == 1) | (label == 2) if template else label == int(row["detail"]) / 10 - 1
+        excess = np.sum(residual[inside] ** 2) - inside.sum()
+        assert row["share"] == pytest.approx(excess / (residual @ residual - residual.size))
 
 
 def test_a_place_holds_half_of_the_labels_at_the_most():
@@ -118,18 +118,15 @@ def test_one_label_is_no_place():
 # ---- names ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("names", "start", "stop", "template", "words"),
-    [
+def test_names_of_places():
+    for names, start, stop, template, words in [
         (["a", "b"], 1, 2, None, "b"),
         ([1200, 1400, 1600], 0, 1, "{} nm", "1200 nm"),
         ([1200, 1400, 1600], 0, 2, "{} nm", "1200-1400 nm"),
         ([(0, 7), (8, 15), (16, 23)], 0, 1, "frames", "frames 0-7"),
         ([(0, 7), (8, 15), (16, 23)], 1, 3, "frames", "frames 8-23"),
-    ],
-)
-def test_names_of_places(names, start, stop, template, words):
-    assert residuals._name(names, start, stop, template) == words
+    ]:
+        assert residuals._name(names, start, stop, template) == words
 
 
 # ---- labels --------------------------------------------------------------------------------
