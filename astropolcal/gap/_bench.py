@@ -558,7 +558,11 @@ class Bench:
                 power = float(np.clip(steps[1] / steps[0], 0.7, 3))
             step = (snr / max(fault.snr, 1e-9)) ** (1 / power)
             wanted = min(float(fault.amplitude * np.clip(step, 0.05, 20)), fault.largest)
-            if abs(fault.snr / snr - 1) < 0.02 or wanted == fault.amplitude or fault.is_whole:
+            if (
+                abs(fault.snr / snr - 1) < 0.02
+                or wanted == fault.amplitude
+                or fault.told.get("what") == "exchanged"
+            ):
                 break
             last, fault.amplitude = (fault.amplitude, fault.snr), wanted
         return residual, fit

@@ -140,11 +140,6 @@ class Fault:
         sizes = [p.canonical_limit / np.abs(self._laws[p.name]).max() for p in edit.parameters]
         self.largest = 0.9 * min(sizes) if sizes else 1.0
 
-    @property
-    def is_whole(self):
-        """Whether it is there or not, without a size."""
-        return self.told.get("what") == "exchanged"
-
     def cells(self, residual, fit):
         """Return the share of its signal that each cell carries; its own is all of it."""
         own = [self.told.get(key) for key in ("place", "kind", "dependence")]

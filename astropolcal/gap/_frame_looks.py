@@ -35,10 +35,7 @@ _BEAMS = {1: "right", -1: "left"}
 
 
 def angle_stages(chain):
-    """Return the stages of a chain that turn an optic, with the optics on them.
-
-    Returns: Index of the optic in the chain and the sign with which it turns.
-    """
+    """Return the stages that turn optics: of each index of the optic in the chain, and sign."""
     found = {}
     for i, leaf in enumerate(leaves(chain)):
         if leaf.stage and leaf.stage not in COORDINATES:
@@ -47,10 +44,7 @@ def angle_stages(chain):
 
 
 class Look:
-    """All frames beside what a nominal model can do.
-
-    ``out``: Frames that take no part, one array (F,) a dataset.
-    """
+    """All frames beside what a nominal model can do; ``out`` are those, (F,), that take no part."""
 
     def __init__(self, model, coefficients, out):
         self.model, self.problem, self.chains = model, model.problem, model.chains
@@ -193,11 +187,12 @@ class Look:
         return self.problem.channels[i].valid.any(axis=0) & ~self.out[i]
 
     def of_frame(self, i, f):
-        """Return what the other frames say of the differences of one.
+        """
+        Return what the other frames say of the differences of one.
 
-        ``missed``: By how far the frame misses what is predicted from the others, (W,), whitened.
-        ``sight``: Inverse of the covariance of these, with the errors of the prediction, (W, W).
-        ``weight``: Inverse of the noise, (W,).
+        By how far it misses what is predicted from them, (W,), whitened; the inverse of the
+        covariance of this, with the errors of the prediction, (W, W); and the inverse of the noise,
+        (W,).
         """
         residual, tangent, _ = self._parts[i]
         channel = self.problem.channels[i]

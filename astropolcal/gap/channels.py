@@ -79,12 +79,12 @@ class Channels:
     # ---- noise and lamp -----------------------------------------------------------------
 
     def set_noise(self, sigma, residual, saturating):
-        """Set the noise of both channels, and fit the lamp.
+        """
+        Set the noise of both channels, (2, W, F), and fit the lamp.
 
-        ``sigma``: Standard deviation of every datum, shape (2, W, F). ``residual``: Observed minus
-        predicted, shape (2, W, F): its sums tell how the lamp drifts and flickers. ``saturating``:
-        What optics could do to the sum of a frame, columns (F, k); it is taken away before the
-        flicker is measured, lest a missing optic be taken for a restless lamp.
+        The sums of the residual, (2, W, F), tell how the lamp drifts and flickers. What optics
+        could do to the sum of a frame, columns (F, k), is taken away first, lest a missing optic be
+        taken for a restless lamp.
         """
         weight = np.where(self.valid, 1 / sigma, 0.0)
         self.sigma = sigma
@@ -96,11 +96,7 @@ class Channels:
         self.nuisance = orthonormal(design.reshape(len(design), -1).T)
 
     def whiten(self, array):
-        """Divide by the noise and take the lamp out.
-
-        ``array``: Residuals or derivatives, shape (..., 2, W, F). Returns: Of the same shape; what
-        is left has unit noise.
-        """
+        """Divide residuals or derivatives, (..., 2, W, F), by the noise and take the lamp out."""
         out = self.whiten_frames(array)
         sums = out[..., 1, :, :]
         flat = sums.reshape(*sums.shape[:-2], sums.shape[-2] * sums.shape[-1])
@@ -109,10 +105,7 @@ class Channels:
         return out
 
     def whiten_frames(self, array):
-        """Divide by the noise and by the flicker, frame by frame: the lamp's drift stays.
-
-        ``array``: Residuals or derivatives, shape (..., 2, W, F). Returns: Of the same shape.
-        """
+        """Divide by noise and flicker only, frame by frame: the lamp's drift stays; as `whiten`."""
         out = np.empty(array.shape)
         out[..., 0, :, :] = array[..., 0, :, :] * self._whitening[0][0]
         out[..., 1, :, :] = self._sum_whitened(array[..., 1, :, :])
@@ -171,11 +164,11 @@ class _Lamp:
         return direction, 1 - 1 / np.sqrt(1 + (self.flicker * norm) ** 2)
 
     def brightness(self, shift, weight):
-        """Return the brightness of each frame, less what is but its noise.
+        """
+        Return the brightness of each frame, (F,), less what is but its noise.
 
-        ``shift``: As measured, in the logarithm of the flux, shape (F,). ``weight``: One over its
-        variance, shape (F,). Returns: The drift; where it is large, the flicker about it as far as
-        it exceeds the noise.
+        It is measured in the logarithm of the flux; the weight is one over its variance. Where the
+        drift is large, the flicker about it is kept as far as it exceeds the noise.
         """
         curve, root = self._curve(self.degree), np.sqrt(weight)
         drift = curve @ np.linalg.lstsq(curve * root[:, None], shift * root, rcond=None)[0]
@@ -350,9 +343,8 @@ def expected_fluxes(channel, sweep):
 
 
 def orthonormal(columns, keep=1e-9):
-    """Return an orthonormal basis of columns.
-
-    ``columns``: Shape (n_rows, k). Returns: Shape (n_rows, rank).
+    """
+    Return an orthonormal basis, (n_rows, rank), of columns, (n_rows, k), compared at unit length.
     """
     norm = np.linalg.norm(columns, axis=0)
     columns = columns[:, norm > 0] / norm[norm > 0]

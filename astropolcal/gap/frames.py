@@ -83,13 +83,12 @@ class FrameFault:
 
 
 def suspect_frames(model):
-    """Find frames whose data are not what the table says.
+    """
+    Return the frames whose data are not what the table says, the most evident first.
 
-    Where an optic is missing from the model everywhere, a small fault of one frame cannot be told
-    from it: look again once the optic is in.
-
-    Returns: The most evident first, frames of which only the lamp is off last. It is empty where no
-    frame stands out, or so many that the model is at fault and not the frames.
+    Those of which only the lamp is off come last. There are none where no frame stands out, or so
+    many that the model is at fault and not the frames. Where an optic is missing from the model
+    everywhere, a small fault of one frame cannot be told from it: look again once the optic is in.
     """
     search = Search(model)
     accused, last = search.accused()
@@ -327,10 +326,10 @@ class Search:
         self.worst = set()
 
     def accused(self):
-        """Return the frames that stand out, and the look at all without them.
+        """
+        Return the frames that stand out, and the look at all without them.
 
-        ``places``: Index of the dataset and of the frame, in the order of accusation; empty if none
-        stands out, or too many.
+        Index of dataset and frame, in the order of accusation; none if too many stand out.
         """
         trail = self._trail([], self.first)
         # the first few, without which nearly all is gone: in a fit that they have bent, more
@@ -411,7 +410,8 @@ class Search:
         """Return whether what was wrong is gone without some frames."""
         if not places or len(places) > self.most:
             return False
-        if _marked_places(look) != set(places):
+        marked = {(i, int(f)) for i, out in enumerate(look.out) for f in np.flatnonzero(out)}
+        if marked != set(places):
             look = self._look(places, look.coefficients)
         if look.chance > _NOISE:
             return True
@@ -421,10 +421,6 @@ class Search:
         falls = [look.deleted(i)[0] for i in range(len(look.out))]
         left = max(np.max(fall, where=look.kept(i), initial=0.0) for i, fall in enumerate(falls))
         return all(falls[i][f] > _APART * left for i, f in places)
-
-
-def _marked_places(look):
-    return {(i, int(f)) for i, out in enumerate(look.out) for f in np.flatnonzero(out)}
 
 
 def _noise_of_others(channel, residual, angles, without):
@@ -474,10 +470,7 @@ def _surprise(fall, freedom, keep):
 
 
 def usual(fall, freedom, keep):
-    """Return how much larger than noise a statistic is in most frames, at least 1.
-
-    ``fall, freedom``: The statistic and its degrees of freedom, (F,).
-    """
+    """Return how much larger than noise a statistic, (F,), is in most frames, at least 1."""
     if not keep.any():
         return 1.0
     usual = stats.chi2.median(np.maximum(np.median(freedom[keep]), 1))

@@ -138,11 +138,11 @@ class Model:
         return Model(problem, fit, self.added | {effect.name: parameters})
 
     def with_effects(self, effects, like=None, **settings):
-        """Return the model with several effects added, and fitted once.
+        """
+        Return the model with several effects added, each with its context, and fitted once.
 
-        One that has no place without another that is not among them is left out.
-
-        ``effects``: Effect and context each, the latter None for that of the data.
+        A context of None is that of the data. An effect that has no place without another that is
+        not among them is left out.
         """
         model = self
         for effect, context in effects:
@@ -213,9 +213,8 @@ class Model:
         return Model(self.problem, fit, self.added)
 
     def sizes(self, name):
-        """Return the fitted coefficients of an added effect and their errors.
-
-        Returns: ``"optic.parameter"`` to coefficients, errors, unit and EffectParameter.
+        """
+        Return the coefficients of an added effect by name, with errors, unit and `EffectParameter`.
         """
         errors = self.problem.errors(self.fit.coefficients)
         found = {}
@@ -325,10 +324,7 @@ class Linear:
 
 
 def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):
-    """Fit the nominal chains in both channels.
-
-    ``calibration``: A calibration of these data; by default it is made.
-    """
+    """Fit the nominal chains in both channels, from a calibration that is made if none is given."""
     if calibration is None:
         calibration = nominal_calibration(chains, observations)
     if calibration.converged is False and fit:
@@ -376,9 +372,8 @@ def _no_convergence():
 
 
 def nominal_calibration(chains, observations):
-    """Calibrate chains without cross-validation, for a diagnosis.
-
-    Returns: It may not have converged, see its ``converged``.
+    """
+    Calibrate chains for a diagnosis, not cross-validated; see ``converged`` of what is returned.
     """
     measurement = Measurement(chains, observations)
     if not measurement.free.size:
@@ -391,10 +386,11 @@ def nominal_calibration(chains, observations):
 
 
 def starting_model(calibration, observations, library, say):
-    """Return the nominal model, and the discrete alternative that beats it.
+    """
+    Return the nominal model, that of the discrete alternative that beats it, and which this is.
 
-    ``base``: That of the alternative that beats it, or the nominal model again. ``alternatives``:
-    The alternative and its aliases, or nothing.
+    Where none does, the second is the nominal model again and the third an empty list; else the
+    alternative is followed by its aliases.
     """
     given = calibration if isinstance(calibration, Calibration) else None
     chains = calibration.chains if given else calibration

@@ -129,10 +129,11 @@ class Exposure:
 
 
 def exposures(model, *, flux_matters=False):
-    """Return exposures that the set-ups of the data allow.
+    """
+    Return exposures that the set-ups of the data allow.
 
-    Returns: New angles, a full turn of the plate, the run again, in another order and backwards,
-    the polarizer turned or taken out, and another lamp.
+    New angles, a full turn of the plate, the run again, in another order and backwards, the
+    polarizer turned or taken out, and another lamp.
     """
     found, trains = [], model.trains
     polarized = [Roles(train).polarizer is not None for train in trains]
@@ -381,9 +382,8 @@ def _sigmas(gain):
 
 
 class Forecast:
-    """A fitted model with all causes that are asked about, and what the data say of each of them.
-
-    ``recipes``: Effect and context of each cause, the latter None for that of the data.
+    """
+    A fitted model with all causes that are asked about, and what the data say of each of them.
     """
 
     def __init__(self, model, recipes):
@@ -429,9 +429,10 @@ class Forecast:
         self.value = (q - problem.coefficients(absent)) * self.scale
 
     def foreseen(self, names):
-        """Return what the data say of causes, one at a time: their coefficients and the solution.
+        """
+        Return what the data say of causes, one at a time.
 
-        Returns: Coefficients that are live, the normal equations, and the solution (size,).
+        The coefficients that are live, the normal equations, and the solution (size,).
         """
         inside = [name for name in names if name in self.model.added]
         # the data, with the causes of the group that are in the model taken out
@@ -511,10 +512,11 @@ class Forecast:
 
 
 def odds(hypotheses, gram):
-    """Return the expected logarithms of Bayes factors, and what tells two causes apart.
+    """
+    Return the expected logarithms of Bayes factors, and what tells two causes apart.
 
-    ``factors``: Of the truth (first axis) against another cause (second axis). ``sigmas``: By how
-    many standard deviations the other one fails.
+    Of the truth (first axis) against another cause (second axis), and by how many standard
+    deviations this one fails.
     """
     n = len(hypotheses)
     chi2, freedom = np.zeros((n, n)), np.zeros(n)

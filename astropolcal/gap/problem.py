@@ -64,15 +64,14 @@ def _mounted(chains):
 
 
 class GapProblem:
-    """Chains against all frames of their datasets, whitened by the noise.
+    """
+    Chains against all frames of their datasets, whitened by the noise.
 
-    ``laws``: Basis (W, k) of parameters given per wavelength, ``"optic.parameter"``. ``priors``:
-    Standard deviation (canonical) of a normal prior on the coefficients of a parameter.
-    ``neutral``: Value (canonical) about which a parameter's prior and limits are, by default 0:
-    that at which an effect is absent. ``limits``: The most (canonical) by which a parameter may
-    differ from that value. A parameter that follows a law is not held to it, but to the bounds of
-    its optic. ``like``: Another problem of the same data whose noise, lamp and fluxes are taken
-    over; by default `settle_noise` must be called.
+    Parameters may have ``laws``, a basis (W, k) each; ``priors``, the standard deviation of a
+    normal prior on their coefficients; ``neutral``, the value about which prior and limits are (0
+    if none is given); and ``limits``, the most by which they may differ from it, where they follow
+    no law: those are held to the bounds of their optic. All by ``"optic.parameter"``, canonical.
+    Noise, lamp and fluxes are those of a problem ``like`` it, or `settle_noise` must be called.
     """
 
     def __init__(
@@ -223,23 +222,19 @@ class GapProblem:
         for i, weights in enumerate(channel.slopes(sweep)):
             slopes = sweep.derivatives(keys, weights)
             for key, where, factor, _ in dataset._live:
-                self._add(out[:, i], where, factor * slopes[key], dataset)
+                self._add(out[:, i], where, factor * slopes[key])
         return out * channel.valid
 
-    def _add(self, out, where, slope, dataset):
-        slot, block = self._owner(where)
+    def _add(self, out, where, slope):
+        """Add the derivative to a free value to those to its coefficients."""
+        first = int(np.min(where))
+        owners = zip(self.free.slots, self._blocks, strict=True)
+        slot, block = next(o for o in owners if o[0].start <= first < o[0].start + o[0].size)
         rows = out[self.slices[slot.name]]
         if np.ndim(where):
             rows += block[np.asarray(where) - slot.start].T[:, :, None] * slope
         else:
             rows[0] += slope
-
-    def _owner(self, where):
-        first = int(np.min(where))
-        for slot, block in zip(self.free.slots, self._blocks, strict=True):
-            if slot.start <= first < slot.start + slot.size:
-                return slot, block
-        raise AssertionError(where)
 
     # ---- noise -----------------------------------------------------------------------
 
@@ -260,9 +255,11 @@ class GapProblem:
     # ---- fit -------------------------------------------------------------------------
 
     def fit(self, start=None, rows=None, held=None, steps=_MAX_STEPS, share=_ARRIVED_SHARE):
-        """Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
+        """
+        Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
 
-        ``rows``: Rows that take part, shape (n_rows,).
+        ``rows`` are those that take part, (n_rows,), ``held`` the coefficients that stay; a step
+        that lowers chi-square by less than ``share`` of it is the last.
         """
         q = self._inside(self.start if start is None else start)
         live = np.ones(self.size, dtype=bool) if held is None else ~held
@@ -461,10 +458,10 @@ def _positions(chain, observations, fluxes):
 
 
 def law_basis(wavelength, degree):
-    """Return the basis of a polynomial law in wavelength.
+    """
+    Return the basis of a polynomial law in wavelength (micrometre, (W,)), shape (W, k).
 
-    ``wavelength``: Micrometre, shape (W,). ``degree``: Degree of the polynomial (Legendre, over the
-    range of the wavelengths); None for one value a wavelength. Returns: Shape (W, k).
+    Legendre polynomials over the range of the wavelengths; one value per wavelength for None.
     """
     n = len(wavelength)
     if degree is None or degree >= n - 1:

@@ -325,10 +325,10 @@ def _row(term, tested, scale):
 
 
 def frame_patterns(observations):
-    """Return patterns over the frames of a dataset.
+    """
+    Return functions of the frame, (k, F), by axis and words.
 
-    Returns: Axis and words to functions of the frame, shape (k, F). What the angles taken cannot
-    tell from an earlier pattern is left out.
+    What the angles taken cannot tell from an earlier pattern is left out.
     """
     found, known = {}, observations.frames.colnames
     if "hwp" in known:
@@ -383,11 +383,12 @@ def _within(columns, spans, n):
 
 
 def badly_separated(observations):
-    """Return the patterns that the plate angles taken separate badly from simpler ones.
+    """
+    Return the patterns that the plate angles taken separate badly from simpler ones, and a note.
 
-    Returns: Words of `frame_patterns` to a note, for harmonics whose condition number together with
-    a constant and harmonic 4 is large, and for the order of frames where the angles always come in
-    the same one.
+    Harmonics whose condition number together with a constant and harmonic 4 is large, and the order
+    of frames where the angles always come in the same one. The dataset with the better angles
+    counts.
     """
     angles = [o.position("hwp") for o in observations if "hwp" in o.frames.colnames]
     found = {}
@@ -451,10 +452,7 @@ def _places(observations):
 
 
 def frame_blocks(observations):
-    """Return the number of the run of frames at one derotator angle of each frame.
-
-    Returns: Integers from 0, shape (F,); each frame is its own where there is no derotator angle.
-    """
+    """Return the number of the run of frames at one derotator angle of each frame, (F,), from 0."""
     if "derotator" not in observations.frames.colnames:
         return np.arange(observations.n_frames)
     # the first frame begins a run but is no step

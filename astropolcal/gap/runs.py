@@ -13,7 +13,7 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import GapError
-from astropolcal.gap._words import listed
+from astropolcal.gap._words import decimals, listed
 from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.optics.perturbations import split_run
 
@@ -25,10 +25,7 @@ _LIKELY = 0.5
 
 
 def distinct(observations, changes=False):
-    """Return the datasets with names of their own.
-
-    Returns: Copies with another name of those whose name is that of one before them.
-    """
+    """Return the datasets, those whose name is taken as copies with another name."""
     observations = list(observations)
     for one, other in combinations(observations, 2):
         if one is other or (
@@ -60,9 +57,10 @@ def distinct(observations, changes=False):
 
 
 def changes(diagnosis, causes):
-    """Return the causes that are in one of several runs only.
+    """
+    Return the causes that are in one of several runs only, a list of dict.
 
-    Returns: Keys ``cell``, ``dataset``, ``size`` (parameter to values, errors, unit and limit),
+    Keys are ``cell``, ``dataset``, ``size`` (parameter to values, errors, unit and limit),
     ``probability``, ``brought_by`` (optics that only this run has, in front of the place) and
     ``words``; the most probable first, and among these the most significant.
     """
@@ -109,7 +107,11 @@ def _run_of(cell, names, chains):
 
 def _brought(cell, run, names, chains):
     """Return the optics that only a run has, at or in front of the place of a cell."""
-    mine = [optic.name for optic in chains[names.index(run)] if not _is_added(optic)]
+    mine = [
+        optic.name
+        for optic in chains[names.index(run)]
+        if not (optic.name or "").startswith("gap_")
+    ]
     others = {o.name for n, c in zip(names, chains, strict=True) if n != run for o in c}
     own = [name for name in mine if name not in others]
     head, _, optic = cell.place.partition(":")
@@ -121,10 +123,6 @@ def _brought(cell, run, names, chains):
     else:
         return []
     return [name for name in own if mine.index(name) < end]
-
-
-def _is_added(optic):
-    return (optic.name or "").startswith("gap_")
 
 
 # ---- in words ----------------------------------------------------------------------------------
@@ -182,8 +180,8 @@ def _sentence(cell, entry, names, wavelength):
 
 
 def _number(value, error):
-    digits = max(0, 1 - int(np.floor(np.log10(error)))) if error > 0 else 3
-    return f"{value:.{min(digits, 6)}f} +- {error:.{min(digits, 6)}f}"
+    digits = min(decimals(error), 6)
+    return f"{value:.{digits}f} +- {error:.{digits}f}"
 
 
 def _size(parameters, wavelength):

@@ -217,20 +217,17 @@ class Context:
 def tracking_laws(observations):
     """Return the law of the half-wave plate of every dataset, as its instrument tells it.
 
-    Returns: Factors of parallactic angle and altitude; those of `~astropolcal.observations.tracked`
-    for tables of no known instrument.
+    Factors of parallactic angle and altitude; those of `~astropolcal.observations.tracked` for
+    tables of no known instrument.
     """
-    return tuple(_tracking_law(one) for one in observations)
-
-
-def _tracking_law(observations):
-    # a table of no known instrument: the law of a plate that follows the sky as usual
-    if observations.instrument is None:
-        return TRACKING
-    try:
-        return instruments.get(observations.instrument).plate_law(observations)
-    except InstrumentError:
-        return TRACKING
+    found = []
+    for one in observations:
+        try:
+            law = one.instrument and instruments.get(one.instrument).plate_law(one)
+        except InstrumentError:
+            law = None
+        found.append(law or TRACKING)
+    return tuple(found)
 
 
 def label_of(name):
@@ -483,7 +480,11 @@ class Effect:
         """
         every = [self.roles(chain) for chain in chains]
         # what is in the chains already applies to them no more, and is still what it is
-        there = [one for one in every if self._is_there(one) or self.where.otherwise]
+        there = [
+            r
+            for r in every
+            if self.where.optic is None or self.where.anchor(r) is not None or self.where.otherwise
+        ]
         roles = next((one for one in there if self.applies_to(one)), next(iter(there), None))
         if roles is None or not (self.kinds or self.near):
             return ()
@@ -495,9 +496,6 @@ class Effect:
         texts = (text,) if isinstance(text, str) else text
         cells = [Cell(place, one, text) for text in texts for place in at for one in kinds]
         return tuple(dict.fromkeys(cells))
-
-    def _is_there(self, roles):
-        return self.where.optic is None or self.where.anchor(roles) is not None
 
     def cell(self, chains):
         """Return the main one of `cells`, None where there is none."""

@@ -142,7 +142,8 @@ class Roles:
             "mirror": self._source_mirrors(),
             **self._turning(),
         }
-        self._kinds["telescope_mirror"] = self._telescope_mirrors()
+        front = self._in_front()
+        self._kinds["telescope_mirror"] = [o for o in front if hasattr(o, "diattenuation")]
         for role, found in self._kinds.items():
             name = chosen.get(role)
             own = (o for o in found if name in (None, o.name))
@@ -194,9 +195,6 @@ class Roles:
         plate = self._kinds["plate"]
         end = next((i for i, o in enumerate(self._own) if plate and o is plate[0]), start)
         return [o for o in self._own[start:end] if not isinstance(o, optics.Rotator)]
-
-    def _telescope_mirrors(self):
-        return [o for o in self._in_front() if hasattr(o, "diattenuation")]
 
     def _is_entrance(self):
         if self.plate is None:
