@@ -109,10 +109,10 @@ def test_keywords_of_the_detectors_before():
     assert (conventional.read_noise, conventional.excess_noise) == (9.6, 1.0)
 
 
-@pytest.mark.parametrize(("value", "state"), [("NA", None), (2, "B"), (2.0, "B"), (" A ", "A")])
-def test_states_in_headers(value, state):
-    values, errors = header_values(U_FLC=value)
-    assert (values.get("flc_state"), errors) == (state, [])
+def test_states_in_headers():
+    for value, state in [("NA", None), (2, "B"), (2.0, "B"), (" A ", "A")]:
+        values, errors = header_values(U_FLC=value)
+        assert (values.get("flc_state"), errors) == (state, []), (value, state)
 
 
 def test_a_state_that_there_is_not():

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from astropolcal.calibration import Calibration, calibrate
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap.cells import FINITE
@@ -114,28 +114,38 @@ class Model:
         tangent = self.problem.tangent(self.fit.coefficients)
         return float(stats.chi2.sf(self.fit.chi2, self.problem.n_data - tangent.shape[1]))
 
-    def edited(self, effect, context=None):
-        """Return the problem of the chains with an effect at zero, and its parameters."""
-        edit = effect.edit(self.trains, self.context if context is None else context)
-        problem = GapProblem(
-            edit.chains,
-            self.observations,
-            ties=self.problem.ties | edit.ties,
-            laws=self.problem.laws | edit.laws,
-            priors=self.problem.priors | edit.priors,
-            neutral=self.problem.neutral | {p.name: p.canonical_neutral for p in edit.parameters},
-            limits=self.problem.limits | edit.limits,
-            like=self.problem,
-        )
-        return problem, edit.parameters
+    def edited(self, *recipes):
+        """
+        Return the model with effects, each with its context, at zero and not fitted.
+
+        A context of None is that of the data. An effect that has no place without another that is
+        not among them is left out; where nothing was added it is the model itself.
+        """
+        mine, trains, edits = self.problem, self.trains, {}
+        for effect, context in recipes:
+            if effect.applies(trains):
+                edits[effect.name] = effect.edit(trains, context or self.context)
+                trains = edits[effect.name].chains
+        if not edits:
+            return self
+        settings = {"neutral": dict(mine.neutral)}
+        for key in ("ties", "laws", "priors", "limits"):
+            settings[key] = dict(getattr(mine, key))
+            for edit in edits.values():
+                settings[key] |= getattr(edit, key)
+        added = {name: edit.parameters for name, edit in edits.items()}
+        parameters = [p for own in added.values() for p in own]
+        settings["neutral"] |= {p.name: p.canonical_neutral for p in parameters}
+        problem = GapProblem(trains, self.observations, like=mine, **settings)
+        return Model(problem, Fit(problem.start, np.inf, False), self.added | added)
 
     def with_effect(self, effect, context=None, **settings):
         """Return the model with an effect added and everything fitted again."""
-        problem, parameters = self.edited(effect, context)
-        starts = off_extremum(problem, problem.start, parameters)
+        model = self.edited((effect, context))
+        problem, added = model.problem, model.added
+        starts = off_extremum(problem, problem.start, added[effect.name])
         fits = [problem.fit(start, **settings) for start in starts]
-        fit = min(fits, key=lambda one: one.chi2)
-        return Model(problem, fit, self.added | {effect.name: parameters})
+        return Model(problem, min(fits, key=lambda one: one.chi2), added)
 
     def with_effects(self, effects, like=None, **settings):
         """
@@ -144,14 +154,8 @@ class Model:
         A context of None is that of the data. An effect that has no place without another that is
         not among them is left out.
         """
-        model = self
-        for effect, context in effects:
-            if not effect.applies(model.trains):
-                continue
-            problem, parameters = model.edited(effect, context)
-            added = model.added | {effect.name: parameters}
-            # not fitted in between: one fit at the end is enough
-            model = Model(problem, Fit(problem.start, np.inf, False), added)
+        model = self.edited(*effects)
+        # not fitted in between: one fit at the end is enough
         if like is not None:
             model = Model(model.problem, like.start_of(model.problem), model.added)
         return self if model is self else model._off_extrema().polished(**settings)

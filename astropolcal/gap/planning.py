@@ -17,7 +17,7 @@ from astropy.table import QTable
 from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
 
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import Train, join, leaves, stages
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap._words import listed

@@ -19,7 +19,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import stats
 
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.exceptions import GapError
 from astropolcal.gap.attribution import false_discovery
 from astropolcal.gap.channels import CHANNELS
