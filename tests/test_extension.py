@@ -6,12 +6,15 @@ import sys
 from importlib.metadata import entry_points
 from importlib.resources import files
 
-import pytest
 import yaml
 
-from astropolcal.converters import get_converters
-from astropolcal.converters.optics import OPTIC_MODULES
-from astropolcal.extension import MANIFEST_URI, get_extensions, get_resource_mappings
+from astropolcal.converters.extension import (
+    MANIFEST_URI,
+    OPTIC_MODULES,
+    get_converters,
+    get_extensions,
+    get_resource_mappings,
+)
 
 BASE = "asdf://astropolcal.org/astropolcal"
 
@@ -54,11 +57,13 @@ def test_types_are_those_that_are_there():
             assert found.__name__ == cls
 
 
-@pytest.mark.parametrize("group", ["asdf.resource_mappings", "asdf.extensions"])
-def test_asdf_finds_both_functions(group):
-    named = [point for point in entry_points(group=group) if point.value.startswith("astropolcal.")]
-    assert {point.load() for point in named} <= {get_extensions, get_resource_mappings}
-    assert len(named) == 1
+def test_asdf_finds_both_functions():
+    for group in ["asdf.resource_mappings", "asdf.extensions"]:
+        named = [
+            point for point in entry_points(group=group) if point.value.startswith("astropolcal.")
+        ]
+        assert {point.load() for point in named} <= {get_extensions, get_resource_mappings}, group
+        assert len(named) == 1, group
 
 
 def test_no_physics_is_imported_for_files_of_others():

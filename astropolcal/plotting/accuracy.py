@@ -6,9 +6,10 @@ from itertools import cycle
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration import paper_accuracies, target_accuracies
-from astropolcal.calibration.groups import what_is_left_out
-from astropolcal.calibration.targets import TARGETS
+from astropolcal.calibration import target_accuracies
+from astropolcal.calibration.noise.scatter import what_is_left_out
+from astropolcal.calibration.validation import paper_accuracies
+from astropolcal.calibration.validation.targets import TARGETS
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.plotting._style import (
     BLACK,
@@ -83,7 +84,7 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     Notes
     -----
     Definitions as in `~astropolcal.calibration.accuracy_table` and
-    `~astropolcal.calibration.standard_accuracy`; ``s_mean`` is s_rel of
+    `~astropolcal.calibration.validation.standard_accuracy`; ``s_mean`` is s_rel of
     McIntosh et al. (2026, Sec. 2.3).
 
     Examples
@@ -410,7 +411,7 @@ def plot_star_check(calibration, entry=None, *, figure=None):
     --------
     >>> import astropy.units as u
     >>> from astropolcal import calibrate, instruments, optics
-    >>> from astropolcal.calibration import add_star_check
+    >>> from astropolcal.calibration.validation.stars import add_star_check
     >>> from astropolcal.plotting import plot_star_check
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")

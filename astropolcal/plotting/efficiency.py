@@ -7,9 +7,9 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration.comparison import compare
-from astropolcal.calibration.efficiency import has_derotator, polarimetric_efficiency
+from astropolcal.calibration.result.comparison import compare
 from astropolcal.chain import stages
+from astropolcal.efficiency import has_derotator, polarimetric_efficiency
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import (
     GREY,

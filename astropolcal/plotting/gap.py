@@ -295,7 +295,7 @@ def _map(axes, gap, nm, limit):
 
 def _frame_axis(axes, observations):
     """Name the runs of frames at one derotator angle, or number the frames."""
-    from astropolcal.gap.patterns import frame_blocks
+    from astropolcal.gap.residuals import frame_blocks
 
     blocks = frame_blocks(observations)
     count = blocks.max() + 1

@@ -10,11 +10,10 @@ from astropy.modeling import Parameter
 from astropy.time import Time
 
 from astropolcal import instruments
-from astropolcal.calibration import mirror_names, mirror_values
-from astropolcal.calibration.history import _Named, _named, parameter_history, significance
-from astropolcal.calibration.reflections import METALS
+from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, FitError, InstrumentError, ParameterError
+from astropolcal.pipeline.history import _Named, _named, parameter_history, significance
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,
@@ -625,7 +624,7 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
     Parameters
     ----------
     calibrations : Library or sequence
-        See `~astropolcal.calibration.parameter_history`; each needs a date.
+        See `~astropolcal.pipeline.parameter_history`; each needs a date.
     parameters : sequence of str, optional
         ``"optic.parameter"`` or ``"optic"``; by default all that are free in one of them.
     shown : int, optional

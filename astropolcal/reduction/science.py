@@ -7,11 +7,10 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration._beam import told_beam
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.fitscheck import primary_header
-from astropolcal.reduction.beams import beam_scale
-from astropolcal.reduction.frames import check_stars, reduce_frame
+from astropolcal.pipeline.headers import told_beam
+from astropolcal.reduction.frames import beam_scale, check_stars, reduce_frame
 from astropolcal.reduction.headers import (
     add_pointing,
     not_of_instrument,

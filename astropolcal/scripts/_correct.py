@@ -311,8 +311,8 @@ def choose_calibration(arguments, files):
     unless the user wants it for any date.
     """
     from astropolcal import Calibration, instruments
-    from astropolcal.calibration.validity import content_hash
-    from astropolcal.correction import sky_chain
+    from astropolcal.converters.calibration import content_hash
+    from astropolcal.correction.rows import sky_chain
     from astropolcal.reduction.science import read_night
 
     path = Path(arguments.calibration)
@@ -339,7 +339,7 @@ def choose_calibration(arguments, files):
 
 def _check_validity(calibration, path, arguments, night):
     """Refuse frames for which the calibration does not hold, unless the user wants it."""
-    from astropolcal.calibration.validity import check_frames
+    from astropolcal.pipeline.headers import check_frames
 
     # --filter names the mode as the file does, whatever the headers call it
     mode = arguments.filter or night.mode
@@ -351,7 +351,7 @@ def _check_validity(calibration, path, arguments, night):
 
 def _of_library(path, arguments, night, beam, files):
     """Return the calibration that holds for the first and the last frame."""
-    from astropolcal.calibration.library import Library
+    from astropolcal.pipeline.library import Library
 
     # None: the library chooses without a date
     dates = [None] if arguments.any_date else night.dates

@@ -7,8 +7,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from astropolcal import instruments, optics, standards
-from astropolcal.calibration import best_derotator, polarimetric_efficiency
 from astropolcal.chain import remove_optic
+from astropolcal.efficiency import best_derotator, polarimetric_efficiency
 from astropolcal.exceptions import ParameterError
 from astropolcal.instruments import SkyLaw
 from astropolcal.plotting import efficiency, plot_observability

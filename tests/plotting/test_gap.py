@@ -17,7 +17,7 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.gap import Cause, diagnose, get_effect
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import EffectParameter
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.plotting import gap as figures
 from astropolcal.plotting._style import BLACK

@@ -9,7 +9,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from astropolcal import Calibration
-from astropolcal.calibration import Covariance, Identifiability, Resampled, harmonic_conditions
+from astropolcal.calibration.identifiability.ambiguities import harmonic_conditions
+from astropolcal.calibration.identifiability.analysis import Identifiability
+from astropolcal.calibration.uncertainty.covariance import Covariance
+from astropolcal.calibration.uncertainty.refits import Resampled
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting import plot_correlations, plot_identifiability
 

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from astropolcal import calibrate, optics
-from astropolcal.calibration import mirror_values
+from astropolcal.calibration.uncertainty.derived import mirror_values
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.measurement import Tie
 from astropolcal.plotting import (

@@ -13,10 +13,12 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from astropolcal import Calibration, calibrate, instruments
-from astropolcal.calibration.library import Library
-from astropolcal.calibration.validity import content_hash, with_validity
-from astropolcal.correction import Corrected, engine
+from astropolcal.calibration.result.validity import with_validity
+from astropolcal.converters.calibration import content_hash
+from astropolcal.correction import Corrected
+from astropolcal.correction import correcting as engine
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
+from astropolcal.pipeline.library import Library
 from astropolcal.reduction import science
 from astropolcal.reduction.cubes import simulate_cubes
 from astropolcal.reduction.headers import FrameHeader
@@ -117,7 +119,7 @@ def test_modes_differ(night, tmp_path):
 
 
 def test_the_calibration_comes_from_a_library(night, tmp_path):
-    library = pytest.importorskip("astropolcal.calibration.library").Library
+    library = pytest.importorskip("astropolcal.pipeline.library").Library
     from astropolcal import Calibration
 
     (tmp_path / "lib").mkdir()
@@ -129,7 +131,7 @@ def test_the_calibration_comes_from_a_library(night, tmp_path):
 
 
 def test_no_calibration_holds_for_the_date(night, tmp_path):
-    library = pytest.importorskip("astropolcal.calibration.library").Library
+    library = pytest.importorskip("astropolcal.pipeline.library").Library
     from astropolcal import Calibration
 
     (tmp_path / "lib").mkdir()
@@ -142,7 +144,7 @@ def test_no_calibration_holds_for_the_date(night, tmp_path):
 
 def test_a_file_that_does_not_hold_is_refused(night, tmp_path):
     from astropolcal import Calibration
-    from astropolcal.calibration.validity import with_validity
+    from astropolcal.calibration.result.validity import with_validity
 
     old = with_validity(Calibration.read(night / "charis.asdf"), valid_from="2026-01-01")
     old.write(tmp_path / "old.asdf")
@@ -531,7 +533,7 @@ def test_mode_that_is_stated_is_that_of_the_file(frames_with, tmp_path):
 
 
 def test_mode_is_not_compared_where_the_file_holds_for_any(frames_with, monkeypatch):
-    from astropolcal.calibration import validity
+    from astropolcal.calibration.result import validity
 
     monkeypatch.setattr(validity, "validity_of", lambda _: validity.Validity("charis"))
     assert chosen(OLD, frames_with({"FILTNAME": "J"}), optics_in=["nbs"], filter="foo")

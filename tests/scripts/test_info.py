@@ -12,10 +12,11 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 
 from astropolcal import Calibration, instruments, optics
-from astropolcal.calibration.library import Library
-from astropolcal.calibration.validity import content_hash, with_validity
+from astropolcal.calibration.result.validity import with_validity
+from astropolcal.converters.calibration import content_hash
 from astropolcal.correction import ScienceFrames, correct
 from astropolcal.observations import example_table
+from astropolcal.pipeline.library import Library
 from astropolcal.reduction.cubes import simulate_cubes
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles
