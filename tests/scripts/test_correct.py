@@ -533,9 +533,10 @@ def test_mode_that_is_stated_is_that_of_the_file(frames_with, tmp_path):
 
 
 def test_mode_is_not_compared_where_the_file_holds_for_any(frames_with, monkeypatch):
-    from astropolcal.calibration.result import validity
+    from astropolcal.calibration.result.validity import Validity
+    from astropolcal.pipeline import headers
 
-    monkeypatch.setattr(validity, "validity_of", lambda _: validity.Validity("charis"))
+    monkeypatch.setattr(headers, "validity_of", lambda _: Validity("charis"))
     assert chosen(OLD, frames_with({"FILTNAME": "J"}), optics_in=["nbs"], filter="foo")
 
 
