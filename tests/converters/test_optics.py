@@ -119,12 +119,14 @@ def test_asdf_knows_the_optic(name):
     assert manager.handles_tag(optic_tag(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_defaults_survive(name):
     optic = OPTICS[name](name="it")
     assert_same(optic, round_trip(optic))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=10)
 @given(data=st.data())
@@ -133,6 +135,7 @@ def test_anything_survives(name, data):
     assert_same(optic, round_trip(optic))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=40)
 @given(data=st.data())
@@ -290,6 +293,7 @@ def test_unit_changed_behind_the_optics_back_is_refused():
         written(optic)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -319,6 +323,7 @@ def test_schema_refuses(old, new):
         read(content.replace(old.encode(), new.encode()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new"),
     [

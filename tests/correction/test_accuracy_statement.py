@@ -55,6 +55,7 @@ def check(calibration, seen, dolp, aolp, choice="infinite"):
     np.testing.assert_allclose(table["s_chi"].to_value(u.deg), rms[3], rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:poorly determined at 1 of 22 wavelengths")
 @pytest.mark.parametrize("dolp", [0.3, 0.01, 0.001])
 @pytest.mark.parametrize("known", [None, LACKING])

@@ -82,6 +82,7 @@ def test_pixels_without_value_stay_without():
     np.testing.assert_allclose(bad.mean(axis=0) - MIDDLE, [c * y + s * x, c * x - s * y], atol=0.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 3])
 @pytest.mark.parametrize("angle", [0.0, 17.0, 45.0])
 def test_variances_are_those_of_turned_noise(order, angle):

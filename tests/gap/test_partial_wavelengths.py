@@ -3,6 +3,7 @@
 
 import astropy.units as u
 import numpy as np
+import pytest
 
 from astropolcal import instruments
 from astropolcal.gap import diagnose
@@ -16,6 +17,7 @@ CHARIS = instruments.get("charis")
 WAVELENGTH = np.geomspace(1200, 2300, 6) * u.nm
 
 
+@pytest.mark.slow
 def test_where_knows_which_wavelengths_a_dataset_has():
     frames = half_wave_plate_cycles(derotator=[45, 70, 95, 120] * u.deg)
     chain = CHARIS.chain(derotator="linear", wavelength=WAVELENGTH)
@@ -30,6 +32,7 @@ def test_where_knows_which_wavelengths_a_dataset_has():
     assert remainder(found.improved) == []
 
 
+@pytest.mark.slow
 def test_one_wavelength_a_dataset_as_filters_have_it():
     frames = half_wave_plate_cycles(derotator=[45, 70, 95, 120] * u.deg)
     chain = CHARIS.chain(derotator="linear", wavelength=WAVELENGTH)

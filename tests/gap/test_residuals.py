@@ -42,11 +42,13 @@ def first(where, kind="pattern"):
 # ---- noise ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_noise_is_silent(noise):
     assert sum(bool(where.entries) for where in noise) <= 1
     assert noise[0].words == "No axis stands out from the noise."
 
 
+@pytest.mark.slow
 def test_p_values_of_patterns_are_uniform_on_noise(noise):
     tables = [where.table for where in noise]
     p = np.concatenate([t["p_single"][t["kind"] == "pattern"] for t in tables])
@@ -60,6 +62,7 @@ def test_p_values_of_patterns_are_uniform_on_noise(noise):
     assert stats.kstest(constant, "uniform").pvalue > 0.01
 
 
+@pytest.mark.slow
 def test_p_values_of_places_are_uniform_on_noise(noise):
     for axis in ("wavelength", "derotator", "beam"):
         p = [float(where.table["p_single"][find(where, axis)]) for where in noise]
@@ -71,6 +74,7 @@ def find(where, axis):
     return np.flatnonzero(rows)[0]
 
 
+@pytest.mark.slow
 def test_corrected_values_are_never_below_single_ones(noise):
     for where in noise[:3]:
         assert np.all(where.table["p_value"] >= where.table["p_single"])
@@ -310,6 +314,7 @@ def test_frame_whose_difference_departs():
     assert "11" in rows["frames"][rows["channel"] == "difference"].tolist()
 
 
+@pytest.mark.slow
 def test_faulty_frames_of_the_real_unpolarized_run(shared_data):
     from astropolcal import instruments
 

@@ -67,6 +67,7 @@ def group(model):
     return [one.name for one in near if one.evidence > ENOUGH]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NEW)
 def test_is_found_at_a_significance_of_thirty(name):
     chains, data = clean(name)
@@ -317,6 +318,7 @@ def standard(shared_data):
     return join([*train, gain]), Observations.from_table(table, name=star.name)
 
 
+@pytest.mark.slow
 def test_real_star_misses_the_tertiary_mirror(standard):
     """The internal optics as the lamp has them, gains free, and no mirror in the chain."""
     chain, star = standard

@@ -49,6 +49,7 @@ def test_beams_follow_from_sum_and_difference(right, left):
     np.testing.assert_allclose(0.5 * (total - x), left, atol=1e-9)
 
 
+@pytest.mark.slow
 @given(fluxes, fluxes)
 def test_doubles_are_means_of_singles(right, left):
     x, total = single_difference(right, left), single_sum(right, left)
@@ -56,6 +57,7 @@ def test_doubles_are_means_of_singles(right, left):
     np.testing.assert_allclose(double_sum(right, left), total.mean(axis=0), atol=1e-9)
 
 
+@pytest.mark.slow
 @given(fluxes, fluxes, offsets)
 def test_exchange_of_beams_or_frames_turns_the_sign(right, left, background):
     x = double_difference(right, left)

@@ -400,6 +400,7 @@ def test_stars_pair_within_a_cycle(name):
     assert np.ptp(obs.position("altitude")) > 0
 
 
+@pytest.mark.slow
 @needs_shared
 @pytest.mark.parametrize("name", [*INTERNAL, *STARS])
 def test_real_tables_survive_everything(tmp_path, name):

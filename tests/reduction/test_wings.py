@@ -66,6 +66,7 @@ def pulls_of(profile, seeds, **options):
 # --- all of the flux -------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("profile", PROFILES)
 def test_what_is_left_without_noise_is_far_below_the_errors(profile):
     pulls, bias = pulls_of(profile, range(3), noise=False)
@@ -73,6 +74,7 @@ def test_what_is_left_without_noise_is_far_below_the_errors(profile):
     assert abs(bias.mean()) < 5e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("profile", PROFILES)
 def test_fluxes_are_unbiased_with_honest_errors(profile):
     """The error of the correction is common to a frame, so frames are what counts."""
