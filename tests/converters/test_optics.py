@@ -128,7 +128,7 @@ def test_defaults_survive(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=10)
+@settings(max_examples=4)
 @given(data=st.data())
 def test_anything_survives(name, data):
     optic = data.draw(an_optic(name))
@@ -137,7 +137,7 @@ def test_anything_survives(name, data):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(data=st.data())
 def test_anything_survives_its_node(name, data):
     optic = data.draw(an_optic(name))
