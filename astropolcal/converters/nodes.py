@@ -1,6 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-What all nodes are made of: plain values, quantities, tables, and a checksum.
+What nodes are made of: plain values, quantities, tables, priors, posteriors; a checksum.
+
+A prior belongs to a parameter, in whatever chain its optic stands; so the file lists priors by the
+parameter's name, beside the chains. Of a posterior it keeps a part of the samples, and what the
+whole run says of its convergence, its quantiles among it.
 """
 
 import datetime
@@ -12,50 +16,22 @@ import numpy as np
 from astropy.table import QTable
 from astropy.time import Time
 
-from astropolcal.exceptions import CalibrationFileError
+from astropolcal import measurement
+from astropolcal.calibration.posterior.samples import Posterior
+from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
+from astropolcal.measurement import parameter_table
 
-__all__ = [
-    "checksum",
-    "node_from_table",
-    "node_from_value",
-    "plain",
-    "table_from_node",
-    "unit_from_text",
-    "unit_text",
-    "value_from_node",
-]
+__all__ = []
 
 
 def unit_text(unit):
-    """
-    Return a unit as text that `unit_from_text` understands; None stays None.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.converters.nodes import unit_text
-    >>> unit_text(u.deg)
-    'deg'
-    """
+    """Return a unit as text that `unit_from_text` understands; None stays None."""
     return None if unit is None else u.Unit(unit).to_string()
 
 
 def unit_from_text(text):
-    """
-    Return the unit that `unit_text` wrote.
-
-    Raises
-    ------
-    CalibrationFileError
-        If it is a number times a unit, such as ``"1e-3 deg"``, which nothing is written in.
-
-    Examples
-    --------
-    >>> from astropolcal.converters.nodes import unit_from_text
-    >>> unit_from_text("mm")
-    Unit("mm")
-    """
+    """Return the unit of `unit_text`; nothing is written in a number times a unit."""
     if text is None:
         return None
     unit = u.Unit(text)
@@ -68,26 +44,7 @@ def unit_from_text(text):
 
 
 def node_from_value(value):
-    """
-    Return the node of a number, an array or a Quantity.
-
-    Parameters
-    ----------
-    value : float, `~numpy.ndarray` or `~astropy.units.Quantity`
-        Of any shape.
-
-    Returns
-    -------
-    dict
-        ``value``, and ``unit`` where it has one.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.converters.nodes import node_from_value
-    >>> node_from_value(1.5 * u.deg)
-    {'value': 1.5, 'unit': 'deg'}
-    """
+    """Return ``value``, and ``unit`` where it has one, of a number, an array or a Quantity."""
     unit = getattr(value, "unit", None)
     # a copy, as views of one array would share a block of the file
     number = np.array(value.value if isinstance(value, u.Quantity) else value)
@@ -96,15 +53,7 @@ def node_from_value(value):
 
 
 def value_from_node(node):
-    """
-    Return the array or the Quantity of a node that `node_from_value` made.
-
-    Examples
-    --------
-    >>> from astropolcal.converters.nodes import value_from_node
-    >>> value_from_node({"value": 1.5, "unit": "deg"})
-    <Quantity 1.5 deg>
-    """
+    """Return the array or the Quantity of a node that `node_from_value` made."""
     unknown = sorted(set(node) - {"name", "unit", "value"})
     if unknown:
         raise CalibrationFileError(f"a value with {unknown[0]!r}, which means nothing here")
@@ -113,32 +62,14 @@ def value_from_node(node):
 
 
 def node_from_table(table):
-    """
-    Return the node of a table, a list of its columns in their order; None stays None.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropy.table import QTable
-    >>> from astropolcal.converters.nodes import node_from_table
-    >>> [column["name"] for column in node_from_table(QTable({"s_res": [0.2] * u.percent}))]
-    ['s_res']
-    """
+    """Return the node of a table, a list of its columns in their order; None stays None."""
     if table is None:
         return None
     return [{"name": name} | node_from_value(table[name]) for name in table.colnames]
 
 
 def table_from_node(node):
-    """
-    Return the `~astropy.table.QTable` of a node that `node_from_table` made.
-
-    Examples
-    --------
-    >>> from astropolcal.converters.nodes import table_from_node
-    >>> table_from_node([{"name": "s_res", "value": [0.2], "unit": "%"}])["s_res"]
-    <Quantity [0.2] %>
-    """
+    """Return the `~astropy.table.QTable` of a node that `node_from_table` made."""
     if node is None:
         return None
     columns = {column["name"]: value_from_node(column) for column in node}
@@ -148,33 +79,10 @@ def table_from_node(node):
 
 
 def plain(value, where="value"):
-    """
-    Return a value as ASDF stores it: numbers, text, lists, mappings, quantities.
+    """Return a value as ASDF stores it: numbers, text, lists, mappings, quantities.
 
-    Dates and times become ISO text, tuples lists, numpy's numbers Python's.
-
-    Parameters
-    ----------
-    value : object
-        The value, such as the meta of a table.
-    where : str
-        What it is called in the error message.
-
-    Returns
-    -------
-    object
-
-    Raises
-    ------
-    CalibrationFileError
-        If it, or something in it, is of another kind.
-
-    Examples
-    --------
-    >>> import datetime
-    >>> from astropolcal.converters.nodes import plain
-    >>> plain({"date": datetime.date(2025, 10, 2), "lamps": ("halogen", 2)})
-    {'date': '2025-10-02', 'lamps': ['halogen', 2]}
+    Dates and times become ISO text, tuples lists, numpy's numbers Python's; ``where`` is for the
+    message.
     """
     if isinstance(value, dict):
         return {str(key): plain(item, f"{where}.{key}") for key, item in value.items()}
@@ -204,29 +112,10 @@ def _plain_scalar(value, where):
 
 
 def checksum(node, expand=None):
-    """
-    Return the SHA-256 of the content of a node, however a file spells it.
+    """Return the SHA-256 of the content of a node, however a file spells it.
 
-    Parameters
-    ----------
-    node : object
-        Mappings, lists, numbers, text, arrays and quantities.
-    expand : callable, optional
-        What turns any other object into such a node.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits. Equal for equal bits, whatever the order of the
-        keys and whether arrays are inline or in blocks.
-
-    Examples
-    --------
-    >>> from astropolcal.converters.nodes import checksum
-    >>> checksum({"a": 1.0, "b": None}) == checksum({"b": None, "a": 1.0})
-    True
-    >>> checksum(1.0) == checksum(1.0000000000000002)
-    False
+    Equal for equal bits, whatever the order of the keys and whether arrays are inline or in blocks.
+    ``expand`` turns any other object into such a node.
     """
     # the order of keys in YAML means nothing
     text = json.dumps(_spelled(node, expand), sort_keys=True)
@@ -257,3 +146,169 @@ def _spelled_array(array):
     # of the same bytes on machines of either order; a block in a file may have any
     array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).reshape(array.shape)
     return {"array": array.tobytes().hex(), "type": array.dtype.str, "shape": list(array.shape)}
+
+
+# ---- priors in a calibration file ----
+
+
+_OURS = {"normal": ("mean", "std"), "uniform": ("low", "high")}
+
+
+def node_from_priors(chains):
+    """Return the priors of the chains' parameters: ``parameter``, ``kind`` and their numbers.
+
+    Normal, Uniform and frozen continuous distributions of `scipy.stats` are allowed.
+    """
+    # one entry a parameter: chains share the optics that stand in several of them
+    table = parameter_table(chains).items()
+    return [
+        {"parameter": name} | prior_node(parameters[0].prior, name)
+        for name, parameters in table
+        if parameters[0].prior is not None
+    ]
+
+
+def prior_node(prior, name):
+    """Return the node of a prior."""
+    kind = type(prior).__name__.lower()
+    if type(prior).__module__ == "astropolcal.measurement.priors" and kind in _OURS:
+        values = {key: node_from_value(getattr(prior, key)) for key in _OURS[kind]}
+        return {"kind": kind} | values
+    return {"kind": "scipy"} | _frozen_node(prior, name)
+
+
+def _frozen_node(prior, name):
+
+    node = {
+        "distribution": getattr(getattr(prior, "dist", None), "name", None),
+        "args": plain(list(getattr(prior, "args", ())), f"prior of {name}"),
+        "kwds": plain(dict(getattr(prior, "kwds", {})), f"prior of {name}"),
+    }
+    try:
+        _frozen(node)
+    except (TypeError, ValueError):
+        raise CalibrationFileError(
+            f"prior of {name} is a {type(prior).__name__}, which files cannot hold; allowed are "
+            "Normal, Uniform and frozen continuous distributions of scipy.stats"
+        ) from None
+    return node
+
+
+def _frozen(node):
+    """Return the distribution of a node; nothing but those of scipy can be named."""
+    import scipy.stats
+
+    name = node["distribution"]
+    # names of modules and functions are there too: only distributions pass the next line
+    family = getattr(scipy.stats, name, None) if isinstance(name, str) else None
+    if not isinstance(family, scipy.stats.rv_continuous):
+        raise ValueError(f"scipy.stats has no continuous distribution {name!r}")
+    found = family(*node["args"], **node["kwds"])
+    # scipy looks at the parameters when they are used, and gives NaN for those that cannot be
+    low, high = found.support()
+    if not low < high:
+        raise ValueError(f"{name} of {node['args']} and {node['kwds']} is no distribution")
+    return found
+
+
+def without_priors(chain):
+    """Return a copy of a chain whose parameters have no priors."""
+    copy = chain.copy()
+    for parameters in parameter_table([copy]).values():
+        for parameter in parameters:
+            parameter.prior = None
+    return copy
+
+
+def restore_priors(chains, nodes):
+    """Give the parameters of chains the priors that `node_from_priors` wrote."""
+    table, seen = parameter_table(chains), set()
+    for node in nodes:
+        if node["parameter"] in seen:
+            raise CalibrationFileError(f"prior of {node['parameter']!r} is given twice")
+        seen.add(node["parameter"])
+        if node["parameter"] not in table:
+            raise CalibrationFileError(f"prior of {node['parameter']!r}, which no chain has")
+        for parameter in table[node["parameter"]]:
+            parameter.prior = prior_from_node(node, node["parameter"])
+
+
+def prior_from_node(node, name):
+    """Return the prior of a node."""
+    try:
+        return _prior(node, name)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CalibrationFileError(f"prior of {name}: {type(error).__name__}, {error}") from None
+
+
+def _prior(node, name):
+    if node["kind"] == "scipy":
+        try:
+            return _frozen(plain(node))
+        except (TypeError, ValueError) as error:
+            raise CalibrationFileError(f"prior of {name}: {error}") from None
+    values = [value_from_node(node[key]) for key in _OURS[node["kind"]]]
+    # a number of its own type, as it was given
+    values = [v if hasattr(v, "unit") else v.item() for v in values]
+    return getattr(measurement, node["kind"].capitalize())(*values)
+
+
+# ---- samples of a posterior in a calibration file ----
+
+
+# for those who look into the file
+_DERIVED = ("converged", "words", "kept")
+
+
+def node_from_posterior(posterior):
+    """Return the node of a posterior, thinned if it is not yet."""
+    kept = posterior if posterior.is_thinned else posterior.thinned()
+    parts = kept.to_dict()
+    # what was thinned has no burn-in any more
+    del parts["burn_in"]
+    return {
+        **plain(parts, "posterior"),
+        "units": [unit_text(unit) for unit in kept.units],
+        "converged": kept.converged,
+        "words": kept.words(),
+        "kept": kept.kept_words(),
+    }
+
+
+def posterior_from_node(node):
+    """Return the thinned posterior that a node, which obeys the schema, stores."""
+    parts = {key: value for key, value in node.items() if key not in _DERIVED}
+    # copies of our own: what ASDF gives may be tied to the file
+    for key in ("chain", "log_prob", "acceptance", "fitted"):
+        parts[key] = None if parts[key] is None else np.array(parts[key])
+    found = {
+        key: np.array(value) if hasattr(value, "__array__") else value
+        for key, value in parts["convergence"].items()
+    }
+    # that of what did not move is not a number
+    if np.isinf(found["times"]).any():
+        raise CalibrationFileError("posterior: times must be finite")
+    parts |= {"settings": plain(parts["settings"]), "convergence": found, "burn_in": None}
+    try:
+        return Posterior.from_dict(parts)
+    except AstropolcalError as error:
+        raise CalibrationFileError(f"posterior: {error}") from None
+
+
+def check_posterior(posterior, covariance):
+    """Check a posterior against the free parameters of its calibration."""
+    if posterior is None:
+        return
+    units = dict(zip(covariance.names, covariance.units, strict=True))
+    if len(set(posterior.names)) < len(posterior.names):
+        raise CalibrationFileError("posterior: a parameter is named twice")
+    for name, unit in zip(posterior.names, posterior.units, strict=True):
+        if name not in units:
+            raise CalibrationFileError(f"posterior of {name!r}, which is no free parameter")
+        if unit != units[name]:
+            raise CalibrationFileError(
+                f"posterior of {name} is in {unit}, allowed is {units[name]}"
+            )
+    for what, values in (("samples", posterior.chain), ("log_prob", posterior.log_prob)):
+        if not values.size or not np.isfinite(values).all():
+            raise CalibrationFileError(f"posterior: {what} must be finite, and some")

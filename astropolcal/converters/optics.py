@@ -1,151 +1,26 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-One converter for all optics.
+Nodes of optics.
 
-An optic is stored as its parameters, each with value, unit, fixed flag and
-both bounds written out, and the settings that rebuild it (name, mount, beam and
-what else its class has).
-The position of its stage belongs to a frame and is not stored.
+An optic is stored as its parameters, each with value, unit, fixed flag and both bounds written out,
+and the settings that rebuild it (name, mount, beam and what else its class has). The position of
+its stage belongs to a frame and is not stored.
 """
 
-import re
-
 import numpy as np
-from asdf.extension import Converter
 
-from astropolcal.converters.priors import prior_from_node, prior_node
+from astropolcal.converters.nodes import prior_from_node, prior_node
 from astropolcal.exceptions import CalibrationFileError, ParameterError
+from astropolcal.optics import OPTICS
 
-__all__ = ["OPTIC_MODULES", "OpticConverter", "node_from_optic", "optic_from_node", "optic_tag"]
-
-#: Module of `astropolcal.optics` in which each optic is defined. It repeats the
-#: registry, so that ASDF can find a converter without importing the optics.
-OPTIC_MODULES = {
-    "BeamGain": "beamsplitters",
-    "Depolarizer": "depolarizers",
-    "Diattenuator": "polarizers",
-    "DiattenuatorRetarder": "polarizers",
-    "DriftRetarder": "modulated",
-    "DriftRotator": "modulated",
-    "EllipticalRetarder": "retarders",
-    "FerroelectricLiquidCrystal": "modulators",
-    "FluxGain": "fluxes",
-    "HarmonicGain": "modulated",
-    "HarmonicRetarder": "modulated",
-    "HarmonicRotator": "modulated",
-    "KMirror": "derotators",
-    "LinearPolarizer": "polarizers",
-    "LinearRetarder": "retarders",
-    "MetalMirror": "mirrors",
-    "MuellerElement": "general",
-    "ParityFlip": "mirrors",
-    "Perturbation": "perturbations",
-    "PolarizedBackground": "fluxes",
-    "PolarizedSource": "sources",
-    "PowerLawMirror": "mirrors",
-    "Rotator": "rotators",
-    "StarSource": "sources",
-    "StrayLight": "fluxes",
-    "TwoLayerWaveplate": "retarders",
-    "VectorDiattenuator": "polarizers",
-    "WollastonPrism": "beamsplitters",
-}
-
-
-def optic_tag(name):
-    """
-    Return the ASDF tag of an optic's class.
-
-    Parameters
-    ----------
-    name : str
-        Name of the class.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> from astropolcal.converters.optics import optic_tag
-    >>> optic_tag("TwoLayerWaveplate")
-    'tag:astropolcal.org:astropolcal/optics/two_layer_waveplate-1.0.0'
-    """
-    stem = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
-    return f"tag:astropolcal.org:astropolcal/optics/{stem}-1.0.0"
-
-
-class OpticConverter(Converter):
-    """
-    Convert one class of optics.
-
-    Parameters
-    ----------
-    name : str
-        Name of the class, a key of `OPTIC_MODULES`.
-
-    Examples
-    --------
-    >>> from astropolcal.converters.optics import OpticConverter
-    >>> OpticConverter("Rotator").types
-    ['astropolcal.optics.rotators.Rotator']
-    """
-
-    def __init__(self, name):
-        self.name = name
-
-    @property
-    def tags(self):
-        """Tags of the class."""
-        return [optic_tag(self.name)]
-
-    @property
-    def types(self):
-        """Full name of the class, which is imported only when it is needed."""
-        return [f"astropolcal.optics.{OPTIC_MODULES[self.name]}.{self.name}"]
-
-    def to_yaml_tree(self, obj, tag, ctx):
-        """Return the node of an optic, see `node_from_optic`."""
-        return node_from_optic(obj)
-
-    def from_yaml_tree(self, node, tag, ctx):
-        """Return the optic of a node, see `optic_from_node`."""
-        return optic_from_node(self.name, node)
+__all__ = []
 
 
 # ---- writing ---------------------------------------------------------------------
 
 
 def node_from_optic(optic):
-    """
-    Return the node that stores an optic.
-
-    Parameters
-    ----------
-    optic : Optic
-        Of a class in `astropolcal.optics.OPTICS`.
-
-    Returns
-    -------
-    dict
-        ``parameters``, ``name`` and ``mount`` where they are not None, and the
-        settings of the class, such as ``beam`` or ``harmonic``.
-
-    Raises
-    ------
-    CalibrationFileError
-        If a file cannot hold the optic: its class is not registered, or a
-        parameter has a callable tie, a prior that is no distribution, or a value that is not
-        finite.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.converters.optics import node_from_optic
-    >>> node = node_from_optic(optics.WollastonPrism(name="wollaston"))
-    >>> node["beam"], node["parameters"]["efficiency"]
-    ('right', {'value': 1.0, 'fixed': False, 'bounds': [0.0, 1.0]})
-    """
+    """Return the node of an optic, of a class in `astropolcal.optics.OPTICS`."""
     _check_class(optic)
     settings = {key: value for key, value in optic._settings().items() if value is not None}
     return settings | {
@@ -154,8 +29,6 @@ def node_from_optic(optic):
 
 
 def _check_class(optic):
-    from astropolcal.optics import OPTICS
-
     cls = type(optic)
     # a class of the same name from elsewhere would be read back as ours
     if OPTICS.get(cls.__name__) is not cls:
@@ -202,35 +75,7 @@ def _bounds(parameter):
 
 
 def optic_from_node(name, node):
-    """
-    Return the optic that a node stores.
-
-    Parameters
-    ----------
-    name : str
-        Name of its class.
-    node : dict
-        Its node, which obeys the schema.
-
-    Returns
-    -------
-    Optic
-
-    Raises
-    ------
-    CalibrationFileError
-        If the class refuses a value or a setting.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.converters.optics import node_from_optic, optic_from_node
-    >>> node = node_from_optic(optics.WollastonPrism(efficiency=0.98, name="wollaston"))
-    >>> optic_from_node("WollastonPrism", node)
-    <WollastonPrism(theta=0. deg, efficiency=0.98, name='wollaston')>
-    """
-    from astropolcal.optics import OPTICS
-
+    """Return the optic of the class ``name`` that a node, which obeys the schema, stores."""
     # an optic that is on no stage says so: the default of some is another
     settings = {"mount": None} | {key: value for key, value in node.items() if key != "parameters"}
     values = {key: _value(entry) for key, entry in node["parameters"].items()}

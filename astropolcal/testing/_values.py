@@ -72,7 +72,7 @@ def check_same(source, optic, old, new):
 def read_back(chain):
     import asdf
 
-    from astropolcal.converters.priors import node_from_priors, restore_priors, without_priors
+    from astropolcal.converters.nodes import node_from_priors, restore_priors, without_priors
 
     buffer = io.BytesIO()
     # a calibration file has priors beside the chains

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from astropolcal import optics
-from astropolcal.calibration._directions import (
+from astropolcal.calibration.identifiability.analysis import (
+    Identifiability,
+    finding_of,
+    physical_scale,
+    telescope_words,
+)
+from astropolcal.calibration.identifiability.linearized import (
     LARGE,
+    Whitened,
     declared_step,
     first_of_each_kind,
     led,
@@ -16,9 +23,6 @@ from astropolcal.calibration._directions import (
     plain,
     step_of,
 )
-from astropolcal.calibration._telescope import telescope_words
-from astropolcal.calibration._whitened import Whitened
-from astropolcal.calibration.identifiability import Identifiability, analyse, physical_scale
 from astropolcal.measurement import FreeParameters, Normal, Uniform
 
 N = 3
@@ -275,7 +279,9 @@ def test_silent_parameters_are_axes_of_the_null_space(free):
     data = np.random.default_rng(1).normal(size=(free.size, 40))
     data[3] = 0
     data[0] = data[1]
-    finding, covariance = analyse(free, data / physical_scale(free)[:, None])
+    scale = physical_scale(free)
+    whitened = Whitened(data / scale[:, None], scale)
+    finding, covariance = finding_of(free, whitened), whitened.covariance()
     assert finding.silent == [NAMES[3]]
     assert finding.rank == free.size - 2
     assert np.flatnonzero(~finding.identifiable).tolist() == [0, 1, 3]

@@ -41,9 +41,10 @@ def test_pulls_have_mean_zero_and_width_one(ensemble):
             continue
         # wavelengths err together: the mean of a group scatters by up to 1 / sqrt(N);
         # a single parameter has 60 pulls only: 3.5 sigma
-        tolerance = (1.5 / np.sqrt(N), 0.1) if slot.size > 1 else (3.5 / np.sqrt(N), 3.5 / np.sqrt(2 * N))
-        assert group.mean() == pytest.approx(0.0, abs=tolerance[0]), name
-        assert group.std() == pytest.approx(1.0, abs=tolerance[1]), name
+        one = slot.size == 1
+        limits = (3.5 if one else 1.5) / np.sqrt(N), 3.5 / np.sqrt(2 * N) if one else 0.1
+        assert group.mean() == pytest.approx(0.0, abs=limits[0]), name
+        assert group.std() == pytest.approx(1.0, abs=limits[1]), name
 
 
 def test_every_single_wavelength_is_right(ensemble):

@@ -9,17 +9,24 @@ import pytest
 from star_data import CHARIS, META, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments, optics
-from astropolcal.calibration import examine, sky_consequences, target_accuracies
-from astropolcal.calibration._settling import _best_star, star_words
-from astropolcal.calibration._sky_view import (
+from astropolcal.calibration import examine, target_accuracies
+from astropolcal.calibration.identifiability.ambiguities import (
+    _best_star,
+    mirror_branches,
+    star_words,
+)
+from astropolcal.calibration.identifiability.sky import (
     FITTED,
     LEFT_OUT,
     PUBLISHED,
+    consequences_along,
+    consequences_of,
+    matters,
+    shows_on_sky,
+    sky_words,
     view_of_calibration,
     view_of_measurement,
 )
-from astropolcal.calibration.mirrors import mirror_branches
-from astropolcal.calibration.sky import consequences_of, matters, shows_on_sky, sky_words
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement import Measurement
@@ -82,7 +89,7 @@ def test_polarization_of_the_telescope_is_subtracted_at_a_wrong_angle():
         live = Measurement(chain, observed)
         step = np.zeros((1, live.free.size))
         step[0, live.free.by_name["hwp.theta"].start] = small
-        (found,) = sky_consequences(live, live.vector(), step)
+        (found,) = consequences_along(view_of_measurement(live, live.vector()), step)
         for target in found["targets"]:
             relative = share / (target["dolp_percent"] / 100)
             assert np.abs(target["dolp_change_percent"]).max() == pytest.approx(

@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 
 from astropolcal import calibrate
-from astropolcal.correction import (
-    RowModel,
-    Systematic,
-    estimator,
-    linear_systematic,
-    sampled_systematic,
-)
+from astropolcal.correction import Systematic
+from astropolcal.correction.rows import RowModel
+from astropolcal.correction.solve import estimator
+from astropolcal.correction.systematic import linear_systematic, sampled_systematic
 from astropolcal.exceptions import ParameterError
 
 STOKES = np.array([1.0, 0.12, -0.2])
@@ -44,7 +41,7 @@ def test_linear_agrees_with_sampled(model, solution, linear):
 
 def test_derivatives_of_the_solution_are_exact(model, solution, linear):
     """A step along a direction of the covariance moves the solution by the factor."""
-    from astropolcal.calibration import full_covariance
+    from astropolcal.calibration.uncertainty.covariance import full_covariance
 
     axes = full_covariance(model.calibration)._axes()
     flux = np.einsum("bwfs,s->bfw", model.rows()[..., :3], STOKES)

@@ -11,7 +11,7 @@ import pytest
 from gap_setups import SETUPS
 
 from astropolcal.gap.cells import Cell, Probes, dependences, places
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.optics import GENERATORS
@@ -37,7 +37,8 @@ def spread(probes):
 
 def differences(model, cell):
     """Return the slope of both channels to each function of a cell, by central differences."""
-    problem, parameters = model.edited(CellEffect(cell, 0))
+    edited = model.edited((CellEffect(cell, 0), None))
+    problem, (parameters,) = edited.problem, edited.added.values()
     rows = [i for p in parameters for i in range(*problem.slices[p.name].indices(problem.size))]
     for row in rows:
         ends = []
