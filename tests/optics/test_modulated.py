@@ -188,6 +188,7 @@ def test_frame_optic_stands_still_unless_it_says_otherwise(position, theta, slop
 # --- what they are for -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(position=ANGLE, cosine=st.floats(-5, 5), sine=st.floats(-5, 5), retardance=ANGLE)
 @pytest.mark.parametrize("harmonic", [1, 2, 4])
 @pytest.mark.parametrize("sign", ["", "-"])

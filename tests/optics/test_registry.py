@@ -611,6 +611,7 @@ def test_only_theta_is_not_the_optics_own(name):
 # --- physics ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=40)
@@ -620,6 +621,7 @@ def test_mueller_matrix_is_physical(label, data):
     assert np.all(mueller.is_physical(optic.mueller(WAVELENGTH)))
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=40)
@@ -630,6 +632,7 @@ def test_mueller_matrix_is_that_of_the_mueller_functions(label, data):
     np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=0, atol=2e-13)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=25)
@@ -644,6 +647,7 @@ def test_one_value_a_wavelength_is_the_stack_of_the_scalars(label, data):
         np.testing.assert_allclose(row, alone, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=25)
@@ -658,6 +662,7 @@ def test_orientation_turns_the_matrix(label, data, angle):
     np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @each_that_turns
 @given(data=st.data(), theta=st.floats(-90, 90), position=st.floats(-90, 90))
 @settings(max_examples=25)
@@ -674,6 +679,7 @@ def test_position_adds_to_theta(label, data, theta, position):
         np.testing.assert_array_equal(optic.mueller(WAVELENGTH), given_)
 
 
+@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data(), theta=ANGLE)
 @settings(max_examples=25)
@@ -691,6 +697,7 @@ def test_position_is_the_coordinate(label, data, theta):
         np.testing.assert_array_equal(optic.mueller(WAVELENGTH), other.mueller(WAVELENGTH))
 
 
+@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data(), theta=ANGLE)
 @settings(max_examples=10)
@@ -700,6 +707,7 @@ def test_without_amplitude_a_frame_optic_is_the_identity(label, data, theta):
     np.testing.assert_allclose(optic.mueller(), np.eye(4), rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=25)
@@ -714,6 +722,7 @@ def test_light_is_matrix_times_stokes(label, data, angle):
     np.testing.assert_allclose(np.array(through[1:]), expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=10)
@@ -740,6 +749,7 @@ def differences(optic, key, position=None):
     return (8 * (matrix(1) - matrix(-1)) - (matrix(2) - matrix(-2))) / (12 * step)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=12)
@@ -758,6 +768,7 @@ def test_derivatives_against_differences(label, data, angle):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * scale)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=8)
@@ -768,6 +779,7 @@ def test_derivative_to_theta_may_vary_with_wavelength(label, data):
     np.testing.assert_allclose(found, differences(optic, "theta"), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data())
 @settings(max_examples=8)
@@ -785,6 +797,7 @@ def test_derivatives_at_several_positions(label, data):
 # --- units ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=10)
@@ -896,6 +909,7 @@ def test_unit_changed_behind_the_optics_back_is_refused(label):
 # --- copies -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=10)
@@ -934,6 +948,7 @@ def state(optic):
     ]
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=5)
@@ -950,6 +965,7 @@ def test_copy_is_equal_and_independent(label, data):
     assert (optic.mount, optic.theta.fixed, optic.theta.value) == (mount, False, 0)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=5)

@@ -67,6 +67,7 @@ def test_unknown_site_lists_the_known_ones(name):
 # --- dark hours -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("site", list(SITES))
 def test_rows_are_those_of_the_evening_named(site):
     """The middle of the night is local midnight of that date, wherever the site is."""
