@@ -101,7 +101,7 @@ def polarimetric_efficiency(
         What the derotator keeps still, such as ``"field"``; needed where the law of the plate
         depends on it.
     law : (float, float), optional
-        Another tracking law of the half-wave plate, see `~astropolcal.observations.tracked`.
+        Another tracking law of the half-wave plate: factors of parallactic angle and altitude.
 
     Returns
     -------

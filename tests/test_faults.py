@@ -34,7 +34,7 @@ from astropolcal.files import atomic_path
 from astropolcal.gap.challenge import _append, _journal
 from astropolcal.pipeline import Library, load, mueller_table, write_mueller
 from astropolcal.reduction.frames import Frame
-from astropolcal.reduction.journal import Journal
+from astropolcal.reduction.run import Journal
 from astropolcal.scripts._common import write_json
 from tests.fuzz.readers import READERS, Checkpoint, calibration, lab
 

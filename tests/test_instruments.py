@@ -17,7 +17,8 @@ from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError
 from astropolcal.instruments import CHARIS, Instrument, SkyLaw
 from astropolcal.measurement import FreeParameters, Measurement
-from astropolcal.observations import Observations, is_star
+from astropolcal.observations import Observations
+from astropolcal.observations.quality import is_star
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 N_BINS = 22

@@ -16,7 +16,7 @@ from astropolcal.exceptions import AstropolcalWarning, InstrumentError, Observat
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
 from astropolcal.observations.pairing import pair_states
-from astropolcal.observations.wavelengths import filter_wavelength, stated_wavelength
+from astropolcal.observations.reading import filter_wavelength, stated_wavelength
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 VAMPIRES = instruments.get("vampires")

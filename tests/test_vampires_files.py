@@ -18,10 +18,10 @@ from astropolcal.instruments.readout import ReadOut
 from astropolcal.instruments.vampires_headers import layout_of, mode_header, slices_of
 from astropolcal.observations import Observations
 from astropolcal.reduction import reduce_run
-from astropolcal.reduction._images import Detector as SimulatedDetector
 from astropolcal.reduction.cubes import both_states, simulate_cubes
-from astropolcal.reduction.errors import Detector, detector_of
 from astropolcal.reduction.headers import read_header
+from astropolcal.reduction.images import Detector as SimulatedDetector
+from astropolcal.reduction.photometry import Detector, detector_of
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles
 

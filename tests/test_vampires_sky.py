@@ -9,10 +9,11 @@ from astropy.table import QTable
 from astropolcal import instruments, optics
 from astropolcal.calibration import calibrate
 from astropolcal.chain import leaves, stages
-from astropolcal.correction import ScienceFrames, correct, frame_positions, measurement_rows
+from astropolcal.correction import ScienceFrames, correct, measurement_rows
+from astropolcal.correction.frames import frame_positions
 from astropolcal.exceptions import ChainError, InstrumentError, ObservationError
 from astropolcal.measurement import Measurement
-from astropolcal.observations import get_observable
+from astropolcal.observations.observables import get_observable
 from astropolcal.reduction.cubes import both_states, true_observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

@@ -20,7 +20,7 @@ from astropolcal.gap.effects.effect import tracking_laws
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
-from astropolcal.observations import common_wavelengths
+from astropolcal.observations.reading import common_wavelengths
 from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 
 __all__ = []

@@ -35,8 +35,8 @@ from astropolcal.instruments._irdis_optics import (
 from astropolcal.instruments.base import Instrument
 from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.telescope import INTERNAL, STARS, star_source
-from astropolcal.observations import is_star
 from astropolcal.observations.pointings import location_of
+from astropolcal.observations.quality import is_star
 
 __all__ = ["IRDIS"]
 

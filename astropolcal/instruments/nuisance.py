@@ -14,7 +14,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import InstrumentError
-from astropolcal.observations import common_wavelengths
+from astropolcal.observations.reading import common_wavelengths
 
 __all__ = ["NUISANCES", "add_nuisance", "without_nuisance"]
 

@@ -30,7 +30,7 @@ from astropolcal.instruments.vampires_headers import (
     mode_header,
     slices_of,
 )
-from astropolcal.observations import is_star, mask_saturated
+from astropolcal.observations.quality import is_star, mask_saturated
 
 __all__ = ["VAMPIRES"]
 

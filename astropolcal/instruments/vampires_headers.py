@@ -17,7 +17,7 @@ from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments._subaru_optics import SITE
 from astropolcal.instruments.layout import FileLayout
 from astropolcal.instruments.readout import EM_EXCESS_NOISE, ReadOut
-from astropolcal.observations.wavelengths import SAME_WAVELENGTH, filter_wavelength
+from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 
 __all__ = ["FIELDS", "KEYWORDS", "LAYOUT", "layout_of", "mode_header", "slices_of"]
 

@@ -10,7 +10,7 @@ from astropy.table import QTable
 from astropolcal.chain import find_optic, leaves, stages, system_mueller, with_beam
 from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.mueller import is_physical
-from astropolcal.observations import is_star
+from astropolcal.observations.quality import is_star
 from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource
 from astropolcal.simulation import simulate
 from astropolcal.testing._values import (

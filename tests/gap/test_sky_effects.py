@@ -26,7 +26,8 @@ from astropolcal.gap.model import Model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.selection import ENOUGH, select
 from astropolcal.instruments.telescope import published_mirror
-from astropolcal.observations import Observations, sky_angles, tracked
+from astropolcal.observations import Observations
+from astropolcal.observations.pointings import sky_angles, tracked
 from astropolcal.simulation import simulate
 
 SMOOTH = [effect for effect in EFFECTS.values() if effect.kind != "discrete"]

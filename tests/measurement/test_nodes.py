@@ -11,7 +11,8 @@ from astropolcal import optics
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement import FreeParameters, Measurement, Normal
-from astropolcal.observations import Observations, sky_positions
+from astropolcal.observations import Observations
+from astropolcal.observations.pointings import sky_positions
 
 
 def truth(**options):

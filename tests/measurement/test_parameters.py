@@ -8,7 +8,8 @@ import pytest
 from astropolcal import optics
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.measurement import FreeParameters, Slot, Tie, parameter_table
-from astropolcal.observations import Observations, common_wavelengths, example_table
+from astropolcal.observations import Observations, example_table
+from astropolcal.observations.reading import common_wavelengths
 
 
 def two_optics(**retarder):

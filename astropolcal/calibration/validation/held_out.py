@@ -9,7 +9,7 @@ from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, FitError, ObservationError
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import PolarizedSource
 
 __all__ = ["add_standard"]

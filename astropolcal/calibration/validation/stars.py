@@ -16,7 +16,7 @@ from astropolcal.exceptions import (
     WavelengthRangeError,
 )
 from astropolcal.measurement import Measurement
-from astropolcal.observations import cycle_numbers
+from astropolcal.observations.quality import cycle_numbers
 from astropolcal.optics import PolarizedSource, StarSource
 from astropolcal.stokes import polarization_angle
 
