@@ -382,15 +382,9 @@ class Search:
             seen = zip(self.model.observations, out, strict=True)
             left = [o.with_mask(mask, "accused") if mask.any() else o for o, mask in seen]
             chains = nominal_calibration(chains, left).chains
-        problem = GapProblem(
-            chains,
-            self.model.observations,
-            ties=old.ties,
-            laws=old.laws,
-            priors=old.priors,
-            neutral=old.neutral,
-            limits=old.limits,
-        )
+        keys = ("ties", "laws", "priors", "neutral", "limits")
+        known = {key: getattr(old, key) for key in keys}
+        problem = GapProblem(chains, self.model.observations, **known)
         q = problem.start if look.chance < _NOISE else look.coefficients
         for channel, dataset, residual, without in zip(
             problem.channels, problem.datasets, problem.differences(q), out, strict=True
