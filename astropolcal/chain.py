@@ -12,9 +12,9 @@ import numpy as np
 from astropy.modeling import CompoundModel
 
 from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.mueller._light import act, turned
 from astropolcal.optics import Optic
-from astropolcal.optics.positions import FLUXES, finite_position
+from astropolcal.optics.core import FLUXES, finite_position
+from astropolcal.propagation import act, turned
 from astropolcal.words import did_you_mean
 
 __all__ = [

@@ -10,7 +10,7 @@ from astropy.table import QTable
 from astropolcal.chain import stages
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
-from astropolcal.optics.positions import finite_position
+from astropolcal.optics.core import finite_position
 from astropolcal.propagation import Propagator
 from astropolcal.units import length_to_um
 

@@ -88,7 +88,7 @@ class OpticConverter(Converter):
     --------
     >>> from astropolcal.converters.optics import OpticConverter
     >>> OpticConverter("Rotator").types
-    ['astropolcal.optics.rotators.Rotator']
+    ['astropolcal.optics.retarders.Rotator']
     """
 
     def __init__(self, name):

@@ -23,7 +23,7 @@ from astropolcal.exceptions import (
 from astropolcal.measurement import FreeParameters
 from astropolcal.observations import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.positions import finite_position
+from astropolcal.optics.core import finite_position
 from astropolcal.units import length_to_um
 
 __all__ = ["RowModel", "check_optics", "measurement_rows", "sky_chain"]

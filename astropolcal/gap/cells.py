@@ -22,8 +22,8 @@ from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap._bases import law_basis
 from astropolcal.gap.problem import GapProblem
 from astropolcal.optics import GENERATORS, Dependence
+from astropolcal.optics.core import COORDINATES
 from astropolcal.optics.perturbations import split_run
-from astropolcal.optics.positions import COORDINATES
 
 __all__ = ["Cell", "Place", "Probes", "dependences", "places"]
 

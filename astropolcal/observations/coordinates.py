@@ -6,7 +6,7 @@ from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.positions import MOVES
+from astropolcal.optics.core import MOVES
 
 __all__ = ["angle_change", "clock", "frame_coordinate"]
 

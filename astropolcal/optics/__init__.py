@@ -7,31 +7,36 @@ registered in `OPTICS`; a new optic is one class and its entry there, and the
 registry tests then hold it to the laws that all optics obey.
 """
 
-from astropolcal.optics.beamsplitters import BeamGain, WollastonPrism
 from astropolcal.optics.core import COORDINATES, Optic, rotation_generator
-from astropolcal.optics.depolarizers import Depolarizer
-from astropolcal.optics.derotators import KMirror
-from astropolcal.optics.fluxes import FluxGain, PolarizedBackground, StrayLight
-from astropolcal.optics.general import MuellerElement
-from astropolcal.optics.mirrors import MetalMirror, ParityFlip, PowerLawMirror
+from astropolcal.optics.mirrors import KMirror, MetalMirror, ParityFlip, PowerLawMirror
 from astropolcal.optics.modulated import (
     DriftRetarder,
     DriftRotator,
+    FerroelectricLiquidCrystal,
+    FluxGain,
     FrameOptic,
     HarmonicGain,
     HarmonicRetarder,
     HarmonicRotator,
+    PolarizedBackground,
+    StrayLight,
 )
-from astropolcal.optics.modulators import FerroelectricLiquidCrystal
-from astropolcal.optics.perturbations import GENERATORS, Dependence, Perturbation
+from astropolcal.optics.perturbations import GENERATORS, Dependence, MuellerElement, Perturbation
 from astropolcal.optics.polarizers import (
+    BeamGain,
+    Depolarizer,
     Diattenuator,
     DiattenuatorRetarder,
     LinearPolarizer,
     VectorDiattenuator,
+    WollastonPrism,
 )
-from astropolcal.optics.retarders import EllipticalRetarder, LinearRetarder, TwoLayerWaveplate
-from astropolcal.optics.rotators import Rotator
+from astropolcal.optics.retarders import (
+    EllipticalRetarder,
+    LinearRetarder,
+    Rotator,
+    TwoLayerWaveplate,
+)
 from astropolcal.optics.sources import PolarizedSource, StarSource
 
 __all__ = [

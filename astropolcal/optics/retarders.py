@@ -1,16 +1,21 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Optics that retard: linear and elliptical retarders, and a waveplate of two layers."""
+"""Optics that retard or rotate: retarders, a waveplate of two layers, turns of the frame."""
 
 import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.materials import MGF2, QUARTZ
-from astropolcal.mueller.elements import _elliptical_retarder, _linear_retarder
-from astropolcal.optics._matrices import blank, retardance_slope
+from astropolcal.mueller import (
+    _elliptical_retarder,
+    _linear_retarder,
+    _rotation_matrix,
+    blank,
+    retardance_slope,
+)
 from astropolcal.optics.core import Optic
 
-__all__ = ["EllipticalRetarder", "LinearRetarder", "TwoLayerWaveplate"]
+__all__ = ["EllipticalRetarder", "LinearRetarder", "Rotator", "TwoLayerWaveplate"]
 
 
 class LinearRetarder(Optic):
@@ -279,3 +284,38 @@ def _series(x2, first, *ratios):
     for ratio in reversed(ratios):
         total = 1.0 - x2 / ratio * total
     return total / first
+
+
+class Rotator(Optic):
+    r"""
+    Rotation of the reference frame for everything that follows.
+
+    .. math:: T(\Theta) = \begin{pmatrix}1&0&0&0\\0&\cos2\Theta&\sin2\Theta&0\\
+              0&-\sin2\Theta&\cos2\Theta&0\\0&0&0&1\end{pmatrix}
+
+    with :math:`\Theta` = ``theta`` + position of the mount (paper, Sec. 4.1).
+    The sky chain of CHARIS is ``Rotator(mount="parallactic") | m3 |
+    Rotator(mount="-altitude")``.
+
+    Parameters
+    ----------
+    theta : `~astropy.units.Quantity`
+        Angle of the rotation.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import Rotator
+    >>> _, I, Q, U, V = Rotator(theta=45 * u.deg)(1.6 * u.um, 1, 1, 0, 0)
+    >>> round(float(U), 6)
+    -1.0
+    """
+
+    rotates_frame = True
+
+    def _matrix(self, dispersion):
+        # the turn by theta and mount is done in Optic, which knows `rotates_frame`
+        return _rotation_matrix(0.0)
+
+    def _derivatives(self, dispersion):
+        return ()

@@ -5,7 +5,7 @@ import astropy.units as units
 import numpy as np
 from astropy.modeling import Parameter
 
-from astropolcal.optics._matrices import blank
+from astropolcal.mueller import blank
 from astropolcal.optics.core import Optic
 
 __all__ = ["PolarizedSource", "StarSource"]

@@ -14,8 +14,7 @@ from hypothesis.extra.numpy import arrays
 
 from astropolcal import mueller, optics, thinfilm
 from astropolcal.exceptions import ParameterError
-from astropolcal.optics import OPTICS, rotation_generator
-from astropolcal.optics._matrices import (
+from astropolcal.mueller import (
     blank,
     diattenuation_slope,
     fill_phase_block,
@@ -23,7 +22,8 @@ from astropolcal.optics._matrices import (
     transverse_share,
     turn,
 )
-from astropolcal.optics.positions import (
+from astropolcal.optics import OPTICS, rotation_generator
+from astropolcal.optics.core import (
     COORDINATES,
     FLUXES,
     MOVES,

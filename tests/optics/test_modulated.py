@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from astropolcal import mueller, optics
 from astropolcal.chain import system_mueller
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller.elements import _diattenuator
+from astropolcal.mueller import _diattenuator
 from astropolcal.optics import (
     COORDINATES,
     OPTICS,
