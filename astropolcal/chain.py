@@ -12,14 +12,13 @@ import numpy as np
 from astropy.modeling import CompoundModel
 
 from astropolcal.exceptions import ChainError, ParameterError
+from astropolcal.mueller import act, turned
 from astropolcal.optics import Optic
 from astropolcal.optics.core import FLUXES, finite_position
-from astropolcal.propagation import act, turned
 from astropolcal.words import did_you_mean
 
 __all__ = [
     "at_positions",
-    "find_optic",
     "insert_optic",
     "join",
     "leaves",
@@ -27,7 +26,6 @@ __all__ = [
     "replace_optic",
     "stages",
     "system_mueller",
-    "system_mueller_derivatives",
     "with_beam",
 ]
 

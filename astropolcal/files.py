@@ -21,7 +21,7 @@ from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
 
-__all__ = ["atomic_path", "check_new", "check_yaml", "one_line", "understood"]
+__all__ = []
 
 # a file of ours is 12 levels deep; loaders call themselves at each and die at some thousands
 _DEEPEST = 64

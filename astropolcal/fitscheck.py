@@ -22,14 +22,7 @@ import numpy as np
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.files import understood
 
-__all__ = [
-    "MOST_BLOCKS",
-    "MOST_HDUS",
-    "check_fits",
-    "open_fits",
-    "primary_header",
-    "readable_fits",
-]
+__all__ = []
 
 # bytes; all parts of a file are filled up to whole blocks (Sec. 3.1 of the standard)
 _BLOCK, _CARD = 2880, 80

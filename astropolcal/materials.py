@@ -18,24 +18,11 @@ from astropolcal.units import length_to_um
 from astropolcal.words import did_you_mean
 
 __all__ = [
-    "AL2O3",
-    "ALUMINIUM",
-    "DATABASE_PREFIX",
-    "FUSED_SILICA",
-    "GOLD",
-    "MGF2",
-    "QUARTZ",
-    "SI3N4",
-    "SILVER",
-    "BrendelBormannLaw",
     "IsotropicMaterial",
     "Metal",
-    "SellmeierLaw",
     "TabulatedLaw",
     "UniaxialMaterial",
-    "database_material",
     "get_material",
-    "material_names",
     "register_material",
 ]
 

@@ -14,7 +14,7 @@ from astropolcal.optics.core import finite_position
 from astropolcal.propagation import Propagator
 from astropolcal.units import length_to_um
 
-__all__ = ["check_seed", "entering_flux", "expected_fluxes", "half_wave_plate_cycles", "simulate"]
+__all__ = ["half_wave_plate_cycles", "simulate"]
 
 #: The angles of a calibration run of CHARIS (paper, Sec. 5.1).
 _CYCLE = np.array([0, 45, 11.25, 56.25, 22.5, 67.5, 33.75, 78.75])

@@ -17,19 +17,7 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import angle_to_rad, to_unit
 
-__all__ = [
-    "angle_of_linear_polarization",
-    "aolp_error",
-    "aolp_interval",
-    "debias_dolp",
-    "degree_of_linear_polarization",
-    "degree_of_polarization",
-    "dolp_error",
-    "is_physical_stokes",
-    "polarization_angle",
-    "stokes_from_dolp_aolp",
-    "transverse_error",
-]
+__all__ = ["aolp_error", "aolp_interval", "debias_dolp", "dolp_error"]
 
 
 def degree_of_linear_polarization(stokes, axis=-1):

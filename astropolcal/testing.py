@@ -23,7 +23,7 @@ from astropolcal.observations import is_star
 from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource
 from astropolcal.simulation import simulate
 
-__all__ = ["RULES", "Conformance", "check_instrument"]
+__all__ = ["check_instrument"]
 
 # standard deviation by which the true values of free parameters are moved: in radian or 1,
 # and of other dimensions the share of them

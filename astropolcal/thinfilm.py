@@ -20,7 +20,7 @@ from astropolcal.materials import get_material
 from astropolcal.mueller import diattenuator_retarder
 from astropolcal.units import angle_to_rad, length_to_um
 
-__all__ = ["Reflection", "fresnel", "reflect"]
+__all__ = ["reflect"]
 
 # keeps the admittance of p finite exactly at the critical angle
 _GRAZING = 1e-12

@@ -19,15 +19,7 @@ from erfa import ErfaWarning
 from astropolcal.exceptions import ParameterError
 from astropolcal.files import one_line
 
-__all__ = [
-    "angle_to_rad",
-    "canonical_factor",
-    "canonical_unit",
-    "iso_date",
-    "length_to_um",
-    "plain_number",
-    "to_unit",
-]
+__all__ = []
 
 # radian for numpy, micrometre because dispersion laws are written in it
 _CANONICAL = (u.rad, u.um, u.dimensionless_unscaled)

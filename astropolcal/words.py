@@ -5,7 +5,7 @@ Words that messages share: near matches of a name, and numbers with their nouns.
 
 import difflib
 
-__all__ = ["counted", "did_you_mean"]
+__all__ = []
 
 # difflib's own default: from this similarity on, 1 being the same, a name is suggested
 _SIMILAR = 0.6

@@ -16,7 +16,8 @@ from astropolcal import calibrate, diagnose, instruments, optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError
 from astropolcal.instruments import CHARIS, Instrument, SkyLaw
-from astropolcal.measurement import FreeParameters, Measurement
+from astropolcal.measurement import Measurement
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import Observations, is_star
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

@@ -10,7 +10,6 @@ from scipy.linalg import expm
 
 from astropolcal import mueller
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller import elements
 
 ANGLE = st.floats(-720, 720)
 RETARDANCE = st.floats(-3.0, 3.0)
@@ -100,7 +99,7 @@ def generator(h, d, r):
 @given(RETARDANCE, RETARDANCE, RETARDANCE, st.integers(-300, 0))
 def test_elliptical_retarder_is_exact_through_zero(h, d, r, exponent):
     scale = 10.0**exponent
-    found = elements._elliptical_retarder(h * scale, d * scale, r * scale)
+    found = mueller._elliptical_retarder(h * scale, d * scale, r * scale)
     expected = expm(generator(h * scale, d * scale, r * scale))
     np.testing.assert_allclose(found[1:, 1:], expected, rtol=0, atol=1e-14)
     # the small elements keep their own relative accuracy
@@ -113,7 +112,7 @@ def test_elliptical_retarder_is_exact_through_zero(h, d, r, exponent):
 
 
 def test_no_retardance_is_no_optic():
-    np.testing.assert_array_equal(elements._elliptical_retarder(0.0, 0.0, 0.0), np.eye(4))
+    np.testing.assert_array_equal(mueller._elliptical_retarder(0.0, 0.0, 0.0), np.eye(4))
 
 
 @given(RETARDANCE)
@@ -371,7 +370,7 @@ def test_retardance_vector_round_trip(h, d, r, exponent):
     length = np.linalg.norm(vector)
     if length > 3.14:
         vector *= 3.14 / length
-    found = mueller.retardance_vector(elements._elliptical_retarder(*vector))
+    found = mueller.retardance_vector(mueller._elliptical_retarder(*vector))
     np.testing.assert_allclose(found.to_value(u.rad), vector, rtol=0, atol=1e-12)
 
 
@@ -385,7 +384,7 @@ def test_half_wave_retardance_has_a_positive_first_component(axis):
     axis = np.array(axis)
     expected = np.pi * axis * np.sign(axis[np.nonzero(axis)[0][0]])
     for sign in (1, -1):
-        matrix = elements._elliptical_retarder(*(sign * np.pi * axis))
+        matrix = mueller._elliptical_retarder(*(sign * np.pi * axis))
         found = mueller.retardance_vector(matrix).to_value(u.rad)
         np.testing.assert_allclose(found, expected, atol=1e-7)
 
@@ -550,7 +549,7 @@ def test_coherency_of_a_retarder_is_that_of_its_jones_matrix(h, d, r):
     vector = np.array([h, d, r])
     total = np.linalg.norm(vector)
     c = np.array([np.cos(total / 2), *(1j * np.sinc(total / 2 / np.pi) * vector / 2)])
-    found = mueller.coherency_matrix(elements._elliptical_retarder(h, d, r))
+    found = mueller.coherency_matrix(mueller._elliptical_retarder(h, d, r))
     np.testing.assert_allclose(found, np.outer(c, c.conj()), atol=1e-14)
 
 

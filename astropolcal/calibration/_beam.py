@@ -9,7 +9,7 @@ from astropolcal.calibration.validity import (
     validity_of,
 )
 from astropolcal.exceptions import AstropolcalError, ChainError
-from astropolcal.instruments import without_nuisance
+from astropolcal.instruments.base import without_nuisance
 
 
 def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"):

@@ -8,7 +8,7 @@ from astropy.time import Time
 
 from astropolcal import instruments
 from astropolcal.exceptions import CalibrationFileError, InstrumentError, ObservationError
-from astropolcal.instruments.keywords import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
+from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
 from astropolcal.observations.reading import numeric_column
 from astropolcal.units import plain_number
 

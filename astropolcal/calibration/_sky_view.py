@@ -16,8 +16,9 @@ from astropolcal import instruments
 from astropolcal.calibration._rows import Rows
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
-from astropolcal.instruments import SkyLaw, without_nuisance
-from astropolcal.measurement import FreeParameters
+from astropolcal.instruments import SkyLaw
+from astropolcal.instruments.base import without_nuisance
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.optics import COORDINATES
 
 _ALTITUDES, _PARALLACTIC = np.deg2rad([30.0, 50.0, 70.0]), np.deg2rad([-60.0, 0.0, 60.0])

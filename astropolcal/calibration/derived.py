@@ -16,7 +16,7 @@ import numpy as np
 from astropolcal.calibration._directions import led
 from astropolcal.calibration.covariance import full_covariance
 from astropolcal.exceptions import ParameterError
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.units import canonical_factor
 
 __all__ = ["Derived", "propagate"]

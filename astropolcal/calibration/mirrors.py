@@ -15,7 +15,7 @@ from astropolcal.calibration._sky_view import LEFT_OUT
 from astropolcal.calibration._system import split_chain
 from astropolcal.calibration.sky import consequences_of, matters, sky_words
 from astropolcal.chain import join, leaves, stages, system_mueller
-from astropolcal.instruments import without_nuisance
+from astropolcal.instruments.base import without_nuisance
 from astropolcal.optics import COORDINATES, EllipticalRetarder, LinearRetarder, MuellerElement
 
 __all__ = ["mirror_solutions"]

@@ -20,7 +20,7 @@ from astropolcal.exceptions import (
     ChainError,
     WavelengthRangeError,
 )
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import finite_position

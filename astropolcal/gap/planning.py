@@ -27,7 +27,8 @@ from astropolcal.gap._forecast import (
 from astropolcal.gap._words import listed
 from astropolcal.gap.effects import Roles, get_effect
 from astropolcal.gap.selection import REMAINDER
-from astropolcal.optics import COORDINATES, Dependence
+from astropolcal.optics import COORDINATES
+from astropolcal.optics.perturbations import Dependence
 
 __all__ = ["Exposure", "exposures", "plan"]
 

@@ -1,17 +1,26 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What an instrument is to astropolcal: its chain, its stages, its tables."""
+"""
+What an instrument is to astropolcal: its chain, its stages, its tables.
+
+With how its stages follow the sky, and the nuisance of a dataset: background in the apertures,
+unequal gains of the beams and the polarization of a lamp that is called unpolarized are optics
+of one dataset, with its name, and with a prior that keeps them small where the data cannot tell
+them from what the datasets share.
+"""
 
 import inspect
+import math
+import re
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal.chain import join, stages
+from astropolcal import optics
+from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments._choices import check_choice
-from astropolcal.instruments.following import SkyLaw
-from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
 from astropolcal.instruments.telescope import as_exact, behind_telescope, star_options
 from astropolcal.observations import (
     common_wavelengths,
@@ -23,10 +32,287 @@ from astropolcal.observations import (
     sky_positions,
 )
 from astropolcal.observations.coordinates import angle_change
-from astropolcal.observations.pointings import location_of
+from astropolcal.observations.pointings import TRACKING, location_of
 from astropolcal.observations.quality import plain_source
 
-__all__ = ["Instrument"]
+__all__ = ["Instrument", "SkyLaw", "add_nuisance"]
+
+
+def check_choice(what, value, allowed):
+    """Raise an InstrumentError if a value is not one of those allowed."""
+    if value not in allowed:
+        words = ", ".join(map(str, allowed)) or "none"
+        raise InstrumentError(f"{what} = {value!r}; allowed are {words}")
+
+
+# what keeps the pupil, or the image, still at a Nasmyth focus
+_NASMYTH = MappingProxyType({"pupil": (0.0, 0.5), "field": (0.5, 0.5)})
+
+
+@dataclass(frozen=True)
+class SkyLaw:
+    r"""
+    How half-wave plate and derotator follow parallactic angle *p* and altitude *a*.
+
+    .. math:: \theta = \theta_0 + f\,p + g\,a
+
+    with the commanded angle, or an offset, :math:`\theta_0`.
+
+    Parameters
+    ----------
+    plate : (float, float) or dict of str to (float, float)
+        (f, g) of the half-wave plate; (0, 0) for one that stays where it is put. Where it depends
+        on what the derotator keeps still, one for each mode, such as ``"field"`` and ``"pupil"``.
+        Without it that of Subaru, (0.5, 1).
+    derotator : dict of str to (float, float)
+        (f, g) of the derotator for each mode; empty where there is none. Without it that of a
+        Nasmyth focus: (0, 0.5) for ``"pupil"``, (0.5, 0.5) for ``"field"``.
+
+    Raises
+    ------
+    InstrumentError
+        If a law is not two finite numbers, or plate and derotator have other modes.
+
+    Examples
+    --------
+    A polarimeter at a Cassegrain focus, which turns with the telescope:
+
+    >>> from astropolcal.instruments import SkyLaw
+    >>> SkyLaw(plate=(0, 0), derotator={}).plate_law()
+    (0.0, 0.0)
+
+    One whose plate has a law of its own for each mode:
+
+    >>> law = SkyLaw(plate={"field": (-1, 1), "pupil": (-0.5, 1)})
+    >>> law.plate_law("pupil"), law.derotator_law("pupil")
+    ((-0.5, 1.0), (0.0, 0.5))
+    """
+
+    plate: object = TRACKING
+    derotator: dict = field(default_factory=lambda: dict(_NASMYTH))
+
+    def __post_init__(self):
+        # one law for all modes has the name ""
+        given = self.plate if isinstance(self.plate, dict) else {"": self.plate}
+        plate = {mode: _pair(f"plate {mode}".strip(), law) for mode, law in given.items()}
+        turns = {mode: _pair(f"derotator {mode}", law) for mode, law in self.derotator.items()}
+        if not plate:
+            raise InstrumentError("plate = {}: at least one law is needed, (0, 0) if it stands")
+        # a frozen instance is set once, here
+        object.__setattr__(self, "plate", plate)
+        object.__setattr__(self, "derotator", turns)
+        # a mode of the plate that the derotator lacks could never be asked for
+        lost = sorted(set(plate) - {""} - set(turns)) if turns else []
+        if lost:
+            raise InstrumentError(
+                f"the plate has a law for {', '.join(lost)}, the derotator for {', '.join(turns)}"
+            )
+
+    @property
+    def modes(self):
+        """What the derotator may keep still, or what the law of the plate depends on."""
+        return tuple(self.derotator) or tuple(mode for mode in self.plate if mode)
+
+    @property
+    def plate_depends_on_mode(self):
+        """Whether the law of the plate is another one in another mode."""
+        # two modes with the same law need not be told apart
+        return len(set(self.plate.values())) > 1
+
+    def plate_law(self, mode=None):
+        """
+        Return the factors of parallactic angle and altitude in the plate's true angle.
+
+        Parameters
+        ----------
+        mode : str, optional
+            What the derotator keeps still; needed where the law depends on it.
+
+        Returns
+        -------
+        (float, float)
+
+        Raises
+        ------
+        InstrumentError
+            If the mode is unknown, or not given where it is needed.
+        """
+        if mode is not None and self.modes:
+            check_choice("mode", mode, self.modes)
+        if mode in self.plate:
+            return self.plate[mode]
+        if self.plate_depends_on_mode:
+            check_choice("mode", mode, tuple(self.plate))
+        return next(iter(self.plate.values()))
+
+    def derotator_law(self, mode):
+        """
+        Return the factors of parallactic angle and altitude in the derotator's angle.
+
+        Parameters
+        ----------
+        mode : str
+            What it keeps still.
+
+        Returns
+        -------
+        (float, float)
+
+        Raises
+        ------
+        InstrumentError
+            If there is no derotator, or the mode is unknown.
+        """
+        if not self.derotator:
+            raise InstrumentError("there is no derotator that follows the sky")
+        check_choice("law", mode, tuple(self.derotator))
+        return self.derotator[mode]
+
+
+def _pair(what, law):
+    try:
+        f, g = (float(number) for number in law)
+    except (TypeError, ValueError):
+        f = g = float("nan")
+    if not (math.isfinite(f) and math.isfinite(g)):
+        raise InstrumentError(
+            f"{what}: {law!r} must be two numbers, factors of parallactic angle and altitude"
+        )
+    return f, g
+
+
+#: What may be added, and the standard deviation of its prior, a normal around zero.
+NUISANCES = {"background": 0.01, "beam_gain": 0.02, "lamp": 0.002}
+
+
+def add_nuisance(chains, datasets, nuisance):
+    """
+    Return the chains with nuisance optics, one of each kind for each dataset.
+
+    ``"background"``, light that is added at a constant flux: the share of it in a frame of median
+    flux, one value a wavelength. ``"beam_gain"``, half the relative difference of the gains
+    of the two beams, one value a wavelength; normalized double differences see it in second
+    order only, single differences in first. ``"lamp"``, q and u of an internal source without
+    polarizer, for all wavelengths; q cannot be told from the diattenuation of a mirror that
+    stands straight, except by the prior.
+
+    Parameters
+    ----------
+    chains : sequence of `~astropy.modeling.CompoundModel`
+        The chain of each dataset.
+    datasets : sequence of Observations
+        The datasets.
+    nuisance : sequence of str
+        Kinds, or ``"KIND:DATASET"`` for one dataset only.
+
+    Returns
+    -------
+    list of `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    InstrumentError
+        If a kind or dataset is unknown, or ``"lamp"`` is asked for where there is no such source.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments import add_nuisance
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
+    >>> lamp = simulate(charis.chain(), charis.wavelength, frames, name="night 1")
+    >>> chain, = add_nuisance([charis.chain()], [lamp], ["background"])
+    >>> [optic.name for optic in chain][-2:]
+    ['background_night_1', 'wollaston']
+    """
+    chains, names = list(chains), [observations.name for observations in datasets]
+    # names of optics must do as optic.parameter
+    labels = [re.sub(r"\W+", "_", name) for name in names]
+    # two tables may have one name
+    labels = [f"{t}_{i + 1}" if labels.count(t) > 1 else t for i, t in enumerate(labels)]
+    size = len(common_wavelengths(datasets))
+    for text in nuisance:
+        kind, _, wanted = str(text).partition(":")
+        _check(kind, wanted, names)
+        chosen = [i for i, name in enumerate(names) if wanted in ("", name)]
+        if kind == "lamp":
+            chosen = _lamps(chains, chosen, text)
+        for i in chosen:
+            chains[i] = _added(chains[i], datasets[i], kind, f"{kind}_{labels[i]}", size)
+    return chains
+
+
+def without_nuisance(chain):
+    """
+    Return a chain without the nuisance optics of its dataset.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        The chain.
+
+    Returns
+    -------
+    `~astropy.modeling.CompoundModel`
+
+    Examples
+    --------
+    >>> from astropolcal import instruments, optics
+    >>> from astropolcal.instruments import without_nuisance
+    >>> chain = instruments.get("charis").chain() | optics.BeamGain(name="beam_gain_night")
+    >>> without_nuisance(chain).submodel_names[-1]
+    'wollaston'
+    """
+    prefixes = tuple(f"{kind}_" for kind in NUISANCES)
+    found = leaves(chain)
+    kept = [leaf for leaf in found if not str(leaf.name).startswith(prefixes)]
+    return chain if len(kept) == len(found) else join(kept)
+
+
+def _check(kind, wanted, names):
+    if kind not in NUISANCES:
+        raise InstrumentError(f"nuisance {kind!r}; allowed are {', '.join(NUISANCES)}")
+    if wanted and wanted not in names:
+        raise InstrumentError(f"nuisance {kind}: no dataset {wanted!r}; there are {names}")
+
+
+def _lamps(chains, chosen, text):
+    """Return the chains of internal sources without polarizer."""
+    polarized = (optics.LinearPolarizer, optics.PolarizedSource)
+    lamps = [i for i in chosen if not isinstance(leaves(chains[i])[0], polarized)]
+    if not lamps:
+        raise InstrumentError(f"nuisance {text}: no dataset is of an unpolarized internal source")
+    return lamps
+
+
+def _added(chain, observations, kind, name, size):
+    found, prior, zero = leaves(chain), _normal(NUISANCES[kind]), np.zeros(size)
+    split = next(i for i, leaf in enumerate(found) if leaf.splits_light)
+    if kind == "lamp":
+        source = optics.PolarizedSource(name=name)
+        source.q.prior = source.u.prior = prior
+        return join([source, *found])
+    if kind == "beam_gain":
+        # behind the splitter, where there are two beams
+        gain = optics.BeamGain(imbalance=zero, name=name)
+        gain.imbalance.prior = prior
+        return join([*found[: split + 1], gain, *found[split + 1 :]])
+    # the sum of both beams is 0 where it is masked
+    flux = observations.position("total_flux")
+    # in front of the splitter: background falls on both beams alike
+    light = optics.StrayLight(
+        amount=zero, reference=float(np.median(flux[flux > 0])), mount="total_flux", name=name
+    )
+    light.amount.prior = prior
+    return join([*found[:split], light, *found[split:]])
+
+
+def _normal(std):
+    from scipy.stats import norm
+
+    return norm(0.0, std)
 
 
 class Instrument(ABC):

@@ -18,26 +18,23 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments._subaru_optics import (
-    CHANGES,
-    SITE,
-    fold_mirror,
-    misaligned,
-    polarizer,
-    two_layer_plate,
-)
 from astropolcal.instruments.base import Instrument
-from astropolcal.instruments.keywords import frame_time
-from astropolcal.instruments.layout import FileLayout
+from astropolcal.instruments.layout import FileLayout, frame_time
 from astropolcal.instruments.telescope import (
+    CHANGES,
     INTERNAL,
     M3_MODELS,
+    SITE,
     STARS,
+    fold_mirror,
     k_mirror,
+    misaligned,
+    polarizer,
     published_mirror,
     star_source,
     telescope,
     tertiary_mirror,
+    two_layer_plate,
 )
 from astropolcal.observations.reading import stated_date
 

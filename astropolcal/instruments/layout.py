@@ -1,13 +1,90 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""How the files of an instrument look: header keywords, detector, places of the beams."""
+"""
+How the FITS files of an instrument look, and what their headers say in the units of the layout.
+"""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
-from astropolcal.exceptions import InstrumentError, ObservationError
-from astropolcal.instruments.readout import EM_EXCESS_NOISE, ReadOut
+import astropy.units as u
+from astropy.io.fits import VerifyError
+from astropy.io.fits.card import Undefined
+from astropy.time import Time
 
-__all__ = ["FileLayout"]
+from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.observations.pointings import offline
+from astropolcal.units import iso_date, plain_number
+
+__all__ = ["FileLayout", "ReadOut"]
+
+#: By what factor a long multiplication register raises the photon noise.
+EM_EXCESS_NOISE = math.sqrt(2)
+
+
+@dataclass(frozen=True)
+class ReadOut:
+    """
+    A way to read a detector out.
+
+    Parameters
+    ----------
+    gain : float
+        Electrons per adu.
+    read_noise : float
+        Of a pixel, electrons.
+    saturation : float
+        Value of a pixel, in adu, above which it is not linear.
+    excess_noise : float
+        Standard deviation of the signal over that of its photon noise; 1 without multiplication.
+
+    Raises
+    ------
+    InstrumentError
+        If a number is out of range.
+
+    Notes
+    -----
+    In an EMCCD the number of electrons that leave the register for each that enters has a wide
+    distribution, which raises the photon noise by a factor near the square root of 2 (Robbins &
+    Hadwen 2003, IEEE Trans. Electron Devices 50, 1227, doi:10.1109/TED.2003.813462).
+
+    Examples
+    --------
+    >>> from astropolcal.instruments.layout import ReadOut
+    >>> ReadOut(gain=4.5, read_noise=90.0).multiplied(300).read_noise
+    0.3
+    """
+
+    gain: float = 1.0
+    read_noise: float = 0.0
+    saturation: float = math.inf
+    excess_noise: float = 1.0
+
+    def __post_init__(self):
+        positive = self.gain > 0 and self.saturation > 0
+        if not (positive and self.read_noise >= 0 and self.excess_noise >= 1):
+            raise InstrumentError(
+                f"{self}: gain and saturation must be above zero, read_noise at least 0 and "
+                "excess_noise at least 1"
+            )
+
+    def multiplied(self, em_gain):
+        """
+        Return gain and read noise in electrons before a multiplication.
+
+        Parameters
+        ----------
+        em_gain : float
+            Electrons that leave the register for each that enters.
+
+        Returns
+        -------
+        ReadOut
+        """
+        return replace(self, gain=self.gain / em_gain, read_noise=self.read_noise / em_gain)
+
 
 _WEIGHTS = ("inverse variance", "error")
 
@@ -274,3 +351,234 @@ class FileLayout:
         rights = [path for path in files if self.beam_files[0] in Path(path).name]
         lefts = {str(self.left_file(path)) for path in rights}
         return [path for path in files if str(Path(path)) not in lefts]
+
+
+#: Columns that are angles of a stage.
+ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
+#: Columns that are text, whatever they look like.
+TEXTS = (
+    "date",
+    "time",
+    "right_ascension",
+    "declination",
+    "object",
+    "instrument",
+    "filter",
+    "pickoff",
+    "flc",
+    "flc_state",
+    "read_mode",
+)
+#: Beyond these, in degree, an angle in a header cannot be right.
+RANGES = dict.fromkeys(ANGLES, (-720.0, 720.0)) | {"altitude": (0.0, 90.0)}
+RANGES |= {"em_gain": (0.0, 1e5)}
+# numbers without a unit
+# what a layout means that gives no unit; everything else is in degree
+_UNITS = {"camera": "", "em_gain": "", "exposure_time": "s"}
+
+_MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
+
+
+def look_up(headers, column, layout):
+    """
+    Return the first keyword that holds a value for a column, and the value.
+
+    Parameters
+    ----------
+    headers : sequence of `~astropy.io.fits.Header` or dict
+        Where to look, in turn.
+    column : str
+        Column of the observation table.
+    layout : FileLayout
+        Its ``keywords`` and ``alternatives``.
+
+    Returns
+    -------
+    keyword : str or None
+        Where there is no value, the first one; None if the layout knows none.
+    value : object or None
+        As it stands in the header; None for what stands for no value, such as "N/A".
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments.layout import look_up
+    >>> layout = instruments.get("charis").files
+    >>> look_up([{"D_IMRPAD": "N/A"}, {layout.keywords["hwp"]: 45.0}], "hwp", layout)[1]
+    45.0
+    """
+    return next(stated(headers, column, layout), (layout.keywords.get(column), None))
+
+
+def stated(headers, column, layout):
+    """
+    Yield all keywords that hold a value for a column, and the values, as `look_up` finds them.
+
+    Parameters
+    ----------
+    headers, column, layout
+        As for `look_up`.
+
+    Yields
+    ------
+    keyword : str
+    value : object
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments.layout import stated
+    >>> layout = instruments.get("vampires").files
+    >>> list(stated([{"U_HWPANG": 45.0, "RET-ANG1": 0.0}], "hwp", layout))
+    [('RET-ANG1', 0.0), ('U_HWPANG', 45.0)]
+    """
+    keywords = (layout.keywords.get(column), *layout.alternatives.get(column, ()))
+    for header, keyword in product(headers, filter(None, keywords)):
+        value = _read(header, keyword)
+        if value is None or isinstance(value, Undefined):
+            continue
+        if str(value).strip().lower() not in _MISSING:
+            yield keyword, value
+
+
+def unit_of(column, layout):
+    """
+    Return the unit of a column's keyword.
+
+    Parameters
+    ----------
+    column : str
+        Column of the observation table.
+    layout : FileLayout
+        Its ``units``; where it gives none, an angle is in degree and a time in seconds.
+
+    Returns
+    -------
+    `~astropy.units.Unit`
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments.layout import unit_of
+    >>> unit_of("altitude", instruments.get("charis").files)
+    Unit("deg")
+    """
+    return u.Unit(layout.units.get(column, _UNITS.get(column, "deg")))
+
+
+def _read(header, keyword):
+    try:
+        return header.get(keyword)
+    except VerifyError:
+        # no number, and no text that anything answers to
+        return "an unreadable card"
+
+
+def convert(column, value, layout, target):
+    """
+    Return a value of a header as a number in a unit.
+
+    Parameters
+    ----------
+    column : str
+        Column of the observation table.
+    value : object
+        As it stands in the header.
+    layout : FileLayout
+        Its ``transforms`` and ``units``.
+    target : unit-like
+        The unit wanted.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the value is no number.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments.layout import convert
+    >>> round(convert("altitude", "45.0", instruments.get("charis").files, "rad"), 6)
+    0.785398
+    """
+    factor, offset = layout.transforms.get(column, (1.0, 0.0))
+    unit = unit_of(column, layout)
+    return (factor * plain_number(value) + offset) * unit.to(target)
+
+
+def frame_time(header, layout):
+    """
+    Return when a frame was taken.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header` or dict
+        Of the frame.
+    layout : FileLayout
+        Where its ``mjd``, or its ``date`` and ``time``, stand.
+
+    Returns
+    -------
+    `~astropy.time.Time` or None
+        UTC; None if the header does not say. A date alone is its midnight.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If what the header says cannot be understood.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments.layout import frame_time
+    >>> layout = instruments.get("charis").files
+    >>> frame_time({layout.keywords["mjd"]: 60982.5}, layout).isot
+    '2025-11-03T12:00:00.000'
+    """
+    mjd, date, clock = (look_up([header], key, layout)[1] for key in ("mjd", "date", "time"))
+    if mjd is not None:
+        return in_calendar(Time(plain_number(mjd), format="mjd", scale="utc"))
+    if date is None:
+        return None
+    day = iso_date(date)
+    if "T" not in day and clock is not None:
+        day = iso_date(f"{day}T{str(clock).strip()}")
+    with offline():
+        return in_calendar(Time(day, scale="utc"))
+
+
+def in_calendar(time):
+    """
+    Return a time as it is, if a calendar has its day.
+
+    Astropy takes any number as a day, and finds out in the first conversion only.
+
+    Parameters
+    ----------
+    time : `~astropy.time.Time`
+        Any.
+
+    Returns
+    -------
+    `~astropy.time.Time`
+
+    Raises
+    ------
+    ValueError
+        ErfaError, if no calendar has the day.
+
+    Examples
+    --------
+    >>> from astropy.time import Time
+    >>> from astropolcal.instruments.layout import in_calendar
+    >>> in_calendar(Time(60982.5, format="mjd")).isot
+    '2025-11-03T12:00:00.000'
+    """
+    # years long before UTC was made are doubtful, but are years
+    with offline():
+        time.tai, time.isot  # noqa: B018
+    return time

@@ -1,5 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What stands before the half-wave plate on sky: a star, and the telescope's tertiary mirror."""
+"""
+What the chains of instruments share: stars, tertiary mirrors, and the polarimeters at Subaru.
+
+On sky a star and the mirrors of the telescope stand before the half-wave plate.
+"""
 
 import re
 import warnings
@@ -18,20 +22,7 @@ from astropolcal.exceptions import (
 from astropolcal.observations import is_star
 from astropolcal.units import to_unit
 
-__all__ = [
-    "INTERNAL",
-    "M3_MODELS",
-    "STARS",
-    "as_exact",
-    "behind_telescope",
-    "k_mirror",
-    "mounted",
-    "published_mirror",
-    "star_options",
-    "star_source",
-    "telescope",
-    "tertiary_mirror",
-]
+__all__ = []
 
 #: Sources of an internal calibration unit, and kinds of stars.
 INTERNAL = ("polarized", "unpolarized")
@@ -461,3 +452,42 @@ def star_options(observations):
     if not words or not is_star(observations.source):
         return {}
     return {"star": f"star_{words}", "target": target}
+
+
+#: Longitude, latitude (deg) and height (m) of the Subaru Telescope.
+SITE = (-155.4761, 19.8255, 4139.0)
+
+# 't Hart et al. 2021, thicknesses of the half-wave plate in mm
+_THART_SIO2, _THART_MGF2 = 1.63398, 1.27711
+
+#: What has changed; both days are known to the month only (McIntosh et al. 2026, Sec. 2 and 7).
+CHANGES = (
+    (None, "2025-08-01", "2025-10-01", "the Nasmyth beam switcher was installed"),
+    ("m3", "2025-12-01", "2026-01-01", "the tertiary mirror M3 was coated anew"),
+)
+
+
+def misaligned(about, most=5):
+    """Return what frees an angle within some degrees of where the optic should stand."""
+    return {"fixed": {"theta": False}, "bounds": {"theta": (about - most, about + most)}}
+
+
+def two_layer_plate(**settings):
+    """Return the half-wave plate of both instruments, its thicknesses near the published ones."""
+    settings["bounds"] |= {
+        "w_sio2": (0.6 * _THART_SIO2, 1.4 * _THART_SIO2),
+        "w_mgf2": (0.6 * _THART_MGF2, 1.4 * _THART_MGF2),
+    }
+    return optics.TwoLayerWaveplate(
+        w_sio2=_THART_SIO2 * u.mm, w_mgf2=_THART_MGF2 * u.mm, mount="hwp", name="hwp", **settings
+    )
+
+
+def polarizer():
+    """Return the polarizer of the calibration unit, which passes -Q."""
+    return optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer", **misaligned(90))
+
+
+def fold_mirror(size):
+    """Return the mirror that polarizes the lamp where the polarizer is out."""
+    return mounted(optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror"))

@@ -14,7 +14,7 @@ from astropolcal.observations import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 
-__all__ = ["Dataset", "as_pairs"]
+__all__ = []
 
 
 def as_pairs(chain, observations, positions):

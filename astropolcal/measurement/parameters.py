@@ -19,7 +19,7 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.measurement.priors import bind_prior, normal_per_wavelength
 from astropolcal.units import canonical_factor, to_unit
 
-__all__ = ["FreeParameters", "Slot", "Tie", "parameter_table"]
+__all__ = ["Tie", "parameter_table"]
 
 # a parameter closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-5

@@ -18,7 +18,7 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor, to_unit
 
-__all__ = ["BoundPrior", "Normal", "Uniform", "bind_prior", "normal_per_wavelength"]
+__all__ = ["Normal"]
 
 # step of the numerical derivative of a general prior's residual, in its standard deviations
 _STEP = 1e-5

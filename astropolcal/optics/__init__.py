@@ -7,7 +7,7 @@ registered in `OPTICS`; a new optic is one class and its entry there, and the
 registry tests then hold it to the laws that all optics obey.
 """
 
-from astropolcal.optics.core import COORDINATES, Optic, rotation_generator
+from astropolcal.optics.core import COORDINATES, Optic
 from astropolcal.optics.mirrors import KMirror, MetalMirror, ParityFlip, PowerLawMirror
 from astropolcal.optics.modulated import (
     DriftRetarder,
@@ -21,7 +21,7 @@ from astropolcal.optics.modulated import (
     PolarizedBackground,
     StrayLight,
 )
-from astropolcal.optics.perturbations import GENERATORS, Dependence, MuellerElement, Perturbation
+from astropolcal.optics.perturbations import GENERATORS, MuellerElement, Perturbation
 from astropolcal.optics.polarizers import (
     BeamGain,
     Depolarizer,
@@ -44,7 +44,6 @@ __all__ = [
     "GENERATORS",
     "OPTICS",
     "BeamGain",
-    "Dependence",
     "Depolarizer",
     "Diattenuator",
     "DiattenuatorRetarder",
@@ -74,40 +73,11 @@ __all__ = [
     "TwoLayerWaveplate",
     "VectorDiattenuator",
     "WollastonPrism",
-    "rotation_generator",
 ]
 
-#: Every optic by class name.
+#: Every optic by class name: all classes above but the two bases.
 OPTICS = {
-    cls.__name__: cls
-    for cls in (
-        BeamGain,
-        Depolarizer,
-        Diattenuator,
-        DiattenuatorRetarder,
-        DriftRetarder,
-        DriftRotator,
-        EllipticalRetarder,
-        FerroelectricLiquidCrystal,
-        FluxGain,
-        HarmonicGain,
-        HarmonicRetarder,
-        HarmonicRotator,
-        KMirror,
-        LinearPolarizer,
-        LinearRetarder,
-        MetalMirror,
-        MuellerElement,
-        ParityFlip,
-        Perturbation,
-        PolarizedBackground,
-        PolarizedSource,
-        PowerLawMirror,
-        Rotator,
-        StarSource,
-        StrayLight,
-        TwoLayerWaveplate,
-        VectorDiattenuator,
-        WollastonPrism,
-    )
+    name: globals()[name]
+    for name in __all__
+    if not name.isupper() and name not in ("FrameOptic", "Optic")
 }

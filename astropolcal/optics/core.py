@@ -22,7 +22,7 @@ from astropolcal.optics._modelling import KeywordOnly, copied_attributes
 from astropolcal.units import angle_to_rad, canonical_factor, length_to_um, to_unit
 from astropolcal.words import did_you_mean
 
-__all__ = ["COORDINATES", "FLUXES", "MOVES", "RATES", "Optic", "rotation_generator"]
+__all__ = ["COORDINATES", "Optic"]
 
 #: Positions that differ between wavelengths and beams: the flux of the beam, and that flux
 #: over the one in the frame before.

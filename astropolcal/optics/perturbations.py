@@ -21,7 +21,7 @@ from astropolcal.optics.modulated import FrameOptic
 from astropolcal.optics.polarizers import BEAMS, _BeamOptic
 from astropolcal.words import did_you_mean
 
-__all__ = ["GENERATORS", "Dependence", "MuellerElement", "Perturbation"]
+__all__ = ["GENERATORS", "MuellerElement", "Perturbation"]
 
 _I, _Q, _U, _V = range(4)
 

@@ -11,7 +11,7 @@ from astropy.time import Time
 
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import atomic_path, check_new
-from astropolcal.instruments.keywords import TEXTS, unit_of
+from astropolcal.instruments.layout import TEXTS, unit_of
 
 
 def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):

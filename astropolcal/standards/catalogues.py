@@ -17,7 +17,7 @@ from astropolcal.standards.priors import angles, interstellar, turning, unpolari
 from astropolcal.units import length_to_um
 from astropolcal.words import did_you_mean
 
-__all__ = ["KINDS", "MAGNITUDES", "StandardStar", "catalogue", "get", "names"]
+__all__ = ["StandardStar", "catalogue", "get", "names"]
 
 #: What a standard star may be.
 KINDS = ("polarized", "unpolarized")

@@ -10,7 +10,7 @@ from astropy.modeling import Fittable1DModel, Parameter
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.units import angle_to_rad, length_to_um, to_unit
 
-__all__ = ["LinearStokes", "SerkowskiLaw", "whittet_width"]
+__all__ = ["SerkowskiLaw", "whittet_width"]
 
 # Whittet et al. (1992): K = intercept + slope * lambda_max / um
 _INTERCEPT, _SLOPE = 0.01, 1.66

@@ -9,7 +9,7 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.standards.law import SerkowskiLaw, whittet_width
 
-__all__ = ["Interstellar", "UnpolarizedError"]
+__all__ = []
 
 # fractions, micrometres and degrees throughout this module
 # what a source does not state

@@ -11,7 +11,7 @@ from astropolcal.calibration import compare, comparison_text, full_covariance
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments.telescope import published_mirror, telescope
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.plotting import plot_comparison
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

@@ -11,7 +11,8 @@ from hypothesis.extra.numpy import arrays
 from astropolcal import optics
 from astropolcal.calibration import Calibration, Covariance, calibrate, full_covariance
 from astropolcal.exceptions import ParameterError
-from astropolcal.measurement import FreeParameters, Normal
+from astropolcal.measurement import Normal
+from astropolcal.measurement.parameters import FreeParameters
 
 NAMES, UNITS = ["hwp.theta", "hwp.w_sio2", "wollaston.efficiency"], [u.deg, u.mm, None]
 MATRIX = np.array([[0.04, 0.001, np.nan], [0.001, 0.0001, np.nan], [np.nan, np.nan, np.nan]])

@@ -19,7 +19,9 @@ from astropolcal.calibration._directions import (
 from astropolcal.calibration._telescope import telescope_words
 from astropolcal.calibration._whitened import Whitened
 from astropolcal.calibration.identifiability import Identifiability, analyse, physical_scale
-from astropolcal.measurement import FreeParameters, Normal, Uniform
+from astropolcal.measurement import Normal
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.measurement.priors import Uniform
 
 N = 3
 NAMES = ["polarizer.theta", "hwp.w_sio2", *(f"retarder.retardance[{i}]" for i in range(N))]

@@ -20,7 +20,8 @@ from astropolcal.calibration import analyse, calibrate, examine, sky_consequence
 from astropolcal.calibration._directions import near_null_directions
 from astropolcal.calibration._whitened import Whitened
 from astropolcal.calibration.identifiability import physical_scale
-from astropolcal.measurement import FreeParameters, Measurement, Normal
+from astropolcal.measurement import Measurement, Normal
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 FRAMES = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)

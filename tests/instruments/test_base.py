@@ -12,9 +12,9 @@ from astropolcal import instruments, optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import ChainError, InstrumentError
 from astropolcal.instruments import Instrument, SkyLaw, add_nuisance
-from astropolcal.instruments._choices import check_choice
-from astropolcal.instruments._subaru_optics import fold_mirror, misaligned, polarizer
+from astropolcal.instruments.base import check_choice
 from astropolcal.instruments.layout import FileLayout
+from astropolcal.instruments.telescope import fold_mirror, misaligned, polarizer
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 GRID = [0.6, 0.7, 0.8] * u.um

@@ -9,16 +9,16 @@ from astropy.io.fits.card import Undefined
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.instruments.keywords import (
+from astropolcal.instruments.layout import (
     ANGLES,
     RANGES,
     TEXTS,
+    FileLayout,
     convert,
     frame_time,
     look_up,
     unit_of,
 )
-from astropolcal.instruments.layout import FileLayout
 
 LAYOUT = FileLayout(
     {

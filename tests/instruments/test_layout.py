@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from astropolcal import instruments
 from astropolcal.exceptions import InstrumentError, ObservationError
-from astropolcal.instruments.layout import FileLayout
-from astropolcal.instruments.readout import EM_EXCESS_NOISE, ReadOut
+from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut
 
 POSITIVE = ("gain", "saturation", "pixel_scale", "fwhm", "hwp_step")
 NOT_NEGATIVE = ("read_noise", "edge", "tracking_tolerance")

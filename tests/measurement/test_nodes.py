@@ -10,7 +10,8 @@ from star_data import CHARIS, observe_star, star_chain
 from astropolcal import optics
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.measurement import FreeParameters, Measurement, Normal
+from astropolcal.measurement import Measurement, Normal
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import Observations, sky_positions
 
 

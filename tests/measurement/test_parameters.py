@@ -7,7 +7,8 @@ import pytest
 
 from astropolcal import optics
 from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.measurement import FreeParameters, Slot, Tie, parameter_table
+from astropolcal.measurement import Tie, parameter_table
+from astropolcal.measurement.parameters import FreeParameters, Slot
 from astropolcal.observations import Observations, common_wavelengths, example_table
 
 

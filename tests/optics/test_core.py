@@ -10,13 +10,8 @@ from hypothesis import strategies as st
 
 from astropolcal import mueller
 from astropolcal.exceptions import ParameterError
-from astropolcal.optics import (
-    Diattenuator,
-    LinearPolarizer,
-    LinearRetarder,
-    Optic,
-    rotation_generator,
-)
+from astropolcal.mueller import rotation_generator
+from astropolcal.optics import Diattenuator, LinearPolarizer, LinearRetarder, Optic
 
 WAVELENGTH = [1.2, 1.6, 2.1] * u.um
 

@@ -19,10 +19,11 @@ from astropolcal.mueller import (
     diattenuation_slope,
     fill_phase_block,
     retardance_slope,
+    rotation_generator,
     transverse_share,
     turn,
 )
-from astropolcal.optics import OPTICS, rotation_generator
+from astropolcal.optics import OPTICS
 from astropolcal.optics.core import (
     COORDINATES,
     FLUXES,

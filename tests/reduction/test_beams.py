@@ -6,8 +6,7 @@ import pytest
 from astropy.io import fits
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.instruments.layout import FileLayout
-from astropolcal.instruments.readout import ReadOut
+from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.reduction.beams import beam_scale, match_beams
 from astropolcal.reduction.errors import detector_of
 from astropolcal.reduction.frames import Frame, open_cube

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from astropolcal import optics
 from astropolcal.exceptions import ParameterError
 from astropolcal.standards import telescope_information
-from astropolcal.standards.information import _design
+from astropolcal.standards.visibility import _design
 
 angles = st.lists(st.floats(-180, 180), min_size=2, max_size=12)
 

@@ -8,7 +8,7 @@ from astropy.coordinates import AltAz, EarthLocation, get_body, get_sun
 from astropy.time import Time
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.standards._sky import (
+from astropolcal.standards.visibility import (
     SITES,
     checked,
     date_of,

@@ -12,8 +12,7 @@ from astropolcal import standards
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.standards import Observability, SerkowskiLaw, StandardStar, telescope_information
 from astropolcal.standards.catalogues import _law, _normal
-from astropolcal.standards.searching import _degree, _in_band
-from astropolcal.standards.visibility import _spread
+from astropolcal.standards.visibility import _degree, _in_band, _spread
 
 BANDS = {"U": 0.36, "V": 0.55, "H": 1.65}
 

@@ -12,7 +12,7 @@ from astropy.time import Time
 
 from astropolcal import standards
 from astropolcal.exceptions import ParameterError
-from astropolcal.standards import _sky
+from astropolcal.standards import visibility as _sky
 
 SUBARU = _sky.location("subaru")
 NIGHT = "2025-11-03"

@@ -19,8 +19,8 @@ from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
 from astropolcal.gap.effects.roles import SEVERAL, Roles
 from astropolcal.gap.effects.where import Where
 from astropolcal.measurement import Tie
-from astropolcal.optics import GENERATORS, Dependence
-from astropolcal.optics.perturbations import split_run
+from astropolcal.optics import GENERATORS
+from astropolcal.optics.perturbations import Dependence, split_run
 from astropolcal.words import did_you_mean
 
 __all__ = ["Effect"]
