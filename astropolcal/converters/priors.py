@@ -32,7 +32,7 @@ def node_from_priors(chains):
     ------
     CalibrationFileError
         If a prior is no `~astropolcal.measurement.Normal`,
-        `~astropolcal.measurement.Uniform` or frozen continuous distribution.
+        ``Uniform`` or frozen continuous distribution.
 
     Examples
     --------
@@ -180,7 +180,7 @@ def prior_from_node(node, name):
 
 
 def _prior(node, name):
-    from astropolcal import measurement
+    from astropolcal.measurement import priors
     from astropolcal.converters.nodes import plain, value_from_node
 
     if node["kind"] == "scipy":
@@ -191,4 +191,4 @@ def _prior(node, name):
     values = [value_from_node(node[key]) for key in _OURS[node["kind"]]]
     # a number of its own type, as it was given
     values = [v if hasattr(v, "unit") else v.item() for v in values]
-    return getattr(measurement, node["kind"].capitalize())(*values)
+    return getattr(priors, node["kind"].capitalize())(*values)
