@@ -2,16 +2,14 @@
 """
 Mueller algebra: pure functions on arrays of shape (..., 4, 4).
 
-The elementary matrices, their derivatives and their rotation; the polar decomposition; and
-which matrices nature allows.
+The elementary matrices, their derivatives and their rotation; what a matrix does; which matrices
+nature allows; and how light goes through matrices.
 
 An optic of matrix M turned by an angle is ``T(-angle) M T(angle)``; a matrix
 acts on Stokes vectors (I, Q, U, V) in the sense of `astropolcal.stokes`.
 """
 
 import cmath
-from dataclasses import dataclass
-from functools import reduce
 
 import astropy.units as u
 import numpy as np
@@ -19,7 +17,7 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import angle_to_rad, to_unit
 
-__all__ = ["elliptical_retarder", "is_physical", "linear_retarder", "nearest_physical", "rotate"]
+__all__ = ["elliptical_retarder", "is_physical", "linear_retarder", "rotate"]
 
 # sums of four factors, each known to a few 1e-16, lie on the limit to within this
 _ROUNDING = 1e-12
@@ -127,35 +125,11 @@ def _elliptical_retarder(horizontal, diagonal, circular):
 
 
 def rotation_matrix(angle):
-    r"""
-    Return T(angle), which takes Stokes vectors to axes turned by the angle.
+    """
+    Return T(angle), shape (..., 4, 4), of an angle with unit.
 
-    Parameters
-    ----------
-    angle : `~astropy.units.Quantity`
-        Angle of the turn, counter-clockwise looking into the beam.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (..., 4, 4): :math:`Q' = Q\cos 2\theta + U\sin 2\theta`,
-        :math:`U' = -Q\sin 2\theta + U\cos 2\theta`.
-
-    Raises
-    ------
-    ParameterError
-        If the angle has no unit of angle or is not finite.
-
-    Notes
-    -----
-    Rotation matrix of Sec. 3 of the CHARIS recalibration paper.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.mueller import rotation_matrix
-    >>> (rotation_matrix(45 * u.deg) @ [1, 0, 1, 0]).round(12).tolist()
-    [1.0, 1.0, 0.0, 0.0]
+    It takes Stokes vectors to axes turned counter-clockwise: Q' = Q cos 2 angle + U sin 2 angle,
+    U' = -Q sin 2 angle + U cos 2 angle.
     """
     return _rotation_matrix(_finite_angle(angle, "angle"))
 
@@ -185,100 +159,27 @@ def rotate(matrix, angle):
 
     Examples
     --------
-    A polarizer turned by 90 degrees passes -Q:
+    A half-wave plate at 22.5 degrees makes U of Q:
 
     >>> import astropy.units as u
-    >>> from astropolcal.mueller import linear_polarizer, rotate
-    >>> (rotate(linear_polarizer(), 90 * u.deg) @ [1, 0, 0, 0]).round(12).tolist()
-    [0.5, -0.5, 0.0, 0.0]
+    >>> from astropolcal.mueller import linear_retarder, rotate
+    >>> half_wave = rotate(linear_retarder(180 * u.deg), 22.5 * u.deg)
+    >>> (half_wave @ [1, 1, 0, 0]).round(12).tolist()
+    [1.0, 0.0, 1.0, 0.0]
     """
     return _rotate(_mueller_array(matrix), _finite_angle(angle, "angle"))
 
 
-def compose(*matrices):
-    """
-    Return the Mueller matrix of several optics behind one another.
-
-    Parameters
-    ----------
-    *matrices : array_like
-        Mueller matrices (..., 4, 4) in the order in which the light meets
-        them, broadcast together.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Their product, the first matrix rightmost.
-
-    Raises
-    ------
-    ParameterError
-        If nothing is given, a matrix is not (..., 4, 4) or not finite.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.mueller import compose, linear_polarizer, linear_retarder, rotate
-    >>> half_wave = rotate(linear_retarder(180 * u.deg), 22.5 * u.deg)
-    >>> (compose(linear_polarizer(), half_wave) @ [1, 1, 0, 0]).round(12).tolist()
-    [1.0, 0.0, 1.0, 0.0]
-    """
-    if not matrices:
-        raise ParameterError("compose needs at least one Mueller matrix")
-    checked = [_mueller_array(m, f"matrix {i + 1}") for i, m in enumerate(matrices)]
-    # light meets the first matrix first, which stands rightmost
-    return reduce(lambda so_far, optic: optic @ so_far, checked)
-
-
 def linear_polarizer():
-    """
-    Return an ideal polarizer that passes +Q and half of unpolarized light.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (4, 4), first element 0.5; turn it with `rotate`. With unit mean
-        transmission it is ``diattenuator(1)``.
-
-    Examples
-    --------
-    >>> from astropolcal.mueller import linear_polarizer
-    >>> (linear_polarizer() @ [1.0, 0.0, 0.0, 0.0]).tolist()
-    [0.5, 0.5, 0.0, 0.0]
-    """
+    """Return an ideal polarizer that passes +Q and half of unpolarized light."""
     return 0.5 * _diattenuator(1.0)
 
 
 def diattenuator(diattenuation):
-    r"""
-    Return a linear diattenuator of unit mean transmission.
+    """
+    Return a linear diattenuator, (..., 4, 4).
 
-    Parameters
-    ----------
-    diattenuation : float or array_like
-        :math:`\epsilon`, -1 to 1; positive where +Q passes better.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (..., 4, 4). Light polarized along the better axis is scaled by
-        :math:`1 + |\epsilon|`, so absolute fluxes need a further factor.
-
-    Raises
-    ------
-    ParameterError
-        If the diattenuation is not between -1 and 1.
-
-    Notes
-    -----
-    Diattenuator-retarder of Sec. 3 of the CHARIS recalibration paper with
-    zero retardance.
-
-    Examples
-    --------
-    >>> from astropolcal.mueller import diattenuator
-    >>> (diattenuator(0.01) @ [1.0, 0.0, 0.0, 0.0]).tolist()
-    [1.0, 0.01, 0.0, 0.0]
+    Positive where +Q passes better, of unit transmission for unpolarized light.
     """
     return _diattenuator(_fraction(diattenuation, "diattenuation"))
 
@@ -317,36 +218,10 @@ def linear_retarder(retardance):
 
 
 def diattenuator_retarder(diattenuation, retardance):
-    r"""
+    """
     Return a linear diattenuator and retarder with common axes along Q.
 
-    Parameters
-    ----------
-    diattenuation : float or array_like
-        :math:`\epsilon`, -1 to 1; positive where +Q passes better.
-    retardance : `~astropy.units.Quantity`
-        :math:`\Delta`, an angle.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (..., 4, 4), unit mean transmission, the arguments broadcast.
-
-    Raises
-    ------
-    ParameterError
-        If a value is out of range, not finite or has the wrong unit.
-
-    Notes
-    -----
-    Equation for :math:`M_{DR}` in Sec. 3 of the CHARIS recalibration paper.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.mueller import diattenuator_retarder
-    >>> diattenuator_retarder(0.6, 90 * u.deg).round(12).tolist()[2]
-    [0.0, 0.0, 0.0, 0.8]
+    Equation for M_DR in Sec. 3 of the CHARIS paper.
     """
     return _diattenuator_retarder(
         _fraction(diattenuation, "diattenuation"), _finite_angle(retardance, "retardance")
@@ -398,34 +273,9 @@ def elliptical_retarder(horizontal, diagonal, circular):
 
 def depolarizer(q, u=None, v=None):
     """
-    Return a diagonal depolarizer.
+    Return a diagonal depolarizer of factors on Q, U and V.
 
-    Parameters
-    ----------
-    q, u, v : float or array_like
-        Factors on Q, U and V, -1 to 1. ``u`` and ``v`` left out equal ``q``.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (..., 4, 4), the arguments broadcast.
-
-    Raises
-    ------
-    ParameterError
-        If a factor is out of range, or no light path has these three
-        together, such as (1, 1, -1).
-
-    Notes
-    -----
-    The three factors are possible where the four eigenvalues of the coherency
-    matrix, ``1 + q + u + v``, ``1 + q - u - v`` and so on, are not negative.
-
-    Examples
-    --------
-    >>> from astropolcal.mueller import depolarizer
-    >>> (depolarizer(0.9) @ [1.0, 1.0, 0.0, 0.0]).tolist()
-    [1.0, 0.9, 0.0, 0.0]
+    It is possible where ``1 + q + u + v``, ``1 + q - u - v`` and so on are not negative.
     """
     q = _fraction(q, "q")
     u, v = (q if x is None else _fraction(x, name) for x, name in ((u, "u"), (v, "v")))
@@ -448,27 +298,9 @@ _ROOT_FLOOR = 1e-8
 
 def rotation_generator(matrix):
     """
-    Return the derivative of ``T(-theta) M T(theta)`` to theta, at theta = 0.
+    Return the derivative of ``T(-theta) M T(theta)`` per radian, at theta = 0.
 
-    With ``T(theta)`` the rotation of Sec. 2 of the CHARIS paper, the
-    derivative is the commutator ``2 (M G - G M)``, where G turns Q into U.
-
-    Parameters
-    ----------
-    matrix : `~numpy.ndarray`
-        Mueller matrices, shape (..., 4, 4).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Derivative per radian, shape (..., 4, 4).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.optics import rotation_generator
-    >>> bool(np.all(rotation_generator(np.eye(4)) == 0))
-    True
+    It is the commutator ``2 (M G - G M)``, where G turns Q into U.
     """
     out = np.zeros_like(matrix)
     # T(theta) = exp(2 theta G) with G[1, 2] = 1 and G[2, 1] = -1: two columns are those of M G
@@ -547,231 +379,9 @@ def _transmitting(matrix):
 
 
 def diattenuation_vector(matrix):
-    """
-    Return the diattenuation vector, the first row without its first element.
-
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Horizontal, diagonal and circular diattenuation, shape (..., 3).
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong, a value is not finite or the transmission of
-        unpolarized light is not positive.
-
-    Notes
-    -----
-    Lu & Chipman 1996, doi:10.1364/JOSAA.13.001106.
-
-    Examples
-    --------
-    >>> from astropolcal.mueller import diattenuation_vector, diattenuator
-    >>> diattenuation_vector(diattenuator(-0.2)).tolist()
-    [-0.2, 0.0, 0.0]
-    """
+    """Return the first row over its first element, (..., 3): horizontal, diagonal, circular."""
     matrix = _transmitting(matrix)
     return matrix[..., 0, 1:] / matrix[..., 0, :1]
-
-
-def polarizance_vector(matrix):
-    """
-    Return the polarizance vector, the first column without its first element.
-
-    It is the polarization that unpolarized light leaves with.
-
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        q, u and v given to unpolarized light, shape (..., 3).
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong, a value is not finite or the transmission of
-        unpolarized light is not positive.
-
-    Notes
-    -----
-    Lu & Chipman 1996, doi:10.1364/JOSAA.13.001106.
-
-    Examples
-    --------
-    >>> from astropolcal.mueller import diattenuator, polarizance_vector
-    >>> polarizance_vector(diattenuator(-0.2)).tolist()
-    [-0.2, 0.0, 0.0]
-    """
-    matrix = _transmitting(matrix)
-    return matrix[..., 1:, 0] / matrix[..., :1, 0]
-
-
-def diattenuation(matrix):
-    """
-    Return the diattenuation, the length of the diattenuation vector.
-
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Contrast of the transmission over all input states, 0 to 1 for
-        physical matrices.
-
-    Raises
-    ------
-    ParameterError
-        As `diattenuation_vector`.
-
-    Examples
-    --------
-    >>> from astropolcal.mueller import diattenuation, diattenuator
-    >>> float(diattenuation(diattenuator(-0.2)))
-    0.2
-    """
-    return np.linalg.norm(diattenuation_vector(matrix), axis=-1)
-
-
-def polarizance(matrix):
-    """
-    Return the polarizance, the length of the polarizance vector.
-
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Degree of polarization that unpolarized light leaves with.
-
-    Raises
-    ------
-    ParameterError
-        As `polarizance_vector`.
-
-    Examples
-    --------
-    >>> from astropolcal.mueller import diattenuator, polarizance
-    >>> float(polarizance(diattenuator(-0.2)))
-    0.2
-    """
-    return np.linalg.norm(polarizance_vector(matrix), axis=-1)
-
-
-def depolarization_index(matrix):
-    r"""
-    Return the depolarization index: one without depolarization, zero with all.
-
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        :math:`\sqrt{(\sum_{ij} m_{ij}^2 - m_{00}^2) / (3 m_{00}^2)}`.
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong, a value is not finite or the transmission of
-        unpolarized light is not positive.
-
-    Notes
-    -----
-    Gil & Bernabeu 1985, Opt. Acta 32, 259, doi:10.1080/713821732.
-
-    Examples
-    --------
-    >>> from astropolcal.mueller import depolarization_index, depolarizer
-    >>> float(depolarization_index(depolarizer(0.9)).round(12))
-    0.9
-    """
-    matrix = _transmitting(matrix)
-    relative = matrix / matrix[..., :1, :1]
-    relative[..., 0, 0] = 0.0
-    return np.sqrt(np.sum(relative**2, axis=(-2, -1)) / 3)
-
-
-@dataclass(frozen=True, eq=False)
-class LuChipman:
-    """
-    A Mueller matrix as diattenuator, retarder and depolarizer, in this order.
-
-    Made by `lu_chipman`; every array may carry leading axes.
-
-    Parameters
-    ----------
-    depolarizer : `~numpy.ndarray`
-        Depolarizer with the polarizance that depolarization brings.
-    retarder : `~numpy.ndarray`
-        Pure elliptical retarder.
-    diattenuator : `~numpy.ndarray`
-        Pure diattenuator, which carries the mean transmission.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.mueller import diattenuator, lu_chipman
-    >>> parts = lu_chipman(diattenuator(0.3))
-    >>> bool(np.allclose(parts.matrix, diattenuator(0.3)))
-    True
-    """
-
-    depolarizer: np.ndarray
-    retarder: np.ndarray
-    diattenuator: np.ndarray
-
-    @property
-    def matrix(self):
-        """The product of the three, the matrix that was decomposed."""
-        return self.depolarizer @ self.retarder @ self.diattenuator
-
-    @property
-    def diattenuation_vector(self):
-        """Horizontal, diagonal and circular diattenuation, shape (..., 3)."""
-        return diattenuation_vector(self.diattenuator)
-
-    @property
-    def polarizance_vector(self):
-        """Polarization that unpolarized light leaves with, shape (..., 3)."""
-        return polarizance_vector(self.matrix)
-
-    @property
-    def retardance_vector(self):
-        """Horizontal, diagonal and circular retardance, Quantity in radian."""
-        return _rotation_vector(self.retarder[..., 1:, 1:]) * u.rad
-
-    @property
-    def retardance(self):
-        """Total retardance, Quantity in radian from 0 to pi."""
-        return np.linalg.norm(self.retardance_vector, axis=-1)
-
-    @property
-    def depolarization_power(self):
-        """One minus the mean of the three depolarization factors."""
-        return 1 - np.abs(np.trace(self.depolarizer, axis1=-2, axis2=-1) - 1) / 3
-
-    @property
-    def depolarization_index(self):
-        """Depolarization index of the whole matrix."""
-        return depolarization_index(self.matrix)
 
 
 def _rotation_vector(block):
@@ -810,8 +420,8 @@ def _smallest_rotation(start, end):
     return halfway @ along
 
 
-def _polar_factors(block):
-    """Return the symmetric and the rotation factor of blocks (..., 3, 3)."""
+def _polar_rotation(block):
+    """Return the rotation factor of blocks (..., 3, 3), which are a symmetric one times it."""
     left, singular, right = np.linalg.svd(block)
     floor = _SINGULAR * np.maximum(singular[..., :1], _SINGULAR)
     hand = np.sign(np.linalg.det(left @ right))[..., None]
@@ -819,29 +429,17 @@ def _polar_factors(block):
     # none, and there the sign of its empty direction makes the rotation proper
     regular = singular[..., 2:] > floor
     flip = np.where(regular | (np.arange(3) == 2), hand, 1.0)
-    retarder = (left * flip[..., None, :]) @ right
-    strength = np.where(regular, hand, 1.0) * singular
-    depolarizer = (left * strength[..., None, :]) @ np.swapaxes(left, -1, -2)
+    rotation = (left * flip[..., None, :]) @ right
     # one direction left, or none: the smallest retardance that fits
     lone = (singular[..., 1:2] <= floor)[..., None]
     empty = (singular[..., :1] <= _SINGULAR)[..., None]
     smallest = _smallest_rotation(right[..., 0, :], left[..., :, 0])
-    return depolarizer, np.where(empty, np.eye(3), np.where(lone, smallest, retarder))
-
-
-def _embed(block, column=0.0, row=0.0):
-    """Return matrices (..., 4, 4) of unit transmission around a 3 by 3 block."""
-    matrix = np.zeros((*block.shape[:-2], 4, 4))
-    matrix[..., 0, 0] = 1.0
-    matrix[..., 1:, 1:] = block
-    matrix[..., 1:, 0] = column
-    matrix[..., 0, 1:] = row
-    return matrix
+    return np.where(empty, np.eye(3), np.where(lone, smallest, rotation))
 
 
 def _without_diattenuator(block, column, axis, strength):
     """
-    Return the block and the column of M times the inverse of its diattenuator.
+    Return the block of M times the inverse of its diattenuator.
 
     Written for the two states that the diattenuator passes best and worst, so
     that nothing cancels however close to a polarizer it is.
@@ -851,246 +449,55 @@ def _without_diattenuator(block, column, axis, strength):
     worst = (column - image) / (1 - strength)
     across = block - image[..., :, None] * axis[..., None, :]
     across = across / np.sqrt((1 - strength) * (1 + strength))[..., None]
-    return across + (best - worst)[..., :, None] * axis[..., None, :] / 2, (best + worst) / 2
+    return across + (best - worst)[..., :, None] * axis[..., None, :] / 2
 
 
-def lu_chipman(matrix):
+def retardance_vector(matrix):
     """
-    Decompose Mueller matrices as depolarizer, retarder and diattenuator.
+    Return the retardance vector of the retarder within Mueller matrices (..., 4, 4).
 
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4).
+    It is a Quantity in radian of shape (..., 3), horizontal, diagonal and circular, of length up
+    to pi; at pi, where both signs are the same retarder, the first component that is not zero is
+    positive.
 
-    Returns
-    -------
-    LuChipman
-        The three factors, ``matrix = depolarizer @ retarder @ diattenuator``,
-        and the vectors drawn from them.
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong, a value is not finite, the transmission of
-        unpolarized light is not positive, or a diattenuation exceeds one (see
-        `nearest_physical <astropolcal.mueller.nearest_physical>`).
-
-    Notes
-    -----
-    Lu & Chipman 1996, doi:10.1364/JOSAA.13.001106. Singular matrices have
-    many decompositions. A polarizer (diattenuation within 1e-13 of one) is
-    given the retarder of smallest retardance that takes its input axis to its
-    output axis, and a depolarizer alike in all directions. A matrix that
-    leaves one state of polarization is given the smallest retardance too, one
-    that leaves none is given no retarder. A negative determinant is given to
-    the depolarizer.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal.mueller import diattenuator_retarder, lu_chipman
-    >>> parts = lu_chipman(diattenuator_retarder(0.1, 60 * u.deg))
-    >>> parts.diattenuation_vector.round(12).tolist()
-    [0.1, 0.0, 0.0]
-    >>> parts.retardance_vector.to_value(u.deg).round(9).tolist()
-    [60.0, 0.0, 0.0]
+    The retarder is that of matrix = depolarizer @ retarder @ diattenuator (Lu & Chipman 1996,
+    doi:10.1364/JOSAA.13.001106). Singular matrices have many: a polarizer (diattenuation within
+    1e-13 of one), and a matrix that leaves one state of polarization, are given the smallest
+    retardance that fits, one that leaves no state is given none. A negative determinant belongs
+    to the depolarizer.
     """
     matrix = _transmitting(matrix)
     mean = matrix[..., :1, :1]
     row, column = matrix[..., 0, 1:] / mean[..., 0], matrix[..., 1:, 0] / mean[..., 0]
     strength = np.linalg.norm(row, axis=-1, keepdims=True)
     if (strength > 1 + _EXCESS).any():
-        raise ParameterError(
-            f"diattenuation = {strength.max()} must be at most 1; "
-            "nearest_physical gives the matrix that it may stand for"
-        )
+        raise ParameterError(f"diattenuation = {strength.max()} must be at most 1")
     axis = _unit(row, np.array([1.0, 0.0, 0.0]))
     pure = strength >= 1 - _POLARIZER
-    block, extra = _without_diattenuator(
+    block = _without_diattenuator(
         matrix[..., 1:, 1:] / mean, column, axis, np.where(pure, 0.0, strength)
     )
-    depolarizer, retarder = _polar_factors(block)
-    polarizer = pure[..., None]
-    kept = np.linalg.norm(column, axis=-1)[..., None, None] * np.eye(3)
-    depolarizer = np.where(polarizer, kept, depolarizer)
     turn = _smallest_rotation(axis, _unit(column, axis))
-    retarder = np.where(polarizer, turn, retarder)
-    strength = np.where(pure, 1.0, strength)
-    across = np.sqrt((1 - strength) * (1 + strength))[..., None]
-    along = (1 - across) * axis[..., :, None] * axis[..., None, :]
-    row = strength * axis
-    return LuChipman(
-        depolarizer=_embed(depolarizer, np.where(pure, 0.0, extra)),
-        retarder=_embed(retarder),
-        diattenuator=mean * _embed(across * np.eye(3) + along, row, row),
-    )
-
-
-def retardance_vector(matrix):
-    """
-    Return the retardance vector of the retarder within Mueller matrices.
-
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4).
-
-    Returns
-    -------
-    `~astropy.units.Quantity`
-        Horizontal, diagonal and circular retardance in radian, shape
-        (..., 3): what `~astropolcal.mueller.elliptical_retarder` takes. Its
-        length is at most pi; at pi, where both signs are the same retarder,
-        the first component that is not zero is positive.
-
-    Raises
-    ------
-    ParameterError
-        As `lu_chipman`.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.mueller import elliptical_retarder, retardance_vector
-    >>> retarder = elliptical_retarder(30 * u.deg, -20 * u.deg, 10 * u.deg)
-    >>> retardance_vector(retarder).to(u.deg).round(9)
-    <Quantity [ 30., -20.,  10.] deg>
-    """
-    return lu_chipman(matrix).retardance_vector
+    return _rotation_vector(np.where(pure[..., None], turn, _polar_rotation(block))) * u.rad
 
 
 # the Pauli matrices in the order of the Stokes parameters
-_PAULI = np.array(
-    [
-        [[1, 0], [0, 1]],
-        [[1, 0], [0, -1]],
-        [[0, 1], [1, 0]],
-        [[0, -1j], [1j, 0]],
-    ]
-)
+_PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, -1j], [1j, 0]]])
 # M_ij = sum_kl _BASIS_ijkl C_kl; four times unitary as a 16 by 16 matrix
 _BASIS = np.einsum("iab,kbc,jcd,lda->ijkl", _PAULI, _PAULI, _PAULI, _PAULI) / 2
 
 
-def _tolerance(value):
-    """Return a tolerance, or raise if it is negative or not a number."""
-    value = to_unit(value, None, "tolerance")
-    if not (value >= 0).all():
-        raise ParameterError(f"tolerance = {value} must be zero or positive")
-    return value
-
-
 def coherency_matrix(matrix):
     r"""
-    Return the coherency matrices of Mueller matrices in the Pauli basis.
+    Return the coherency matrices of Mueller matrices (..., 4, 4) in the Pauli basis.
 
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Hermitian complex matrices of shape (..., 4, 4) whose trace is the
-        transmission of unpolarized light. For an optic of Jones matrix
-        :math:`\sum_k c_k \sigma_k` it is :math:`c\,c^\dagger`.
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong or a value is not finite.
-
-    Notes
-    -----
-    Inverse of :math:`M_{ij} = \frac{1}{2} \sum_{kl} C_{kl}
-    \mathrm{tr}(\sigma_i \sigma_k \sigma_j \sigma_l)`, Cloude 1990, Proc. SPIE
-    1166, 177, doi:10.1117/12.962889. In the sign convention of the package a
-    retarder has the Jones matrix :math:`e^{+i \Delta \cdot \sigma / 2}`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.mueller import coherency_matrix
-    >>> coherency_matrix(np.eye(4)).real.diagonal().tolist()
-    [1.0, 0.0, 0.0, 0.0]
+    They are Hermitian, their trace is the transmission of unpolarized light. For an optic of Jones
+    matrix :math:`\sum_k c_k \sigma_k` it is :math:`c\,c^\dagger`. Inverse of :math:`M_{ij} =
+    \frac{1}{2} \sum_{kl} C_{kl} \mathrm{tr}(\sigma_i \sigma_k \sigma_j \sigma_l)`, Cloude 1990,
+    Proc. SPIE 1166, 177, doi:10.1117/12.962889; a retarder is
+    :math:`e^{+i \Delta \cdot \sigma / 2}`.
     """
     return np.einsum("ijkl,...ij->...kl", _BASIS.conj(), _mueller_array(matrix)) / 4
-
-
-def mueller_from_coherency(coherency):
-    """
-    Return the Mueller matrices of coherency matrices.
-
-    Parameters
-    ----------
-    coherency : array_like
-        Hermitian matrices of shape (..., 4, 4), as of `coherency_matrix`.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Real matrices of shape (..., 4, 4).
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong, a value is not finite or a matrix is not
-        Hermitian.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.mueller import mueller_from_coherency
-    >>> mueller_from_coherency(np.eye(4) / 4).tolist()[0]
-    [1.0, 0.0, 0.0, 0.0]
-    """
-    coherency = np.asarray(coherency, dtype=complex)
-    if coherency.shape[-2:] != (4, 4) or not np.isfinite(coherency).all():
-        raise ParameterError(
-            f"coherency of shape {coherency.shape} must be finite and of shape (..., 4, 4)"
-        )
-    # products of measured matrices are Hermitian to rounding only, hence 1e-9 of the largest
-    skew = np.abs(coherency - np.swapaxes(coherency, -1, -2).conj()).max(initial=0.0)
-    if skew > 1e-9 * np.abs(coherency).max(initial=0.0):
-        raise ParameterError(f"coherency differs from its adjoint by {skew}; it must be Hermitian")
-    return _mueller(coherency)
-
-
-def _mueller(coherency):
-    """Return the Mueller matrices of Hermitian matrices, unchecked."""
-    return np.einsum("ijkl,...kl->...ij", _BASIS, coherency).real
-
-
-def coherency_eigenvalues(matrix):
-    """
-    Return the eigenvalues of the coherency matrices, smallest first.
-
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (..., 4); their sum is the transmission of unpolarized light.
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong or a value is not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.mueller import coherency_eigenvalues
-    >>> coherency_eigenvalues(np.diag([1.0, 1.0, 1.0, -1.0])).round(12).tolist()
-    [-0.5, 0.5, 0.5, 0.5]
-    """
-    return np.linalg.eigvalsh(coherency_matrix(matrix))
 
 
 def is_physical(matrix, tolerance=1e-9):
@@ -1116,13 +523,10 @@ def is_physical(matrix, tolerance=1e-9):
         If the shape is wrong, a value is not finite or the tolerance is
         negative.
 
-    See Also
-    --------
-    is_passive : whether it also gives out no more light than it takes.
-
     Notes
     -----
-    Cloude 1990, doi:10.1117/12.962889.
+    A matrix is a mixture of at most four optics without depolarization where its coherency
+    matrix has no negative eigenvalue: Cloude 1990, doi:10.1117/12.962889.
 
     Examples
     --------
@@ -1131,113 +535,11 @@ def is_physical(matrix, tolerance=1e-9):
     >>> bool(is_physical(np.diag([1.0, 1.0, 1.0, -1.0])))
     False
     """
-    matrix = _mueller_array(matrix)
-    return coherency_eigenvalues(matrix)[..., 0] >= -_tolerance(tolerance) * matrix[..., 0, 0]
-
-
-def _nearest_eigenvalues(values, total):
-    """Return the nearest values that are not negative and have the sum given."""
-    # projection onto the simplex: the largest eigenvalues are lowered alike until their sum is
-    # right, and those that fall below zero count as zero
-    falling = values[..., ::-1]
-    count = np.arange(1, 5)
-    shift = (np.cumsum(falling, axis=-1) - total[..., None]) / count
-    last = np.sum(falling > shift, axis=-1, keepdims=True) - 1
-    return np.maximum(values - np.take_along_axis(shift, last, axis=-1), 0.0)
-
-
-def nearest_physical(matrix, tolerance=1e-12):
-    """
-    Return the nearest Mueller matrices of the same transmission.
-
-    Negative eigenvalues of the coherency matrix, the part that no mixture of
-    optics can make, are removed, and the others lowered alike until their sum
-    is again the transmission of unpolarized light.
-
-    Parameters
-    ----------
-    matrix : array_like
-        Matrices of shape (..., 4, 4), such as measured ones.
-    tolerance : float
-        Matrices that are physical within this tolerance (see `is_physical`)
-        are returned as they are.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (..., 4, 4): the physical matrix of the same first element that
-        is nearest in the Frobenius norm. Applying it again changes nothing,
-        and no physical matrix of that first element comes to lie farther away.
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong, a value is not finite, the transmission of
-        unpolarized light is not positive or the tolerance is negative.
-
-    Notes
-    -----
-    Eigenvalue filtering of Cloude 1990, Proc. SPIE 1166, 177,
-    doi:10.1117/12.962889, with the sum kept as Smolin, Gambetta & Smith 2012,
-    doi:10.1103/PhysRevLett.108.070502, do for density matrices. Scaling the
-    eigenvalues instead keeps the sum too, but can take a noisy matrix farther
-    from the truth.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.mueller import nearest_physical
-    >>> nearest_physical(np.diag([1.0, 1.0, 1.0, -1.0])).diagonal().round(6).tolist()
-    [1.0, 0.333333, 0.333333, -0.333333]
-    """
-    matrix = _transmitting(matrix)
-    values, vectors = np.linalg.eigh(coherency_matrix(matrix))
-    kept = _nearest_eigenvalues(values, matrix[..., 0, 0])
-    # V diag(kept) V^H
-    filtered = _mueller((vectors * kept[..., None, :]) @ np.swapaxes(vectors, -1, -2).conj())
-    physical = values[..., 0] >= -_tolerance(tolerance) * matrix[..., 0, 0]
-    return np.where(physical[..., None, None], matrix, filtered)
-
-
-def is_passive(matrix, tolerance=1e-9):
-    r"""
-    Tell which Mueller matrices give out no more light than they take.
-
-    Parameters
-    ----------
-    matrix : array_like
-        Mueller matrices of shape (..., 4, 4), physical ones.
-    tolerance : float
-        Excess over full transmission that still passes.
-
-    Returns
-    -------
-    `~numpy.ndarray` of bool
-        Whether :math:`m_{00} (1 + \max(D, P)) \le 1`, with diattenuation D
-        and polarizance P (light may travel either way).
-
-    Raises
-    ------
-    ParameterError
-        If the shape is wrong, a value is not finite, the transmission of
-        unpolarized light is not positive or the tolerance is negative.
-
-    Notes
-    -----
-    San José & Gil 2020, J. Opt. Soc. Am. A 37, 199,
-    doi:10.1364/JOSAA.37.000199. The matrices of unit mean transmission of a
-    calibration are passive only where they have no diattenuation.
-
-    Examples
-    --------
-    >>> from astropolcal.mueller import diattenuator, is_passive, linear_polarizer
-    >>> bool(is_passive(linear_polarizer())), bool(is_passive(diattenuator(0.1)))
-    (True, False)
-    """
-    matrix = _transmitting(matrix)
-    # the state that passes best has 1 + D of the mean; backwards the polarizance takes its place
-    best = matrix[..., 0, 0] * (1 + np.maximum(diattenuation(matrix), polarizance(matrix)))
-    return best <= 1 + _tolerance(tolerance)
+    matrix, tolerance = _mueller_array(matrix), to_unit(tolerance, None, "tolerance")
+    if not (tolerance >= 0).all():
+        raise ParameterError(f"tolerance = {tolerance} must be zero or positive")
+    smallest = np.linalg.eigvalsh(coherency_matrix(matrix))[..., 0]
+    return smallest >= -tolerance * matrix[..., 0, 0]
 
 
 # ---- Stokes vectors of many frames and wavelengths through Mueller matrices ----

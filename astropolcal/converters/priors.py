@@ -180,8 +180,8 @@ def prior_from_node(node, name):
 
 
 def _prior(node, name):
-    from astropolcal.measurement import priors
     from astropolcal.converters.nodes import plain, value_from_node
+    from astropolcal.measurement import priors
 
     if node["kind"] == "scipy":
         try:
