@@ -35,19 +35,8 @@ class SellmeierLaw:
     r"""
     A Sellmeier law, :math:`n^2 = A + \sum_i B_i \lambda^2 / (\lambda^2 - C_i)`.
 
-    Parameters
-    ----------
-    terms : tuple of (float, float)
-        Strength :math:`B_i` (dimensionless) and pole :math:`C_i` (squared
-        resonance wavelength in square micrometres) of each term.
-    constant : float
-        :math:`A`, one for the textbook form.
-
-    Examples
-    --------
-    >>> from astropolcal.materials import SellmeierLaw
-    >>> round(SellmeierLaw(terms=((1.0, 0.01),))._index_um(0.5), 6)
-    1.428869
+    ``terms`` are pairs of strength :math:`B_i` and pole :math:`C_i` (squared resonance wavelength
+    in square micrometres), ``constant`` is :math:`A`, one for the textbook form.
     """
 
     terms: tuple
@@ -255,95 +244,17 @@ class UniaxialMaterial(_Ranged):
         self.extraordinary_law = extraordinary_law
 
     def ordinary(self, wavelength):
-        """
-        Return the ordinary refractive index.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Wavelength in vacuum, any shape.
-
-        Returns
-        -------
-        `~astropy.units.Quantity`
-            Dimensionless, of the shape of ``wavelength``.
-
-        Raises
-        ------
-        WavelengthRangeError
-            If a wavelength lies outside ``valid_range`` or is not a number.
-        ParameterError
-            If the wavelength has no unit of length.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.materials import QUARTZ
-        >>> QUARTZ.ordinary(589.3 * u.nm).round(4)
-        <Quantity 1.5442>
-        """
+        """Return the ordinary refractive index, a dimensionless Quantity."""
         return u.Quantity(self.ordinary_law._index_um(self._checked_um(length_to_um(wavelength))))
 
     def extraordinary(self, wavelength):
-        """
-        Return the extraordinary refractive index.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Wavelength in vacuum, any shape.
-
-        Returns
-        -------
-        `~astropy.units.Quantity`
-            Dimensionless, of the shape of ``wavelength``.
-
-        Raises
-        ------
-        WavelengthRangeError
-            If a wavelength lies outside ``valid_range`` or is not a number.
-        ParameterError
-            If the wavelength has no unit of length.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.materials import QUARTZ
-        >>> QUARTZ.extraordinary(589.3 * u.nm).round(4)
-        <Quantity 1.5533>
-        """
+        """Return the extraordinary refractive index, a dimensionless Quantity."""
         return u.Quantity(
             self.extraordinary_law._index_um(self._checked_um(length_to_um(wavelength)))
         )
 
     def birefringence(self, wavelength):
-        """
-        Return the extraordinary minus the ordinary refractive index.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Wavelength in vacuum, any shape.
-
-        Returns
-        -------
-        `~astropy.units.Quantity`
-            Dimensionless, of the shape of ``wavelength``.
-
-        Raises
-        ------
-        WavelengthRangeError
-            If a wavelength lies outside ``valid_range`` or is not a number.
-        ParameterError
-            If the wavelength has no unit of length.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.materials import MGF2
-        >>> MGF2.birefringence([1.2, 1.6, 2.2] * u.um).round(5)
-        <Quantity [0.01154, 0.0114 , 0.01115]>
-        """
+        """Return the extraordinary minus the ordinary refractive index (Quantity)."""
         return u.Quantity(self._birefringence_um(length_to_um(wavelength)))
 
     def _birefringence_um(self, wavelength_um):
@@ -702,15 +613,7 @@ _BY_NAME = {name.lower(): m for m in _BUILT_IN for name in (m.name, *m.aliases)}
 
 
 def material_names():
-    """
-    Return the names of the materials that `get_material` knows.
-
-    Examples
-    --------
-    >>> from astropolcal.materials import material_names
-    >>> material_names()[:4]
-    ['quartz', 'MgF2', 'silver', 'gold']
-    """
+    """Return the names of the materials that `get_material` knows."""
     return list(_MATERIALS)
 
 
@@ -760,7 +663,7 @@ def get_material(name):
     name : str
         Name or alias, in any case: ``"quartz"`` (also ``"SiO2"``, which here
         means the crystal), ``"fused silica"``, ``"silver"``; or
-        ``"refractiveindex:SHELF/BOOK/PAGE"``, see `database_material`.
+        ``"refractiveindex:SHELF/BOOK/PAGE"``, a page of the refractiveindex.info database.
 
     Returns
     -------
@@ -813,31 +716,9 @@ class _DatabaseLaw:
 @lru_cache(maxsize=64)
 def database_material(address):
     """
-    Return a material of the refractiveindex.info database.
+    Return a material of the refractiveindex.info database by ``"refractiveindex:SHELF/BOOK/PAGE"``.
 
-    Parameters
-    ----------
-    address : str
-        ``"refractiveindex:SHELF/BOOK/PAGE"``, the three names in the address of a
-        page of refractiveindex.info.
-
-    Returns
-    -------
-    IsotropicMaterial
-        With the address as its name and the range of the page's data, where n
-        and k overlap. A page without k is taken as transparent.
-
-    Raises
-    ------
-    ParameterError
-        If the package ``refractiveindex`` is not installed, the address is not
-        complete, or the database has no such page.
-
-    Examples
-    --------
-    >>> from astropolcal.materials import database_material
-    >>> database_material("refractiveindex:main/Ag/Yang")  # doctest: +SKIP
-    <IsotropicMaterial 'refractiveindex:main/Ag/Yang', 0.27 to 24.92 um>
+    Its range is that of the data, where n and k overlap; a page without k is taken as transparent.
     """
     names = address.removeprefix(DATABASE_PREFIX).split("/")
     if len(names) != 3 or not all(names) or not address.startswith(DATABASE_PREFIX):

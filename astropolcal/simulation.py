@@ -144,30 +144,7 @@ def simulate(
 
 
 def check_seed(seed):
-    """
-    Return the seed of random numbers if it is one.
-
-    Parameters
-    ----------
-    seed : int, None or `~numpy.random.Generator`
-        What `numpy.random.default_rng` takes.
-
-    Returns
-    -------
-    int, None or `~numpy.random.Generator`
-        The same.
-
-    Raises
-    ------
-    ParameterError
-        If it is negative, or no whole number.
-
-    Examples
-    --------
-    >>> from astropolcal.simulation import check_seed
-    >>> check_seed(7)
-    7
-    """
+    """Return the seed of random numbers if `numpy.random.default_rng` takes it, else raise."""
     try:
         # draws nothing, so that a generator stays as it is
         np.random.default_rng(seed)
@@ -178,44 +155,10 @@ def check_seed(seed):
 
 def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
     """
-    Return the noiseless fluxes of both beams for a source of unit flux.
+    Return the noiseless fluxes of both beams, (n_wavelengths, n_frames) each, not negative.
 
-    Parameters
-    ----------
-    chain : `~astropy.modeling.CompoundModel`
-        With a beam splitter.
-    wavelength : `~astropy.units.Quantity`
-        Shape (n_wavelengths,).
-    frames : `~astropy.table.QTable`
-        One row a frame: the position of every stage. A column such as ``hwp_true`` goes
-        before ``hwp``.
-    source : sequence of float
-        Stokes vector of the light that enters.
-
-    Returns
-    -------
-    right, left : `~numpy.ndarray`
-        Each of shape (n_wavelengths, n_frames), not negative.
-
-    Raises
-    ------
-    ParameterError
-        If a flux is negative, which no physical chain gives.
-    ChainError
-        If the position of a stage is missing.
-
-    Examples
-    --------
-    A half-wave plate at 0 and 45 deg turns light that is polarized along +Q into -Q:
-
-    >>> import astropy.units as u
-    >>> from astropolcal import optics
-    >>> from astropolcal.simulation import expected_fluxes, half_wave_plate_cycles
-    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp") | optics.WollastonPrism()
-    >>> frames = half_wave_plate_cycles(hwp=[0, 45] * u.deg)
-    >>> right, left = expected_fluxes(chain, [1.6] * u.um, frames, source=(1, 1, 0, 0))
-    >>> (right - left).round(12).tolist()
-    [[1.0, -1.0]]
+    ``frames`` has the position of every stage, one row per frame; a column such as ``hwp_true``
+    goes before ``hwp``. ``source`` is the Stokes vector of the light that enters.
     """
     # where the true angle of a stage is known, it is that at which it stands
     known = {stage: f"{stage}_true" for stage in stages(chain)}
@@ -259,32 +202,10 @@ def check_electrons(electrons):
 
 def entering_flux(flux, lamp, n_frames, n_wavelengths):
     """
-    Return the flux that enters a chain in every frame.
+    Return the flux that enters a chain in every frame, shape (n_frames, n_wavelengths).
 
-    Parameters
-    ----------
-    flux : float or array_like
-        Scalar or one value a wavelength.
-    lamp : array_like or None
-        Relative brightness in each frame; None if it is constant.
-    n_frames, n_wavelengths : int
-        Numbers of them.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_frames, n_wavelengths).
-
-    Raises
-    ------
-    ParameterError
-        If one is not positive, or of another shape.
-
-    Examples
-    --------
-    >>> from astropolcal.simulation import entering_flux
-    >>> entering_flux([10, 20], [1.0, 0.5], 2, 2).tolist()
-    [[10.0, 20.0], [5.0, 10.0]]
+    The flux is a scalar or one value per wavelength, the brightness of the lamp is relative, one
+    per frame or None.
     """
     flux = _positive("flux", flux)
     lamp = _positive("lamp", np.ones(n_frames) if lamp is None else lamp)

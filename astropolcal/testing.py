@@ -521,7 +521,7 @@ def check_instrument(instrument, *, skip=(), seed=0, raises=True):
     instrument : Instrument or type
         The instrument, or its class; it need not be registered.
     skip : sequence of str
-        Rules that are left out, see `RULES`.
+        Rules that are left out, see ``RULES``.
     seed : int
         Of the random positions and of the noise.
     raises : bool

@@ -29,7 +29,7 @@ class Channels:
 
     Parameters
     ----------
-    dataset : `~astropolcal.measurement.datasets.Dataset`
+    dataset : ``Dataset``
         A dataset with one frame a datum.
 
     Examples

@@ -123,19 +123,7 @@ class SkyLaw:
         """
         Return the factors of parallactic angle and altitude in the plate's true angle.
 
-        Parameters
-        ----------
-        mode : str, optional
-            What the derotator keeps still; needed where the law depends on it.
-
-        Returns
-        -------
-        (float, float)
-
-        Raises
-        ------
-        InstrumentError
-            If the mode is unknown, or not given where it is needed.
+        The ``mode``, what the derotator keeps still, is needed where the law depends on it.
         """
         if mode is not None and self.modes:
             check_choice("mode", mode, self.modes)
@@ -146,23 +134,7 @@ class SkyLaw:
         return next(iter(self.plate.values()))
 
     def derotator_law(self, mode):
-        """
-        Return the factors of parallactic angle and altitude in the derotator's angle.
-
-        Parameters
-        ----------
-        mode : str
-            What it keeps still.
-
-        Returns
-        -------
-        (float, float)
-
-        Raises
-        ------
-        InstrumentError
-            If there is no derotator, or the mode is unknown.
-        """
+        """Return the factors of parallactic angle and altitude in the derotator's angle."""
         if not self.derotator:
             raise InstrumentError("there is no derotator that follows the sky")
         check_choice("law", mode, tuple(self.derotator))
@@ -245,26 +217,7 @@ def add_nuisance(chains, datasets, nuisance):
 
 
 def without_nuisance(chain):
-    """
-    Return a chain without the nuisance optics of its dataset.
-
-    Parameters
-    ----------
-    chain : `~astropy.modeling.CompoundModel`
-        The chain.
-
-    Returns
-    -------
-    `~astropy.modeling.CompoundModel`
-
-    Examples
-    --------
-    >>> from astropolcal import instruments, optics
-    >>> from astropolcal.instruments import without_nuisance
-    >>> chain = instruments.get("charis").chain() | optics.BeamGain(name="beam_gain_night")
-    >>> without_nuisance(chain).submodel_names[-1]
-    'wollaston'
-    """
+    """Return a chain without the nuisance optics of its dataset."""
     prefixes = tuple(f"{kind}_" for kind in NUISANCES)
     found = leaves(chain)
     kept = [leaf for leaf in found if not str(leaf.name).startswith(prefixes)]
@@ -414,27 +367,8 @@ class Instrument(ABC):
         """
         Raise if what `chain` is asked for is not known, the first thing that it does.
 
-        Parameters
-        ----------
-        source : str
-            One of ``sources``.
-        optics_in : sequence of str
-            Each one of ``optional_optics``.
-        **choices : (str, sequence of str)
-            Name of another choice to its value and what is allowed.
-
-        Raises
-        ------
-        InstrumentError
-            Naming the instrument, the value and what is allowed.
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("irdis").check_choices("moon")
-        Traceback (most recent call last):
-        ...
-        astropolcal.exceptions.InstrumentError: irdis: source = 'moon'; allowed are polarized, ...
+        ``choices`` are other choices by name, each with its value and what is allowed; the message
+        names the instrument, the value and what is allowed.
         """
         check_choice(f"{self.name}: source", source, self.sources)
         for name in optics_in:
@@ -443,51 +377,15 @@ class Instrument(ABC):
             check_choice(f"{self.name}: {what}", value, allowed)
 
     def grid(self, wavelength=None):
-        """
-        Return the wavelengths of the parameters of a chain, a Quantity of shape (n_wavelengths,).
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`, optional
-            As given to `chain`; without it the usual ones.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal import instruments
-        >>> instruments.get("charis").grid(1.6 * u.um)
-        <Quantity [1.6] um>
-        """
+        """Return the wavelengths of the parameters of a chain, by default the usual ones."""
         return self.wavelength if wavelength is None else np.atleast_1d(u.Quantity(wavelength))
 
     def source_of(self, observations, spellings=None):
         """
         Return the source that a table's meta state, for `setup`.
 
-        Parameters
-        ----------
-        observations : Observations
-            The dataset.
-        spellings : dict of str to str, optional
-            What tables may call the sources; by default as in ``sources``. Case, hyphens and
-            underscores do not matter, and a ``"standard star"`` is a ``"star"``.
-
-        Returns
-        -------
-        str
-
-        Raises
-        ------
-        InstrumentError
-            If it is none of them.
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> from astropolcal.observations import Observations, example_table
-        >>> table = Observations.from_table(example_table())
-        >>> instruments.get("charis").source_of(table)
-        'polarized'
+        ``spellings`` lead from what tables may call the sources to the names; case, hyphens and
+        underscores do not matter, and a ``"standard star"`` is a ``"star"``.
         """
         allowed = {name: name for name in self.sources} if spellings is None else spellings
         known = {plain_source(word): name for word, name in allowed.items()}
@@ -500,93 +398,27 @@ class Instrument(ABC):
         return known[word]
 
     def meta_without(self, names):
-        """
-        Return what the meta of a table say when optional optics are out of the beam.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Optics that are taken out; others than the optional ones change nothing.
-
-        Returns
-        -------
-        dict
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("charis").meta_without(["nbs"])
-        {'nasmyth_beam_switcher': 'not installed'}
-        """
+        """Return what the meta of a table say when these optional optics are out of the beam."""
         return {}
 
     def optics_of(self, header):
-        """
-        Return what a frame's header tells of the optional optics.
-
-        Parameters
-        ----------
-        header : `~astropy.io.fits.Header` or mapping
-            Primary header.
-
-        Returns
-        -------
-        dict of str to bool
-            Name of an optic to whether it was in the beam; what the header does not tell is
-            absent.
-        """
+        """Return what a header tells of optional optics: name to whether it is in the beam."""
         return {}
 
     def configured(self, header):
         """
-        Return the instrument as a frame's mode has it, with the wavelengths and shape of its files.
+        Return the instrument as a frame's mode has it, with wavelengths and shape of its files.
 
-        Parameters
-        ----------
-        header : `~astropy.io.fits.Header` or mapping
-            Primary header.
-
-        Returns
-        -------
-        Instrument
-            Here the same: files of one kind only.
-
-        Raises
-        ------
-        InstrumentError
-            If the mode is not known.
+        Here the same: files of one kind only; an unknown mode raises an InstrumentError.
         """
         return self
 
     def mode_header(self, wavelength):
-        """
-        Return the keywords by which `configured` knows cubes of some wavelengths.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Of the slices.
-
-        Returns
-        -------
-        dict of str to str
-
-        Raises
-        ------
-        InstrumentError
-            If no mode of the instrument has these wavelengths.
-        """
+        """Return the keywords by which `configured` knows cubes of some wavelengths."""
         return {}
 
     def published(self):
-        """
-        Return the chain with published values, for simulations and examples.
-
-        Raises
-        ------
-        InstrumentError
-            If the instrument has none.
-        """
+        """Return the chain with published values, for simulations and examples."""
         raise InstrumentError(f"{self.name}: no published values; give a calibration file")
 
     def published_meta(self):

@@ -83,40 +83,10 @@ class _Header:
 
 def frame_table(headers, location, filters, law):
     """
-    Return the table of frames from their headers, see `astropolcal.instruments.IRDIS`.
+    Return the table of frames from their headers, see `astropolcal.instruments.IRDIS.frame_table`.
 
-    Parameters
-    ----------
-    headers : list of mappings
-        One a frame.
-    location : `~astropy.coordinates.EarthLocation`
-        Site of the telescope.
-    filters : dict of str to `~astropy.units.Quantity`
-        Central wavelength of every filter with coefficients.
-    law : SkyLaw
-        How plate and derotator follow the sky.
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-
-    Raises
-    ------
-    ObservationError, InstrumentError
-        If a header cannot be used; the message names frame and keyword.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If the stages are known at the start of an exposure only.
-
-    Examples
-    --------
-    >>> from astropolcal.instruments.irdis import frame_table
-    >>> frame_table([], None, {}, None)
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: no headers were given, at least one is needed
+    ``filters`` are the central wavelengths of those with coefficients, ``law`` says how plate and
+    derotator follow the sky.
     """
     if not headers:
         raise ObservationError("no headers were given, at least one is needed")
@@ -490,19 +460,7 @@ class IRDIS(Instrument):
         return join([light, *telescope(index, coating), *common])
 
     def published(self):
-        """
-        Return the chain of the polarized internal source with the published values.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("irdis").published()["wollaston"].efficiency.value.round(3).tolist()
-        [0.98, 0.989, 0.996, 0.984]
-        """
+        """Return the chain of the polarized internal source with the published values."""
         return self.chain("polarized")
 
     def published_meta(self):
@@ -553,75 +511,18 @@ class IRDIS(Instrument):
         return telescope(index, coating_of(coating, date))
 
     def setup(self, observations):
-        """
-        Return source and optics in the beam, as the table's meta states them.
-
-        Parameters
-        ----------
-        observations : Observations
-            Its meta holds ``source``.
-
-        Returns
-        -------
-        source : str
-        optics_in : tuple of str
-            Empty.
-
-        Raises
-        ------
-        InstrumentError
-            If the source is not known.
-        """
+        """Return the source from the table's meta, and no optional optics."""
         return self.source_of(observations), ()
 
     def particulars(self, observations):
-        """
-        Return the coating, and source optic and target of a star.
-
-        Parameters
-        ----------
-        observations : Observations
-            Of a star: its meta holds ``date`` (ISO), or ``coating``, which is
-            ``before`` or ``after``; and ``object``.
-
-        Returns
-        -------
-        dict
-
-        Raises
-        ------
-        InstrumentError
-            If the table of a star does not tell the coating.
-        """
+        """Return the coating, by ``date`` or ``coating`` in the meta, and names of a star."""
         if not is_star(observations.source):
             return {}
         return {"coating": stated_coating(observations)} | super().particulars(observations)
 
     @staticmethod
     def coating_on(date):
-        """
-        Return which coating the telescope's mirrors had.
-
-        Parameters
-        ----------
-        date : str, ``datetime.date`` or `~astropy.time.Time`
-            Date of the observation, a text in ISO form.
-
-        Returns
-        -------
-        {"before", "after"}
-
-        Raises
-        ------
-        InstrumentError
-            If it is no date.
-
-        Examples
-        --------
-        >>> from astropolcal.instruments import IRDIS
-        >>> coating_on("2017-04-15"), coating_on("2017-04-16T03:00")
-        ('before', 'after')
-        """
+        """Return which coating the telescope's mirrors had on a date, "before" or "after"."""
         return coating_on(date)
 
     @property

@@ -71,18 +71,7 @@ class ReadOut:
             )
 
     def multiplied(self, em_gain):
-        """
-        Return gain and read noise in electrons before a multiplication.
-
-        Parameters
-        ----------
-        em_gain : float
-            Electrons that leave the register for each that enters.
-
-        Returns
-        -------
-        ReadOut
-        """
+        """Return gain and read noise in electrons before a multiplication by ``em_gain``."""
         return replace(self, gain=self.gain / em_gain, read_noise=self.read_noise / em_gain)
 
 
@@ -240,27 +229,8 @@ class FileLayout:
         """
         Return how the detector was read out in a frame.
 
-        Parameters
-        ----------
-        values : dict
-            Of its header: ``em_gain``, ``read_mode`` and ``camera``, as far as they are known.
-
-        Returns
-        -------
-        ReadOut
-            With an EM gain above one, gain and read noise are those before the multiplication.
-
-        Raises
-        ------
-        ObservationError
-            If the mode is none of ``read_outs``, or the EM gain is impossible.
-
-        Examples
-        --------
-        >>> from astropolcal.instruments.layout import FileLayout
-        >>> emccd = FileLayout({"em_gain": "EMGAIN"}, (1, 512, 512), gain=4.5, read_noise=90.0)
-        >>> emccd.read_out({"em_gain": 300.0})
-        ReadOut(gain=0.015, read_noise=0.3, saturation=inf, excess_noise=1.4142135623730951)
+        ``values`` of its header are ``em_gain``, ``read_mode`` and ``camera``, as far as they are
+        known. With an EM gain above one, gain and read noise are those before the multiplication.
         """
         own = ReadOut(self.gain, self.read_noise, self.saturation)
         em_gain, mode = values.get("em_gain"), values.get("read_mode")
@@ -291,27 +261,7 @@ class FileLayout:
         """
         Return the file of the left beam that belongs to one of the right beam.
 
-        Parameters
-        ----------
-        path : path-like
-            The file of the right beam.
-
-        Returns
-        -------
-        `~pathlib.Path` or None
-            In the same folder; None where one file holds both beams.
-
-        Raises
-        ------
-        ObservationError
-            If the name does not have the mark of the right beam.
-
-        Examples
-        --------
-        >>> from astropolcal.instruments.layout import FileLayout
-        >>> layout = FileLayout({}, (1, 64, 128), beam_files=("cam1", "cam2"))
-        >>> layout.left_file("night_00000007_cam1.fits").name
-        'night_00000007_cam2.fits'
+        None where one file holds both.
         """
         if not self.beam_files:
             return None
@@ -325,25 +275,7 @@ class FileLayout:
         return path.with_name(f"{head}{left}{tail}")
 
     def frame_files(self, files):
-        """
-        Return one file a frame, without those of left beams that belong to another file.
-
-        Parameters
-        ----------
-        files : sequence of path-like
-            The files, in any order.
-
-        Returns
-        -------
-        list of str
-
-        Examples
-        --------
-        >>> from astropolcal.instruments.layout import FileLayout
-        >>> layout = FileLayout({}, (1, 64, 128), beam_files=("cam1", "cam2"))
-        >>> layout.frame_files(["a_cam1.fits", "a_cam2.fits", "b_cam2.fits"])
-        ['a_cam1.fits', 'b_cam2.fits']
-        """
+        """Return one file per frame, without those of left beams that belong to another file."""
         files = [str(path) for path in files]
         if not self.beam_files:
             return files
@@ -383,55 +315,15 @@ def look_up(headers, column, layout):
     """
     Return the first keyword that holds a value for a column, and the value.
 
-    Parameters
-    ----------
-    headers : sequence of `~astropy.io.fits.Header` or dict
-        Where to look, in turn.
-    column : str
-        Column of the observation table.
-    layout : FileLayout
-        Its ``keywords`` and ``alternatives``.
-
-    Returns
-    -------
-    keyword : str or None
-        Where there is no value, the first one; None if the layout knows none.
-    value : object or None
-        As it stands in the header; None for what stands for no value, such as "N/A".
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.instruments.layout import look_up
-    >>> layout = instruments.get("charis").files
-    >>> look_up([{"D_IMRPAD": "N/A"}, {layout.keywords["hwp"]: 45.0}], "hwp", layout)[1]
-    45.0
+    Looked through are the headers in turn, for the ``keywords`` and ``alternatives`` of the
+    layout. Without a value it is the first keyword (None if the layout knows none) and None, as
+    for what stands for no value, such as "N/A".
     """
     return next(stated(headers, column, layout), (layout.keywords.get(column), None))
 
 
 def stated(headers, column, layout):
-    """
-    Yield all keywords that hold a value for a column, and the values, as `look_up` finds them.
-
-    Parameters
-    ----------
-    headers, column, layout
-        As for `look_up`.
-
-    Yields
-    ------
-    keyword : str
-    value : object
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.instruments.layout import stated
-    >>> layout = instruments.get("vampires").files
-    >>> list(stated([{"U_HWPANG": 45.0, "RET-ANG1": 0.0}], "hwp", layout))
-    [('RET-ANG1', 0.0), ('U_HWPANG', 45.0)]
-    """
+    """Yield all keywords that hold a value for a column, with the value, see ``look_up``."""
     keywords = (layout.keywords.get(column), *layout.alternatives.get(column, ()))
     for header, keyword in product(headers, filter(None, keywords)):
         value = _read(header, keyword)
@@ -445,23 +337,7 @@ def unit_of(column, layout):
     """
     Return the unit of a column's keyword.
 
-    Parameters
-    ----------
-    column : str
-        Column of the observation table.
-    layout : FileLayout
-        Its ``units``; where it gives none, an angle is in degree and a time in seconds.
-
-    Returns
-    -------
-    `~astropy.units.Unit`
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.instruments.layout import unit_of
-    >>> unit_of("altitude", instruments.get("charis").files)
-    Unit("deg")
+    Where the layout gives none, angles are in degree and times in seconds.
     """
     return u.Unit(layout.units.get(column, _UNITS.get(column, "deg")))
 
@@ -475,36 +351,7 @@ def _read(header, keyword):
 
 
 def convert(column, value, layout, target):
-    """
-    Return a value of a header as a number in a unit.
-
-    Parameters
-    ----------
-    column : str
-        Column of the observation table.
-    value : object
-        As it stands in the header.
-    layout : FileLayout
-        Its ``transforms`` and ``units``.
-    target : unit-like
-        The unit wanted.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the value is no number.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.instruments.layout import convert
-    >>> round(convert("altitude", "45.0", instruments.get("charis").files, "rad"), 6)
-    0.785398
-    """
+    """Return a value of a header as a float in a unit, or raise TypeError or ValueError."""
     factor, offset = layout.transforms.get(column, (1.0, 0.0))
     unit = unit_of(column, layout)
     return (factor * plain_number(value) + offset) * unit.to(target)
@@ -512,32 +359,9 @@ def convert(column, value, layout, target):
 
 def frame_time(header, layout):
     """
-    Return when a frame was taken.
+    Return when a frame was taken (UTC), None if the header does not say.
 
-    Parameters
-    ----------
-    header : `~astropy.io.fits.Header` or dict
-        Of the frame.
-    layout : FileLayout
-        Where its ``mjd``, or its ``date`` and ``time``, stand.
-
-    Returns
-    -------
-    `~astropy.time.Time` or None
-        UTC; None if the header does not say. A date alone is its midnight.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If what the header says cannot be understood.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.instruments.layout import frame_time
-    >>> layout = instruments.get("charis").files
-    >>> frame_time({layout.keywords["mjd"]: 60982.5}, layout).isot
-    '2025-11-03T12:00:00.000'
+    A date alone is its midnight; what cannot be understood raises TypeError or ValueError.
     """
     mjd, date, clock = (look_up([header], key, layout)[1] for key in ("mjd", "date", "time"))
     if mjd is not None:
@@ -553,30 +377,9 @@ def frame_time(header, layout):
 
 def in_calendar(time):
     """
-    Return a time as it is, if a calendar has its day.
+    Return a time as it is if a calendar has its day, else raise a ValueError (ErfaError).
 
     Astropy takes any number as a day, and finds out in the first conversion only.
-
-    Parameters
-    ----------
-    time : `~astropy.time.Time`
-        Any.
-
-    Returns
-    -------
-    `~astropy.time.Time`
-
-    Raises
-    ------
-    ValueError
-        ErfaError, if no calendar has the day.
-
-    Examples
-    --------
-    >>> from astropy.time import Time
-    >>> from astropolcal.instruments.layout import in_calendar
-    >>> in_calendar(Time(60982.5, format="mjd")).isot
-    '2025-11-03T12:00:00.000'
     """
     # years long before UTC was made are doubtful, but are years
     with offline():

@@ -92,7 +92,7 @@ def _places(side):
     }
 
 
-#: The multiband imager; `layout_of` has the other modes.
+#: The multiband imager; ``layout_of`` has the other modes.
 LAYOUT = FileLayout(
     keywords=KEYWORDS
     | {
@@ -129,29 +129,7 @@ LAYOUT = FileLayout(
 
 
 def slices_of(header):
-    """
-    Return the wavelengths of the slices in a file.
-
-    Parameters
-    ----------
-    header : `~astropy.io.fits.Header` or mapping
-        With the mode, and outside of the multiband imager the filter.
-
-    Returns
-    -------
-    `~astropy.units.Quantity`
-
-    Raises
-    ------
-    InstrumentError
-        If the filter is missing or has no known wavelength.
-
-    Examples
-    --------
-    >>> from astropolcal.instruments.vampires import slices_of
-    >>> slices_of({"OBS-MOD": "IPOL_MBI"}), slices_of({"FILTER01": "750-50"})
-    (<Quantity [610., 670., 720., 760.] nm>, <Quantity [750.] nm>)
-    """
+    """Return the wavelengths of the slices in a file, by mode and filter in its header."""
     mode = str(header.get(_MODE, "")).upper()
     if "MBI" in mode:
         # the reduced multiband imager leaves the first field out
@@ -169,25 +147,7 @@ def layout_of(header):
     """
     Return how files of a mode look.
 
-    Parameters
-    ----------
-    header : `~astropy.io.fits.Header` or mapping
-        Primary header; without ``NAXIS1`` and ``NAXIS2`` of images as large as they usually are.
-
-    Returns
-    -------
-    FileLayout
-
-    Raises
-    ------
-    InstrumentError
-        If the image is not square, or the filter is not known.
-
-    Examples
-    --------
-    >>> from astropolcal.instruments.vampires import layout_of
-    >>> layout_of({"FILTER01": "Open", "NAXIS1": 128, "NAXIS2": 128}).shape
-    (1, 128, 256)
+    A header without ``NAXIS1`` and ``NAXIS2`` is of images as large as usual.
     """
     multiband = "MBI" in str(header.get(_MODE, "")).upper()
     # headers that are asked before any file is read have no size
@@ -203,30 +163,7 @@ def layout_of(header):
 
 
 def mode_header(wavelength):
-    """
-    Return the keywords of the mode that has slices of these wavelengths.
-
-    Parameters
-    ----------
-    wavelength : `~astropy.units.Quantity`
-        Shape (n_wavelengths,).
-
-    Returns
-    -------
-    dict of str to str
-
-    Raises
-    ------
-    InstrumentError
-        If they are neither one filter nor the fields of the multiband imager.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.instruments.vampires import mode_header
-    >>> mode_header([775] * u.nm)
-    {'OBS-MOD': 'IPOL', 'FILTER01': '775-50'}
-    """
+    """Return the keywords of the mode that has slices of these wavelengths."""
     known = [({_MODE: _MULTIBAND, _FILTER: "Open"}, FIELDS)]
     known.append(({_MODE: _REDUCED, _FILTER: "Open"}, FIELDS[1:]))
     known += [({_MODE: _SINGLE, _FILTER: name}, (name,)) for name in _BANDS]
@@ -419,8 +356,7 @@ class VAMPIRES(Instrument):
             Grid, by default the fields of the multiband imager.
         derotator : {"elliptical", "linear", "kmirror"}
             Kind of retarder, with values of its own in each band; or three silver mirrors with
-            films of silica, one law for all bands, see
-            `~astropolcal.instruments.telescope.k_mirror`.
+            films of silica, one law for all bands, free in their thickness.
         bounds : {"physical"}
             Half-wave plate from -180 to -90 deg, derotator within the turn from 0 deg on.
         m3 : {"free", "power law", "metal"}
@@ -484,16 +420,6 @@ class VAMPIRES(Instrument):
 
         No values of all optics are published; these are where fits start, rounded from a fit to
         the internal source in September 2023.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("vampires").published()["flc"].switching_angle.quantity
-        <Quantity 43. deg>
         """
         return self.chain("polarized")
 
@@ -508,29 +434,7 @@ class VAMPIRES(Instrument):
         }
 
     def configured(self, header):
-        """
-        Return the instrument with the wavelengths and the shape of a file.
-
-        Parameters
-        ----------
-        header : `~astropy.io.fits.Header` or mapping
-            Primary header, with mode, filter and size of the image.
-
-        Returns
-        -------
-        VAMPIRES
-
-        Raises
-        ------
-        InstrumentError
-            If the filter is not known, or the image not square.
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("vampires").configured({"FILTER01": "750-50"}).wavelength
-        <Quantity [750.] nm>
-        """
+        """Return the instrument with the wavelengths and the shape of a file."""
         # a new one: the registry hands out instances that others may hold
         one = type(self)()
         one.wavelength, one.files = slices_of(header), layout_of(header)
@@ -552,21 +456,8 @@ class VAMPIRES(Instrument):
         """
         Return the source from the table's meta, and whether the liquid crystal is in the beam.
 
-        Parameters
-        ----------
-        observations : Observations
-            Its meta holds ``source``, and ``flc`` (``in`` or ``out``); where it does not, the
-            liquid crystal is in if there is a column ``flc_state``.
-
-        Returns
-        -------
-        source : str
-        optics_in : tuple of str
-
-        Raises
-        ------
-        InstrumentError
-            If the source is unknown, or ``flc`` is neither.
+        Where the meta have no ``flc`` (``in`` or ``out``), it is in if there is a column
+        ``flc_state``.
         """
         source = self.source_of(observations, _SOURCES)
         return source, ("flc",) if _is_modulated(observations) else ()
@@ -579,18 +470,9 @@ class VAMPIRES(Instrument):
         """
         Return the observations with saturated frames masked.
 
-        Where frames are paired by the state of the liquid crystal, a drift of the lamp is
-        the same in both and no frame is masked for it. Elsewhere as
+        Where frames are paired by the state of the liquid crystal, a drift of the lamp is the same
+        in both and no frame is masked for it. Elsewhere as
         `~astropolcal.instruments.Instrument.prepare`.
-
-        Parameters
-        ----------
-        observations : Observations
-            The dataset.
-
-        Returns
-        -------
-        Observations
         """
         if observations.pairing == "flc_state" and not is_star(observations.source):
             return mask_saturated(observations)

@@ -203,33 +203,10 @@ class Measurement(FittableModel):
 
     def thinned(self, most):
         """
-        Return the measurement with fewer frames, for searches that need not see them all.
+        Return the measurement with fewer frames, and which data it keeps, bool of shape (n_data,).
 
-        Parameters
-        ----------
-        most : int
-            Number of groups of frames that a dataset keeps at most; they are drawn at random,
-            always the same ones.
-
-        Returns
-        -------
-        measurement : Measurement
-            With the same free parameters and current values.
-        kept : `~numpy.ndarray` of bool
-            The data that it keeps, shape (n_data,).
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> from astropolcal.measurement import Measurement
-        >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-        >>> import astropy.units as u
-        >>> charis = instruments.get("charis")
-        >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
-        >>> whole = Measurement(charis.chain(), simulate(charis.chain(), charis.wavelength, frames))
-        >>> fewer, kept = whole.thinned(5)
-        >>> fewer.n_data, int(kept.sum()), whole.n_data
-        (110, 110, 176)
+        For searches that need not see them all: up to ``most`` groups of frames of each dataset,
+        drawn at random, always the same ones. Free parameters and current values are the same.
         """
         chosen = [_drawn(dataset.frames.shape[0], most) for dataset in self.datasets]
         new = copy_module.deepcopy(self)
@@ -265,37 +242,13 @@ class Measurement(FittableModel):
         return sweeps
 
     def predict(self, vector):
-        """
-        Return all predicted data for a vector of free parameters.
-
-        Parameters
-        ----------
-        vector : array_like
-            Canonical values, shape (n_free,).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Shape (n_data,).
-        """
+        """Return all predicted data, (n_data,), for a vector of free parameters (canonical)."""
         sweeps = self._sweeps(np.asarray(vector, dtype=float).ravel())
         parts = [d.values(s) for d, s in zip(self.datasets, sweeps, strict=True)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def jacobian(self, vector):
-        """
-        Return the derivative of all data to all free parameters.
-
-        Parameters
-        ----------
-        vector : array_like
-            Canonical values, shape (n_free,).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Shape (n_free, n_data).
-        """
+        """Return the derivative of all data to all free parameters, (n_free, n_data)."""
         sweeps = self._sweeps(np.asarray(vector, dtype=float).ravel())
         parts = [d.jacobian(s) for d, s in zip(self.datasets, sweeps, strict=True)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
@@ -326,24 +279,11 @@ class Measurement(FittableModel):
 
     def fit_arguments(self, weights=None, noise=1.0, keep=None):
         """
-        Return what a fitter takes: index, data and weights, with the priors as data.
+        Return what a fitter takes: index, data and weights, with the priors as data behind them.
 
-        Parameters
-        ----------
-        weights : `~numpy.ndarray`, optional
-            Weight of each datum, shape (n_data,); None for equal weights.
-        noise : float
-            Standard deviation of a datum of weight one; sets how much a prior
-            weighs against the data.
-        keep : `~numpy.ndarray`, optional
-            True for the data that take part, shape (n_data,).
-
-        Returns
-        -------
-        index, observed : `~numpy.ndarray`
-            Shape (n_data + n_priors,), or fewer with ``keep``.
-        weights : `~numpy.ndarray` or None
-            None where all weigh the same.
+        ``weights`` of the data may be None for equal ones, ``noise`` is the standard deviation of
+        a datum of weight one, which sets how much a prior weighs against the data, and ``keep`` is
+        True for the data that take part.
         """
         take = np.ones(self.n_data, dtype=bool) if keep is None else keep
         index, observed = self.index[take], self.observed[take]
@@ -360,18 +300,7 @@ class Measurement(FittableModel):
         )
 
     def log_prior(self, vector):
-        """
-        Return the log density of the priors, minus infinity outside the bounds.
-
-        Parameters
-        ----------
-        vector : array_like
-            Canonical values, shape (n_free,).
-
-        Returns
-        -------
-        float
-        """
+        """Return the log density of the priors, minus infinity outside the bounds."""
         return self.free.log_prior(vector)
 
     # ---- results --------------------------------------------------------------

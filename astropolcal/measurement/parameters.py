@@ -58,24 +58,8 @@ class Slot:
     """
     Where a named parameter lives in the flat vector.
 
-    Parameters
-    ----------
-    name : str
-        ``"optic.parameter"``.
-    unit : `~astropy.units.Unit` or None
-        The unit it is declared in.
-    start, size : int
-        First element and number of elements; more than one for a parameter
-        with one value a wavelength.
-    bounds : tuple
-        Lower and upper bound in ``unit``, None where open.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.measurement import Slot
-    >>> Slot("hwp.theta", u.deg, 0, 1, (-5, 5)).slice
-    slice(0, 1, None)
+    Its first element and number of elements, which is more than one for a parameter with one value
+    per wavelength; bounds in ``unit``, None where open.
     """
 
     name: str
@@ -160,31 +144,11 @@ def parameter_table(chains):
 
 class FreeParameters:
     """
-    The free parameters of chains that share optics by name.
+    The free parameters of chains that share optics by name, one chain per dataset.
 
-    Parameters
-    ----------
-    chains : sequence
-        The chains, one a dataset.
-    n_wavelengths : int
-        Size of the common wavelength grid.
-    ties : dict of str to Tie, optional
-        Parameters that follow others.
-
-    Raises
-    ------
-    ParameterError
-        If shapes do not fit the grid, a parameter is free in one chain and
-        fixed in another, a tie is circular or unknown, or astropy's callable
-        ``tied`` is used (it spoils analytic Jacobians).
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.measurement import FreeParameters
-    >>> free = FreeParameters([optics.WollastonPrism(name="wollaston")], 22)
-    >>> [slot.name for slot in free.slots], free.size
-    (['wollaston.efficiency'], 1)
+    Refused are shapes that do not fit the common grid of ``n_wavelengths``, parameters that are
+    free in one chain and fixed in another, ties that are circular or unknown, and astropy's
+    callable ``tied``, which spoils analytic Jacobians.
     """
 
     def __init__(self, chains, n_wavelengths, ties=None):
@@ -330,18 +294,7 @@ class FreeParameters:
         return np.repeat([slot.factor for slot in self.slots], [slot.size for slot in self.slots])
 
     def log_prior(self, vector):
-        """
-        Return the log density of the priors, minus infinity outside the bounds.
-
-        Parameters
-        ----------
-        vector : array_like
-            Canonical values, shape (n_free,).
-
-        Returns
-        -------
-        float
-        """
+        """Return the log density of the priors, minus infinity outside the bounds."""
         vector = np.asarray(vector, dtype=float)
         low, high = self._bounds
         if np.any(vector < low) or np.any(vector > high):
@@ -367,14 +320,9 @@ class FreeParameters:
 
     def lookup(self, name):
         """
-        Return where the value of a parameter comes from.
+        Return slot, factor and offset of a parameter, ``value = factor * vector[slot] + offset``.
 
-        Returns
-        -------
-        slot : Slot or None
-            None for a parameter that is fixed.
-        factor, offset : float
-            ``value = factor * vector[slot] + offset``.
+        The slot of a fixed parameter is None.
         """
         # free itself: the value is the element of the vector
         if name in self.by_name:

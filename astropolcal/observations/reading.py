@@ -207,7 +207,7 @@ def stated_date(meta, label, error=ObservationError):
     Returns
     -------
     str or None
-        As `~astropolcal.units.iso_date` returns it, perhaps a month alone; None where the meta
+        As ``iso_date`` returns it, perhaps a month alone; None where the meta
         have none.
 
     Raises

@@ -264,17 +264,10 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     def canonical_values(self):
         """
-        Return the parameter values as canonical floats, ``theta`` first.
+        Return the parameter values as canonical floats (radian, micrometre or 1), ``theta`` first.
 
-        Returns
-        -------
-        list of `~numpy.ndarray`
-            Radian, micrometre or 1; shape () or (n_wavelengths,).
-
-        Raises
-        ------
-        ParameterError
-            If a parameter was given another unit behind the optic's back.
+        Each has shape () or (n_wavelengths,). A parameter that was given another unit behind the
+        optic's back raises a ParameterError.
         """
         values = []
         for key in self.param_names:
@@ -483,19 +476,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         return new
 
     def loosened(self, wavelength):
-        """
-        Return the optic with its law in wavelength replaced by one value a wavelength.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        Optic
-            Itself where it has no such law.
-        """
+        """Return the optic with one value per wavelength for its law, or itself without one."""
         return self
 
     def _settings(self):

@@ -118,51 +118,19 @@ class _Mirror(Optic):
         return self._log_ratio(dispersion, *values)
 
     def diattenuation(self, wavelength):
-        """
-        Return the diattenuation at a wavelength.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Scalar or shape (n_wavelengths,).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Positive where the field across the plane of incidence is better reflected.
-        """
+        """Return the diattenuation, positive where s is better reflected than p."""
         return -np.tanh(self._ratio_at(wavelength).real)
 
     def retardance(self, wavelength):
-        """
-        Return the retardance at a wavelength.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Scalar or shape (n_wavelengths,).
-
-        Returns
-        -------
-        `~astropy.units.Quantity`
-            0 to 360 deg; 180 deg for an ideal mirror.
-        """
+        """Return the retardance, 0 to 360 deg (Quantity); 180 deg for an ideal mirror."""
         return np.rad2deg(_wrapped(self._ratio_at(wavelength).imag)) * u.deg
 
     def law_slopes(self, wavelength):
         """
         Return the derivatives of diattenuation and retardance to the parameters.
 
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        dict of str to dict
-            ``"diattenuation"`` and ``"retardance"`` (degree) to the name of each parameter but
-            ``theta`` to the derivative per unit of that parameter, shape (n_wavelengths,).
+        ``"diattenuation"`` and ``"retardance"`` (degree) to the name of each parameter but
+        ``theta`` to the derivative per unit of that parameter, shape (n_wavelengths,).
         """
         dispersion, _, values = self._resolve(wavelength, None)
         ratio, slopes = self._log_slopes(dispersion, *values)
@@ -176,19 +144,7 @@ class _Mirror(Optic):
         return found
 
     def loosened(self, wavelength):
-        """
-        Return the diattenuator-retarder that starts with the same values.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        DiattenuatorRetarder
-            One free diattenuation and one free retardance a wavelength.
-        """
+        """Return the diattenuator-retarder of the same values, free at each wavelength."""
         # name and mount only: the free optic has neither metal nor film
         settings = Optic._settings(self)
         free = DiattenuatorRetarder(
@@ -280,26 +236,7 @@ class PowerLawMirror(_Mirror):
         return stack.log_ratio(), slopes
 
     def index(self, wavelength):
-        """
-        Return the complex index n + ik of the law.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Scalar or shape (n_wavelengths,).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Complex.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.optics import PowerLawMirror
-        >>> PowerLawMirror().index(1.6 * u.um).round(1)
-        np.complex128(2+17j)
-        """
+        """Return the complex index n + ik of the law."""
         log, _, values = self._resolve(wavelength, None)
         return np.sqrt(sum(self._parts(log, *values[:4])))
 

@@ -55,31 +55,14 @@ GENERATORS = {
 @dataclass(frozen=True)
 class Dependence:
     """
-    How a perturbation depends on the frame.
+    How a perturbation depends on the frame, by the text that says so.
 
-    Parameters
-    ----------
-    text : str
-        ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
-        ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``,
-        cosine and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last
-        move of the stage was backwards; ``"move:STAGE"``, how far it was moved, in radian;
-        ``"dataset:NAME"``, in one dataset only. With ``"/dataset:NAME"`` behind it, any of the
-        others is in that dataset only.
-
-    Raises
-    ------
-    ParameterError
-        If the text is none of these.
-
-    Examples
-    --------
-    >>> from astropolcal.optics.perturbations import Dependence
-    >>> turn = Dependence("harmonic:hwp:2")
-    >>> turn.driver, turn.count
-    ('hwp', 2)
-    >>> turn.waves(0.0).tolist()
-    [1.0, 0.0]
+    ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
+    ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``, cosine
+    and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last move of the
+    stage was backwards; ``"move:STAGE"``, how far it was moved, in radian; ``"dataset:NAME"``, in
+    one dataset only. With ``"/dataset:NAME"`` behind it, any of the others is in that dataset
+    only.
     """
 
     text: str
@@ -124,18 +107,7 @@ class Dependence:
         return 2 if self.kind == "harmonic" else 1
 
     def waves(self, position):
-        """
-        Return the functions at positions of the driver, shape (count, ...).
-
-        Parameters
-        ----------
-        position : `~numpy.ndarray`
-            Radian or a number.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-        """
+        """Return the functions at positions of the driver (canonical), shape (count, ...)."""
         x = np.asarray(position, dtype=float)
         if self.kind == "harmonic":
             angle = int(self.parts[2]) * x
@@ -166,11 +138,8 @@ def split_run(text):
     """
     Return a dependence without its dataset, and the name of that, None where it has none.
 
-    Examples
-    --------
-    >>> from astropolcal.optics.perturbations import split_run
-    >>> split_run("time/dataset:July"), split_run("dataset:July"), split_run("time")
-    (('time', 'July'), ('dataset', 'July'), ('time', None))
+    So ``"time/dataset:July"`` is ``("time", "July")``, and ``"dataset:July"`` ``("dataset",
+    "July")``.
     """
     if text.startswith(_DATASET):
         return "dataset", text.removeprefix(_DATASET)
@@ -182,7 +151,7 @@ class Perturbation(_BeamOptic, FrameOptic):
     r"""
     A small error of an optic: :math:`\exp\left[(a f_1 + b f_2)\,G\right]`.
 
-    G is a generator of Mueller matrices and the f are functions of the frame, see `Dependence`.
+    G is a generator of Mueller matrices and the f are functions of the frame.
 
     Parameters
     ----------
@@ -194,7 +163,11 @@ class Perturbation(_BeamOptic, FrameOptic):
     kind : str
         Key of `GENERATORS`.
     dependence : str
-        As `Dependence` takes it; the ``mount`` has to be its driver.
+        ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
+        ``"step:N"``, from frame N on; ``"frame:N"``; ``"harmonic:STAGE:N"``, cosine and sine of N
+        times the angle of a stage; ``"direction:STAGE"`` and ``"move:STAGE"``, the last move of a
+        stage; ``"dataset:NAME"``; each also with ``"/dataset:NAME"`` behind it. The ``mount`` has
+        to be what it follows.
     beam : {"right", "left"}
         The beam that goes on in a chain; of consequence for ``"gain"`` only.
     theta : `~astropy.units.Quantity`

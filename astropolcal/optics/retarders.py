@@ -112,50 +112,12 @@ class TwoLayerWaveplate(Optic):
         return tuple(per_um[..., None, None] * slope for per_um in dispersion)
 
     def retardance(self, wavelength):
-        """
-        Return the retardance at a wavelength.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Any shape.
-
-        Returns
-        -------
-        `~astropy.units.Quantity`
-            Retardance in degree, of the same shape, not wrapped.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.optics import TwoLayerWaveplate
-        >>> TwoLayerWaveplate().retardance(1.6 * u.um).round(0)
-        <Quantity -171. deg>
-        """
+        """Return the retardance at a wavelength of any shape, in degree and not wrapped."""
         dispersion, _, (w_sio2, w_mgf2) = self._resolve(wavelength, None)
         return (w_sio2 * dispersion[0] + w_mgf2 * dispersion[1]) * u.rad.to(u.deg) * u.deg
 
     def loosened(self, wavelength):
-        """
-        Return the linear retarder that starts with the same retardances.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        LinearRetarder
-            One free retardance a wavelength.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.optics import TwoLayerWaveplate
-        >>> TwoLayerWaveplate().loosened([1.2, 1.6] * u.um).retardance.shape
-        (2,)
-        """
+        """Return the linear retarder of the same retardances, free at each wavelength."""
         free = LinearRetarder(
             retardance=self.retardance(wavelength),
             theta=self.theta.value * u.deg,

@@ -136,34 +136,12 @@ class StarSource(PolarizedSource):
     )
 
     def stokes(self, wavelength):
-        """
-        Return q and u of the star.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,) or a scalar.
-
-        Returns
-        -------
-        q, u : `~numpy.ndarray`
-        """
+        """Return q and u of the star at wavelengths."""
         matrix = self.mueller(wavelength)
         return matrix[..., 1, 0], matrix[..., 2, 0]
 
     def loosened(self, wavelength):
-        """
-        Return the source with the q and u that the law has at each wavelength, held.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        PolarizedSource
-        """
+        """Return the source with the q and u that the law has at each wavelength, held."""
         upright = self.with_parameters(theta=0 * units.deg)
         upright.mount = None
         q, u = upright.stokes(wavelength)

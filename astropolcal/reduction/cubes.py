@@ -92,7 +92,7 @@ def simulate_cubes(
     chain : `~astropy.modeling.CompoundModel`
         The true chain, with a beam splitter.
     instrument : Instrument
-        With a `~astropolcal.instruments.layout.FileLayout`.
+        With a `~astropolcal.instruments.FileLayout`.
     frames : `~astropy.table.QTable`
         One row a frame: ``hwp`` as commanded, ``derotator`` and whatever else
         the chain needs; for a star ``parallactic`` and ``altitude``. A column

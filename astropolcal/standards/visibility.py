@@ -150,31 +150,7 @@ class TelescopeInformation:
     covariance: np.ndarray
 
     def error(self, name):
-        """
-        Return the standard error of one of the parameters.
-
-        Parameters
-        ----------
-        name : str
-            One of ``names``.
-
-        Returns
-        -------
-        float
-            Infinite if the frames do not determine it.
-
-        Raises
-        ------
-        ParameterError
-            If there is no such parameter.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.standards import telescope_information
-        >>> telescope_information([10] * u.deg).error("diattenuation")
-        inf
-        """
+        """Return the standard error of a parameter, infinite if the frames do not determine it."""
         if name not in self.names:
             raise ParameterError(f"no parameter {name!r}; there are {', '.join(self.names)}")
         place = self.names.index(name)
