@@ -39,10 +39,10 @@ def test_elements_are_fixed_and_the_default_is_nothing():
     assert all(getattr(element, key).fixed for key in element.param_names)
 
 
-@pytest.mark.parametrize("shape", [(4,), (3, 4), (2, 3, 4, 4), (4, 4, 3)])
-def test_matrix_of_other_shape_is_refused(shape):
-    with pytest.raises(ParameterError, match=r"shape \(4, 4\) or \(n, 4, 4\), not"):
-        MuellerElement.from_matrix(np.zeros(shape))
+def test_matrix_of_other_shape_is_refused():
+    for shape in [(4,), (3, 4), (2, 3, 4, 4), (4, 4, 3)]:
+        with pytest.raises(ParameterError, match=r"shape \(4, 4\) or \(n, 4, 4\), not"):
+            MuellerElement.from_matrix(np.zeros(shape))
 
 
 def test_matrix_that_is_not_finite_is_refused():
