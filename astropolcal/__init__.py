@@ -36,13 +36,13 @@ __all__ = [
 _WHERE = {
     "Calibration": "calibration",
     "Diagnosis": "gap",
-    "Library": "calibration",
+    "Library": "pipeline",
     "Observations": "observations",
     "calibrate": "calibration",
     "correct": "correction",
     "diagnose": "gap",
     "half_wave_plate_cycles": "simulation",
-    "load": "calibration",
+    "load": "pipeline",
     "reduce_cubes": "reduction",
     "simulate": "simulation",
 }

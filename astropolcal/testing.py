@@ -39,15 +39,18 @@ class Absent(Exception):
 
 
 def require(condition, words):
+    """Raise if a rule does not hold."""
     if not condition:
         raise Broken(words)
 
 
 def optic_names(chain):
+    """Return the names of the optics of a chain."""
     return [leaf.name for leaf in leaves(chain)]
 
 
 def check_values(label, chain, size):
+    """Require values that are finite, within their bounds and as many as the wavelengths."""
     for leaf in leaves(chain):
         for key in leaf.param_names:
             parameter, name = getattr(leaf, key), f"{label}: {leaf.name}.{key}"
@@ -66,6 +69,7 @@ def check_values(label, chain, size):
 
 
 def check_keyword(column, keyword):
+    """Require a keyword of FITS, perhaps a hierarchical one."""
     require(isinstance(keyword, str) and keyword.strip(), f"{column}: keyword {keyword!r}")
     plain = keyword.replace("-", "").replace("_", "")
     short = len(keyword) <= 8 and plain.isalnum()
@@ -78,6 +82,7 @@ def check_keyword(column, keyword):
 
 
 def check_same(source, optic, old, new):
+    """Require that a parameter is the same after a file."""
     name = f"{source}: {optic.name}.{old.name} after a file"
     require(np.array_equal(old.value, new.value), f"{name} is {new.value}, not {old.value}")
     for what in ("unit", "bounds", "fixed"):
@@ -87,9 +92,10 @@ def check_same(source, optic, old, new):
 
 
 def read_back(chain):
+    """Return a chain after it was written to an ASDF file."""
     import asdf
 
-    from astropolcal.converters.priors import node_from_priors, restore_priors, without_priors
+    from astropolcal.converters.nodes import node_from_priors, restore_priors, without_priors
 
     buffer = io.BytesIO()
     # a calibration file has priors beside the chains
@@ -105,6 +111,7 @@ def read_back(chain):
 
 
 def moved_value(parameter, rng):
+    """Return a value of a parameter a little off, within its bounds."""
     low, high = (
         np.inf * sign if bound is None else bound
         for bound, sign in zip(parameter.bounds, (-1, 1), strict=True)

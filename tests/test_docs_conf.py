@@ -60,7 +60,7 @@ def test_with_network_links_are_followed_where_there_are_any(settings, variable)
         ("ValueError", True),
         ("pathlib.Path", True),
         ("io.BytesIO", True),
-        ("astropolcal.calibration._checkpoint.State", True),
+        ("astropolcal.calibration.posterior.checkpoint.State", True),
         ("astropolcal.calibration.Calibration", False),
         ("numpyx.array", False),
     ],

@@ -11,8 +11,10 @@ import pytest
 from astropy.table import Table
 
 from astropolcal import Observations, calibrate, instruments
-from astropolcal.calibration import polarimetric_efficiency, star_check, star_stokes
-from astropolcal.calibration.targets import paper_accuracies
+from astropolcal.calibration import star_check
+from astropolcal.calibration.validation import star_stokes
+from astropolcal.calibration.validation.targets import paper_accuracies
+from astropolcal.efficiency import polarimetric_efficiency
 from astropolcal.exceptions import AstropolcalWarning
 
 CHARIS = instruments.get("charis")

@@ -9,9 +9,13 @@ from importlib.resources import files
 import pytest
 import yaml
 
-from astropolcal.converters import get_converters
-from astropolcal.converters.optics import OPTIC_MODULES
-from astropolcal.extension import MANIFEST_URI, get_extensions, get_resource_mappings
+from astropolcal.converters.extension import (
+    MANIFEST_URI,
+    OPTIC_MODULES,
+    get_converters,
+    get_extensions,
+    get_resource_mappings,
+)
 
 BASE = "asdf://astropolcal.org/astropolcal"
 

@@ -28,10 +28,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import astropolcal
 from astropolcal import Calibration, Observations
-from astropolcal.calibration import Library, _checkpoint, load, mueller_table, write_mueller
+from astropolcal.calibration.posterior import checkpoint as _checkpoint
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError, FitError, GapError
 from astropolcal.files import atomic_path
 from astropolcal.gap.challenge import _append, _journal
+from astropolcal.pipeline import Library, load, mueller_table, write_mueller
 from astropolcal.reduction.frames import Frame
 from astropolcal.reduction.journal import Journal
 from astropolcal.scripts._common import write_json

@@ -1,6 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""
-What all nodes are made of: plain values, quantities, tables, and a checksum.
+"""What all nodes are made of: plain values, quantities, tables, and a checksum.
+
+Priors in a calibration file.
+
+A prior belongs to a parameter, in whatever chain its optic stands; so the file
+lists priors by the parameter's name, beside the chains.
+
+Samples of a posterior in a calibration file.
+
+A file keeps a part of the samples, and what the whole run says of its
+convergence, its quantiles among it.
 """
 
 import datetime
@@ -12,19 +21,12 @@ import numpy as np
 from astropy.table import QTable
 from astropy.time import Time
 
-from astropolcal.exceptions import CalibrationFileError
+from astropolcal.calibration.posterior.samples import Posterior
+from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
+from astropolcal.measurement import parameter_table, priors
 
-__all__ = [
-    "checksum",
-    "node_from_table",
-    "node_from_value",
-    "plain",
-    "table_from_node",
-    "unit_from_text",
-    "unit_text",
-    "value_from_node",
-]
+__all__ = []
 
 
 def unit_text(unit):
@@ -34,7 +36,7 @@ def unit_text(unit):
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal.converters.nodes import unit_text
+
     >>> unit_text(u.deg)
     'deg'
     """
@@ -52,7 +54,6 @@ def unit_from_text(text):
 
     Examples
     --------
-    >>> from astropolcal.converters.nodes import unit_from_text
     >>> unit_from_text("mm")
     Unit("mm")
     """
@@ -84,7 +85,7 @@ def node_from_value(value):
     Examples
     --------
     >>> import astropy.units as u
-    >>> from astropolcal.converters.nodes import node_from_value
+
     >>> node_from_value(1.5 * u.deg)
     {'value': 1.5, 'unit': 'deg'}
     """
@@ -101,7 +102,6 @@ def value_from_node(node):
 
     Examples
     --------
-    >>> from astropolcal.converters.nodes import value_from_node
     >>> value_from_node({"value": 1.5, "unit": "deg"})
     <Quantity 1.5 deg>
     """
@@ -120,7 +120,7 @@ def node_from_table(table):
     --------
     >>> import astropy.units as u
     >>> from astropy.table import QTable
-    >>> from astropolcal.converters.nodes import node_from_table
+
     >>> [column["name"] for column in node_from_table(QTable({"s_res": [0.2] * u.percent}))]
     ['s_res']
     """
@@ -135,7 +135,6 @@ def table_from_node(node):
 
     Examples
     --------
-    >>> from astropolcal.converters.nodes import table_from_node
     >>> table_from_node([{"name": "s_res", "value": [0.2], "unit": "%"}])["s_res"]
     <Quantity [0.2] %>
     """
@@ -172,7 +171,7 @@ def plain(value, where="value"):
     Examples
     --------
     >>> import datetime
-    >>> from astropolcal.converters.nodes import plain
+
     >>> plain({"date": datetime.date(2025, 10, 2), "lamps": ("halogen", 2)})
     {'date': '2025-10-02', 'lamps': ['halogen', 2]}
     """
@@ -222,7 +221,6 @@ def checksum(node, expand=None):
 
     Examples
     --------
-    >>> from astropolcal.converters.nodes import checksum
     >>> checksum({"a": 1.0, "b": None}) == checksum({"b": None, "a": 1.0})
     True
     >>> checksum(1.0) == checksum(1.0000000000000002)
@@ -257,3 +255,316 @@ def _spelled_array(array):
     # of the same bytes on machines of either order; a block in a file may have any
     array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).reshape(array.shape)
     return {"array": array.tobytes().hex(), "type": array.dtype.str, "shape": list(array.shape)}
+
+
+# ---- priors in a calibration file ----
+
+
+_OURS = {"normal": ("mean", "std"), "uniform": ("low", "high")}
+
+
+def node_from_priors(chains):
+    """
+    Return the priors of the chains' parameters.
+
+    Parameters
+    ----------
+    chains : sequence
+        The chains.
+
+    Returns
+    -------
+    list of dict
+        ``parameter`` and ``kind``, with ``mean`` and ``std``, ``low`` and
+        ``high``, or ``distribution``, ``args`` and ``kwds`` of `scipy.stats`.
+
+    Raises
+    ------
+    CalibrationFileError
+        If a prior is no `~astropolcal.measurement.Normal`,
+        ``Uniform`` or frozen continuous distribution.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import optics
+
+    >>> from astropolcal.measurement import Normal
+    >>> hwp = optics.TwoLayerWaveplate(name="hwp")
+    >>> hwp.theta.prior = Normal(0 * u.deg, 6 * u.arcmin)
+    >>> node_from_priors([hwp])[0]["std"]
+    {'value': 6.0, 'unit': 'arcmin'}
+    """
+    # one entry a parameter: chains share the optics that stand in several of them
+    table = parameter_table(chains).items()
+    return [
+        {"parameter": name} | prior_node(parameters[0].prior, name)
+        for name, parameters in table
+        if parameters[0].prior is not None
+    ]
+
+
+def prior_node(prior, name):
+    """Return the node of a prior."""
+    kind = type(prior).__name__.lower()
+    if type(prior).__module__ == "astropolcal.measurement.priors" and kind in _OURS:
+        values = {key: node_from_value(getattr(prior, key)) for key in _OURS[kind]}
+        return {"kind": kind} | values
+    return {"kind": "scipy"} | _frozen_node(prior, name)
+
+
+def _frozen_node(prior, name):
+
+    node = {
+        "distribution": getattr(getattr(prior, "dist", None), "name", None),
+        "args": plain(list(getattr(prior, "args", ())), f"prior of {name}"),
+        "kwds": plain(dict(getattr(prior, "kwds", {})), f"prior of {name}"),
+    }
+    try:
+        _frozen(node)
+    except (TypeError, ValueError):
+        raise CalibrationFileError(
+            f"prior of {name} is a {type(prior).__name__}, which files cannot hold; allowed are "
+            "Normal, Uniform and frozen continuous distributions of scipy.stats"
+        ) from None
+    return node
+
+
+def _frozen(node):
+    """Return the distribution of a node; nothing but those of scipy can be named."""
+    import scipy.stats
+
+    name = node["distribution"]
+    # names of modules and functions are there too: only distributions pass the next line
+    family = getattr(scipy.stats, name, None) if isinstance(name, str) else None
+    if not isinstance(family, scipy.stats.rv_continuous):
+        raise ValueError(f"scipy.stats has no continuous distribution {name!r}")
+    found = family(*node["args"], **node["kwds"])
+    # scipy looks at the parameters when they are used, and gives NaN for those that cannot be
+    low, high = found.support()
+    if not low < high:
+        raise ValueError(f"{name} of {node['args']} and {node['kwds']} is no distribution")
+    return found
+
+
+def without_priors(chain):
+    """
+    Return a copy of a chain whose parameters have no priors.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain; it is not changed.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+
+    >>> without_priors(optics.Rotator(name="r")).theta.prior is None
+    True
+    """
+    copy = chain.copy()
+    for parameters in parameter_table([copy]).values():
+        for parameter in parameters:
+            parameter.prior = None
+    return copy
+
+
+def restore_priors(chains, nodes):
+    """
+    Give the parameters of chains the priors that `node_from_priors` wrote.
+
+    Parameters
+    ----------
+    chains : sequence
+        The chains, which are changed.
+    nodes : list of dict
+        The priors.
+
+    Raises
+    ------
+    CalibrationFileError
+        If no chain has such a parameter, or there is no such distribution.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+
+    >>> rotator = optics.Rotator(name="r")
+    >>> bound = {"value": 1.0, "unit": "deg"}
+    >>> restore_priors([rotator], [{"parameter": "r.theta", "kind": "normal", "mean": bound,
+    ...                             "std": bound}])
+    >>> rotator.theta.prior.std
+    <Quantity 1. deg>
+    """
+    table, seen = parameter_table(chains), set()
+    for node in nodes:
+        if node["parameter"] in seen:
+            raise CalibrationFileError(f"prior of {node['parameter']!r} is given twice")
+        seen.add(node["parameter"])
+        if node["parameter"] not in table:
+            raise CalibrationFileError(f"prior of {node['parameter']!r}, which no chain has")
+        for parameter in table[node["parameter"]]:
+            parameter.prior = prior_from_node(node, node["parameter"])
+
+
+def prior_from_node(node, name):
+    """Return the prior of a node."""
+    try:
+        return _prior(node, name)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CalibrationFileError(f"prior of {name}: {type(error).__name__}, {error}") from None
+
+
+def _prior(node, name):
+    if node["kind"] == "scipy":
+        try:
+            return _frozen(plain(node))
+        except (TypeError, ValueError) as error:
+            raise CalibrationFileError(f"prior of {name}: {error}") from None
+    values = [value_from_node(node[key]) for key in _OURS[node["kind"]]]
+    # a number of its own type, as it was given
+    values = [v if hasattr(v, "unit") else v.item() for v in values]
+    return getattr(priors, node["kind"].capitalize())(*values)
+
+
+# ---- samples of a posterior in a calibration file ----
+
+
+# for those who look into the file
+_DERIVED = ("converged", "words", "kept")
+
+
+def node_from_posterior(posterior):
+    """
+    Return the node that stores a posterior.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        If it is not thinned yet, it is thinned as
+        `~astropolcal.calibration.posterior.Posterior.thinned` does by default.
+
+    Returns
+    -------
+    dict
+        As the schema ``calibration-1.0.0`` describes it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.calibration.posterior.samples import Posterior
+
+    >>> chain = np.random.default_rng(1).normal(size=(4000, 8, 1))
+    >>> node = node_from_posterior(Posterior(["hwp.theta"], ["deg"], chain, chain[..., 0]))
+    >>> node["chain"].size <= 4000, node["converged"]
+    (True, True)
+    """
+    kept = posterior if posterior.is_thinned else posterior.thinned()
+    parts = kept.to_dict()
+    # what was thinned has no burn-in any more
+    del parts["burn_in"]
+    return {
+        **plain(parts, "posterior"),
+        "units": [unit_text(unit) for unit in kept.units],
+        "converged": kept.converged,
+        "words": kept.words(),
+        "kept": kept.kept_words(),
+    }
+
+
+def posterior_from_node(node):
+    """
+    Return the posterior that a node stores.
+
+    Parameters
+    ----------
+    node : dict
+        Its node, which obeys the schema.
+
+    Returns
+    -------
+    Posterior
+        Thinned.
+
+    Raises
+    ------
+    CalibrationFileError
+        If its parts do not belong together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.calibration.posterior.samples import Posterior
+
+    >>> chain = np.random.default_rng(1).normal(size=(100, 8, 1))
+    >>> posterior = Posterior(["hwp.theta"], ["deg"], chain, chain[..., 0]).thinned()
+    >>> posterior_from_node(node_from_posterior(posterior)) == posterior
+    True
+    """
+    parts = {key: value for key, value in node.items() if key not in _DERIVED}
+    # copies of our own: what ASDF gives may be tied to the file
+    for key in ("chain", "log_prob", "acceptance", "fitted"):
+        parts[key] = None if parts[key] is None else np.array(parts[key])
+    found = {
+        key: np.array(value) if hasattr(value, "__array__") else value
+        for key, value in parts["convergence"].items()
+    }
+    # that of what did not move is not a number
+    if np.isinf(found["times"]).any():
+        raise CalibrationFileError("posterior: times must be finite")
+    parts |= {"settings": plain(parts["settings"]), "convergence": found, "burn_in": None}
+    try:
+        return Posterior.from_dict(parts)
+    except AstropolcalError as error:
+        raise CalibrationFileError(f"posterior: {error}") from None
+
+
+def check_posterior(posterior, covariance):
+    """
+    Check a posterior against the free parameters of its calibration.
+
+    Parameters
+    ----------
+    posterior : Posterior or None
+        The posterior.
+    covariance : Covariance
+        Of all free parameters.
+
+    Raises
+    ------
+    CalibrationFileError
+        If it has samples of something else, in other units, or no finite ones.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.calibration.posterior.samples import Posterior
+    >>> from astropolcal.calibration.uncertainty.covariance import Covariance
+
+    >>> chain = np.random.default_rng(1).normal(size=(100, 8, 1))
+    >>> posterior = Posterior(["hwp.theta"], ["deg"], chain, chain[..., 0])
+    >>> check_posterior(posterior, Covariance(["hwp.w_sio2"], ["mm"], [[1.0]]))
+    Traceback (most recent call last):
+    ...
+    astropolcal.exceptions.CalibrationFileError: posterior of 'hwp.theta', which is ...
+    """
+    if posterior is None:
+        return
+    units = dict(zip(covariance.names, covariance.units, strict=True))
+    if len(set(posterior.names)) < len(posterior.names):
+        raise CalibrationFileError("posterior: a parameter is named twice")
+    for name, unit in zip(posterior.names, posterior.units, strict=True):
+        if name not in units:
+            raise CalibrationFileError(f"posterior of {name!r}, which is no free parameter")
+        if unit != units[name]:
+            raise CalibrationFileError(
+                f"posterior of {name} is in {unit}, allowed is {units[name]}"
+            )
+    for what, values in (("samples", posterior.chain), ("log_prob", posterior.log_prob)):
+        if not values.size or not np.isfinite(values).all():
+            raise CalibrationFileError(f"posterior: {what} must be finite, and some")

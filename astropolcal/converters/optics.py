@@ -8,109 +8,13 @@ what else its class has).
 The position of its stage belongs to a frame and is not stored.
 """
 
-import re
-
 import numpy as np
-from asdf.extension import Converter
 
-from astropolcal.converters.priors import prior_from_node, prior_node
+from astropolcal.converters.nodes import prior_from_node, prior_node
 from astropolcal.exceptions import CalibrationFileError, ParameterError
+from astropolcal.optics import OPTICS
 
-__all__ = ["OPTIC_MODULES", "OpticConverter", "node_from_optic", "optic_from_node", "optic_tag"]
-
-#: Module of `astropolcal.optics` in which each optic is defined. It repeats the
-#: registry, so that ASDF can find a converter without importing the optics.
-OPTIC_MODULES = {
-    "BeamGain": "polarizers",
-    "Depolarizer": "polarizers",
-    "Diattenuator": "polarizers",
-    "DiattenuatorRetarder": "polarizers",
-    "DriftRetarder": "modulated",
-    "DriftRotator": "modulated",
-    "EllipticalRetarder": "retarders",
-    "FerroelectricLiquidCrystal": "modulated",
-    "FluxGain": "modulated",
-    "HarmonicGain": "modulated",
-    "HarmonicRetarder": "modulated",
-    "HarmonicRotator": "modulated",
-    "KMirror": "mirrors",
-    "LinearPolarizer": "polarizers",
-    "LinearRetarder": "retarders",
-    "MetalMirror": "mirrors",
-    "MuellerElement": "perturbations",
-    "ParityFlip": "mirrors",
-    "Perturbation": "perturbations",
-    "PolarizedBackground": "modulated",
-    "PolarizedSource": "sources",
-    "PowerLawMirror": "mirrors",
-    "Rotator": "retarders",
-    "StarSource": "sources",
-    "StrayLight": "modulated",
-    "TwoLayerWaveplate": "retarders",
-    "VectorDiattenuator": "polarizers",
-    "WollastonPrism": "polarizers",
-}
-
-
-def optic_tag(name):
-    """
-    Return the ASDF tag of an optic's class.
-
-    Parameters
-    ----------
-    name : str
-        Name of the class.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> from astropolcal.converters.optics import optic_tag
-    >>> optic_tag("TwoLayerWaveplate")
-    'tag:astropolcal.org:astropolcal/optics/two_layer_waveplate-1.0.0'
-    """
-    stem = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
-    return f"tag:astropolcal.org:astropolcal/optics/{stem}-1.0.0"
-
-
-class OpticConverter(Converter):
-    """
-    Convert one class of optics.
-
-    Parameters
-    ----------
-    name : str
-        Name of the class, a key of `OPTIC_MODULES`.
-
-    Examples
-    --------
-    >>> from astropolcal.converters.optics import OpticConverter
-    >>> OpticConverter("Rotator").types
-    ['astropolcal.optics.retarders.Rotator']
-    """
-
-    def __init__(self, name):
-        self.name = name
-
-    @property
-    def tags(self):
-        """Tags of the class."""
-        return [optic_tag(self.name)]
-
-    @property
-    def types(self):
-        """Full name of the class, which is imported only when it is needed."""
-        return [f"astropolcal.optics.{OPTIC_MODULES[self.name]}.{self.name}"]
-
-    def to_yaml_tree(self, obj, tag, ctx):
-        """Return the node of an optic, see `node_from_optic`."""
-        return node_from_optic(obj)
-
-    def from_yaml_tree(self, node, tag, ctx):
-        """Return the optic of a node, see `optic_from_node`."""
-        return optic_from_node(self.name, node)
+__all__ = []
 
 
 # ---- writing ---------------------------------------------------------------------
@@ -154,8 +58,6 @@ def node_from_optic(optic):
 
 
 def _check_class(optic):
-    from astropolcal.optics import OPTICS
-
     cls = type(optic)
     # a class of the same name from elsewhere would be read back as ours
     if OPTICS.get(cls.__name__) is not cls:
@@ -229,8 +131,6 @@ def optic_from_node(name, node):
     >>> optic_from_node("WollastonPrism", node)
     <WollastonPrism(theta=0. deg, efficiency=0.98, name='wollaston')>
     """
-    from astropolcal.optics import OPTICS
-
     # an optic that is on no stage says so: the default of some is another
     settings = {"mount": None} | {key: value for key, value in node.items() if key != "parameters"}
     values = {key: _value(entry) for key, entry in node["parameters"].items()}

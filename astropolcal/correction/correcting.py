@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 
-from astropolcal.calibration.validity import check_frames
 from astropolcal.correction.engine import correct_block, covariance_index, run_blocks
 from astropolcal.correction.ideal import ideal_chain
 from astropolcal.correction.result import Corrected
@@ -16,6 +15,7 @@ from astropolcal.correction.solve import estimator
 from astropolcal.correction.systematic import linear_systematic, sampled_systematic
 from astropolcal.exceptions import AstropolcalWarning, ObservationError, ParameterError
 from astropolcal.observations import OBSERVABLES
+from astropolcal.pipeline.headers import check_frames
 
 __all__ = ["MODES", "correct"]
 
@@ -92,7 +92,7 @@ def correct(
         See `linear_systematic`.
     max_age : `~astropy.units.Quantity`, optional
         Time between the data of the calibration and the frames from which on there is a warning;
-        by default that of the instrument, see `~astropolcal.calibration.load`.
+        by default that of the instrument, see `~astropolcal.pipeline.load`.
     any_date : bool
         Take the calibration whatever the date of the frames.
     n_samples : int

@@ -7,7 +7,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration._header import describe
 from astropolcal.chain import stages
 from astropolcal.correction.brightness import frame_brightness
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
@@ -15,6 +14,7 @@ from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.fitscheck import primary_header
 from astropolcal.observations import Observations, pair_frames
 from astropolcal.optics import COORDINATES
+from astropolcal.pipeline.headers import describe
 
 __all__ = ["ScienceFrames", "frame_positions"]
 

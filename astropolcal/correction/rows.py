@@ -11,9 +11,8 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration._beam import inner_optics, telescope_optics
-from astropolcal.calibration._rows import Rows
-from astropolcal.calibration._sky_view import chain_from_sky, known_instrument
+from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
+from astropolcal.calibration.system import Rows
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import (
     AstropolcalWarning,
@@ -24,6 +23,7 @@ from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import finite_position
+from astropolcal.pipeline.headers import inner_optics, telescope_optics
 from astropolcal.units import length_to_um
 
 __all__ = ["RowModel", "check_optics", "measurement_rows", "sky_chain"]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.correction.channels import Channels
 from astropolcal.exceptions import ObservationError, ParameterError
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration import full_covariance
-from astropolcal.calibration._directions import led
-from astropolcal.calibration._rows import model_error
+from astropolcal.calibration.identifiability.linearized import led
+from astropolcal.calibration.system import model_error
+from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.correction.solve import estimator
 from astropolcal.exceptions import ParameterError
 from astropolcal.simulation import check_seed

@@ -33,6 +33,8 @@ _DEGREE = 2
 _LEAST_SHARE = 0.3
 # directions of a cell below this share of its length are taken up by the nominal model
 _OPEN = 1e-4
+# fits on the way to the size of a fault
+_TRIES = 14
 
 
 def _unit(row, column, sign):
@@ -372,11 +374,13 @@ class Bench:
             scaled = one * weight
             sums = self._steadied(scaled[..., 1, :, :], weight[1]).reshape(*shape, -1)
             rows += [scaled[..., 0, :, :].reshape(*shape, -1), sums - (sums @ lamp) @ lamp.T]
-        return np.concatenate(rows, axis=-1)
+        # behind the data, what is known beforehand of the parameters: no fault changes that
+        known = np.zeros((*rows[0].shape[:-1], np.count_nonzero(self._weight)))
+        return np.concatenate([*rows, known], axis=-1)
 
     def _slots(self):
         """Collect the free parameters: name of the optic, place among its values, size."""
-        self._known, self._free, start, bounds = {}, [], [], []
+        self._known, self._free, start, bounds, known = {}, [], [], [], []
         for optics in self.optics:
             for leaf, _ in optics:
                 if leaf.name in self._known:
@@ -384,19 +388,22 @@ class Bench:
                 self._known[leaf.name] = leaf.canonical_values()
                 for i, key in enumerate(leaf.param_names):
                     parameter = getattr(leaf, key)
-                    # what is known beforehand stays as it is known
-                    if parameter.fixed or parameter.prior is not None:
+                    if parameter.fixed:
                         continue
                     value = np.atleast_1d(self._known[leaf.name][i])
                     self._free.append((leaf.name, i, np.shape(self._known[leaf.name][i])))
                     start.append(value)
                     unit = 1.0 if parameter.unit is None else canonical_factor(parameter.unit)
+                    # what is known beforehand is one more datum each
+                    error = np.inf if parameter.prior is None else parameter.prior.std() * unit
+                    known += [1 / error] * value.size
                     limits = [
                         default if b is None else b * unit
                         for b, default in zip(parameter.bounds, (-np.inf, np.inf), strict=True)
                     ]
                     bounds += [limits] * value.size
         self._start, self._bounds = np.concatenate(start), np.array(bounds, dtype=float).T
+        self._weight = np.array(known)
 
     def _values(self, vector):
         values, at = {name: list(known) for name, known in self._known.items()}, 0
@@ -425,7 +432,14 @@ class Bench:
                 slopes = [np.eye(size)[:, None, None, :] * s for s in slopes]
             columns.append(np.atleast_2d(self._whiten(slopes)))
             at += size
-        return np.concatenate(columns).T
+        return self._with_known(np.concatenate(columns).T, np.diag(self._weight))
+
+    def _with_known(self, rows, known):
+        """Fill the rows of what is known beforehand of the parameters."""
+        some = self._weight > 0
+        if some.any():
+            rows[-np.count_nonzero(some) :] = known[some]
+        return rows
 
     def residual(self, faults):
         """Return what faults leave beside the refitted nominal model, whitened, and the fit."""
@@ -435,7 +449,8 @@ class Bench:
 
         def miss(vector):
             model = self._model(vector)
-            return self._whiten([m - s for m, s in zip(model, seen, strict=True)])
+            rows = self._whiten([m - s for m, s in zip(model, seen, strict=True)])
+            return self._with_known(rows, (vector - self._start) * self._weight)
 
         fit = least_squares(
             miss, self._start, self._jacobian, self._bounds, x_scale="jac", max_nfev=25, ftol=1e-6
@@ -549,18 +564,26 @@ class Bench:
     def scale(self, fault, snr):
         """Scale a fault until it stands out by this much, or is as large as it can be."""
         power, last = 1.0, None
-        for _ in range(12):
+        # amplitudes at which it stands out by less, and by more
+        low, high = 0.0, np.inf
+        for _ in range(_TRIES):
             residual, fit = self.residual([fault])
             fault.snr = float(np.linalg.norm(residual))
             if last is not None and min(fault.snr, last[1]) > 0.1:
                 # some grow with the square of the size
                 steps = np.log(fault.amplitude / last[0]), np.log(fault.snr / last[1])
                 power = float(np.clip(steps[1] / steps[0], 0.7, 3))
+            low, high = (fault.amplitude, high) if fault.snr < snr else (low, fault.amplitude)
             step = (snr / max(fault.snr, 1e-9)) ** (1 / power)
             wanted = min(float(fault.amplitude * np.clip(step, 0.05, 20)), fault.largest)
+            if not low < wanted < high and low and np.isfinite(high):
+                # parameters at their bounds let it stand out all at once
+                wanted = float(np.sqrt(low * high))
             if abs(fault.snr / snr - 1) < 0.02 or wanted == fault.amplitude or fault.is_whole:
-                break
+                return residual, fit
             last, fault.amplitude = (fault.amplitude, fault.snr), wanted
+        residual, fit = self.residual([fault])
+        fault.snr = float(np.linalg.norm(residual))
         return residual, fit
 
 

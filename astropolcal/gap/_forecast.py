@@ -14,7 +14,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy.linalg import cho_factor, cho_solve
 
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import Train, join, leaves
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import Roles

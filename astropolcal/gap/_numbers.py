@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration import calibrate, target_accuracies
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.gap.problem import OPEN, TOUCHES

@@ -11,7 +11,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration import Calibration
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import GapError
 from astropolcal.gap.effects import Context, adapted, tracking_laws

@@ -11,7 +11,7 @@ magnitude only and is averaged over.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from scipy import stats
@@ -177,12 +177,17 @@ class Scan:
         -------
         Candidate
         """
-        best = candidate
-        for degree in _FREER if self.probes is not None else ():
+        best, probes = candidate, self.probes
+        near = () if probes is None or candidate.is_named else probes.steps_near(candidate.cell)
+        if near:
+            # the step itself, of which only some frames were looked at
+            best = _of_cell(probes, candidate.cell, candidate.degree, self.temper, near)[0]
+            candidate = best
+        for degree in _FREER if probes is not None else ():
             if candidate.is_named:
-                found = _named(self.probes, [candidate.named], self.temper, degree)
+                found = _named(probes, [candidate.named], self.temper, degree)
             else:
-                found = _of_cell(self.probes, candidate.cell, degree, self.temper)
+                found = _of_cell(probes, candidate.cell, degree, self.temper)
             best = max([best, *found], key=lambda one: one.evidence)
         return best
 
@@ -311,24 +316,22 @@ def scan(model, effects=(), *, cells=True, temper=1.0, without=None, like=None):
 
 def _cells(probes, temper):
     """Return the candidate of every cell, with the better of its laws."""
-    own, best = probes.own, {}
-    for place, kind, degree, reduced in probes.reduced(_DEGREES):
-        scale = Cell(place, kind, "constant").scale
-        waves = {
-            name: probes.waves_of(Cell(place, kind, name))
-            for name in probes.dependences_of(place, kind)
-        }
-        single = [name for name, w in waves.items() if len(w[0]) == 1]
-        stacked = [np.concatenate(each) for each in zip(*(waves[n] for n in single), strict=True)]
-        parts = list(zip(single, *reduced.normal(stacked), strict=True))
-        parts += [(name, *reduced.pair(w)) for name, w in waves.items() if len(w[0]) > 1]
-        bent = _bent(probes, place, kind, law_basis(probes.problem.wavelength, degree))
-        if bent is not None:
-            parts = [(n, *bent) if n == "constant" else (n, *own) for n, *own in parts]
-        for name, one in _candidates(place, kind, degree, parts, scale, temper):
-            if name not in best or best[name].evidence < one.evidence:
-                best[name] = one
-    return [one for one in best.values() if one.name not in own]
+    laws = {degree: law_basis(probes.problem.wavelength, degree) for degree in _DEGREES}
+    found = []
+    for (place, kind), slopes in probes.slopes.items():
+        whole, names = (
+            Reduced(probes, slopes, laws[_DEGREES[-1]]),
+            probes.dependences_of(place, kind),
+        )
+        if (place, kind) in probes.bends:
+            names = [name for name in names if name != "constant"]
+            constant = Cell(place, kind, "constant")
+            bent = [one for d in _DEGREES for one in _of_cell(probes, constant, d, temper)]
+            found += sorted(bent, key=lambda one: -one.evidence)[:1]
+        for same, waves in probes.grouped(names):
+            by_law = [(d, whole.first(law.shape[1]).normal(waves)) for d, law in laws.items()]
+            found += _candidates(place, kind, same, by_law, temper)
+    return [one for one in found if one.name not in probes.own]
 
 
 def _bent(probes, place, kind, law):
@@ -341,53 +344,48 @@ def _bent(probes, place, kind, law):
     bend = probes.bends.get((place, kind))
     if bend is None:
         return None
-    gram, target = Reduced(probes, [probes.slopes[place, kind], bend], law).pair(probes.ones)
+    both = Reduced(probes, [probes.slopes[place, kind], bend], law)
+    ((gram,), (target,)) = both.normal([ones[None] for ones in probes.ones])
     k = law.shape[1]
     held = gram + np.eye(2 * k) / Cell(place, kind, "constant").scale ** 2
     size = law @ np.linalg.solve(held, target)[k:]
     return (gram, target) if size.mean() > 0 else None
 
 
-def _of_cell(probes, cell, degree, temper):
-    """Return the candidate of one cell with a law of some degree, in a list."""
+def _of_cell(probes, cell, degree, temper, others=()):
+    """Return the candidate of a cell, or the best of several, with one law, in a list."""
     law = law_basis(probes.problem.wavelength, degree)
-    both = None
-    if cell.dependence == "constant":
-        both = _bent(probes, cell.place, cell.kind, law)
-    if both is None:
-        reduced = Reduced(probes, probes.slopes[cell.place, cell.kind], law)
-        both = reduced.pair(probes.waves_of(cell))
-    parts = [(cell.dependence, *both)]
-    return [one for _, one in _candidates(cell.place, cell.kind, degree, parts, cell.scale, temper)]
+    bent = _bent(probes, cell.place, cell.kind, law) if cell.dependence == "constant" else None
+    if bent is None:
+        cells = [cell, *others]
+        waves = [np.stack(each) for each in zip(*map(probes.waves_of, cells), strict=True)]
+        parts = Reduced(probes, probes.slopes[cell.place, cell.kind], law).normal(waves)
+        names = [one.dependence for one in cells]
+    else:
+        names, parts = [cell.dependence], [part[None] for part in bent]
+    found = _candidates(cell.place, cell.kind, names, [(degree, parts)], temper)
+    return sorted(found, key=lambda one: -one.evidence)[:1]
 
 
-def _candidates(place, kind, degree, parts, scale, temper):
-    """Yield name and candidate of normal equations (dependence, gram, target)."""
-    for size in dict.fromkeys(len(target) for _, _, target in parts):
-        same = [part for part in parts if len(part[2]) == size]
-        values, share = _spectra(np.stack([g for _, g, _ in same]), np.stack([t for *_, t in same]))
-        factors = _log_factor(values, share, scale, temper)
-        ranks = _rank(values, scale)
-        for (name, *_), own, part, factor, rank in zip(
-            same, values, share, factors, ranks, strict=True
-        ):
-            if rank:
-                cell, prior = Cell(place, kind, name), _prior(name)
-                yield (
-                    cell,
-                    Candidate(
-                        None,
-                        cell,
-                        float(part.sum()),
-                        int(rank),
-                        float(factor) + prior,
-                        prior,
-                        (own, part, scale),
-                        degree,
-                    ),
-                )
+def _candidates(place, kind, names, by_law, temper):
+    """Return the candidates of dependences from (degree, normal equations), of the better law."""
+    scale, best = Cell(place, kind, "constant").scale, {}
+    for degree, (gram, target) in by_law:
+        values, share = _spectra(gram, target)
+        factors, ranks = _log_factor(values, share, scale, temper), _rank(values, scale)
+        for i in np.flatnonzero(ranks):
+            if i not in best or best[i][0] < factors[i]:
+                best[i] = (factors[i], int(ranks[i]), values[i], share[i], degree)
+    found = []
+    for i, (factor, rank, values, share, degree) in best.items():
+        prior = _prior(names[i])
+        evidence, spectrum = float(factor) + prior, (values, share, scale)
+        cell, statistic = Cell(place, kind, names[i]), float(share.sum())
+        found.append(Candidate(None, cell, statistic, rank, evidence, prior, spectrum, degree))
+    return found
 
 
+@cache
 def _prior(dependence):
     text, run = split_run(dependence)
     alone = _ALONE if run is not None and text != "dataset" else 0.0
@@ -437,19 +435,6 @@ def _named(probes, effects, temper, degree="default"):
             for one in _of_columns(probes, effect, slopes * size, temper)
         ]
     return found
-
-
-def _of_columns(probes, effect, slopes, size, temper):
-    """Return the candidate of an effect with these derivatives and usual sizes, in a list."""
-    if size is None or not size.size:
-        return []
-    scaled = slopes * size
-    seen = probes.tangent.T @ scaled
-    gram, target = scaled.T @ scaled - seen.T @ seen, scaled.T @ probes.residual
-    values, share = (part[0] for part in _spectra(gram[None], target[None]))
-    if not _rank(values, 1.0):
-        return []
-    return [_with_name(effect, probes.model, values, share, temper)]
 
 
 def _columns(model, effects, degree):

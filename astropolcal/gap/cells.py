@@ -19,7 +19,6 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import insert_optic, leaves
-from astropolcal.gap._bases import law_basis
 from astropolcal.gap.problem import GapProblem
 from astropolcal.optics import GENERATORS
 from astropolcal.optics.core import COORDINATES
@@ -37,8 +36,8 @@ _DETECTOR = {
 }
 _SKY = ("parallactic", "altitude")
 _HARMONICS = (1, 2, 4)
-# steps are looked for at so many frames
-_MOST_STEPS = 64
+# steps are looked for at so many frames, and the best of them at those in between
+_MOST_STEPS = 16
 # functions of the frame that differ by less are the same
 _SAME = 1e-9
 # size (radian) of a retardance that is tried where its derivative vanishes
@@ -418,6 +417,7 @@ class Probes:
         self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
         self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
+        self._groups = {}
         #: Second derivatives over the size that is tried, where they outdo the first ones.
         self.bends = {} if like is None else like.bends
         self.slopes = self._at_places() if like is None else like.slopes
@@ -459,8 +459,50 @@ class Probes:
 
     def waves_of(self, cell):
         """Return the functions of the frame by which the derivative of a cell is multiplied."""
+        name = cell.dependence
+        if name not in self.waves and name.startswith("step:"):
+            return [_waves(Dependence(name), dataset) for dataset in self.problem.datasets]
         # the derivative of what belongs to a detector has its dependence in it
-        return self.waves[cell.dependence] if cell.dependence in self.waves else self.ones
+        return self.waves.get(name, self.ones)
+
+    def grouped(self, names):
+        """
+        Return dependences with their functions of the frame, those of as many together.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Dependences.
+
+        Returns
+        -------
+        list of tuple
+            Names, and their functions of each dataset, shape (n, count, F).
+        """
+        key = tuple(names)
+        if key not in self._groups:
+            waves = {name: self.waves.get(name, self.ones) for name in names}
+            counts = dict.fromkeys(len(w[0]) for w in waves.values())
+            together = [[n for n, w in waves.items() if len(w[0]) == count] for count in counts]
+            self._groups[key] = [
+                (same, [np.stack(each) for each in zip(*(waves[n] for n in same), strict=True)])
+                for same in together
+            ]
+        return self._groups[key]
+
+    def steps_near(self, cell):
+        """Return the cells of the steps between one that was looked at and its neighbours."""
+        text, run = split_run(cell.dependence)
+        if not text.startswith("step:"):
+            return []
+        known = [split_run(name) for name in self.waves if name.startswith("step:")]
+        frames = sorted(int(step[5:]) for step, where in known if where == run)
+        at = int(text[5:])
+        before = max((frame for frame in frames if frame < at), default=0)
+        after = min((frame for frame in frames if frame > at), default=at + 1)
+        others = [f"step:{frame}" for frame in range(before + 1, after) if frame != at]
+        others = others if run is None else [f"{name}/dataset:{run}" for name in others]
+        return [replace(cell, dependence=name) for name in others]
 
     def _at_places(self):
         """Return the derivative of both channels to a constant perturbation, by place and kind."""
@@ -553,32 +595,6 @@ class Probes:
             slopes = [a * one + b * other for a, b in channel.slopes(sweep)]
             yield kind, np.stack(slopes)
 
-    # ---- normal equations --------------------------------------------------------------------
-
-    def reduced(self, degrees=(0, 2)):
-        """
-        Yield, of each place and kind and law in wavelength, what all dependences need.
-
-        Parameters
-        ----------
-        degrees : sequence of int or None
-            Degrees of the laws in wavelength.
-
-        Yields
-        ------
-        place, kind : str
-        degree : int or None
-        Reduced
-        """
-        laws = {degree: law_basis(self.problem.wavelength, degree) for degree in degrees}
-        widest = max(laws.values(), key=lambda law: law.shape[1])
-        for (place, kind), slopes in self.slopes.items():
-            whole = Reduced(self, slopes, widest)
-            for degree, law in laws.items():
-                k = law.shape[1]
-                part = np.array_equal(widest[:, :k], law)
-                yield place, kind, degree, whole.first(k) if part else Reduced(self, slopes, law)
-
 
 def _frames_first(basis, shape):
     """Return columns (..., F) x q of a table as (F, rows of a frame, q)."""
@@ -628,69 +644,58 @@ class Reduced:
             columns = np.concatenate([own * slope.get(i, nothing) for slope in slopes])
             white = channel.whiten_frames(columns)
             n_frames = channel.shape[2]
-            # frames last, then a product of matrices a frame
-            flat = white.reshape(k, -1, n_frames)
-            self.gram.append(np.einsum("krf,lrf->klf", flat, flat))
+            # frames first: a product of matrices for each
+            flat = np.ascontiguousarray(white.reshape(k, -1, n_frames).transpose(2, 0, 1))
+            self.gram.append(flat @ flat.swapaxes(1, 2))
             residual = probes.residual[rows].reshape(-1, n_frames)
-            self.target.append(np.einsum("krf,rf->kf", flat, residual))
-            self.seen.append(_by_frame(flat, probes.by_frame[i]))
+            self.target.append((flat @ residual.T[:, :, None])[..., 0])
+            self.seen.append(flat @ probes.by_frame[i])
             # the lamp is taken up as the tangent is: both are directions that data do not tell
-            self.lamps.append(_by_frame(white[:, 1], probes.lamp_by_frame[i]))
+            sums = flat[:, :, flat.shape[2] // 2 :]
+            self.lamps.append(sums @ probes.lamp_by_frame[i])
 
     def first(self, k):
         """Return the same for the law of the first columns of the basis."""
-        if k == len(self.target[0]):
+        if k == self.target[0].shape[1]:
             return self
         part = copy(self)
-        part.gram = [g[:k, :k] for g in self.gram]
-        part.target = [t[:k] for t in self.target]
-        part.seen = [s[:k] for s in self.seen]
-        part.lamps = [s[:k] for s in self.lamps]
+        part.gram = [g[:, :k, :k] for g in self.gram]
+        for name in ("target", "seen", "lamps"):
+            setattr(part, name, [each[:, :k] for each in getattr(self, name)])
         return part
 
     def normal(self, waves):
         """
-        Return the normal equations of dependences of one function each, less tangent and lamp.
+        Return the normal equations of dependences, less tangent and lamp.
 
         Parameters
         ----------
         waves : list of `~numpy.ndarray`
-            Functions of the frame, shape (n, F), one array a dataset.
+            Functions of the frame, m for each of n dependences, shape (n, m, F), one array a
+            dataset.
 
         Returns
         -------
         gram : `~numpy.ndarray`
-            Shape (n, k, k).
+            Shape (n, m k, m k), of a law of k columns.
         target : `~numpy.ndarray`
-            Shape (n, k).
+            Shape (n, m k).
         """
-        parts = zip(self.gram, waves, strict=True)
-        gram = sum(np.einsum("klf,nf->nkl", g, w * w, optimize=True) for g, w in parts)
-        target = sum(np.einsum("kf,nf->nk", t, w) for t, w in zip(self.target, waves, strict=True))
-        for seen in self._taken(waves):
+        n, m = waves[0].shape[:2]
+        k = self.target[0].shape[1]
+        pairs = [(w[:, :, None] * w[:, None]).reshape(n * m * m, -1) for w in waves]
+        gram = sum(_over_frames(p, g) for p, g in zip(pairs, self.gram, strict=True))
+        gram = gram.reshape(n, m, m, k, k).swapaxes(2, 3).reshape(n, m * k, m * k)
+        flat = [w.reshape(n * m, -1) for w in waves]
+        target = sum(_over_frames(w, t) for w, t in zip(flat, self.target, strict=True))
+        taken = [sum(_over_frames(w, s) for w, s in zip(flat, self.seen, strict=True))]
+        taken += [_over_frames(w, s) for w, s in zip(flat, self.lamps, strict=True)]
+        for part in taken:
+            seen = part.reshape(n, m * k, -1)
             gram = gram - seen @ seen.swapaxes(1, 2)
-        return gram, target
-
-    def pair(self, waves):
-        """Return the same for one dependence of several functions: (n k, n k) and (n k,)."""
-        n = len(waves[0])
-        products = [(w[:, None] * w[None]).reshape(n * n, -1) for w in waves]
-        gram = sum(np.tensordot(p, g, (1, 2)) for g, p in zip(self.gram, products, strict=True))
-        k = gram.shape[-1]
-        gram = gram.reshape(n, n, k, k).transpose(0, 2, 1, 3).reshape(n * k, n * k)
-        target = sum(np.einsum("kf,nf->nk", t, w) for t, w in zip(self.target, waves, strict=True))
-        for seen in self._taken(waves):
-            flat = seen.reshape(n * k, -1)
-            gram = gram - flat @ flat.T
-        return gram, target.ravel()
-
-    def _taken(self, waves):
-        """Yield what tangent and lamps take of the columns, (n, k, rank)."""
-        yield sum(np.tensordot(w, s, (1, 1)) for s, w in zip(self.seen, waves, strict=True))
-        for lamp, wave in zip(self.lamps, waves, strict=True):
-            yield np.tensordot(wave, lamp, (1, 1))
+        return gram, target.reshape(n, m * k)
 
 
-def _by_frame(columns, basis):
-    """Return products of columns (k, R, F) and a basis (F, R, q), frame by frame: (k, F, q)."""
-    return np.matmul(columns.transpose(2, 0, 1), basis).transpose(1, 0, 2)
+def _over_frames(waves, table):
+    """Return the sums of a table (F, ...) over the frames with weights (n, F)."""
+    return waves @ table.reshape(len(table), -1)

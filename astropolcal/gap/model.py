@@ -132,34 +132,38 @@ class Model:
         tangent = self.problem.tangent(self.fit.coefficients)
         return float(stats.chi2.sf(self.fit.chi2, self.degrees_of_freedom(tangent)))
 
-    def edited(self, effect, context=None):
+    def edited(self, *recipes):
         """
-        Return the problem of the chains with an effect at zero, and its parameters.
+        Return the model with effects at zero, not fitted.
 
         Parameters
         ----------
-        effect : Effect
-            The effect.
-        context : Context, optional
-            By default that of the data.
+        *recipes : tuple
+            Effect and context each, the latter None for that of the data. An effect that has no
+            place without another that is not among them is left out.
 
         Returns
         -------
-        problem : GapProblem
-        parameters : list of EffectParameter
+        Model
+            The model itself where nothing was added.
         """
-        edit = effect.edit(self.trains, self.context if context is None else context)
-        problem = GapProblem(
-            edit.chains,
-            self.observations,
-            ties=self.problem.ties | edit.ties,
-            laws=self.problem.laws | edit.laws,
-            priors=self.problem.priors | edit.priors,
-            neutral=self.problem.neutral | {p.name: p.canonical_neutral for p in edit.parameters},
-            limits=self.problem.limits | edit.limits,
-            like=self.problem,
-        )
-        return problem, edit.parameters
+        mine, trains, edits = self.problem, self.trains, {}
+        for effect, context in recipes:
+            if effect.applies(trains):
+                edits[effect.name] = effect.edit(trains, context or self.context)
+                trains = edits[effect.name].chains
+        if not edits:
+            return self
+        settings = {"neutral": dict(mine.neutral)}
+        for key in ("ties", "laws", "priors", "limits"):
+            settings[key] = dict(getattr(mine, key))
+            for edit in edits.values():
+                settings[key] |= getattr(edit, key)
+        added = {name: edit.parameters for name, edit in edits.items()}
+        parameters = [p for own in added.values() for p in own]
+        settings["neutral"] |= {p.name: p.canonical_neutral for p in parameters}
+        problem = GapProblem(trains, self.observations, like=mine, **settings)
+        return Model(problem, Fit(problem.start, np.inf, False), self.added | added)
 
     def with_effect(self, effect, context=None, **settings):
         """
@@ -178,11 +182,11 @@ class Model:
         -------
         Model
         """
-        problem, parameters = self.edited(effect, context)
-        starts = off_extremum(problem, problem.start, parameters)
+        model = self.edited((effect, context))
+        problem, added = model.problem, model.added
+        starts = off_extremum(problem, problem.start, added[effect.name])
         fits = [problem.fit(start, **settings) for start in starts]
-        fit = min(fits, key=lambda one: one.chi2)
-        return Model(problem, fit, self.added | {effect.name: parameters})
+        return Model(problem, min(fits, key=lambda one: one.chi2), added)
 
     def with_effects(self, effects, like=None, **settings):
         """
@@ -204,14 +208,8 @@ class Model:
         -------
         Model
         """
-        model = self
-        for effect, context in effects:
-            if not effect.applies(model.trains):
-                continue
-            problem, parameters = model.edited(effect, context)
-            added = model.added | {effect.name: parameters}
-            # not fitted in between: one fit at the end is enough
-            model = Model(problem, Fit(problem.start, np.inf, False), added)
+        model = self.edited(*effects)
+        # not fitted in between: one fit at the end is enough
         if like is not None:
             model = Model(model.problem, like.start_of(model.problem), model.added)
         return self if model is self else model._off_extrema().polished(**settings)

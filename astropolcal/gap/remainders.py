@@ -15,7 +15,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy import stats
 
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.gap.channels import CHANNELS
 from astropolcal.gap.patterns import frame_blocks, frame_patterns
 from astropolcal.observations.quality import MAD_TO_SIGMA, robust_curve

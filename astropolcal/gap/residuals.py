@@ -20,7 +20,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy import stats
 
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.exceptions import GapError
 from astropolcal.gap._places import most_uneven, places
 from astropolcal.gap.attribution import false_discovery

@@ -42,6 +42,10 @@ _OF_OPTIC = (("retardance_h", None), ("retardance_d", None), ("rotation", 2))
 # by the number of causes: so many sets grow side by side, and so many of their continuations
 # are fitted in full
 _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
+# those that promise less than this share of what the best of them gained are not
+_PROMISING = 0.8
+# names are asked for beside so many causes
+_NAMES = 2
 # and so many times as many where all of these are impossible
 _MORE = 3
 # causes that lower chi-square by shares closer than this are the same for these data
@@ -393,13 +397,15 @@ def _search(best, library, first, say, cells, most_causes):
         say(f"looking for cause {k + 1}, at most {most_causes}")
         for state in states:
             if state.outline not in known:
-                known[state.outline] = _scanned(state.model, library, cells)
+                # what takes many causes has no names; they are asked for once more at the end
+                names = library if k <= _NAMES or not cells else ()
+                known[state.outline] = _scanned(state.model, names, cells)
         fitted = []
         for several in (most, _MORE * most):
             # what is impossible is passed over, and is not the end of the search
             grown = _grown(states, known, several)
             tried = grown[:most] if several == most else grown[most:]
-            fitted = [state for item in tried if (state := _extended(*item)) is not None]
+            fitted = _fitted(tried)
             if fitted:
                 break
         fitted.sort(key=lambda state: -state.evidence)
@@ -410,6 +416,19 @@ def _search(best, library, first, say, cells, most_causes):
             # what is left may be noise: one look beside the best set will tell
             states = states[:1]
     return best
+
+
+def _fitted(grown):
+    """Return sets fitted in full, without those that promise too little beside the best of them."""
+    found, most = [], -np.inf
+    for promised, state, added in grown:
+        if promised - state.evidence < _PROMISING * (most - state.evidence):
+            break
+        one = _extended(promised, state, added)
+        if one is not None:
+            found.append(one)
+            most = max(most, one.evidence)
+    return found
 
 
 def _grown(states, known, most):

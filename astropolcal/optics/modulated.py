@@ -356,6 +356,7 @@ class HarmonicGain(_BeamOptic, _Harmonic):
 
 
 def scaled(gain):
+    """Return the Mueller matrix of a gain that does not depend on polarization."""
     return np.asarray(gain)[..., None, None] * _IDENTITY
 
 

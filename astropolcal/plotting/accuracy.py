@@ -4,7 +4,7 @@
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration.groups import what_is_left_out
+from astropolcal.calibration.noise.scatter import what_is_left_out
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import (
     BLACK,
@@ -71,7 +71,7 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
     Notes
     -----
     Definitions as in `~astropolcal.calibration.accuracy_table` and
-    `~astropolcal.calibration.standard_accuracy`; ``s_mean`` is s_rel of
+    `~astropolcal.calibration.validation.standard_accuracy`; ``s_mean`` is s_rel of
     McIntosh et al. (2026, Sec. 2.3).
 
     Examples

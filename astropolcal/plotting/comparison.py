@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration.comparison import compare
+from astropolcal.calibration.result.comparison import compare
 from astropolcal.plotting._style import canvas, legend_outside, looks, style, wavelength_label
 
 __all__ = ["plot_comparison"]

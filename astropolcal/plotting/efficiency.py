@@ -4,8 +4,8 @@
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration.efficiency import has_derotator, polarimetric_efficiency
 from astropolcal.chain import stages
+from astropolcal.efficiency import has_derotator, polarimetric_efficiency
 from astropolcal.plotting._style import canvas, looks, nanometres, style
 
 __all__ = ["plot_derotator_offsets", "plot_polarimetric_efficiency"]
@@ -115,7 +115,7 @@ def plot_derotator_offsets(best, *, title=None, figure=None):
     --------
     >>> import astropy.units as u
     >>> from astropolcal import instruments
-    >>> from astropolcal.calibration import best_derotator
+    >>> from astropolcal.efficiency import best_derotator
     >>> from astropolcal.plotting.efficiency import plot_derotator_offsets
     >>> charis = instruments.get("charis")
     >>> best = best_derotator(charis.on_sky(charis.published()), charis.wavelength,

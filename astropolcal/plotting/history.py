@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 from astropy.time import Time
 
-from astropolcal.calibration.history import _Named, _named, parameter_history, significance
 from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.pipeline.history import _Named, _named, parameter_history, significance
 from astropolcal.plotting._style import GREY, SIGMA, canvas, looks, style
 
 __all__ = ["plot_history"]
@@ -25,7 +25,7 @@ def plot_history(calibrations, parameters=None, *, shown=None, title=None, figur
     Parameters
     ----------
     calibrations : Library or sequence
-        See `~astropolcal.calibration.parameter_history`; each needs a date.
+        See `~astropolcal.pipeline.parameter_history`; each needs a date.
     parameters : sequence of str, optional
         ``"optic.parameter"`` or ``"optic"``; by default all that are free in one of them.
     shown : int, optional

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration._directions import ranked
-from astropolcal.calibration.harmonics import _POOR, SETS, harmonic_conditions
+from astropolcal.calibration.identifiability.ambiguities import _POOR, SETS, harmonic_conditions
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import (
     BLACK,

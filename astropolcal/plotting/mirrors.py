@@ -5,8 +5,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments
-from astropolcal.calibration import mirror_names, mirror_values
-from astropolcal.calibration.reflections import METALS
+from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
 from astropolcal.exceptions import ChainError, InstrumentError
 from astropolcal.plotting._style import (
     BLACK,

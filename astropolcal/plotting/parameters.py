@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
 
-from astropolcal.calibration.reflections import mirror_names
+from astropolcal.calibration.uncertainty.derived import mirror_names
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.plotting._points import draw_entry, draw_law, legend_of, mark_half_wave

@@ -3,9 +3,7 @@
 
 import numpy as np
 
-from astropolcal.calibration import autocorrelation
-from astropolcal.calibration._optional import need
-from astropolcal.calibration.convergence import ENOUGH
+from astropolcal.calibration.posterior.samples import ENOUGH, autocorrelation, need
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting._style import BLACK, BLUE, GREY, MINUS, VERMILION, canvas, style
 
@@ -63,7 +61,7 @@ def plot_corner(posterior, parameters=None, *, fitted=True, figure=None):
     --------
     >>> import numpy as np
     >>> import astropy.units as u
-    >>> from astropolcal.calibration import Posterior
+    >>> from astropolcal.calibration.posterior import Posterior
     >>> from astropolcal.plotting import plot_corner
     >>> chain = np.random.default_rng(1).normal(size=(500, 8, 2))
     >>> names = ["hwp.theta", "derotator.theta"]
@@ -247,7 +245,7 @@ def plot_traces(posterior, parameters=None, *, figure=None):
     --------
     >>> import numpy as np
     >>> import astropy.units as u
-    >>> from astropolcal.calibration import Posterior
+    >>> from astropolcal.calibration.posterior import Posterior
     >>> from astropolcal.plotting import plot_traces
     >>> chain = np.random.default_rng(1).normal(size=(500, 8, 1))
     >>> plot_traces(Posterior(["hwp.theta"], [u.deg], chain, chain[..., 0])).axes[0].get_ylabel()

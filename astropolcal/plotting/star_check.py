@@ -55,7 +55,7 @@ def plot_star_check(calibration, entry=None, *, figure=None):
     --------
     >>> import astropy.units as u
     >>> from astropolcal import calibrate, instruments, optics
-    >>> from astropolcal.calibration import add_star_check
+    >>> from astropolcal.calibration.validation.stars import add_star_check
     >>> from astropolcal.plotting import plot_star_check
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")

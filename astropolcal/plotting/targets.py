@@ -4,8 +4,9 @@
 import astropy.units as u
 import numpy as np
 
-from astropolcal.calibration import paper_accuracies, target_accuracies
-from astropolcal.calibration.targets import TARGETS
+from astropolcal.calibration import target_accuracies
+from astropolcal.calibration.validation import paper_accuracies
+from astropolcal.calibration.validation.targets import TARGETS
 from astropolcal.exceptions import ObservationError
 from astropolcal.plotting._style import (
     canvas,

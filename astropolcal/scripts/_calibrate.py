@@ -212,10 +212,10 @@ def _add_accuracy_options(parser):
 
 def run(arguments):
     """Calibrate, print the summary and write what was asked for."""
-    from astropolcal.calibration import to_dict
-    from astropolcal.calibration.standards import add_standard
-    from astropolcal.calibration.star_checks import add_star_check
-    from astropolcal.calibration.targets import TARGETS
+    from astropolcal.calibration.result.summary import to_dict
+    from astropolcal.calibration.validation.held_out import add_standard
+    from astropolcal.calibration.validation.stars import add_star_check
+    from astropolcal.calibration.validation.targets import TARGETS
     from astropolcal.observations import get_observable
 
     say = printer(arguments)
@@ -265,8 +265,8 @@ def run(arguments):
 
 def _tell(arguments, calibration, targets, written):
     """Print the summary and what was written; of an unusable result something even if quiet."""
-    from astropolcal.calibration import summary, verdict
-    from astropolcal.calibration._compact import HEIGHT, HINT, compact_lines
+    from astropolcal.calibration.result.summary import summary
+    from astropolcal.calibration.result.verdict import HEIGHT, HINT, compact_lines, verdict
 
     found = verdict(calibration, targets)
     if is_quiet(arguments):
@@ -309,7 +309,8 @@ def _is_known(observations):
 
 def _fitted(arguments, chains, datasets, positions, instrument):
     """Return the fit of all that is free, or of what changed since another calibration."""
-    from astropolcal.calibration import Calibration, calibrate, restart
+    from astropolcal.calibration import Calibration, calibrate
+    from astropolcal.pipeline import restart
 
     options = {
         "weights": None if arguments.weights == "none" else arguments.weights,

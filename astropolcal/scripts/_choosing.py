@@ -40,8 +40,8 @@ class Night:
 
 def read_night(files, instrument, raw=None):
     """Return what headers tell; refuse frames that differ in their mode or optics."""
-    from astropolcal.calibration._beam import told_beam
     from astropolcal.fitscheck import primary_header
+    from astropolcal.pipeline.headers import told_beam
     from astropolcal.reduction.headers import observation_time, read_header
 
     layout = instrument.files
@@ -87,7 +87,7 @@ def choose_calibration(arguments, files, raw=None):
     unless the user wants it for any date.
     """
     from astropolcal import Calibration, instruments
-    from astropolcal.calibration.validity import content_hash
+    from astropolcal.converters.calibration import content_hash
     from astropolcal.correction import sky_chain
 
     path = Path(arguments.calibration)
@@ -117,7 +117,7 @@ def choose_calibration(arguments, files, raw=None):
 
 def _check_validity(calibration, path, arguments, night):
     """Refuse frames for which the calibration does not hold, unless the user wants it."""
-    from astropolcal.calibration.validity import check_frames
+    from astropolcal.pipeline.headers import check_frames
 
     # --filter names the mode as the file does, whatever the headers call it
     mode = arguments.filter or night.mode
@@ -129,7 +129,7 @@ def _check_validity(calibration, path, arguments, night):
 
 def _of_library(path, arguments, night, beam, files):
     """Return the calibration that holds for the first and the last frame."""
-    from astropolcal.calibration.library import Library
+    from astropolcal.pipeline.library import Library
 
     # None: the library chooses without a date
     dates = [None] if arguments.any_date else night.dates

@@ -161,7 +161,7 @@ def _on_sky(instrument, chain, grid, arguments):
 
 
 def _table(arguments, instrument, chain, grid):
-    from astropolcal.calibration.efficiency import has_derotator, polarimetric_efficiency
+    from astropolcal.efficiency import has_derotator, polarimetric_efficiency
 
     turns = has_derotator(chain)
     if arguments.derotator and not turns:
@@ -223,7 +223,7 @@ def _rows(wanted, grid):
 
 def _best(arguments, instrument, chain, grid):
     """Return the best derotator offset, and what is said of it."""
-    from astropolcal.calibration import best_derotator
+    from astropolcal.efficiency import best_derotator
 
     altitude, parallactic = _track(arguments, instrument)
     mode = _mode(arguments, instrument)

@@ -82,8 +82,9 @@ def _installation():
 
 def _calibration(path, full):
     from astropolcal.calibration import Calibration
-    from astropolcal.calibration._compact import HEIGHT, HINT, compact_lines
-    from astropolcal.calibration.validity import content_hash, validity_of
+    from astropolcal.calibration.result.validity import validity_of
+    from astropolcal.calibration.result.verdict import HEIGHT, HINT, compact_lines
+    from astropolcal.converters.calibration import content_hash
 
     calibration = Calibration.read(path)
     # when it was made and for when it holds are two things
@@ -110,7 +111,7 @@ def _calibration(path, full):
 
 def _library(folder):
     """Return what a folder of calibrations holds, one block of lines a file."""
-    from astropolcal.calibration.library import Library
+    from astropolcal.pipeline.library import Library
 
     library = Library(folder)
     table = library.table()

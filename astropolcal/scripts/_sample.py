@@ -152,8 +152,8 @@ def _check_options(arguments):
 
 def _check_run(calibration, arguments):
     """Refuse names of parameters that are wrong, then packages that are missing."""
-    from astropolcal.calibration import LogPosterior
-    from astropolcal.calibration._optional import need
+    from astropolcal.calibration.posterior import LogPosterior
+    from astropolcal.calibration.posterior.samples import need
 
     if arguments.parameters:
         LogPosterior(calibration.live_measurement(), parameters=arguments.parameters)

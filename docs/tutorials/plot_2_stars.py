@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from astropolcal import Observations, calibrate, instruments
-from astropolcal.calibration import star_accuracy, star_stokes
+from astropolcal.calibration.validation import star_accuracy, star_stokes
 from astropolcal.plotting import plot_double_differences, plot_mirrors, plot_target_accuracy
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

@@ -21,8 +21,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from astropolcal import Observations, calibrate, instruments
-from astropolcal.calibration import polarimetric_efficiency
 from astropolcal.chain import replace_optic
+from astropolcal.efficiency import polarimetric_efficiency
 from astropolcal.plotting import (
     plot_double_differences,
     plot_efficiency,

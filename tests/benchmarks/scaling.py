@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from timing import fastest
 
 from astropolcal import instruments
-from astropolcal.calibration import LogPosterior
+from astropolcal.calibration.posterior import LogPosterior
 from astropolcal.measurement import Measurement
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

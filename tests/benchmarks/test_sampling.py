@@ -14,7 +14,8 @@ import pytest
 from timing import fastest, report
 
 from astropolcal import calibrate, instruments
-from astropolcal.calibration import LogPosterior, sample
+from astropolcal.calibration import sample
+from astropolcal.calibration.posterior import LogPosterior
 from astropolcal.exceptions import AstropolcalWarning
 from astropolcal.measurement import Normal
 

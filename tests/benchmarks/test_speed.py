@@ -22,9 +22,10 @@ from scipy.optimize import least_squares
 from timing import interleaved, report
 
 from astropolcal import Calibration, calibrate, instruments
-from astropolcal.calibration import BinProblem, Library, library, search_branches
+from astropolcal.calibration.fit.strategies import BinProblem, search_branches
 from astropolcal.chain import leaves, system_mueller
 from astropolcal.measurement import Measurement
+from astropolcal.pipeline import Library, library
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")

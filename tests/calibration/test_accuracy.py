@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from astropolcal import optics
-from astropolcal.calibration import (
+from astropolcal.calibration import calibrate
+from astropolcal.calibration.noise.scatter import leave_out_groups
+from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
-    calibrate,
     cross_validated_residuals,
-    leave_out_groups,
 )
 from astropolcal.chain import insert_optic
 from astropolcal.exceptions import FitError

@@ -7,7 +7,7 @@ import pytest
 
 from astropolcal import Calibration
 from astropolcal.calibration import calibrate, profile
-from astropolcal.calibration.bounds import STATUSES, status_of
+from astropolcal.calibration.uncertainty.covariance import STATUSES, status_of
 from astropolcal.exceptions import CalibrationFileError
 
 LAM = [1.2, 1.6, 2.2] * u.um

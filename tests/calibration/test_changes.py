@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from astropolcal.calibration import Change
-from astropolcal.calibration.history import _belongs, _chi_square, _determined, _log_p
+from astropolcal.pipeline import Change
+from astropolcal.pipeline.history import _belongs, _chi_square, _determined, _log_p
 
 
 def _change(chi2, dof, **options):

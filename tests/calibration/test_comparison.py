@@ -7,7 +7,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from astropolcal import calibrate, instruments, optics
-from astropolcal.calibration import compare, comparison_text, full_covariance
+from astropolcal.calibration import compare
+from astropolcal.calibration.result.comparison import comparison_text
+from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments.telescope import published_mirror, telescope

@@ -4,12 +4,13 @@
 import numpy as np
 import pytest
 
-from astropolcal.calibration import autocorrelation, autocorrelation_time
-from astropolcal.calibration.convergence import (
+from astropolcal.calibration.posterior.samples import (
     ENOUGH,
     FEWEST_SAMPLES,
     LARGEST_R_HAT,
     Convergence,
+    autocorrelation,
+    autocorrelation_time,
     autocorrelation_times,
 )
 from astropolcal.exceptions import ParameterError

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from astropolcal import optics
-from astropolcal.calibration import Calibration, Covariance, calibrate, full_covariance
+from astropolcal.calibration import Calibration, calibrate
+from astropolcal.calibration.uncertainty.covariance import Covariance, full_covariance
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement import Normal
 from astropolcal.measurement.parameters import FreeParameters

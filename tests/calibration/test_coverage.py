@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from astropolcal.calibration import derived_data, derived_retardance
+from astropolcal.calibration.uncertainty import derived_data, derived_retardance
 from astropolcal.measurement import Measurement
 
 pytestmark = pytest.mark.slow

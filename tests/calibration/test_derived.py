@@ -6,17 +6,15 @@ import numpy as np
 import pytest
 
 from astropolcal import optics
-from astropolcal.calibration import (
-    Calibration,
-    calibrate,
+from astropolcal.calibration import Calibration, calibrate, propagate
+from astropolcal.calibration.uncertainty import (
     derived_data,
     derived_efficiency,
     derived_mueller,
     derived_retardance,
     derived_sky,
-    full_covariance,
-    propagate,
 )
+from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import system_mueller, with_beam
 from astropolcal.exceptions import (
     CalibrationFileError,

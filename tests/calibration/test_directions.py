@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from astropolcal import optics
-from astropolcal.calibration._directions import (
+from astropolcal.calibration.identifiability.analysis import (
+    Identifiability,
+    analyse,
+    physical_scale,
+    telescope_words,
+)
+from astropolcal.calibration.identifiability.linearized import (
     LARGE,
+    Whitened,
     declared_step,
     first_of_each_kind,
     led,
@@ -16,9 +23,6 @@ from astropolcal.calibration._directions import (
     plain,
     step_of,
 )
-from astropolcal.calibration._telescope import telescope_words
-from astropolcal.calibration._whitened import Whitened
-from astropolcal.calibration.identifiability import Identifiability, analyse, physical_scale
 from astropolcal.measurement import Normal
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.measurement.priors import Uniform

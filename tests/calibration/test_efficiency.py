@@ -9,9 +9,14 @@ from hypothesis import strategies as st
 from star_data import CHARIS
 
 from astropolcal import instruments, optics
-from astropolcal.calibration import best_derotator, polarimetric_efficiency
-from astropolcal.calibration.efficiency import DEROTATOR_LAWS, has_derotator, sky_path
 from astropolcal.chain import join, leaves, replace_optic
+from astropolcal.efficiency import (
+    DEROTATOR_LAWS,
+    best_derotator,
+    has_derotator,
+    polarimetric_efficiency,
+    sky_path,
+)
 from astropolcal.exceptions import ChainError, InstrumentError, ObservationError, ParameterError
 from astropolcal.instruments import Instrument, SkyLaw
 

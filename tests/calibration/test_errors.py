@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from astropolcal.calibration import Calibration, calibrate, standard_errors
+from astropolcal.calibration import Calibration, calibrate
+from astropolcal.calibration.uncertainty import standard_errors
 from astropolcal.exceptions import CalibrationFileError, FitError
 
 LAM = [1.2, 1.6, 2.2] * u.um

@@ -10,9 +10,9 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from astropolcal.calibration.export import mueller_table, write_mueller
-from astropolcal.calibration.loading import load
 from astropolcal.exceptions import CalibrationFileError, ParameterError
+from astropolcal.pipeline.export import mueller_table, write_mueller
+from astropolcal.pipeline.loading import load
 
 OLD = Path(__file__).parent / "data" / "calibration-1.0.0.asdf"
 POSITIONS = {"hwp": [0, 22.5] * u.deg, "derotator": 60 * u.deg}

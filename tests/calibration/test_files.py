@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from astropolcal import Calibration, calibrate, optics
-from astropolcal.calibration import Covariance, DatasetRecord, Posterior
+from astropolcal.calibration.posterior import Posterior
+from astropolcal.calibration.result.calibration import DatasetRecord
+from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import calibration_from_node, node_from_calibration
 from astropolcal.exceptions import CalibrationFileError
@@ -464,8 +466,9 @@ def test_prior_of_an_unknown_kind_is_refused(change, message):
 
 def test_unreadable_date_of_an_older_file_is_refused(content, path, monkeypatch):
     """Such files could be written once; they would hold from any date on."""
-    from astropolcal.calibration import Library, validity_of
+    from astropolcal.calibration.result.validity import validity_of
     from astropolcal.converters import calibration as converter
+    from astropolcal.pipeline import Library
 
     monkeypatch.setattr(converter, "_checksum", lambda node: node["checksum"])
     path.write_bytes(replaced(content, b"date: '2025-10-02'", b"date: 2 Oct 2025"))
@@ -500,7 +503,7 @@ def test_observations_are_brought_back(calibration, content, path):
 
 @pytest.mark.parametrize("weights", [None, "wavelength", "errors", 0.003, [0.002, 0.003, 0.004]])
 def test_noise_of_the_fit_is_brought_back(path, weights):
-    from astropolcal.calibration.weighting import weighting_of
+    from astropolcal.calibration.noise.weighting import weighting_of
 
     night = make_nights()[0]
     calibration = calibrate(make_chain(), night, weights=weights, cross_validate=False)
@@ -661,7 +664,7 @@ def test_failure_midway_leaves_nothing(calibration, path, monkeypatch):
     def stop(self, obj, tag, ctx):
         raise RuntimeError("no more")
 
-    monkeypatch.setattr("astropolcal.converters.optics.OpticConverter.to_yaml_tree", stop)
+    monkeypatch.setattr("astropolcal.converters.extension.OpticConverter.to_yaml_tree", stop)
     path.write_text("precious")
     message = "cannot be written: RuntimeError: no more"
     assert_not_written(calibration, path, message, overwrite=True)

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, LMLSQFitter, TRFLSQFitter
 
-from astropolcal.calibration import Calibration, calibrate, search_branches, to_dict
+from astropolcal.calibration import Calibration, calibrate
+from astropolcal.calibration.fit.strategies import search_branches
+from astropolcal.calibration.result.summary import to_dict
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError, FitError
 from astropolcal.measurement import Measurement, Tie
@@ -316,7 +318,7 @@ def test_more_parameters_than_data_are_refused(make):
 
 
 def test_fit_that_does_not_arrive_warns(few, monkeypatch):
-    from astropolcal.calibration import fit
+    from astropolcal.calibration.fit import calibrate as fit
 
     chain, _, data = few
     monkeypatch.setattr(fit, "_MAX_EVALUATIONS", 1)
@@ -327,7 +329,7 @@ def test_fit_that_does_not_arrive_warns(few, monkeypatch):
 
 
 def test_step_that_does_not_arrive_warns_too(few, monkeypatch):
-    from astropolcal.calibration import fit
+    from astropolcal.calibration.fit import calibrate as fit
 
     chain, _, data = few
     monkeypatch.setattr(fit, "_MAX_EVALUATIONS", 1)
@@ -356,7 +358,7 @@ def test_fitter_that_leaves_the_bounds_is_told_on(few):
     ],
 )
 def test_when_branches_are_searched(few, monkeypatch, strategy, search, searches):
-    from astropolcal.calibration import fit
+    from astropolcal.calibration.fit import calibrate as fit
 
     calls = []
 

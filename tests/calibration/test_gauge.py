@@ -7,8 +7,7 @@ import pytest
 from astropy.modeling.fitting import DogBoxLSQFitter, LevMarLSQFitter, TRFLSQFitter
 
 from astropolcal import Calibration, calibrate, instruments, optics
-from astropolcal.calibration import BinProblem, describe_gauge
-from astropolcal.calibration.gauge import hold_silent
+from astropolcal.calibration.fit.strategies import BinProblem, describe_gauge, hold_silent
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.measurement import Measurement, Normal
 from astropolcal.simulation import half_wave_plate_cycles, simulate

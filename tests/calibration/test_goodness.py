@@ -7,13 +7,13 @@ import pytest
 from scipy import stats
 
 from astropolcal import optics
-from astropolcal.calibration import (
-    calibrate,
-    lack_of_fit,
+from astropolcal.calibration import calibrate
+from astropolcal.calibration.noise import (
     noise_from_errors,
     noise_from_null_channel,
     noise_from_replicates,
 )
+from astropolcal.calibration.validation import lack_of_fit
 from astropolcal.chain import join
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, Normal

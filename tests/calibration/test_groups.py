@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from astropolcal.calibration import groups as module
-from astropolcal.calibration.groups import groups_by, leave_out_groups, what_is_left_out
+from astropolcal.calibration.noise import scatter as module
+from astropolcal.calibration.noise.scatter import groups_by, leave_out_groups, what_is_left_out
 from astropolcal.exceptions import FitError
 
 

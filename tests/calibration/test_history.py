@@ -9,19 +9,19 @@ import pytest
 from scipy import stats
 
 from astropolcal import calibrate, instruments
-from astropolcal.calibration.history import (
+from astropolcal.chain import leaves
+from astropolcal.converters.calibration import content_hash
+from astropolcal.exceptions import AstropolcalError, FitError, ParameterError
+from astropolcal.measurement import Tie
+from astropolcal.pipeline.history import (
     Change,
     _log_p,
     changes,
     parameter_history,
+    restart,
     significance,
 )
-from astropolcal.calibration.library import Library
-from astropolcal.calibration.restarting import restart
-from astropolcal.calibration.validity import content_hash
-from astropolcal.chain import leaves
-from astropolcal.exceptions import AstropolcalError, FitError, ParameterError
-from astropolcal.measurement import Tie
+from astropolcal.pipeline.library import Library
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")
@@ -219,7 +219,7 @@ def test_restart_frees_what_is_named_and_holds_the_rest(years):
 
 
 def test_restart_of_a_parameter_and_from_a_file(years, tmp_path):
-    from astropolcal.calibration.loading import load
+    from astropolcal.pipeline.loading import load
 
     years[0].write(tmp_path / "old.asdf")
     new = restart(load(tmp_path / "old.asdf"), observe(7, "2026-03-01"), "HWP.theta")

@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astropolcal import optics
-from astropolcal.calibration import analyse, calibrate, examine, sky_consequences
-from astropolcal.calibration._directions import near_null_directions
-from astropolcal.calibration._whitened import Whitened
-from astropolcal.calibration.identifiability import physical_scale
+from astropolcal.calibration import calibrate, examine
+from astropolcal.calibration.identifiability.analysis import analyse, physical_scale
+from astropolcal.calibration.identifiability.linearized import Whitened, near_null_directions
+from astropolcal.calibration.identifiability.sky import sky_consequences
 from astropolcal.measurement import Measurement, Normal
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.simulation import half_wave_plate_cycles, simulate

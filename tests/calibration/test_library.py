@@ -17,10 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import Calibration, calibrate, instruments
-from astropolcal.calibration import library as module
-from astropolcal.calibration.library import Entry, Library
-from astropolcal.calibration.validity import Validity, content_hash, validity_of, with_validity
+from astropolcal.calibration.result.validity import Validity, validity_of, with_validity
+from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import CalibrationFileError
+from astropolcal.pipeline import library as module
+from astropolcal.pipeline.library import Entry, Library
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 OLD = Path(__file__).parent / "data" / "calibration-1.0.0.asdf"

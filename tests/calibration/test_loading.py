@@ -13,9 +13,7 @@ from astropy.io import fits
 
 from astropolcal import calibrate, instruments
 from astropolcal.calibration import propagate
-from astropolcal.calibration.library import Library
-from astropolcal.calibration.loading import load
-from astropolcal.calibration.validity import with_validity
+from astropolcal.calibration.result.validity import with_validity
 from astropolcal.chain import join, leaves, system_mueller, with_beam
 from astropolcal.exceptions import (
     AstropolcalWarning,
@@ -26,6 +24,8 @@ from astropolcal.exceptions import (
     ParameterError,
     WavelengthRangeError,
 )
+from astropolcal.pipeline.library import Library
+from astropolcal.pipeline.loading import load
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 OLD = Path(__file__).parent / "data" / "calibration-1.0.0.asdf"
@@ -449,15 +449,15 @@ for module, owners in packages_distributions().items():
         blocked.append(module)
 assert {"matplotlib", "photutils", "specutils", "tqdm", "jinja2", "scipy"} <= set(blocked), blocked
 
-from astropolcal.calibration.loading import load
-from astropolcal.calibration.validity import with_validity
+from astropolcal.pipeline.loading import load
+from astropolcal.calibration.result.validity import with_validity
 header = {"INSTRUME": "CHARIS", "MJD": 60988.5, "RET-ANG1": 22.5, "D_IMRANG": 60.0,
           "FILTNAME": "broadband JHK"}
 calibration = load(sys.argv[1], header)
 mueller = calibration.system_mueller([header] * 2, light="internal")
 assert mueller.covariance.shape == (2, 3, 16, 16)
 
-from astropolcal.calibration.export import mueller_table, write_mueller
+from astropolcal.pipeline.export import mueller_table, write_mueller
 write_mueller(mueller_table(calibration, header, light="internal"), sys.argv[2])
 print(repr(float(mueller.value[0, 0, 0, 1])))
 """

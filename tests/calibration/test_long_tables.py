@@ -9,8 +9,9 @@ import pytest
 from star_data import CHARIS, observe_star
 
 from astropolcal import calibrate
-from astropolcal.calibration import accuracy, cross_validated_residuals
-from astropolcal.calibration import fit as fit_module
+from astropolcal.calibration.fit import calibrate as fit_module
+from astropolcal.calibration.validation import cross_validation as accuracy
+from astropolcal.calibration.validation.cross_validation import cross_validated_residuals
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement
 from astropolcal.simulation import half_wave_plate_cycles, simulate

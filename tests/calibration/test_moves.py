@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from astropolcal import calibrate
-from astropolcal.calibration import LogPosterior, sample
-from astropolcal.calibration import sampling as sampling_module
-from astropolcal.calibration._ensemble import (
+from astropolcal.calibration import sample
+from astropolcal.calibration.posterior import LogPosterior
+from astropolcal.calibration.posterior import sampler as sampling_module
+from astropolcal.calibration.posterior.sampler import (
     Laplace,
     default_moves,
     move_names,
     refuse_biased,
 )
-from astropolcal.calibration.convergence import autocorrelation_times
+from astropolcal.calibration.posterior.samples import autocorrelation_times
 from astropolcal.exceptions import AstropolcalWarning, FitError
 
 emcee = pytest.importorskip("emcee")

@@ -8,14 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import instruments, optics
-from astropolcal.calibration import (
-    calibrate,
-    estimate_noise,
+from astropolcal.calibration import calibrate
+from astropolcal.calibration.noise import (
     noise_from_errors,
     noise_from_null_channel,
     noise_from_replicates,
 )
-from astropolcal.calibration.noise import data_by_wavelength, equal_axes
+from astropolcal.calibration.noise.estimates import data_by_wavelength, equal_axes, estimate_noise
 from astropolcal.chain import join
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement

@@ -10,16 +10,16 @@ from astropy.io import fits
 from astropy.time import Time
 
 from astropolcal import instruments, optics
-from astropolcal.calibration import Validity, validity_of, with_validity
-from astropolcal.calibration._beam import (
-    inner_optics,
+from astropolcal.calibration import with_validity
+from astropolcal.calibration.result.validity import (
+    Validity,
+    beam_words,
     instrument_of,
-    telescope_optics,
-    told_beam,
+    optics_sets,
+    optics_words,
+    validity_of,
 )
-from astropolcal.calibration._header import FrameAngles, describe
-from astropolcal.calibration._system import at_bins, match_wavelengths, split_chain
-from astropolcal.calibration.validity import beam_words, optics_sets, optics_words
+from astropolcal.calibration.system import at_bins, match_wavelengths, split_chain
 from astropolcal.chain import leaves
 from astropolcal.exceptions import (
     CalibrationFileError,
@@ -28,6 +28,13 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
     WavelengthRangeError,
+)
+from astropolcal.pipeline.headers import (
+    FrameAngles,
+    describe,
+    inner_optics,
+    telescope_optics,
+    told_beam,
 )
 
 CHARIS = instruments.get("charis")

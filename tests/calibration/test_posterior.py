@@ -7,7 +7,8 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal.calibration import Posterior, autocorrelation, autocorrelation_time
+from astropolcal.calibration.posterior import Posterior
+from astropolcal.calibration.posterior.samples import autocorrelation, autocorrelation_time
 from astropolcal.exceptions import AstropolcalError, ParameterError
 
 NAMES, UNITS = ["hwp.theta", "wollaston.efficiency[0]"], [u.deg, None]

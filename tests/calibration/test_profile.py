@@ -5,7 +5,8 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal.calibration import Calibration, Profile, calibrate, profile
+from astropolcal.calibration import Calibration, calibrate, profile
+from astropolcal.calibration.uncertainty.refits import Profile
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Normal
 

@@ -10,28 +10,19 @@ import pytest
 from astropy.table import QTable
 
 from astropolcal import calibrate, instruments, optics
-from astropolcal.calibration import (
-    BinProblem,
-    Covariance,
-    LogPosterior,
-    Posterior,
-    Profile,
-    derived_efficiency,
-    derived_sky,
-    estimate_noise,
-    full_covariance,
-    noise_from_null_channel,
-    noise_from_replicates,
-    paper_accuracies,
-    settle,
-    star_stokes,
-    target_accuracies,
-)
-from astropolcal.calibration._header import describe
-from astropolcal.calibration.accuracy import cross_validated_residuals
-from astropolcal.calibration.robust import outlying_data, robust_sigma
-from astropolcal.calibration.star_checks import _add_known
-from astropolcal.calibration.summaries import _target_lines
+from astropolcal.calibration import target_accuracies
+from astropolcal.calibration.fit.strategies import BinProblem, settle
+from astropolcal.calibration.noise import noise_from_null_channel, noise_from_replicates
+from astropolcal.calibration.noise.estimates import estimate_noise
+from astropolcal.calibration.noise.weighting import outlying_data, robust_sigma
+from astropolcal.calibration.posterior import LogPosterior, Posterior
+from astropolcal.calibration.result.summary import _target_lines
+from astropolcal.calibration.uncertainty import derived_efficiency, derived_sky
+from astropolcal.calibration.uncertainty.covariance import Covariance, full_covariance
+from astropolcal.calibration.uncertainty.refits import Profile
+from astropolcal.calibration.validation import paper_accuracies, star_stokes
+from astropolcal.calibration.validation.cross_validation import cross_validated_residuals
+from astropolcal.calibration.validation.stars import _add_known
 from astropolcal.exceptions import (
     AstropolcalWarning,
     ChainError,
@@ -42,6 +33,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
+from astropolcal.pipeline.headers import describe
 from astropolcal.reduction.cubes import both_states
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 from astropolcal.standards import SerkowskiLaw
@@ -167,7 +159,7 @@ def test_a_far_datum_is_noisy_and_a_near_one_is_not(cal, loss):
 
 
 def test_robust_weights_that_do_not_settle_are_told(chain, data, monkeypatch):
-    from astropolcal.calibration import fit
+    from astropolcal.calibration.fit import calibrate as fit
 
     monkeypatch.setattr(fit, "_ROBUST_ROUNDS", 1)
     with pytest.warns(
@@ -257,7 +249,7 @@ def test_a_chain_that_does_not_move_is_half_burn_in():
 
 def test_linear_steps_are_what_refits_give(cal, monkeypatch):
     """Eight groups, refitted one by one, and the linear way that is taken for more than 16."""
-    from astropolcal.calibration import accuracy
+    from astropolcal.calibration.validation import cross_validation as accuracy
 
     (part,) = cal.measurement.datasets
     groups, vector = part.group_of_datum // 2, cal.measurement.vector()
@@ -272,7 +264,7 @@ def test_linear_steps_are_what_refits_give(cal, monkeypatch):
 
 def test_a_group_that_alone_determines_something_is_named(make, chain, monkeypatch):
     """One wavelength lacks all but the first cycle, which alone tells its efficiency."""
-    from astropolcal.calibration import accuracy
+    from astropolcal.calibration.validation import cross_validation as accuracy
 
     table = make.observe(chain, half_wave_plate_cycles(derotator=ANGLES), LAM, seed=3)
     mask = np.zeros((table.n_frames, 3), dtype=bool)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from astropolcal import calibrate
-from astropolcal.calibration._refit import Refit
+from astropolcal.calibration.uncertainty.refits import Refit
 from astropolcal.measurement import Normal
 from astropolcal.simulation import half_wave_plate_cycles
 

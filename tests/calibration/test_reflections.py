@@ -9,14 +9,10 @@ import pytest
 from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, standards
-from astropolcal.calibration import (
-    add_star_check,
-    mirror_names,
-    mirror_values,
-    star_check,
-    summary,
-    to_dict,
-)
+from astropolcal.calibration import star_check
+from astropolcal.calibration.result.summary import summary, to_dict
+from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
+from astropolcal.calibration.validation.stars import add_star_check
 from astropolcal.chain import leaves, replace_optic
 from astropolcal.exceptions import (
     AstropolcalWarning,

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import Calibration, calibrate, instruments, optics
-from astropolcal.calibration import (
-    examine,
+from astropolcal.calibration import examine
+from astropolcal.calibration.identifiability.ambiguities import (
     harmonic_conditions,
     harmonic_words,
     mirror_solutions,
-    sky_consequences,
 )
+from astropolcal.calibration.identifiability.sky import sky_consequences
 from astropolcal.chain import join
 from astropolcal.measurement import Measurement
 from astropolcal.simulation import half_wave_plate_cycles, simulate

@@ -5,15 +5,10 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal.calibration import (
-    Calibration,
-    Covariance,
-    Resampled,
-    bootstrap,
-    calibrate,
-    standard_errors,
-)
-from astropolcal.calibration._refit import Refit
+from astropolcal.calibration import Calibration, bootstrap, calibrate
+from astropolcal.calibration.uncertainty import standard_errors
+from astropolcal.calibration.uncertainty.covariance import Covariance
+from astropolcal.calibration.uncertainty.refits import Refit, Resampled
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Normal
 from astropolcal.observations import Observations
@@ -216,7 +211,7 @@ def test_too_few_blocks_are_refused(make):
 
 def test_blocks_that_do_not_determine_the_model_are_refused(make, monkeypatch):
     """If hardly any resample can be fitted there is an error, not an endless loop."""
-    from astropolcal.calibration import resampling
+    from astropolcal.calibration.uncertainty import refits as resampling
 
     cal = calibrated(make, angles=[45, 60, 80] * u.deg)
     monkeypatch.setattr(resampling, "_resample", lambda *arguments: None)

@@ -5,18 +5,12 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal.calibration import (
-    Calibration,
-    bootstrap,
-    calibrate,
-    derived_retardance,
-    leave_out_groups,
-    standard_errors,
-)
-from astropolcal.calibration._scatter import Scatter
-from astropolcal.calibration.accuracy import cross_validated_residuals
-from astropolcal.calibration.errors import robust_covariance
-from astropolcal.calibration.weighting import around, weighting_of
+from astropolcal.calibration import Calibration, bootstrap, calibrate
+from astropolcal.calibration.noise.scatter import Scatter, leave_out_groups
+from astropolcal.calibration.noise.weighting import around, weighting_of
+from astropolcal.calibration.uncertainty import derived_retardance, standard_errors
+from astropolcal.calibration.uncertainty.refits import robust_covariance
+from astropolcal.calibration.validation.cross_validation import cross_validated_residuals
 from astropolcal.exceptions import CalibrationFileError, FitError
 from astropolcal.measurement import Normal
 

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from astropolcal import Calibration, calibrate, optics
-from astropolcal.calibration import LogPosterior, Posterior, residual_noise, sample
-from astropolcal.calibration import _checkpoint as checkpoint_module
+from astropolcal.calibration import sample
+from astropolcal.calibration.noise.weighting import residual_noise
+from astropolcal.calibration.posterior import LogPosterior, Posterior
+from astropolcal.calibration.posterior import checkpoint as checkpoint_module
 from astropolcal.exceptions import (
     AstropolcalError,
     AstropolcalWarning,
@@ -515,7 +517,7 @@ import sys, warnings
 sys.path.insert(0, {folder!r})
 warnings.simplefilter("ignore")
 from test_sampling import EVERY, STEPS, make_calibration, sample
-from astropolcal.calibration._checkpoint import Chain
+from astropolcal.calibration.posterior.checkpoint import Chain
 
 append = Chain.append
 def tell(self, *args):

@@ -9,17 +9,24 @@ import pytest
 from star_data import CHARIS, META, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments, optics
-from astropolcal.calibration import examine, sky_consequences, target_accuracies
-from astropolcal.calibration._settling import _best_star, star_words
-from astropolcal.calibration._sky_view import (
+from astropolcal.calibration import examine, target_accuracies
+from astropolcal.calibration.identifiability.ambiguities import (
+    _best_star,
+    mirror_branches,
+    star_words,
+)
+from astropolcal.calibration.identifiability.sky import (
     FITTED,
     LEFT_OUT,
     PUBLISHED,
+    consequences_of,
+    matters,
+    shows_on_sky,
+    sky_consequences,
+    sky_words,
     view_of_calibration,
     view_of_measurement,
 )
-from astropolcal.calibration.mirrors import mirror_branches
-from astropolcal.calibration.sky import consequences_of, matters, shows_on_sky, sky_words
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement import Measurement

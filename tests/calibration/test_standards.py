@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from astropolcal import Calibration, calibrate, optics
-from astropolcal.calibration.standards import add_standard, refuse_fitted, standard_accuracy
-from astropolcal.calibration.summaries import summary, to_dict
+from astropolcal.calibration.result.summary import summary, to_dict
+from astropolcal.calibration.validation.held_out import (
+    add_standard,
+    refuse_fitted,
+    standard_accuracy,
+)
 from astropolcal.chain import insert_optic, join, leaves, replace_optic
 from astropolcal.exceptions import ChainError, FitError, ObservationError
 from astropolcal.measurement import Measurement, Tie

@@ -11,12 +11,11 @@ from astropy.table import QTable
 from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import calibrate
-from astropolcal.calibration import (
-    fitted_stars,
+from astropolcal.calibration import fitted_stars, star_check
+from astropolcal.calibration.validation import (
     paper_accuracies,
     standard_accuracy,
     star_accuracy,
-    star_check,
     star_stokes,
 )
 from astropolcal.chain import leaves, replace_optic

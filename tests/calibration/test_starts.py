@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from astropolcal import optics
-from astropolcal.calibration import BinProblem, calibrate, search_branches
+from astropolcal.calibration import calibrate
+from astropolcal.calibration.fit.strategies import BinProblem, search_branches
 from astropolcal.measurement import Measurement, Normal
 
 N_BINS = 22

@@ -8,9 +8,9 @@ from astropy.table import QTable
 from star_data import CHARIS, META, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate
-from astropolcal.calibration import outlying_data, robust_sigma
-from astropolcal.calibration.robust import LOSSES
-from astropolcal.calibration.steps import kind_of_source
+from astropolcal.calibration.noise import outlying_data
+from astropolcal.calibration.noise.scatter import kind_of_source
+from astropolcal.calibration.noise.weighting import LOSSES, robust_sigma
 from astropolcal.exceptions import FitError
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -238,7 +238,7 @@ def test_good_data_have_no_outliers(fitted):
 
 
 def test_robust_noise_is_found_again_from_the_file(spoiled, tmp_path):
-    from astropolcal.calibration import weighting_of
+    from astropolcal.calibration.noise.weighting import weighting_of
 
     cal = calibrate(*spoiled, loss="huber", instrument="charis", cross_validate=False)
     cal.write(tmp_path / "robust.asdf")

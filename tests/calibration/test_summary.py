@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from astropolcal.calibration._compact import parameter_lines
-from astropolcal.calibration._sky_summary import (
-    mirror_lines,
-    open_lines,
-    open_on_sky,
-    star_lines,
-)
-from astropolcal.calibration.bounds import status_of
-from astropolcal.calibration.summaries import (
+from astropolcal.calibration.result.summary import (
     _accuracy_lines,
     _bound_lines,
     _global_lines,
@@ -30,7 +22,13 @@ from astropolcal.calibration.summaries import (
     _wavelength_blocks,
     _with_wavelengths,
     _wrap,
+    mirror_lines,
+    open_lines,
+    open_on_sky,
+    star_lines,
 )
+from astropolcal.calibration.result.verdict import parameter_lines
+from astropolcal.calibration.uncertainty.covariance import status_of
 
 
 def _entry(value, std=np.nan, unit=None, **flags):
@@ -340,7 +338,7 @@ def test_many_open_directions_are_counted():
 
 @pytest.mark.parametrize(("n", "shown", "says"), [(7, 7, None), (12, 12, None), (22, 5, 5)])
 def test_mirrors_at_all_of_a_few_wavelengths(n, shown, says, monkeypatch):
-    from astropolcal.calibration import _sky_summary
+    from astropolcal.calibration.result import summary as _sky_summary
 
     def values(calibration, name):
         keys = ["diattenuation", "diattenuation_err"]
@@ -367,7 +365,7 @@ def test_mirrors_at_all_of_a_few_wavelengths(n, shown, says, monkeypatch):
     ],
 )
 def test_a_mirror_unlike_any_metal_is_pointed_at(percent, std, says, monkeypatch):
-    from astropolcal.calibration import _sky_summary
+    from astropolcal.calibration.result import summary as _sky_summary
 
     columns = {"wavelength": [600, 800] * u.nm, "diattenuation": percent * u.percent}
     columns |= {"diattenuation_err": std * u.percent}

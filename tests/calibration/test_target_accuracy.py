@@ -10,20 +10,12 @@ from astropy.table import QTable, Table
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.calibration import (
-    Calibration,
-    absolute_accuracy,
-    calibrate,
-    cross_validated_residuals,
-    four_accuracies,
-    groups_by,
-    leave_out_groups,
-    paper_accuracies,
-    propagate_accuracy,
-    target_accuracy,
-)
-from astropolcal.calibration.groups import GROUPS
-from astropolcal.calibration.standards import add_standard
+from astropolcal.calibration import Calibration, calibrate, four_accuracies
+from astropolcal.calibration.noise.scatter import GROUPS, groups_by, leave_out_groups
+from astropolcal.calibration.validation import paper_accuracies, target_accuracy
+from astropolcal.calibration.validation.cross_validation import cross_validated_residuals
+from astropolcal.calibration.validation.held_out import add_standard
+from astropolcal.calibration.validation.targets import absolute_accuracy, propagate_accuracy
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Measurement
 from astropolcal.observations import get_observable

@@ -18,8 +18,9 @@ from star_data import observe_star, star_chain
 
 import astropolcal
 from astropolcal import Calibration, Observations, calibrate, instruments, optics
-from astropolcal.calibration import verdict, verdicts
-from astropolcal.calibration.bounds import status_of
+from astropolcal.calibration.result import verdict as verdicts
+from astropolcal.calibration.result.verdict import verdict
+from astropolcal.calibration.uncertainty.covariance import status_of
 
 CHARIS = instruments.get("charis")
 

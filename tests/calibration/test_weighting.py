@@ -7,20 +7,18 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal.calibration import (
-    Calibration,
-    LogPosterior,
-    bootstrap,
-    calibrate,
-    estimate_noise,
-    lack_of_fit,
-    noise_from_errors,
-    noise_from_null_channel,
-    profile,
+from astropolcal.calibration import Calibration, bootstrap, calibrate, profile
+from astropolcal.calibration.noise import noise_from_errors, noise_from_null_channel
+from astropolcal.calibration.noise.estimates import estimate_noise
+from astropolcal.calibration.noise.weighting import (
+    Weighting,
+    noise_of,
     residual_noise,
+    weighting_of,
 )
-from astropolcal.calibration._refit import Refit
-from astropolcal.calibration.weighting import Weighting, noise_of, weighting_of
+from astropolcal.calibration.posterior import LogPosterior
+from astropolcal.calibration.uncertainty.refits import Refit
+from astropolcal.calibration.validation import lack_of_fit
 from astropolcal.exceptions import (
     AstropolcalWarning,
     CalibrationFileError,
@@ -299,7 +297,7 @@ def test_no_freedom_at_all_gives_no_error(make):
 
 
 def test_noise_that_does_not_settle_is_told(truth, data, monkeypatch):
-    from astropolcal.calibration import fit as module
+    from astropolcal.calibration.fit import calibrate as module
 
     monkeypatch.setattr(module, "ROUNDS", 1)
     with pytest.warns(AstropolcalWarning, match="noise from the residuals did not settle in 1 fit"):

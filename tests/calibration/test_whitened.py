@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from astropolcal.calibration._whitened import Whitened, decompose
+from astropolcal.calibration.identifiability.linearized import Whitened, decompose
 
 SCALE = np.array([0.01, 1.0, 20.0, 3.0])
 

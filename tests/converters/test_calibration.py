@@ -12,17 +12,15 @@ import numpy as np
 import pytest
 
 from astropolcal import Calibration, calibrate, optics
-from astropolcal.calibration import Covariance
+from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.converters import calibration as converter
 from astropolcal.converters.calibration import (
-    CALIBRATION_TAG,
-    CALIBRATION_TAGS,
     MIGRATIONS,
-    CalibrationConverter,
     calibration_from_node,
+    check_calibration,
     node_from_calibration,
 )
-from astropolcal.converters.consistency import check_calibration
+from astropolcal.converters.extension import CALIBRATION_TAG, CALIBRATION_TAGS, CalibrationConverter
 from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError
 from astropolcal.measurement import Normal, Tie
 from astropolcal.simulation import half_wave_plate_cycles, simulate

@@ -14,12 +14,10 @@ from scipy.stats import norm
 
 from astropolcal import optics
 from astropolcal.chain import at_positions, leaves
+from astropolcal.converters.extension import OPTIC_MODULES, OpticConverter, optic_tag
 from astropolcal.converters.optics import (
-    OPTIC_MODULES,
-    OpticConverter,
     node_from_optic,
     optic_from_node,
-    optic_tag,
 )
 from astropolcal.exceptions import CalibrationFileError
 from astropolcal.measurement import Normal

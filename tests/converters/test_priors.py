@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from astropolcal import optics
-from astropolcal.converters.priors import node_from_priors, restore_priors, without_priors
+from astropolcal.converters.nodes import node_from_priors, restore_priors, without_priors
 from astropolcal.exceptions import CalibrationFileError
 from astropolcal.measurement import Normal
 from astropolcal.measurement.priors import Uniform

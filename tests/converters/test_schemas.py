@@ -9,9 +9,13 @@ import pytest
 import yaml
 from asdf.schema import check_schema, load_schema
 
-from astropolcal.converters import get_converters
-from astropolcal.converters.optics import optic_tag
-from astropolcal.extension import MANIFEST_URI, get_extensions, get_resource_mappings
+from astropolcal.converters.extension import (
+    MANIFEST_URI,
+    get_converters,
+    get_extensions,
+    get_resource_mappings,
+    optic_tag,
+)
 from astropolcal.optics import OPTICS
 
 ROOT = files("astropolcal") / "resources"

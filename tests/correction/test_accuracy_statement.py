@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from astropolcal.calibration import target_accuracies
-from astropolcal.calibration._sky_view import view_of_calibration
+from astropolcal.calibration.identifiability.sky import view_of_calibration
 from astropolcal.correction import (
     RowModel,
     ScienceFrames,

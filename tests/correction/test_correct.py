@@ -549,7 +549,7 @@ def test_against_numpy_least_squares(star, sky, charis):
 
 
 def test_systematic_errors_against_those_of_double_differences(calibration, charis, track, seen):
-    from astropolcal.calibration import derived_sky
+    from astropolcal.calibration.uncertainty import derived_sky
 
     _, positions = track(1)
     hwp = positions["hwp"][0] + [0, 45, 22.5, 67.5] * u.deg

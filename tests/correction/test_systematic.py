@@ -43,7 +43,7 @@ def test_linear_agrees_with_sampled(model, solution, linear):
 
 def test_derivatives_of_the_solution_are_exact(model, solution, linear):
     """A step along a direction of the covariance moves the solution by the factor."""
-    from astropolcal.calibration import full_covariance
+    from astropolcal.calibration.uncertainty.covariance import full_covariance
 
     axes = full_covariance(model.calibration)._axes()
     flux = np.einsum("bwfs,s->bfw", model.rows()[..., :3], STOKES)

@@ -96,7 +96,7 @@ def calibration():
 @lru_cache(maxsize=1)
 def sampled():
     """Return a calibration with samples."""
-    from astropolcal.calibration import Posterior
+    from astropolcal.calibration.posterior import Posterior
 
     cal = calibration()
     names = ["hwp.w_sio2", "derotator.retardance[1]"]
@@ -293,7 +293,7 @@ class Loaded(ForgedCalibration):
     """Forged calibrations in a library, from which a pipeline loads."""
 
     def read(self, path):
-        from astropolcal.calibration import load
+        from astropolcal.pipeline import load
 
         real = super().read(path)
         positions = {name: [10.0, 20.0] * u.deg for name in ("hwp", "derotator")}
@@ -316,7 +316,7 @@ class Index(Reader):
     _state = (100, 1, 2, 3, True)
 
     def seeds(self):
-        from astropolcal.calibration import library
+        from astropolcal.pipeline import library
 
         quality = {"datasets": "night", "s_res": 0.1, "s_cv": None, "converged": True}
         files = {}
@@ -332,7 +332,7 @@ class Index(Reader):
         return self._signed(rng, mutate.some(rng, kinds)(rng, content))
 
     def _signed(self, rng, content):
-        from astropolcal.calibration import library
+        from astropolcal.pipeline import library
 
         try:
             files = json.loads(content)["files"]
@@ -341,7 +341,7 @@ class Index(Reader):
             return content
 
     def read(self, path):
-        from astropolcal.calibration import library
+        from astropolcal.pipeline import library
 
         real, library._INDEX = library._INDEX, path.name
         try:
@@ -354,7 +354,7 @@ class Index(Reader):
         return found
 
     def check(self, found, path):
-        from astropolcal.calibration import Library
+        from astropolcal.pipeline import Library
 
         for wanted in ({}, {"date": "2022-02-03"}, {"mode": "J", "optics_in": ["nbs"]}):
             library = Library([])
@@ -472,7 +472,7 @@ class Exported(Table):
     """Exported tables of Mueller matrices, and any other ECSV table."""
 
     def seeds(self):
-        from astropolcal.calibration import load, mueller_table, write_mueller
+        from astropolcal.pipeline import load, mueller_table, write_mueller
 
         positions = {name: [10.0, 20.0] * u.deg for name in ("hwp", "derotator")}
         table = mueller_table(load(calibration()), positions=positions, light="internal")
@@ -689,8 +689,8 @@ class Header(Reader):
         return content if rng.random() < 0.5 else binary.mutate_fits(rng, content)
 
     def read(self, path):
-        from astropolcal.calibration._header import FrameAngles, describe
         from astropolcal.fitscheck import primary_header
+        from astropolcal.pipeline.headers import FrameAngles, describe
         from astropolcal.reduction.headers import observation_time, pointing, read_header
 
         header, charis = primary_header(path), instruments.get("charis")
@@ -861,7 +861,7 @@ class Checkpoint(Reader):
     arrays = {"noise": np.ones(5), "bounds": np.zeros((2, 2))}
 
     def _run(self, path, n, resume=True):
-        from astropolcal.calibration._checkpoint import Chain
+        from astropolcal.calibration.posterior.checkpoint import Chain
 
         chain = Chain(self.shape, self.every)
         state = np.random.RandomState(1).get_state()
@@ -883,7 +883,7 @@ class Checkpoint(Reader):
         return self._run(path, 8)
 
     def check(self, found, path):
-        from astropolcal.calibration._checkpoint import Chain
+        from astropolcal.calibration.posterior.checkpoint import Chain
 
         assert found.count == 8
         expected = np.broadcast_to(np.arange(1.0, 9)[:, None, None], self.shape)

@@ -37,7 +37,8 @@ def spread(probes):
 
 def differences(model, cell):
     """Return the slope of both channels to each function of a cell, by central differences."""
-    problem, parameters = model.edited(CellEffect(cell, 0))
+    edited = model.edited((CellEffect(cell, 0), None))
+    problem, (parameters,) = edited.problem, edited.added.values()
     rows = [i for p in parameters for i in range(*problem.slices[p.name].indices(problem.size))]
     for row in rows:
         ends = []

@@ -398,7 +398,8 @@ def test_no_effect_is_possible_beyond_the_bounds_of_its_optic():
         chains, data = clean(name)
         nominal = GapProblem(chains, data)
         model = Model(nominal, Fit(nominal.start, 0.0, True))
-        problem, parameters = model.edited(EFFECTS[name], context_of(data))
+        edited = model.edited((EFFECTS[name], context_of(data)))
+        problem, parameters = edited.problem, edited.added[name]
         for parameter in parameters:
             slot = problem.free.by_name[parameter.name]
             for side, bound in zip((-1, 1), _own_bounds(chains, problem, slot), strict=True):

@@ -253,7 +253,7 @@ def test_residuals_of_the_data_are_zero_for_what_they_predict():
 
 def test_an_effect_of_the_flux_sees_the_expected_fluxes():
     model = data.clean_model()
-    problem, _ = model.edited(get_effect("persistence"))
+    problem = model.edited((get_effect("persistence"), None)).problem
     flux = model.problem.fluxes[0]
     chain = problem.measurement.chains[0]
     previous = _positions(chain, model.observations[0], flux)["previous_flux"]

@@ -73,7 +73,8 @@ def test_bounds_that_no_optic_has_do_not_make_a_size_possible():
     effect = get_effect("anisotropic_depolarizer")
     wide = effect.changed(inserted=effect.inserted.copy())
     wide.inserted.retained_q.bounds = (0, 1.5)
-    problem, parameters = data.clean_model().edited(wide)
+    edited = data.clean_model().edited((wide, None))
+    problem, parameters = edited.problem, edited.added[wide.name]
     for size, possible in ((0.9, True), (1.1, False)):
         q = problem.start.copy()
         q[problem.slices[parameters[0].name]] = size, 0.0, 0.0

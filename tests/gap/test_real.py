@@ -18,7 +18,7 @@ import pytest
 from sky_data import held
 
 from astropolcal import calibrate, instruments
-from astropolcal.calibration import robust_covariance
+from astropolcal.calibration.uncertainty import robust_covariance
 from astropolcal.chain import join, leaves, remove_optic
 from astropolcal.gap import diagnose
 from astropolcal.gap.alternatives import thinned

@@ -212,7 +212,8 @@ def test_the_derivative_of_a_cell_in_one_run_is_that_of_its_optic():
     model = data.fitted(pair())
     probes = Probes(model, most_steps=0)
     cell = Cell("in:derotator", "retardance_h", f"time/dataset:{OCTOBER}")
-    problem, parameters = model.edited(CellEffect(cell, 0))
+    edited = model.edited((CellEffect(cell, 0), None))
+    problem, (parameters,) = edited.problem, edited.added.values()
     where = problem.slices[parameters[0].name]
     slope = problem.jacobian(problem.start)[:, where][:, 0]
     cut = problem.segments[0].stop

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from astropolcal.calibration import Covariance, Resampled
+from astropolcal.calibration.uncertainty.covariance import Covariance
+from astropolcal.calibration.uncertainty.refits import Resampled
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting import plot_correlations
 

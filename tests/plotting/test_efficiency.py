@@ -7,8 +7,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from astropolcal import instruments, optics
-from astropolcal.calibration import best_derotator, polarimetric_efficiency
 from astropolcal.chain import remove_optic
+from astropolcal.efficiency import best_derotator, polarimetric_efficiency
 from astropolcal.instruments import SkyLaw
 from astropolcal.plotting import plot_polarimetric_efficiency
 from astropolcal.plotting.efficiency import plot_derotator_offsets

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from astropolcal import Calibration
-from astropolcal.calibration import Identifiability, harmonic_conditions
+from astropolcal.calibration.identifiability.ambiguities import harmonic_conditions
+from astropolcal.calibration.identifiability.analysis import Identifiability
 from astropolcal.exceptions import ParameterError
 from astropolcal.plotting import plot_identifiability
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from astropolcal import optics
-from astropolcal.calibration import mirror_values
+from astropolcal.calibration.uncertainty.derived import mirror_values
 from astropolcal.exceptions import ChainError
 from astropolcal.plotting import plot_mirrors
 

@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal.calibration import Posterior
+from astropolcal.calibration.posterior import Posterior
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.plotting import plot_corner, plot_traces
 

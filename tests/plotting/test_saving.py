@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from astropolcal import optics
-from astropolcal.calibration import Posterior
+from astropolcal.calibration.posterior import Posterior
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.plotting import (
     plot_accuracy,

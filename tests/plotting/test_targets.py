@@ -7,7 +7,8 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal.calibration import paper_accuracies, target_accuracies
+from astropolcal.calibration import target_accuracies
+from astropolcal.calibration.validation import paper_accuracies
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.plotting import plot_star_check, plot_target_accuracy

@@ -16,9 +16,9 @@ from star_data import observe_star, star_chain
 
 import astropolcal
 from astropolcal import Calibration, Observations, calibrate, instruments, standards
-from astropolcal.calibration.groups import GROUPS
-from astropolcal.calibration.standards import standard_accuracy
-from astropolcal.calibration.targets import target_accuracies
+from astropolcal.calibration.noise.scatter import GROUPS
+from astropolcal.calibration.validation.held_out import standard_accuracy
+from astropolcal.calibration.validation.targets import target_accuracies
 from astropolcal.scripts._calibrate import _target
 from astropolcal.scripts.main import build_parser, main
 from astropolcal.simulation import half_wave_plate_cycles, simulate

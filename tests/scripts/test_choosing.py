@@ -8,9 +8,10 @@ import pytest
 from astropy.io import fits
 
 from astropolcal import Calibration, instruments
-from astropolcal.calibration.library import Library
-from astropolcal.calibration.validity import content_hash, with_validity
+from astropolcal.calibration.result.validity import with_validity
+from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
+from astropolcal.pipeline.library import Library
 from astropolcal.scripts._choosing import choose_calibration, configured, read_night
 
 OLD = Path(__file__).parents[1] / "calibration" / "data" / "calibration-1.0.0.asdf"
@@ -129,7 +130,7 @@ def test_mode_that_is_stated_is_that_of_the_file(night, tmp_path):
 
 
 def test_mode_is_not_compared_where_the_file_holds_for_any(night, monkeypatch):
-    from astropolcal.calibration import validity
+    from astropolcal.calibration.result import validity
 
     monkeypatch.setattr(validity, "validity_of", lambda _: validity.Validity("charis"))
     assert chosen(OLD, night({"FILTNAME": "J"}), optics_in=["nbs"], filter="foo")

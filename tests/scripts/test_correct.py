@@ -102,7 +102,7 @@ def test_modes_differ(night, tmp_path):
 
 
 def test_the_calibration_comes_from_a_library(night, tmp_path):
-    library = pytest.importorskip("astropolcal.calibration.library").Library
+    library = pytest.importorskip("astropolcal.pipeline.library").Library
     from astropolcal import Calibration
 
     (tmp_path / "lib").mkdir()
@@ -114,7 +114,7 @@ def test_the_calibration_comes_from_a_library(night, tmp_path):
 
 
 def test_no_calibration_holds_for_the_date(night, tmp_path):
-    library = pytest.importorskip("astropolcal.calibration.library").Library
+    library = pytest.importorskip("astropolcal.pipeline.library").Library
     from astropolcal import Calibration
 
     (tmp_path / "lib").mkdir()
@@ -127,7 +127,7 @@ def test_no_calibration_holds_for_the_date(night, tmp_path):
 
 def test_a_file_that_does_not_hold_is_refused(night, tmp_path):
     from astropolcal import Calibration
-    from astropolcal.calibration.validity import with_validity
+    from astropolcal.calibration.result.validity import with_validity
 
     old = with_validity(Calibration.read(night / "charis.asdf"), valid_from="2026-01-01")
     old.write(tmp_path / "old.asdf")
@@ -236,7 +236,7 @@ def changed(night, folder, *keywords):
 )
 def test_frames_of_another_set_up(night, tmp_path, keywords, message):
     from astropolcal import Calibration
-    from astropolcal.calibration.validity import with_validity
+    from astropolcal.calibration.result.validity import with_validity
 
     calibration = Calibration.read(night / "charis.asdf")
     stated = with_validity(calibration, mode="broadband JHK", valid_from="2025-01-01")

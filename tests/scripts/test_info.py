@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from astropolcal import Calibration
-from astropolcal.calibration.library import Library
-from astropolcal.calibration.validity import content_hash, with_validity
+from astropolcal.calibration.result.validity import with_validity
+from astropolcal.converters.calibration import content_hash
+from astropolcal.pipeline.library import Library
 from astropolcal.scripts.main import main
 
 OLD = Path(__file__).parents[1] / "calibration" / "data" / "calibration-1.0.0.asdf"

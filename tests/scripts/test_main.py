@@ -368,7 +368,7 @@ def test_summary_has_no_negative_zero(desk, capsys):
 
 
 def test_parameter_just_below_zero_is_printed_without_a_sign():
-    from astropolcal.calibration._compact import number
+    from astropolcal.calibration.result.verdict import number
 
     entry = {"value": -1e-7, "std": 1e-3, "unit": "deg", "tied": None, "status": "determined"}
     assert number(entry).strip() == "0.00000 +- 0.00100 deg"

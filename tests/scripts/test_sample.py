@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from astropolcal import Calibration, instruments
-from astropolcal.calibration._checkpoint import Chain
+from astropolcal.calibration.posterior.checkpoint import Chain
 from astropolcal.exceptions import AstropolcalWarning
 from astropolcal.scripts.main import build_parser, main
 from astropolcal.simulation import half_wave_plate_cycles, simulate

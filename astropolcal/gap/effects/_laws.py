@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.calibration._directions import ranked
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import insert_optic, leaves, remove_optic, replace_optic
 from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
 from astropolcal.gap.effects.effect import Effect

@@ -1,0 +1,545 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Calibrate a chain against observations, with any astropy fitter.
+
+The joint strategy fits all free parameters of all datasets at once, from a
+start in which every wavelength sits in its best mirror branch. The two-step
+strategy is the procedure of McIntosh et al. (2026, Sec. 5.2): per wavelength
+with misalignments held, then global, then per wavelength again.
+"""
+
+import platform
+import time
+import warnings
+from datetime import UTC, datetime
+from importlib.metadata import version as installed
+
+import astropy
+import astropy.units as u
+import numpy as np
+from astropy.modeling import Model
+from astropy.modeling.fitting import TRFLSQFitter
+from astropy.utils.exceptions import AstropyWarning
+
+from astropolcal.calibration.fit.strategies import (
+    BinProblem,
+    copy_fitted,
+    describe_gauge,
+    hold_silent,
+    open_parameters,
+    search_branches,
+    sequential,
+    settled,
+    telescope_alone,
+    two_step,
+)
+from astropolcal.calibration.identifiability.analysis import complete, finding_of
+from astropolcal.calibration.identifiability.sky import view_of_measurement
+from astropolcal.calibration.noise.estimates import noise_from_errors, noise_from_null_channel
+from astropolcal.calibration.noise.scatter import Scatter, model_error
+from astropolcal.calibration.noise.weighting import (
+    LOSSES,
+    ROUNDS,
+    Weighting,
+    around,
+    describe,
+    first_weighting,
+    noise_of,
+    outlying_data,
+    robust_sigma,
+)
+from astropolcal.calibration.result.calibration import Calibration, DatasetRecord
+from astropolcal.calibration.uncertainty.covariance import (
+    covariance_around,
+    errors_at_bounds,
+    white_covariance,
+)
+from astropolcal.calibration.validation.cross_validation import accuracy_table, lack_of_fit
+from astropolcal.calibration.validation.targets import keep_sky_accuracy
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, FitError
+from astropolcal.measurement import Measurement, parameter_table
+from astropolcal.measurement.parameters import ROUNDING
+from astropolcal.units import to_unit
+from astropolcal.version import version
+
+__all__ = ["calibrate"]
+
+STRATEGIES = ("joint", "two-step", "sequential")
+ERRORS = ("scatter", "white")
+_MAX_EVALUATIONS = 500
+_MAX_ROUNDS = 4
+_ROBUST_ROUNDS = 50
+# branches are searched in so many groups of frames of a dataset, if it has several times as many
+_FEW, _LONG = 256, 4
+
+
+def calibrate(
+    chain,
+    observations,
+    *,
+    fitter=None,
+    strategy="joint",
+    observable="normalized_double_difference",
+    weights=None,
+    ties=None,
+    positions=None,
+    wavelength=None,
+    search=None,
+    gauge="minimal",
+    loss="linear",
+    fix=None,
+    instrument=None,
+    errors="scatter",
+    cross_validate=True,
+):
+    """
+    Calibrate a chain against observations.
+
+    Parameters
+    ----------
+    chain : Optic, `~astropy.modeling.CompoundModel` or sequence of them
+        The chain of each dataset, with starting values, bounds and fixed
+        flags; it is not changed. Optics of the same name are the same optic.
+    observations : Observations or sequence of Observations
+        The datasets.
+    fitter : `~astropy.modeling.fitting.Fitter`, optional
+        Any non-linear astropy fitter, by default ``TRFLSQFitter()``.
+    strategy : {"joint", "two-step", "sequential"}
+        All parameters at once; or the paper's procedure for the polarized source; or
+        the paper's order of datasets: polarized source, unpolarized source, stars, each
+        step holding what the ones before have found.
+    observable : str or Observable
+        What is fitted; see `astropolcal.observations.OBSERVABLES`.
+    weights : {None, "wavelength", "errors"}, NoiseEstimate or array_like
+        Noise of the data, which sets their weights and the scale of all
+        errors. None: one level for all data, from the residuals (the default,
+        as the errors of real tables are rarely complete). ``"wavelength"``: one
+        level for each wavelength of each dataset, from the residuals, with the
+        fit repeated until both agree. ``"errors"``: the errors of the tables.
+        Or the noise itself, its standard deviation as one value, one a
+        wavelength or one a datum.
+    ties : dict of str to Tie, optional
+        Parameters that follow others.
+    positions : sequence of dict, optional
+        Position of every stage for each dataset, see
+        `~astropolcal.measurement.Measurement`.
+    wavelength : `~astropy.units.Quantity`, optional
+        Grid of the parameters given per wavelength.
+    search : bool, optional
+        Whether to look for the best mirror branch of each wavelength; without
+        it the fit goes downhill from the chain's own values. By default the
+        joint strategy searches, and the two-step one, like the paper, does not.
+    gauge : {"minimal", None}
+        Which solution to take where the data leave a choice: that with the
+        least change of the parameters common to all wavelengths, or wherever
+        the fit happens to end. The choice is recorded in ``settings``.
+    loss : {"linear", "huber", "cauchy", "bisquare"}
+        With another loss than the linear one, which is least squares, data that depart far
+        from the model count less, see `~astropolcal.calibration.robust_sigma`. It sets the
+        noise of each datum, so ``weights`` counts for the first fit only.
+    fix : dict of str to `~astropy.units.Quantity` or None, optional
+        Parameters to hold, ``"optic.parameter"``, at a value or (None) at
+        that of the chain: another way to choose a gauge.
+    instrument : str, optional
+        Name to record.
+    errors : {"scatter", "white"}
+        Errors of the parameters: from how the residuals scatter and hang together at wavelengths,
+        pairs of frames and settings of each dataset; or those of independent data whose noise is
+        that of ``weights``.
+    cross_validate : bool
+        Whether to work out ``s_cv``, which costs one fit a derotator angle.
+
+    Returns
+    -------
+    Calibration
+        Chains, errors, accuracy, and what the data do not determine.
+
+    Raises
+    ------
+    FitError
+        If there is nothing to fit, fewer data than free parameters, the
+        weights are asked for where the table has no errors, the residuals of a
+        wavelength tell no noise, a parameter starts outside its bounds, or the two-step
+        strategy has no polarized source.
+    ChainError, ObservationError, ParameterError
+        If chain and observations do not fit together, or a noise given is not
+        a possible one.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> cal.converged
+    True
+    """
+    choices = {"strategy": STRATEGIES, "loss": LOSSES, "errors": ERRORS}
+    for (name, allowed), value in zip(choices.items(), (strategy, loss, errors), strict=True):
+        if value not in allowed:
+            raise FitError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
+    search = strategy != "two-step" if search is None else search
+    started = time.perf_counter()
+    fitter = TRFLSQFitter() if fitter is None else fitter
+    options = {"observable": observable, "positions": positions, "wavelength": wavelength}
+    chain = chain if fix is None else _fixed(chain, fix)
+    measurement = Measurement(chain, observations, ties=ties, **options)
+    weighting = first_weighting(measurement, weights)
+    _check(measurement)
+    origin = measurement.vector()
+    how = _Strategy(fitter, search, weights, options)
+    outcome, weighting, stages = how.fit(strategy, measurement, weighting)
+    if loss != "linear":
+        outcome, weighting = _robust(measurement, fitter, loss, outcome)
+    if not outcome["converged"]:
+        warnings.warn(
+            f"the fit did not converge: {outcome['message']}", AstropolcalWarning, stacklevel=2
+        )
+    hold_silent(measurement, origin)
+    chosen, weighting, whitened = _settled(measurement, weighting, origin, gauge)
+    seconds = time.perf_counter() - started
+    return _result(
+        measurement,
+        whitened,
+        settings={
+            "instrument": instrument,
+            "observable": measurement.observable.name,
+            "fitter": type(fitter).__name__,
+            "strategy": strategy,
+            "weights": weighting.choice,
+            "loss": loss,
+            "errors": errors,
+            "noise": describe(measurement, weighting),
+            "gauge": describe_gauge(gauge, chosen, measurement.free, list(fix or ())),
+        },
+        fit={"seconds": seconds, "n_data": measurement.n_data, **outcome},
+        stages=stages,
+        cross_validate=cross_validate,
+    )
+
+
+def _fixed(chain, fix):
+    """Return copies of the chains with parameters held."""
+    single = isinstance(chain, Model)
+    copies = [item.copy() for item in ([chain] if single else chain)]
+    table = parameter_table(copies)
+    for name, value in fix.items():
+        if name not in table:
+            raise FitError(f"fix: no parameter {name!r}; there are {', '.join(table)}")
+        for parameter in table[name]:
+            if value is not None:
+                # every dataset's chain has its own Parameter object of the name
+                number = to_unit(value, parameter.unit, name)
+                parameter.value = np.broadcast_to(number, np.shape(parameter.value)).copy()
+            parameter.fixed = True
+    return copies[0] if single else copies
+
+
+def _settled(measurement, weighting, origin, gauge):
+    """Choose the gauge where there is a choice; return what is open, noise and linear problem."""
+    if gauge == "minimal":
+        problem = BinProblem(measurement, weighting.weight, _level(weighting))
+        chosen, whitened = settled(problem, weighting, origin)
+    else:
+        whitened = around(measurement, weighting)
+        chosen = open_parameters(measurement.free, whitened)
+    if len(whitened.data.null):
+        hold_silent(measurement, origin)
+    measurement.weighting = weighting.updated(measurement, whitened)
+    if measurement.weighting.weight is not None and weighting.from_residuals:
+        whitened = around(measurement, measurement.weighting)
+    return chosen, measurement.weighting, whitened
+
+
+def _level(weighting):
+    """Return the noise against which priors weigh; one that is not known leaves them out."""
+    return weighting.level if weighting.is_known else 0.0
+
+
+def _check(measurement):
+    if not measurement.free.size:
+        raise FitError("nothing to fit: every parameter is fixed or tied")
+    if measurement.free.size > measurement.n_data:
+        raise FitError(
+            f"{measurement.free.size} free parameters but only {measurement.n_data} data; "
+            "fix some, or add frames"
+        )
+    for name in _outside_bounds(measurement):
+        free, i = measurement.free, measurement.free.names.index(name)
+        unit, factor = free.by_name[name.partition("[")[0]].unit or "", free.factors()[i]
+        value, low, high = (x[i] / factor for x in (measurement.vector(), *free.bounds()))
+        # fitters tell neither name nor value
+        allowed = f"{low:.7g} to {high:.7g} {unit}".strip()
+        raise FitError(f"{name} starts at {value:.7g}; allowed are {allowed}")
+    vector, inside = measurement.vector(), np.clip(measurement.vector(), *measurement.free.bounds())
+    # fitters refuse a start that is outside by a rounding error, too
+    if (vector != inside).any():
+        measurement.parameters = inside
+
+
+def _run(measurement, weighting, fitter):
+    """Fit in place until the noise agrees with the residuals; return how it went, and the noise."""
+    # one level for all data does not move the minimum, unless priors weigh against them
+    told = weighting.choice == "wavelength" or (weighting.from_residuals and measurement.n_priors)
+    if not told:
+        return _fit(measurement, weighting, fitter), weighting
+    if not weighting.is_known:
+        weighting = weighting.started(measurement)
+    # noise from the residuals of a fit whose weights come from that noise: a fixed point
+    for _ in range(ROUNDS):
+        outcome = _fit(measurement, weighting, fitter)
+        before, weighting = weighting, weighting.updated(measurement)
+        if weighting.agrees(before):
+            return outcome, weighting
+    message = f"the noise from the residuals did not settle in {ROUNDS} fits"
+    return outcome | {"converged": False, "message": message}, weighting
+
+
+def _fit(measurement, weighting, fitter):
+    """Fit in place; return whether it arrived, what it said, and how long it took."""
+    index, observed, weights = measurement.fit_arguments(weighting.weight, weighting.level)
+    with warnings.catch_warnings(record=True) as caught:
+        # recorded, not shown: whether the fit arrived is told once, in the words of this package
+        warnings.simplefilter("always", AstropyWarning)
+        try:
+            fitter(
+                measurement,
+                index,
+                observed,
+                weights=weights,
+                maxiter=_MAX_EVALUATIONS,
+                inplace=True,
+            )
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise FitError(f"{type(fitter).__name__} failed: {error}") from error
+    info = fitter.fit_info if hasattr(fitter, "fit_info") and fitter.fit_info else {}
+    said = [str(w.message) for w in caught if "unsuccessful" in str(w.message)]
+    outside = _outside_bounds(measurement)
+    if outside:
+        said.append(f"{type(fitter).__name__} left the bounds of {', '.join(outside)}")
+    evaluations = info.get("nfev")
+    return {
+        "converged": not said,
+        "message": said[-1] if said else str(info.get("message", "")).strip(),
+        "evaluations": None if evaluations is None else int(evaluations),
+    }
+
+
+def _outside_bounds(measurement):
+    """Return the names of parameters that a fitter without bounds left outside of theirs."""
+    low, high = measurement.free.bounds()
+    vector = measurement.vector()
+    # a fitter that minds the bounds ends on them only as exactly as rounding allows
+    slack = ROUNDING * np.maximum(1.0, np.abs(vector))
+    outside = (vector < low - slack) | (vector > high + slack)
+    return [measurement.free.names[i] for i in np.flatnonzero(outside)]
+
+
+def _joint(measurement, weighting, fitter, search, prepare):
+    """Fit everything; go on as long as some bin finds a better mirror branch."""
+    origin = measurement.vector()
+    small, noise = _thinned(measurement, weighting)
+    if search:
+        small.parameters = _first_search(small, noise, origin)
+    prepare(small)
+    # branches are found on few frames, so the long table starts from their fit
+    if small is not measurement:
+        _run(small, noise, fitter)
+        measurement.parameters = small.vector()
+    for left in reversed(range(_MAX_ROUNDS)):
+        outcome, weighting = _run(measurement, weighting, fitter)
+        # the last word belongs to the fit of all parameters, not to a search by bin
+        if not search or not left:
+            break
+        small, noise = _thinned(measurement, weighting)
+        problem = BinProblem(small, noise.weight, _level(noise))
+        better, moved = search_branches(problem, small.vector(), origin)
+        if not moved.any():
+            break
+        measurement.parameters = better
+    return outcome, weighting
+
+
+def _thinned(measurement, weighting):
+    """Return a few hundred frames of each dataset, and their noise; short tables as they are."""
+    if max(d.frames.shape[0] for d in measurement.datasets) <= _LONG * _FEW:
+        return measurement, weighting
+    small, kept = measurement.thinned(_FEW)
+    return small, Weighting(weighting.choice, weighting.sigma[kept])
+
+
+def _first_search(measurement, weighting, origin):
+    """Return the best branches; where no noise is known yet, first without the priors."""
+    problem = BinProblem(measurement, weighting.weight, _level(weighting))
+    found = search_branches(problem, origin)[0]
+    if weighting.is_known or not problem.has_priors:
+        return found
+    measurement.parameters = found
+    weighting = weighting.started(measurement)
+    problem = BinProblem(measurement, weighting.weight, weighting.level)
+    return search_branches(problem, origin)[0]
+
+
+class _Strategy:
+    """How a measurement is fitted: fitter, search of branches, and the order of steps."""
+
+    def __init__(self, fitter, search, weights, options):
+        self.fitter, self.search, self.weights, self.options = fitter, search, weights, options
+
+    def fit(self, strategy, measurement, weighting):
+        """Fit in place; return how it went, the noise, and the values after each step."""
+        if strategy == "joint":
+            return *self._joint(measurement, weighting, self._stars), []
+        if strategy == "two-step":
+            return two_step(measurement, weighting, self._joint, self._run, self.options)
+        outcome, stages = sequential(measurement, self._first, self._joint, self._run, self.options)
+        return outcome, noise_of(measurement, self.weights), stages
+
+    def _joint(self, measurement, weighting, prepare=lambda _: None):
+        return _joint(measurement, weighting, self.fitter, self.search, prepare)
+
+    def _stars(self, measurement):
+        # the law of a telescope's mirror is nearly degenerate: cheap steps with the rest held
+        alone = telescope_alone(measurement, self.options)
+        if alone is not None:
+            self._run(alone, first_weighting(alone, None))
+            copy_fitted(alone, measurement)
+
+    def _run(self, measurement, weighting):
+        return _run(measurement, weighting, self.fitter)
+
+    def _first(self, measurement):
+        if self.weights is not None and not isinstance(self.weights, str):
+            raise FitError(
+                "strategy='sequential' fits the datasets one by one, so the noise cannot be given "
+                "for all data; allowed are weights = None, 'wavelength', 'errors'"
+            )
+        return first_weighting(measurement, self.weights)
+
+
+def _robust(measurement, fitter, loss, outcome):
+    """Fit with the weights of a robust loss until they settle."""
+    before = None
+    for _ in range(_ROBUST_ROUNDS):
+        # iteratively reweighted least squares, which every fitter can do
+        weighting = Weighting("given", robust_sigma(measurement, loss))
+        if before is not None and weighting.agrees(before):
+            return outcome, weighting
+        outcome = _fit(measurement, weighting, fitter)
+        before = weighting
+    message = f"the weights of the robust fit did not settle in {_ROBUST_ROUNDS} fits"
+    return outcome | {"converged": False, "message": message}, weighting
+
+
+# ---- the result ------------------------------------------------------------------
+
+
+def _result(measurement, whitened, *, settings, fit, stages, cross_validate):
+    vector = measurement.vector()
+    residuals, level = measurement.residuals(vector), measurement.weighting.level
+    finding = finding_of(measurement.free, whitened)
+    view = view_of_measurement(measurement, vector, settings["instrument"])
+    complete(finding, measurement, vector, whitened, level, view=view)
+    names = measurement.free.names
+    covariance, lacking = _errors(measurement, whitened, settings["errors"])
+    calibration = Calibration(
+        chains=measurement.put_back(vector),
+        wavelength=(measurement.wavelength * u.um).to(u.nm),
+        covariance=covariance,
+        identifiability=finding,
+        at_bound=[names[i] for i in np.flatnonzero(whitened.held)],
+        datasets=[_record(measurement, i, residuals) for i in range(len(measurement.datasets))],
+        settings=settings,
+        fit=fit,
+        ties=dict(measurement.free.ties),
+        stages=stages,
+        measurement=measurement,
+        provenance=_provenance(),
+    )
+    observations = (dataset.observations for dataset in measurement.datasets)
+    calibration.fit["masked"] = [dict(each.mask_reasons) for each in observations]
+    calibration.fit["bounds"] = errors_at_bounds(measurement, whitened)
+    calibration.fit["lack_of_fit"] = _lack_of_fit(calibration)
+    calibration.fit["outliers"] = _outliers(calibration)
+    calibration.fit["model_error"] = lacking
+    keep_sky_accuracy(calibration, view)
+    return calibration.cross_validate() if cross_validate else calibration
+
+
+def _errors(measurement, whitened, how):
+    """Return the covariance of the parameters, and the error of the model at a new setting."""
+    if how == "white":
+        return white_covariance(measurement, whitened, measurement.weighting), None
+    scatter = Scatter(measurement, measurement.weighting, whitened)
+    covariance = covariance_around(measurement, whitened, measurement.weighting, scatter)
+    return covariance, model_error(measurement, scatter)
+
+
+def _lack_of_fit(calibration):
+    """Hold the residuals against the noise that the table states, and that the data show."""
+    found = []
+    for method in (noise_from_errors, _smooth_null):
+        try:
+            noise = method(calibration.measurement)
+            test = lack_of_fit(calibration.measurement, calibration, noise)
+        except AstropolcalError:
+            continue  # no errors in the table, or no pairs: nothing to hold against
+        found.append(
+            {
+                "noise": noise.method,
+                "times_noise": _ratio(test),
+                "p_value": float(test.p_value),
+                "words": test.words,
+            }
+        )
+    return found
+
+
+def _ratio(test):
+    """Return residuals over noise; unknown where no degree of freedom is left."""
+    return float(np.sqrt(test.chi2 / test.expected)) if test.expected > 0 else np.nan
+
+
+def _outliers(calibration):
+    """Return the pairs of frames at odds with the fit, for summary, JSON and file."""
+    table = outlying_data(calibration)
+    return [
+        {
+            "dataset": str(row["dataset"]),
+            "frames": str(row["frames"]),
+            "residual_percent": float(row["residual"].to_value("percent")),
+            "sigma": float(row["sigma"]),
+            "brightness": float(row["brightness"]),
+        }
+        for row in table
+    ]
+
+
+def _smooth_null(measurement):
+    return noise_from_null_channel(measurement, null_model="smooth")
+
+
+def _record(measurement, i, residuals):
+    observations = measurement.datasets[i].observations
+    return DatasetRecord(
+        name=observations.name,
+        source=observations.source,
+        content_hash=observations.content_hash,
+        meta=dict(observations.meta),
+        n_frames=observations.n_frames,
+        n_masked=int(observations.mask.sum()),
+        accuracy=accuracy_table(measurement, i, residuals),
+    )
+
+
+def _provenance():
+    return {
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "astropolcal": version,
+        "astropy": astropy.__version__,
+        "numpy": np.__version__,
+        "scipy": installed("scipy"),
+        "python": platform.python_version(),
+    }

@@ -1,0 +1,390 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Derivatives of data and priors in units of the noise, decomposed once for all who ask.
+
+Directions in the space of the parameters, in words.
+"""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.calibration.identifiability.sky import sky_words
+from astropolcal.units import canonical_factor
+
+__all__ = []
+
+# singular values below this share of the largest count as zero
+_RANK_TOLERANCE = 1e-9
+# and so do those below this: a rounding error, as the error would be 1e12 degrees
+_NOTHING = 1e-12
+# a parameter that moves by less than this share along an open direction stands still
+STILL = 1e-5
+
+
+class Directions(NamedTuple):
+    """Singular values, right singular vectors as rows, and the rank."""
+
+    singular: np.ndarray
+    right: np.ndarray
+    rank: int
+
+    @property
+    def null(self):
+        """Rows along which nothing changes."""
+        return self.right[self.rank :]
+
+    @property
+    def determined(self):
+        """Whether each column stands still along all open directions."""
+        return (np.abs(self.null) < STILL).all(axis=0)
+
+    @property
+    def half(self):
+        """Determined rows, each as long as its standard error for unit noise."""
+        # covariance = V S^-2 V^T = half^T half
+        return self.right[: self.rank] / self.singular[: self.rank, None]
+
+
+def decompose(rows):
+    """
+    Decompose rows of derivatives, shape (n_rows, n_columns).
+
+    All right vectors are there even if there are fewer rows than columns.
+    """
+    n_rows, n_columns = rows.shape
+    # null directions need all right vectors; with more rows than columns they are there anyway
+    _, singular, right = np.linalg.svd(rows, full_matrices=n_rows < n_columns)
+    singular = np.pad(singular, (0, n_columns - singular.size))
+    # without data the largest singular value is zero too: nothing is determined then
+    threshold = max(_RANK_TOLERANCE * singular.max(initial=0.0), _NOTHING)
+    return Directions(singular, right, int(np.sum(singular > threshold)))
+
+
+class Whitened:
+    """
+    The problem around a solution, linear, with steps of a degree, micrometre or percent.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`
+        Derivative of the data times their weights, shape (n_free, n_data).
+    scale : `~numpy.ndarray`
+        Step of each parameter, shape (n_free,).
+    priors : `~numpy.ndarray`, optional
+        Derivative of the priors' residuals times their weight, shape (n_free, n_priors).
+    held : `~numpy.ndarray`, optional
+        True for parameters that count as known.
+    """
+
+    def __init__(self, data, scale, priors=None, held=None):
+        self.rows, self.scale = (data * scale[:, None]).T, scale
+        self.held = np.zeros(scale.size, dtype=bool) if held is None else held
+        self.live = np.flatnonzero(~self.held)
+        self.prior_rows = np.zeros((0, scale.size))
+        if priors is not None:
+            self.prior_rows = (priors * scale[:, None]).T
+
+    @cached_property
+    def _square(self):
+        """The triangular factor: as good as all rows, and much shorter."""
+        rows = self.rows
+        return np.linalg.qr(rows, mode="r") if len(rows) > rows.shape[1] else rows
+
+    @cached_property
+    def data(self):
+        """What the data alone determine."""
+        return decompose(self._square)
+
+    @cached_property
+    def together(self):
+        """What data and priors determine."""
+        if not len(self.prior_rows):
+            return self.data
+        return decompose(np.concatenate([self._square, self.prior_rows]))
+
+    @cached_property
+    def errors(self):
+        """What data and priors determine of the parameters that are not held; ``live`` columns."""
+        if not self.held.any():
+            return self.together
+        return decompose(np.concatenate([self._square, self.prior_rows])[:, self.live])
+
+    @cached_property
+    def leverage(self):
+        """Derivative of each fitted to its observed datum, shape (n_data,)."""
+        # diagonal of the hat matrix J (J^T J + P)^-1 J^T
+        return np.sum((self.rows[:, self.live] @ self.errors.half.T) ** 2, axis=1)
+
+    @cached_property
+    def n_taken(self):
+        """Degrees of freedom that the parameters take from the data, the sum of the leverages."""
+        if not len(self.prior_rows):
+            # trace of a projection
+            return float(self.errors.rank)
+        return float(np.sum((self._square[:, self.live] @ self.errors.half.T) ** 2))
+
+    def factor(self):
+        """Return `errors.half` over all columns, zero for what is held, in steps."""
+        return self._spread(self.errors.half)
+
+    def null(self):
+        """Return the open directions over all columns, zero for what is held, in steps."""
+        return self._spread(self.errors.null)
+
+    def _spread(self, rows):
+        out = np.zeros((len(rows), self.scale.size))
+        out[:, self.live] = rows
+        return out
+
+    def covariance(self):
+        """
+        Return the covariance for unit noise, canonical, shape (n_free, n_free).
+
+        NaN in the rows and columns of what is held or not determined.
+        """
+        out = np.full((self.scale.size, self.scale.size), np.nan)
+        # a pseudo-inverse would give a small number for what is open; it gets none
+        known = self.errors.determined
+        columns = self.live[known]
+        half = self.errors.half[:, known] * self.scale[columns]
+        out[np.ix_(columns, columns)] = half.T @ half
+        return out
+
+
+# ---- directions in the space of the parameters, in words ----
+
+
+# what is worth a word in a direction, as a share of its largest component
+_WORTH_A_WORD = 0.02
+# where a parameter is that uncertain, an error is no help: degree, micrometre, percent
+LARGE = {" deg": 5.0, " um": 50.0, "": 0.05}
+# and where the data hold one direction so much better than another
+_CONDITION = 1e4
+# what of a near-null direction is worth a word, as a share of what moves most
+_PART = 0.1
+# the sky is worked out for so many near-null directions, the worst
+_ON_SKY = 6
+# open directions that differ in their wavelength only and are told one by one
+_MOST_ALIKE = 3
+# numbers that differ by less than this share of the largest are equal but for rounding
+_EQUAL = 1e-6
+
+
+def ranked(values, equal=None):
+    """
+    Return the indices of values, largest first; equal ones keep their order.
+
+    Which of two that are equal comes out larger hangs on the processor. Equal are by default
+    those that differ by rounding.
+    """
+    values = np.asarray(values, dtype=float)
+    if equal is None:
+        equal = _EQUAL * np.abs(values[np.isfinite(values)]).max(initial=0.0)
+    order = np.argsort(-values, kind="stable")
+    falling = values[order]
+    # two infinities are equal, although their difference is not a number
+    with np.errstate(invalid="ignore"):
+        smaller = np.diff(falling, prepend=falling[:1]) < -equal
+    # by groups of equal ones, and by place within a group
+    return order[np.lexsort((order, np.cumsum(smaller)))]
+
+
+def step_of(unit):
+    """Return the step of a parameter in canonical units, its size and its unit in words."""
+    if unit is None:
+        return 0.01, 0.01, ""
+    if u.Unit(unit).is_equivalent(u.rad):
+        # canonical is radian: one degree is the step that a user has a feeling for
+        return np.deg2rad(1.0), 1.0, " deg"
+    return 1.0, 1.0, " um"
+
+
+def declared_step(unit):
+    """Return the step of a parameter in its declared unit, such as 3600 for one in arcsec."""
+    return step_of(unit)[0] / canonical_factor(unit)
+
+
+# ---- open directions ----------------------------------------------------------------------
+
+
+def open_directions(free, null):
+    """Rewrite open directions so that each is led by one parameter; say them in words."""
+    directions = []
+    for vector, lead in led(free, null):
+        moved = _moved(free, vector)
+        directions.append({"words": _open_words(free, moved, lead), "parameters": plain(moved)})
+    return directions
+
+
+def _moved(free, vector):
+    """Return what a direction changes, by parameter, in degree, micrometre or 1."""
+    moved, worth = {}, _WORTH_A_WORD * min(1.0, np.abs(vector).max(initial=0.0))
+    for slot in free.slots:
+        # a parameter per wavelength shows if any of its values moves
+        part = vector[slot.slice]
+        if np.abs(part).max() > worth:
+            size = step_of(slot.unit)[1]
+            moved[slot.name] = part[0] * size if slot.size == 1 else part * size
+    return moved
+
+
+def led(free, null):
+    """Yield each open direction, led by a parameter that the others do not move."""
+    if not len(null):
+        return
+    leads = _leads(free, null)
+    # a basis in which each leading parameter moves by one step in its own direction only
+    for vector, lead in zip(np.linalg.solve(null[:, leads], null), leads, strict=True):
+        yield vector, free.names[lead]
+
+
+def _leads(free, null):
+    """Choose a leading parameter for each open direction, those for all wavelengths first."""
+    order = np.argsort(
+        [slot.per_wavelength for slot in free.slots for _ in range(slot.size)], kind="stable"
+    )
+    n_single = sum(not slot.per_wavelength for slot in free.slots)
+    columns, leads = null.copy(), []
+    while len(leads) < len(null):
+        size = np.linalg.norm(columns, axis=0)
+        single = size[order[:n_single]]
+        # the first that moves about as much as any: small changes of the data do not reorder
+        pool = order[:n_single] if single.size and single.max() > 1e-3 else order
+        lead = next(i for i in pool if size[i] > 0.3 * size[pool].max())
+        direction = columns[:, lead] / size[lead]
+        # take out what this lead explains, as in a QR decomposition with pivots
+        columns -= np.outer(direction, direction @ columns)
+        leads.append(int(lead))
+    return leads
+
+
+def _open_words(free, moved, lead):
+    stem = lead.split("[")[0]
+    others = [_change(free, name, value) for name, value in moved.items() if name != stem]
+    step = step_of(free.by_name[stem].unit)
+    if not others:
+        with_prior = any(slot.name == stem and not prior.is_flat for slot, prior in free.priors)
+        known = "by them, only its prior tells it" if with_prior else "and keeps its start value"
+        return f"{lead} changes no datum: it cannot be determined {known}"
+    return f"{lead} by +{step[1]:g}{step[2]} cannot be told from {', '.join(others)}"
+
+
+def first_of_each_kind(directions):
+    """Return the words of open directions; of one at each wavelength, of the first few."""
+    kinds = {}
+    for direction in directions:
+        kinds.setdefault(_kind(direction), []).append(direction["words"])
+    words = []
+    for alike in kinds.values():
+        # a line that counts a single one would be as long as that one
+        n = len(alike) if len(alike) <= _MOST_ALIKE + 1 else _MOST_ALIKE
+        words += alike[:n]
+        words += [f"and {len(alike) - n} more of the same kind"] if n < len(alike) else []
+    return words
+
+
+def _kind(direction):
+    """Return what leads and what else moves; a lead for all wavelengths has no likes."""
+    lead, bracket, _ = direction["words"].partition("[")
+    is_element = bracket and " " not in lead
+    return (lead if is_element else direction["words"], *sorted(direction.get("parameters", ())))
+
+
+def _change(free, name, value):
+    unit = step_of(free.by_name[name].unit)[2]
+    # adding zero turns -0.0 into 0.0
+    value = np.round(value, 9) + 0.0
+    if np.ndim(value) == 0:
+        return f"{name} by {_signed(value, 3)}{unit}"
+    low, high = np.min(value), np.max(value)
+    return f"{name} by {_signed(low, 3)} to {_signed(high, 3)}{unit} over the wavelengths"
+
+
+def _signed(value, digits):
+    """Return a number with its sign; zero has none."""
+    return f"{value:+.{digits}g}" if value else "0"
+
+
+def plain(moved):
+    """Return changes by parameter as floats and lists."""
+    return {
+        name: float(value) if np.ndim(value) == 0 else [float(v) for v in value]
+        for name, value in moved.items()
+    }
+
+
+# ---- near-null directions -----------------------------------------------------------------
+
+
+def near_null_directions(free, whitened, level, sky_of):
+    """
+    Say what data and priors determine so badly that it hardly counts as determined.
+
+    Of the principal directions of the errors those along which some parameter
+    is uncertain by more than `LARGE`, or whose singular value is 1e4 times
+    smaller than the largest. ``sky_of`` returns what canonical changes do on sky.
+    """
+    found = whitened.errors
+    # each row is a principal direction, as long as its standard error at the noise of the fit
+    singular, errors = found.singular[: found.rank], whitened.factor() * level
+    condition = found.singular[:1] / singular
+    times_large = np.abs(errors) / _large(free)
+    bad = (times_large > 1).any(axis=1) | (condition > _CONDITION)
+    leads = np.array([ranked(row)[0] for row in times_large], dtype=int)
+    # the sign of a singular vector is arbitrary: the worst parameter goes up
+    errors = errors * np.sign(errors[np.arange(len(errors)), leads])[:, None]
+    worst = [i for i in np.argsort(singular, kind="stable") if bad[i]]
+    skies = _skies(errors[worst] * whitened.scale, sky_of)
+    return [
+        _near_null(free, errors[i], times_large[i], condition[i], sky)
+        for i, sky in zip(worst, skies, strict=True)
+    ]
+
+
+def _large(free):
+    """Return `LARGE` of each element in steps, shape (n_free,)."""
+    kinds = [step_of(slot.unit)[1:] for slot in free.slots]
+    return np.repeat(
+        [LARGE[unit] / size for size, unit in kinds], [slot.size for slot in free.slots]
+    )
+
+
+def _skies(changes, sky_of):
+    # each direction costs two evaluations of the whole chain
+    some = sky_of(changes[:_ON_SKY]) if len(changes) else []
+    return some + [None] * (len(changes) - len(some))
+
+
+def _near_null(free, error, times_large, condition, sky):
+    """Return one direction: words, what it changes at one standard error, and on sky."""
+    lead = int(ranked(times_large)[0])
+    words = f"{_uncertain(free, free.names[lead], error)} at the noise of this fit"
+    stem = free.names[lead].split("[")[0]
+    much = np.where(times_large > _PART * times_large[lead], error, 0.0)
+    others = [
+        _change(free, name, value) for name, value in _moved(free, much).items() if name != stem
+    ]
+    if others:
+        words += f", together with {', '.join(others)}"
+    if condition > _CONDITION:
+        words += f" (condition {condition:.1g})"
+    found = {"words": words, "parameters": plain(_moved(free, error))}
+    if sky is not None:
+        found["words"] += f"; {sky_words(sky)}"
+        found["sky"] = sky
+    return found
+
+
+def _uncertain(free, name, error):
+    slot = free.by_name[name.split("[")[0]]
+    _, size, unit = step_of(slot.unit)
+    part = np.abs(error[slot.slice]) * size
+    much = part[part > 0.5 * part.max()]
+    if much.size == 1:
+        return f"{name} is uncertain by {much[0]:.2g}{unit}"
+    return (
+        f"{slot.name} is uncertain by {much.min():.2g} to {much.max():.2g}{unit} at "
+        f"{much.size} wavelengths together"
+    )

@@ -1,0 +1,403 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""A standard observation of the sky, and how the Stokes parameters that it finds change.
+
+Cycles of the half-wave plate at a few positions of telescope and derotator, each solved by itself
+for I, Q and U from normalized double differences, as `~astropolcal.correction.correct` does it.
+
+What an open direction, or a mirror branch, does to the polarization measured on sky.
+
+The data that were fitted may not change, and yet the q and u that the same optics give of the sky
+do. Rotation and gain are the same for all degrees of polarization; instrumental polarization that
+is subtracted wrongly is not, and matters the more the fainter the polarization is.
+"""
+
+import warnings
+from functools import cached_property
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import instruments
+from astropolcal.calibration.system import Rows
+from astropolcal.chain import join, leaves, stages
+from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
+from astropolcal.instruments import SkyLaw
+from astropolcal.instruments.base import without_nuisance
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.optics import COORDINATES
+
+__all__ = []
+
+_ALTITUDES, _PARALLACTIC = np.deg2rad([30.0, 50.0, 70.0]), np.deg2rad([-60.0, 0.0, 60.0])
+_TELESCOPE = ("parallactic", "altitude")
+# frames 0 and 1, and 2 and 3, are pairs
+_CYCLE = np.deg2rad([0.0, 45.0, 22.5, 67.5])
+# a modulator takes both states in each of them
+_MODULATOR, _STATES = "flc_state", (0.0, 1.0)
+# so many settings; the angles of a stage are taken in steps of 4, which has no divisor with it
+_MOST, _STRIDE = 9, 4
+# as for `correct`: a setting that determines q and u worse is left out
+_MAX_CONDITION = 30.0
+
+FITTED = "telescope as fitted"
+PUBLISHED = "telescope of published values, taken without errors"
+LEFT_OUT = "without telescope"
+
+
+def known_instrument(name):
+    """Return the instrument of a name, None if there is none or it is not installed here."""
+    try:
+        return instruments.get(name) if name else None
+    except AstropolcalError:
+        return None
+
+
+def chain_from_sky(chains, instrument=None, wavelength=None, date=None):
+    """Return the optics from the sky on, and what their telescope is in words."""
+    seen = next((chain for chain in chains if "parallactic" in stages(chain)), None)
+    if seen is not None:
+        return _from_stage(without_nuisance(seen), ("parallactic",)), FITTED
+    if instrument is not None and instrument.has_telescope:
+        known = {"wavelength": wavelength, "date": date}
+        options = {key: known[key] for key in instrument.sky_options}
+        return instrument.on_sky(chains[0], **options), PUBLISHED
+    chain = without_nuisance(chains[0])
+    return _from_stage(chain, [s for s in stages(chain) if s not in COORDINATES]), LEFT_OUT
+
+
+def _from_stage(chain, wanted):
+    found = leaves(chain)
+    first = next((i for i, leaf in enumerate(found) if leaf.stage in wanted), None)
+    if first is None:
+        raise ChainError("the chain has no optic on a stage; give the chain from the sky")
+    return join(found[first:])
+
+
+def settings_of(measurement):
+    """Return a few of the angles at which each stage but plate and telescope stood, in radian."""
+    angles = {}
+    for dataset in measurement.datasets:
+        for stage, angle in dataset.positions.items():
+            if stage not in ("hwp", *_TELESCOPE):
+                angles.setdefault(stage, []).append(np.round(angle, 6).ravel())
+    return {
+        stage: _spread_out(np.unique(np.concatenate(several))).tolist()
+        for stage, several in angles.items()
+    }
+
+
+def _spread_out(values):
+    return values[np.unique(np.rint(np.linspace(0, len(values) - 1, _MOST)).astype(int))]
+
+
+def view_of_measurement(measurement, vector, name=None):
+    """Return the view of the sky that a measurement has at some values, None without a plate."""
+    chains = measurement.put_back(vector)
+    metas = [dataset.observations.meta for dataset in measurement.datasets]
+    free, settings = measurement.free.of_chains(chains), settings_of(measurement)
+    return _view(chains, free, measurement.wavelength, metas, name, settings)
+
+
+def view_of_calibration(calibration):
+    """Return the view of the sky that a calibration has, None without a half-wave plate."""
+    grid = calibration.wavelength
+    free = FreeParameters(calibration.chains, len(grid), calibration.ties)
+    settings = calibration.fit.get("sky_settings")
+    if settings is None and calibration.measurement is not None:
+        settings = settings_of(calibration.measurement)
+    metas = [record.meta for record in calibration.datasets]
+    chains, lam = calibration.chains, grid.to_value(u.um)
+    return _view(chains, free, lam, metas, calibration.instrument, settings or {})
+
+
+def _view(chains, free, lam, metas, name, settings):
+    instrument = known_instrument(name)
+    date = max((str(meta["date"]) for meta in metas if meta.get("date")), default=None)
+    try:
+        with warnings.catch_warnings():
+            # the published telescope of a coating that nobody states is named as such
+            warnings.simplefilter("ignore", AstropolcalWarning)
+            chain, telescope = chain_from_sky(chains, instrument, lam * u.um, date)
+    except AstropolcalError:
+        try:
+            chain, telescope = chain_from_sky(chains)
+        except ChainError:
+            return None
+    if "hwp" not in stages(chain):
+        return None
+    law = SkyLaw() if instrument is None or telescope == LEFT_OUT else instrument.sky_law
+    stated = [meta.get("tracking") for meta in metas if meta.get("tracking") in law.modes]
+    mode = stated[0] if stated else next(iter(law.modes), None)
+    placed = _positions(stages(chain), settings, law.plate_law(mode))
+    site = None if instrument is None else instrument.location
+    view = SkyView(chain, telescope, free, lam, placed, site)
+    # optics that never determine q and u say nothing of the sky
+    return view if view.good.any() else None
+
+
+def _positions(wanted, settings, law):
+    """Return the position of every stage in the frames of all settings."""
+    angles = {
+        # a file of before does not say where the derotator stood
+        stage: np.asarray(settings.get(stage) or np.linspace(0, np.pi, _MOST, endpoint=False))
+        for stage in wanted
+        if stage not in ("hwp", *_TELESCOPE, *COORDINATES)
+    }
+    altitude, parallactic = (grid.ravel() for grid in np.meshgrid(_ALTITUDES, _PARALLACTIC))
+    on_sky = bool(set(_TELESCOPE) & set(wanted))
+    count = _MOST if on_sky else max([len(a) for a in angles.values()], default=1)
+    # in another order than the telescope's, so that the two do not go together
+    order = np.arange(count) * (_STRIDE if on_sky else 1)
+    each = {stage: angle[order % len(angle)] for stage, angle in angles.items()}
+    plate = np.zeros(count)
+    if on_sky:
+        each |= {"altitude": altitude, "parallactic": parallactic}
+        plate = law[0] * parallactic + law[1] * altitude
+    n_states = len(_STATES) if _MODULATOR in wanted else 1
+    cycle, n_frames = np.tile(_CYCLE, n_states), n_states * len(_CYCLE)
+    placed = {stage: np.repeat(angle, n_frames) for stage, angle in each.items()}
+    placed["hwp"] = np.repeat(plate, n_frames) + np.tile(cycle, count)
+    # where another number of a frame is zero, an optic that depends on it does nothing
+    placed |= {stage: np.zeros(1) for stage in wanted if stage in COORDINATES}
+    if n_states > 1:
+        placed[_MODULATOR] = np.tile(np.repeat(_STATES, len(_CYCLE)), count)
+    return {stage: placed[stage] for stage in wanted}, count
+
+
+class SkyView:
+    """What a chain from the sky measures in the standard observation, and how it changes."""
+
+    def __init__(self, chain, telescope, free, lam, placed, site=None):
+        self.chain, self.telescope, self.free, self.lam = chain, telescope, free, lam
+        (self.placed, self._count), self.site = placed, site
+        self._model = Rows(chain, lam, self.placed, free)
+        # beams first, then wavelengths, settings, frames of a setting, and I, Q and U
+        self._rows = self._by_setting(self._model)
+        self._gain, self.good = _solve(self._rows)
+
+    def _by_setting(self, model):
+        rows = model.rows(n=3)
+        return rows.reshape(*rows.shape[:2], self._count, -1, 3)
+
+    @cached_property
+    def changes(self):
+        """
+        How I, Q and U that are found change with each free parameter, per declared unit.
+
+        Shape (n_wavelengths, n_settings, 3, 3, n_free), the last but one axis that of the light.
+        """
+        n_wavelengths, count = self.good.shape
+        block = np.zeros((n_wavelengths, count, 3, 2, count, self._gain.shape[-1]))
+        own = np.arange(count)
+        # each setting is solved from its own frames
+        block[:, own, :, :, own] = np.moveaxis(self._gain, 1, 0)
+        found = self._model.changes(block.reshape(n_wavelengths, 3 * count, 2, -1))
+        return found.reshape(n_wavelengths, count, 3, 3, -1)
+
+    def along(self, directions):
+        """Return the changes for steps along directions in canonical units, (..., w, s, 3, 3)."""
+        steps = np.asarray(directions) / self.free.factors()
+        return np.moveaxis(self.changes @ steps.T, -1, 0)
+
+    def with_optics_of(self, chains):
+        """Return the chain from the sky with those optics that other chains have from them."""
+        known = {leaf.name: leaf for chain in chains for leaf in leaves(chain)}
+        return join(known.get(leaf.name, leaf) for leaf in leaves(self.chain))
+
+    def against(self, chain):
+        """Return what another chain finds of what this one measures, less the truth."""
+        gain, good = _solve(self._by_setting(Rows(chain, self.lam, self.placed)))
+        both = self.good & good
+        found = np.einsum("wskbf,bwsfc->wskc", gain, self._rows) - np.eye(3)
+        return np.where(both[..., None, None], found, np.nan)
+
+
+def _solve(rows):
+    """Return what turns fluxes into I, Q and U in each setting, and which are well determined."""
+    n_frames = rows.shape[3]
+    # beams and frames of a setting become half differences and half sums of its pairs
+    minus, plus = (np.kron(np.eye(n_frames // 2), [[1, sign]]) for sign in (-1, 1))
+    combine = np.concatenate([np.hstack([minus, -minus]), np.hstack([plus, plus])]) / 2
+    beams = np.moveaxis(rows, 0, 2)
+    channels = combine @ beams.reshape(*beams.shape[:2], -1, 3)
+    singular = np.linalg.svd(channels, compute_uv=False)
+    good = singular[..., -1] * _MAX_CONDITION > singular[..., 0]
+    gain = np.linalg.pinv(channels) @ combine
+    return gain.reshape(*gain.shape[:3], 2, n_frames), good
+
+
+# ---- what an open direction, or a mirror branch, does to the polarization measured on sky ----
+
+
+#: Degrees of linear polarization for which consequences are given, percent.
+DOLPS = (30.0, 1.0, 0.1)
+# angles of polarization among which least and largest are sought
+_DOUBLE = 2 * np.deg2rad(np.arange(0, 180, 7.5))
+# changes on sky that are not worth a number, degree and percent
+_NOTHING = 0.005
+# and those of a source of 1 % that are worth a warning
+_MATTERS = {"aolp_deg": 0.1, "dolp_change_percent": 1.0}
+
+
+def sky_consequences(measurement, vector, directions, instrument=None):
+    """
+    Return how recovered AoLP and DoLP change along given directions.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement. The light comes from the sky through the telescope of a star's chain, or
+        through that which the instrument publishes; where there is neither the telescope is left
+        out, and the light begins with the first optic on a stage.
+    vector : `~numpy.ndarray`
+        The solution, canonical values, shape (n_free,).
+    directions : `~numpy.ndarray`
+        Canonical changes, shape (n_directions, n_free).
+    instrument : str, optional
+        Name of the instrument, for its telescope.
+
+    Returns
+    -------
+    list of dict or None
+        For each direction ``targets``, a list with an entry for sources of 30, 1 and 0.1 %
+        (``dolp_percent``): least and largest change of the AoLP in degree, ``aolp_deg``, and of
+        the DoLP in percent of itself, ``dolp_change_percent``, to first order, over wavelengths,
+        angles of polarization, and a few settings of telescope and derotator, each one cycle of
+        the half-wave plate. ``aolp_deg`` and ``dolp_percent`` beside it are those of 30 %. None
+        where the chain has no half-wave plate.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal import instruments
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[60, 85] * u.deg)
+    >>> measurement = Measurement(chain, simulate(chain, charis.wavelength, frames, seed=1))
+    >>> turn = np.zeros((1, measurement.free.size))
+    >>> turn[0, measurement.free.by_name["hwp.theta"].start] = np.deg2rad(1)
+    >>> sky = sky_consequences(measurement, measurement.vector(), turn)[0]
+    >>> [round(max(map(abs, target["aolp_deg"])), 1) for target in sky["targets"]]
+    [2.1, 2.1, 2.1]
+
+    The tertiary mirror polarizes, and with a plate at a wrong angle its polarization is
+    subtracted at a wrong angle, too:
+
+    >>> sky = sky_consequences(measurement, measurement.vector(), turn, "charis")[0]
+    >>> [round(max(map(abs, target["aolp_deg"])), 1) for target in sky["targets"]]
+    [2.4, 5.7, 37.4]
+    """
+    view = view_of_measurement(measurement, vector, instrument)
+    return consequences_along(view, directions)
+
+
+def consequences_along(view, directions):
+    """Return the consequences of small steps; None for each direction without a view."""
+    if view is None or not len(directions):
+        return [None] * len(directions)
+    return [_consequences(change[view.good], _small) for change in view.along(directions)]
+
+
+def consequences_of(view, chain):
+    """Return the consequences of taking another chain for the true one, however far it is."""
+    change = view.against(chain)
+    return _consequences(change[np.isfinite(change).all(axis=(-2, -1))], _whole)
+
+
+def _consequences(matrices, changed):
+    """Return least and largest change for each degree of polarization."""
+    targets = []
+    for dolp in DOLPS:
+        turn, gain = changed(matrices, dolp / 100)
+        # an angle cannot be off by more than 90 deg
+        turn = np.clip(np.rad2deg(turn), -90, 90)
+        spans = {"aolp_deg": _span(turn), "dolp_change_percent": _span(100 * gain)}
+        targets.append({"dolp_percent": dolp} | spans)
+    first = targets[0]
+    both = {"aolp_deg": first["aolp_deg"], "dolp_percent": first["dolp_change_percent"]}
+    return both | {"targets": targets}
+
+
+def light_of(dolp, double=_DOUBLE):
+    """Return I, Q and U of light of a degree of polarization at angles, (3, n_angles)."""
+    return np.stack([np.ones_like(double), dolp * np.cos(double), dolp * np.sin(double)])
+
+
+# ---- in words ---------------------------------------------------------------------------
+
+
+def sky_words(sky):
+    """Say what a direction or a branch does on sky."""
+    if not shows_on_sky(sky):
+        return "on sky nothing changes"
+    each = [
+        (f"{target['dolp_percent']:g} %", *map(_size, _largest(target)))
+        for target in targets_of(sky)
+    ]
+    (dolp, turn, gain), *fainter = each
+    turned, gained = (f"up to {size}" if size[0].isdigit() else size for size in (turn, gain))
+    words = f"on sky the AoLP changes by {turned} deg and the DoLP by {gained} % of itself"
+    if all(one[1:] == (turn, gain) for one in each):
+        return f"{words}, whatever the DoLP"
+    others = (f"{dolp}: {turn} deg, {gain} %" for dolp, turn, gain in fainter)
+    return "; ".join([f"{words} for a source of {dolp}", *others])
+
+
+def targets_of(sky):
+    """Return the entries for each degree of polarization; a file of before has one."""
+    first = {"dolp_percent": DOLPS[0], "aolp_deg": sky["aolp_deg"]}
+    return sky.get("targets") or [first | {"dolp_change_percent": sky["dolp_percent"]}]
+
+
+def shows_on_sky(sky):
+    """Return whether the AoLP or the DoLP on sky changes by what is worth a word."""
+    return max(max(_largest(target)) for target in targets_of(sky)) >= _NOTHING
+
+
+def matters(sky):
+    """Return whether a source of 1 % changes by so much that a warning is due."""
+    target = next(t for t in targets_of(sky) if t["dolp_percent"] == DOLPS[1])
+    return any(max(map(abs, target[key])) > limit for key, limit in _MATTERS.items())
+
+
+def _largest(target):
+    return [max(map(abs, target[key])) for key in ("aolp_deg", "dolp_change_percent")]
+
+
+def _size(value):
+    if value < _NOTHING:
+        return "less than 0.01"
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
+
+
+# ---- numbers ----------------------------------------------------------------------------
+
+
+def _small(matrices, dolp):
+    """Return the changes of angle and degree (of itself) to first order."""
+    light = light_of(dolp)
+    change, (q, u) = matrices @ light, light[1:]
+    # q is Q / I, and what is found of I may change, too
+    dq, du = (change[..., i, :] - light[i] * change[..., 0, :] for i in (1, 2))
+    return (q * du - u * dq) / (2 * dolp**2), (q * dq + u * du) / dolp**2
+
+
+def _whole(matrices, dolp):
+    """Return the changes of angle and degree (of itself), however large."""
+    light = light_of(dolp)
+    found = light + matrices @ light
+    # q + iu, over that of the source: its modulus is the gain, half its phase the turn
+    ratio = (found[..., 1, :] + 1j * found[..., 2, :]) / found[..., 0, :]
+    ratio = ratio / (light[1] + 1j * light[2])
+    return np.angle(ratio) / 2, np.abs(ratio) - 1
+
+
+def _span(values):
+    if not values.size:
+        return [0.0, 0.0]
+    # adding zero turns -0.0 into 0.0
+    return [round(float(values.min()), 4) + 0.0, round(float(values.max()), 4) + 0.0]

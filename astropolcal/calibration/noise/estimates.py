@@ -1,0 +1,572 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Noise of the data, from stated errors or from repeated data.
+
+A chi-square means something only beside a noise that does not come from the
+residuals it is compared with. There are three sources: the errors in the
+table, the scatter among data taken at the same settings, and the null channel
+(`~astropolcal.calibration.noise.estimates`). Each says what it includes.
+
+Noise of the data from the null channel, which the double difference cancels.
+
+Every pair of frames gives a null beside its datum, so that this noise is there for every
+table that has no repeated data; `estimate_noise` takes the better of the two.
+"""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.exceptions import FitError
+from astropolcal.units import angle_to_rad
+
+__all__ = ["NoiseEstimate", "noise_from_errors", "noise_from_null_channel", "noise_from_replicates"]
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """
+    Noise of one datum at each wavelength of each dataset.
+
+    Parameters
+    ----------
+    dataset : `~numpy.ndarray` of int
+        Dataset of each row, shape (n_rows,).
+    wavelength : `~astropy.units.Quantity`
+        Wavelength of each row.
+    sigma : `~astropy.units.Quantity`
+        Standard deviation of one datum (rms where they differ), in percent;
+        NaN where it could not be estimated.
+    dof : `~numpy.ndarray`
+        Degrees of freedom of ``sigma``, infinite where it is known.
+    method : {"errors", "replicates", "null channel"}
+        Where it comes from.
+    words : str
+        What it includes and what it does not.
+    sigma_of_data : `~numpy.ndarray`
+        Standard deviation of every datum, dimensionless, shape (n_data,).
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.observations import Observations, example_table
+    >>> chain = (optics.LinearPolarizer(name="polarizer")
+    ...          | optics.LinearRetarder(mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(name="wollaston"))
+    >>> measurement = Measurement(chain, Observations.from_table(example_table()))
+    >>> noise = noise_from_errors(measurement)
+    >>> noise.method, noise.sigma[0].round(2)
+    ('errors', <Quantity 2.09 %>)
+    """
+
+    dataset: np.ndarray
+    wavelength: u.Quantity
+    sigma: u.Quantity
+    dof: np.ndarray
+    method: str
+    words: str
+    sigma_of_data: np.ndarray
+
+    @property
+    def table(self):
+        """One row a dataset and wavelength, a `~astropy.table.QTable`."""
+        columns = {"dataset": self.dataset, "wavelength": self.wavelength}
+        meta = {"method": self.method, "words": self.words}
+        return QTable(columns | {"sigma": self.sigma, "dof": self.dof}, meta=meta)
+
+
+def data_by_wavelength(measurement):
+    """
+    Return which data belong to each wavelength of each dataset.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+
+    Returns
+    -------
+    dataset : `~numpy.ndarray` of int
+        Shape (n_rows,).
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_rows,).
+    rows : list of `~numpy.ndarray`
+        Indices of the data, those that are not masked.
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.observations import Observations, example_table
+    >>> chain = (optics.LinearPolarizer(name="polarizer")
+    ...          | optics.LinearRetarder(mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(name="wollaston"))
+    >>> measurement = Measurement(chain, Observations.from_table(example_table()))
+    >>> dataset, wavelength, rows = data_by_wavelength(measurement)
+    >>> wavelength[1], rows[1].tolist()
+    (<Quantity 1600. nm>, [2, 3])
+    """
+    numbers, wavelengths, rows = [], [], []
+    for i, part in enumerate(measurement.datasets):
+        bins = measurement.bins[measurement.segments[i]]
+        first = measurement.segments[i].start
+        rows += [first + np.flatnonzero(bins == b) for b in part.bins]
+        wavelengths.append(part.observations.wavelength.to_value(u.nm))
+        numbers += [i] * len(part.bins)
+    return np.array(numbers), np.concatenate(wavelengths) * u.nm, rows
+
+
+def noise_of_cells(measurement, sigma, dof, method, words):
+    """
+    Return an estimate of one noise for each wavelength of each dataset.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    sigma : array_like
+        Standard deviation of a datum, dimensionless, in the order of `data_by_wavelength`.
+    dof : array_like
+        Degrees of freedom of each; without any the noise is not known.
+    method, words : str
+        As `NoiseEstimate` has them.
+
+    Returns
+    -------
+    NoiseEstimate
+
+    Examples
+    --------
+    >>> from astropolcal import optics
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.observations import Observations, example_table
+    >>> chain = (optics.LinearPolarizer(name="polarizer")
+    ...          | optics.LinearRetarder(mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(name="wollaston"))
+    >>> measurement = Measurement(chain, Observations.from_table(example_table()))
+    >>> noise_of_cells(measurement, [0.01, 0.02, 0.03], [4, 4, 0], "made up", "").sigma
+    <Quantity [ 1.,  2., nan] %>
+    """
+    numbers, wavelength, rows = data_by_wavelength(measurement)
+    sigma = np.where(np.asarray(dof) > 0, sigma, np.nan)
+    of_data = np.empty(measurement.n_data)
+    for row, value in zip(rows, sigma, strict=True):
+        of_data[row] = value
+    percent = 100 * sigma * u.percent
+    return NoiseEstimate(numbers, wavelength, percent, np.asarray(dof), method, words, of_data)
+
+
+# ---- known ------------------------------------------------------------------------------
+
+
+def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
+    """
+    Return the noise that the errors of the fluxes give.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    gain : float, optional
+        Electrons per unit of flux. With it the errors of the table, if any, are
+        left aside: the variance of a flux F is F / gain + (read_noise / gain)^2.
+    read_noise : float
+        Standard deviation per beam and frame in electrons, all pixels of the
+        aperture together.
+
+    Returns
+    -------
+    NoiseEstimate
+        Infinite degrees of freedom: taken as known.
+
+    Raises
+    ------
+    FitError
+        If the tables give no errors and no gain is given, or the gain or read
+        noise is not a possible one.
+
+    Examples
+    --------
+    >>> import numpy as np
+
+    >>> from astropolcal import optics
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.observations import Observations, example_table
+    >>> chain = (optics.LinearPolarizer(name="polarizer")
+    ...          | optics.LinearRetarder(mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(name="wollaston"))
+    >>> measurement = Measurement(chain, Observations.from_table(example_table()))
+    >>> stated, four = (noise_from_errors(measurement, gain=g) for g in (None, 4.0))
+    >>> np.allclose(stated.sigma, 2 * four.sigma)
+    True
+    """
+    if gain is None:
+        sigma, words = measurement.sigma, "the errors stated in the table, and nothing else"
+    else:
+        sigma = _photon_sigma(measurement, _number("gain", gain, 0, False), read_noise)
+        words = f"photon noise at gain {gain:g} and read noise of {read_noise:g} electrons a beam"
+    bad = ~(np.isfinite(sigma) & (sigma > 0))
+    if bad.any():
+        raise FitError(
+            f"{bad.sum()} of {bad.size} data have no error; give gain= or estimate the noise from "
+            "replicates or the null channel"
+        )
+    numbers, wavelength, rows = data_by_wavelength(measurement)
+    rms = [np.sqrt(np.mean(sigma[row] ** 2)) if row.size else np.nan for row in rows]
+    return NoiseEstimate(
+        numbers,
+        wavelength,
+        100 * np.array(rms) * u.percent,
+        np.full(len(rows), np.inf),
+        "errors",
+        f"{words}: not flicker, nor what moves between frames",
+        sigma.copy(),
+    )
+
+
+def _number(name, value, low, closed):
+    if not np.isfinite(value) or value < low or (value == low and not closed):
+        raise FitError(f"{name} = {value}; allowed are numbers {'from' if closed else 'above'} 0")
+    return float(value)
+
+
+def _photon_sigma(measurement, gain, read_noise):
+    extra = (_number("read_noise", read_noise, 0, True) / gain) ** 2
+    found = []
+    for part in measurement.datasets:
+        obs = part.observations
+        fluxes = obs.flux_right, obs.flux_left
+        right, left = (np.moveaxis(f.T[:, part.frames], 2, 0) for f in fluxes)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            # Poisson: var(F) = F / gain, plus the read noise in the same units
+            variance = part.observable.variance(
+                right, left, right / gain + extra, left / gain + extra
+            )
+        found.append(np.sqrt(variance[part.valid]))
+    return np.concatenate(found)
+
+
+# ---- replicates ---------------------------------------------------------------------------
+
+
+def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
+    r"""
+    Return the noise from the scatter among data taken at the same settings.
+
+    Same are all stages of the chain, modulo 180 deg, and the state of a
+    modulator (column ``flc_state``). The scatter is that of the *residuals*, so
+    that differences of position within ``tolerance`` count to second order only:
+    with :math:`\bar r` the mean residual of a group of replicates,
+    :math:`\sigma^2 = \sum (r - \bar r)^2 / \sum (m - 1)` over groups of m
+    (pure error; Draper & Smith 1998, Applied Regression Analysis, Sec. 2.1,
+    doi:10.1002/9781118625590).
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    vector : array_like, optional
+        Parameters for the residuals, by default the current ones; shape (n_free,).
+    tolerance : `~astropy.units.Quantity`
+        Largest difference of a position among replicates.
+
+    Returns
+    -------
+    NoiseEstimate
+        It includes all that differs between repeated data: photon and read noise,
+        flicker, repeatability of the stages, drifts; but nothing that is the same
+        in all of them.
+
+    Raises
+    ------
+    FitError
+        If nothing was repeated.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 50, 80, 80] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> int(noise_from_replicates(Measurement(charis.chain(), observations)).dof[0])
+    8
+    """
+    residuals = measurement.residuals(vector)
+    limit = float(angle_to_rad(tolerance, "tolerance"))
+    group = np.empty(measurement.n_data, dtype=int)
+    for part, where in zip(measurement.datasets, measurement.segments, strict=True):
+        group[where] = _same_settings(part, limit)[part.group_of_datum]
+    squares, dof = _scatter(residuals, group, data_by_wavelength(measurement)[2])
+    if not dof.any():
+        names = ", ".join(part.observations.name for part in measurement.datasets)
+        raise FitError(
+            f"{names}: no two data at the same settings within {np.rad2deg(limit):g} deg; "
+            "repeat a half-wave-plate cycle, or use the null channel"
+        )
+    sigma = np.sqrt(squares / np.maximum(dof, 1))
+    words = (
+        "scatter among repeated data: photon and read noise, flicker, repeatability of the "
+        "stages; not what is the same in every repetition"
+    )
+    return noise_of_cells(measurement, sigma, dof, "replicates", words)
+
+
+def _scatter(values, group, rows):
+    """Return the sum of squares about the mean of each group, and its freedom, by cell."""
+    squares, dof = np.zeros(len(rows)), np.zeros(len(rows), dtype=int)
+    for i, row in enumerate(rows):
+        if row.size:
+            _, label, counts = np.unique(group[row], return_inverse=True, return_counts=True)
+            mean = np.bincount(label, values[row]) / counts
+            squares[i] = np.sum((values[row] - mean[label]) ** 2)
+            dof[i] = row.size - counts.size
+    return squares, dof
+
+
+def _same_settings(part, tolerance):
+    """Return a number for the settings of every group of frames of a dataset."""
+    columns = [equal_axes(angle, tolerance) for row in part.positions.values() for angle in row]
+    frames = part.observations.frames
+    if "flc_state" in frames.colnames:
+        columns.append(np.unique(np.asarray(frames["flc_state"]), return_inverse=True)[1])
+        columns[-1] = columns[-1][part.frames[:, 0]]
+    if not columns:
+        return np.zeros(len(part.frames), dtype=int)
+    return np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
+
+
+def equal_axes(angle, tolerance):
+    """
+    Number axes, angles modulo 180 deg, so that those of one number lie within a tolerance.
+
+    Parameters
+    ----------
+    angle : `~numpy.ndarray`
+        In radian, shape (n,).
+    tolerance : float
+        Largest difference among those of one number, in radian.
+
+    Returns
+    -------
+    `~numpy.ndarray` of int
+        Shape (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+
+    >>> equal_axes(np.deg2rad([0, 45, 179.95, 225]), np.deg2rad(0.1)).tolist()
+    [0, 1, 0, 1]
+    """
+    axis = np.mod(angle, np.pi)
+    order = np.argsort(axis, kind="stable")
+    gaps = np.diff(axis[order], append=axis[order[0]] + np.pi)
+    # begin behind the largest gap, lest 0 and 180 deg be torn apart
+    start = (int(np.argmax(gaps)) + 1) % len(axis)
+    order = np.roll(order, -start)
+    along = np.mod(axis[order] - axis[order[0]], np.pi)
+    label, first = np.zeros(len(axis), dtype=int), along[0]
+    for i, value in enumerate(along[1:], start=1):
+        new = value - first > tolerance
+        first = value if new else first
+        label[i] = label[i - 1] + new
+    result = np.empty_like(label)
+    result[order] = label
+    return result
+
+
+# ---- noise of the data from the null channel, which the double difference cancels ----
+
+
+_NULL_MODELS = ("constant", "smooth")
+# far below the steps of a run, which in CHARIS's are 12.5 deg of derotator and 11.25 deg of plate
+_SAME_DEROTATOR = np.deg2rad(0.5)
+_SAME_PLATE = np.deg2rad(0.3)
+# what does not vary beyond this share is no column of its own
+_RANK = 1e-9
+
+
+def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
+    r"""
+    Return the noise from the double sum of normalized differences.
+
+    With :math:`x = (R - L)/(R + L)` of the frames of a pair, 45 deg of
+    half-wave plate apart, the double difference is :math:`(x^+ - x^-)/2` and the
+    null :math:`z = (x^+ + x^-)/2`. The plate turns the sign of the signal, so
+    the null has next to none, while independent noise of the frames is the same
+    in both. Taken away from z are what the chain predicts of it (a plate that is not
+    exactly half a wave, with a retarder behind it, leaves some signal there),
+    a multiple of :math:`x^2` at each wavelength (what beams unequal by e add,
+    :math:`e(1 - x^2)`), and the null model. A datum of one frame is given
+    :math:`\sqrt2` times the scatter of what is left.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    vector : array_like, optional
+        Parameters for the chain's own null, by default the current ones.
+    null_model : {"constant", "smooth"}
+        The mean over the plate angles at each derotator angle; or for each
+        plate angle a curve over the derotator angle D,
+        :math:`a + b\cos 2D + c\sin 2D + d\cos 4D + f\sin 4D`.
+
+    Returns
+    -------
+    NoiseEstimate
+        An upper limit: besides photon and read noise and flicker that changes
+        the ratio of the beams it includes whatever else makes the null change
+        with the plate and is not in the chain, such as diattenuation. For strongly
+        polarized light that exceeds the noise; the smooth null model takes
+        away most of it. A change of the source's brightness cancels in x.
+
+    Raises
+    ------
+    FitError
+        If there are too few pairs for the null model, or no such model.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 57.5, 70] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> noise = noise_from_null_channel(Measurement(charis.chain(), observations))
+    >>> int(noise.dof[0]), noise.method
+    (8, 'null channel')
+    """
+    if null_model not in _NULL_MODELS:
+        raise FitError(f"null_model = {null_model!r}; allowed are {', '.join(_NULL_MODELS)}")
+    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
+    parts = [_null_scatter(part, vector, null_model) for part in measurement.datasets]
+    squares, dof = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if not (dof > 0).any():
+        raise FitError(
+            f"the null channel has no degree of freedom left by the {null_model} null model; "
+            "two plate angles a derotator angle (constant) or six derotator angles a plate "
+            "angle (smooth) are needed"
+        )
+    per_datum = [
+        # z is a mean of two frames: its variance is half that of a frame, as is that of a double
+        # difference; an observable of m frames has 2 / m of the null's
+        np.full(len(part.bins), 2.0 / part.observable.frames_per_datum)
+        for part in measurement.datasets
+    ]
+    sigma = np.sqrt(np.concatenate(per_datum) * squares / np.maximum(dof, 1))
+    words = (
+        f"scatter of the null channel about the chain's and a {null_model} null, an upper limit: "
+        "photon and read noise, flicker, and what the chain leaves out of the null"
+    )
+    return noise_of_cells(measurement, sigma, dof, "null channel", words)
+
+
+def _null_scatter(part, vector, null_model):
+    """Return sum of squares of the null's residuals and freedom at each wavelength."""
+    obs = part.observations
+    right, left = obs.flux_right, obs.flux_left
+    pairs = obs.pairs()
+    predicted = _predicted_differences(part, vector)
+    # (n_pairs, n_wavelengths)
+    null = 0.5 * ((right - left) / (right + left) - predicted)[pairs].sum(axis=1)
+    signal = 0.5 * (predicted[pairs[:, 0]] - predicted[pairs[:, 1]])
+    design = _null_design(obs, pairs[:, 0], null_model)
+    squares, dof = np.zeros(obs.n_bins), np.zeros(obs.n_bins, dtype=int)
+    for i, (z, x) in enumerate(zip(null.T, signal.T, strict=True)):
+        good = np.isfinite(z)
+        if good.any():
+            # beams unequal by e have the difference x + e (1 - x^2):
+            # its constant part is in the design
+            columns = np.column_stack([design, x**2])[good]
+            fit, _, rank, _ = np.linalg.lstsq(columns, z[good], rcond=_RANK)
+            squares[i] = np.sum((z[good] - columns @ fit) ** 2)
+            dof[i] = good.sum() - rank
+    return squares, dof
+
+
+def _predicted_differences(part, vector):
+    """Return the chain's normalized difference of every frame that gives a datum, (F, W)."""
+    right, left = part.forward(vector).fluxes
+    shape = (part.observations.n_bins, part.frames.size)
+    difference = np.broadcast_to((right - left) / (right + left), shape)
+    result = np.full((part.observations.n_frames, shape[0]), np.nan)
+    result[part.frames.T.ravel()] = difference.T
+    return result
+
+
+def _null_design(observations, frames, null_model):
+    angle = observations.position("derotator")[frames]
+    state = np.zeros(len(frames), dtype=int)
+    if "flc_state" in observations.frames.colnames:
+        column = np.asarray(observations.frames["flc_state"])
+        state = np.unique(column, return_inverse=True)[1][frames]
+    if null_model == "constant":
+        curves, setting = np.ones((1, len(angle))), equal_axes(angle, _SAME_DEROTATOR)
+    else:
+        twice = 2 * angle
+        curves = np.stack([np.ones_like(twice), *_harmonics(twice), *_harmonics(2 * twice)])
+        setting = equal_axes(observations.position("hwp")[frames], _SAME_PLATE)
+    _, setting = np.unique(np.stack([setting, state], axis=1), axis=0, return_inverse=True)
+    # one column for each setting and curve
+    steps = setting.ravel()[:, None] == np.arange(setting.max() + 1)
+    return np.concatenate([curve[:, None] * steps for curve in curves], axis=1)
+
+
+def _harmonics(angle):
+    return np.cos(angle), np.sin(angle)
+
+
+def estimate_noise(measurement, vector=None, *, null_model="constant"):
+    """
+    Return the noise estimated from the data, replicates where there are any.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    vector : array_like, optional
+        Parameters, by default the current ones.
+    null_model : {"constant", "smooth"}
+        For the null channel, see `noise_from_null_channel`.
+
+    Returns
+    -------
+    NoiseEstimate
+        Of replicates where every wavelength has some, otherwise of the null channel.
+
+    Raises
+    ------
+    FitError
+        If neither is possible.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 57.5, 57.5] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> estimate_noise(Measurement(charis.chain(), observations)).method
+    'replicates'
+    """
+    try:
+        noise = noise_from_replicates(measurement, vector)
+    except FitError:
+        return noise_from_null_channel(measurement, vector, null_model=null_model)
+    if (noise.dof > 0).all():
+        return noise
+    return noise_from_null_channel(measurement, vector, null_model=null_model)

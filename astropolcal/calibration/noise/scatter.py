@@ -1,0 +1,543 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+r"""Groups of data that cross-validation leaves out together.
+
+How residuals scatter and hang together, and what this does to the errors.
+
+What a model gets wrong is not independent from datum to datum: neighbouring wavelengths of a pair
+of frames depart alike, and so do the pairs at one setting of the derotator. Errors that count all
+data as independent are too small then. Here the residuals of each dataset have the covariance
+
+.. math:: V = S \left( \sum_k \tau_k\, C_k \otimes L_k \right) S .
+
+S is the scatter at each wavelength. C is the correlation of pairs of frames: of a pair with itself,
+or of the pairs at one setting, where an error of Stokes q and u goes with :math:`\cos 4\theta` and
+:math:`\sin 4\theta` of the half-wave plate. L is that of wavelengths: none, over a tenth of their
+logarithm, all, or that of the principal components of the errors at the settings. The shares
+:math:`\tau` are those for which products of residuals have the values that are found, after what
+the fit took away (MINQUE: Rao 1971, J. Multivariate Anal. 1, 257,
+doi:10.1016/0047-259X(71)90001-7).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from astropolcal.exceptions import FitError
+from astropolcal.observations import cycle_numbers, is_star
+
+__all__ = []
+
+#: What may make a group, and what groups of it are called.
+GROUPS = {
+    "derotator": "derotator angles",
+    "cycle": "half-wave-plate cycles",
+    "dataset": "datasets",
+}
+# derotator angles that differ by less belong to one group
+_SAME_ANGLE = np.deg2rad(0.5)
+# runs into which the cycles of a star are divided
+_RUNS = 8
+
+
+def leave_out_groups(measurement):
+    """
+    Return the group of each datum for cross-validation: its derotator angle.
+
+    On sky the derotator turns slowly, so there a group is one of eight runs of
+    consecutive cycles of the half-wave plate, or one cycle where there are fewer.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Number of the group, shape (n_data,); datasets have their own groups.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames)
+    >>> measurement = Measurement(charis.chain(), observations)
+    >>> int(leave_out_groups(measurement).max())
+    2
+    """
+    groups, first = [], 0
+    for dataset in measurement.datasets:
+        if "parallactic" in dataset.positions:
+            group = _star_runs(dataset)
+            groups.append(first + group[dataset.group_of_datum])
+            first += int(group.max()) + 1
+            continue
+        angle = dataset.observations.position("derotator")[dataset.frames[:, 0]]
+        # sorted angles fall apart into groups at every step larger than the tolerance
+        order = np.argsort(angle)
+        new = np.concatenate([[0], np.cumsum(np.diff(angle[order]) > _SAME_ANGLE)])
+        group = np.empty(len(angle), dtype=int)
+        group[order] = new
+        groups.append(first + group[dataset.group_of_datum])
+        first += int(new[-1]) + 1
+    return np.concatenate(groups)
+
+
+def _star_runs(dataset):
+    """Return the run of consecutive cycles of each group of frames, shape (n_groups,)."""
+    cycle = cycle_numbers(dataset.observations)[dataset.frames[:, 0]]
+    rank = np.unique(cycle, return_inverse=True)[1]
+    runs = min(_RUNS, int(rank.max()) + 1)
+    # equal runs of consecutive cycles; a derotator that follows the sky gives no angles to group by
+    return rank * runs // (int(rank.max()) + 1)
+
+
+def groups_by(measurement, by="derotator"):
+    """
+    Return the group of each datum for cross-validation.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    by : {"derotator", "cycle", "dataset"}
+        A group is a derotator angle of a dataset (of a star: a run of cycles); a cycle of
+        the half-wave plate; or a whole dataset (a night). A cycle is the column ``cycle`` of the
+        frames where there is one; otherwise it ends where a plate angle
+        (of one state of a modulator) comes again or the derotator moves. A
+        datum belongs to the cycle of its plus frame.
+
+    Returns
+    -------
+    `~numpy.ndarray` of int
+        Shape (n_data,); numbered from 0.
+
+    Raises
+    ------
+    FitError
+        If a group has a single member at each wavelength, or there is one
+        group only, or no such way of grouping.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 60] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames)
+    >>> measurement = Measurement(charis.chain(), observations)
+    >>> [int(groups_by(measurement, by).max()) for by in ("derotator", "cycle")]
+    [1, 2]
+    """
+    if by not in GROUPS:
+        raise FitError(f"groups by {by!r}; allowed are {', '.join(GROUPS)}")
+    groups = leave_out_groups(measurement) if by == "derotator" else _groups(measurement, by)
+    names = _members(measurement, groups, by)
+    if len(names) < 2:
+        raise FitError(f"cross-validation by {by}: all data are in one group, {names[0][0]}")
+    for name, count in names:
+        if count < 2:
+            raise FitError(
+                f"cross-validation by {by}: group {name} has a single member; at least 2 data a "
+                "wavelength are needed, group by something else or leave it out"
+            )
+    return groups
+
+
+def _groups(measurement, by):
+    groups, first = [], 0
+    for part in measurement.datasets:
+        number = np.zeros(len(part.frames), dtype=int)
+        if by == "cycle":
+            number = cycle_numbers(part.observations)[part.frames[:, 0]]
+        number = np.unique(number, return_inverse=True)[1]
+        groups.append(first + number[part.group_of_datum])
+        # groups of different datasets never share a number
+        first += int(number.max()) + 1
+    return np.concatenate(groups)
+
+
+def _members(measurement, groups, by):
+    """Return name and largest number of data at one wavelength of every group."""
+    found = []
+    for i, (part, where) in enumerate(zip(measurement.datasets, measurement.segments, strict=True)):
+        angle = np.rad2deg(part.observations.position("derotator"))[part.frames[:, 0]]
+        own, bins = groups[where], measurement.bins[where]
+        for k, label in enumerate(np.unique(own)):
+            rows = own == label
+            what = {
+                "derotator": f"{angle[part.group_of_datum[rows][0]]:g} deg",
+                "cycle": f"number {k}",
+                "dataset": f"number {i}",
+            }[by]
+            count = int(np.bincount(bins[rows]).max())
+            found.append((f"{by} {what} of {part.observations.name}", count))
+    return found
+
+
+def what_is_left_out(calibration):
+    """
+    Return what the cross-validation of a calibration has left out, in words.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; its ``fit["groups"]`` counts, by default "derotator".
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+
+    >>> what_is_left_out(SimpleNamespace(fit={"groups": "cycle"}))
+    'half-wave-plate cycles'
+    """
+    return GROUPS.get(calibration.fit.get("groups", "derotator"), "groups")
+
+
+# ---- how residuals scatter and hang together, and what this does to the errors ----
+
+
+# over which misfits of neighbouring wavelengths hang together, in the logarithm of the wavelength:
+# the correlation falls to 0.7 from one bin of CHARIS to the next, as it does in Datasets 1 and 3
+_LENGTH = 0.1
+# no wavelength counts as less noisy than this share of the median of its dataset
+_FLOOR = 0.1
+# fewer degrees of freedom than this tell no scatter
+_LEAST_FREEDOM = 1.0
+# fewer settings do not tell an error of theirs from the parameters
+_FEWEST_SETTINGS = 3
+# shares below so many times their error under independence count as chance
+_CHANCE = 2.0
+# share of the scatter that is independent from datum to datum at the least
+_INDEPENDENT = 0.05
+# and principal components of the errors at settings below so many times what they have by chance
+_MORE = 1.5
+# a part of which the fit leaves less than this share is not seen in the residuals
+_LEFT = 0.05
+
+
+@dataclass(eq=False)
+class _Part:
+    """Residuals of one dataset: where they are among pairs and wavelengths, and their scatter."""
+
+    rows: slice
+    pair: np.ndarray
+    bin: np.ndarray
+    patterns: np.ndarray
+    kernels: tuple
+    amplitude: np.ndarray
+    shares: np.ndarray = None
+
+    def dense(self, columns):
+        """Return columns as an array of pairs, wavelengths and columns; masked data are zero."""
+        out = np.zeros((len(self.patterns), len(self.kernels[0]), columns.shape[1]))
+        out[self.pair, self.bin] = columns
+        return out
+
+    def components(self):
+        """Yield whether pairs of a setting hang together, and the correlation of wavelengths."""
+        yield from ((False, kernel) for kernel in self.kernels)
+        if self.patterns.shape[1]:
+            yield from ((True, kernel) for kernel in self.kernels[1:])
+
+    def halves(self, columns):
+        """Return, for each component, columns before and behind its matrix, to be multiplied."""
+        dense = self.dense(columns)
+        seen = np.tensordot(self.patterns, dense, axes=(0, 0))
+        for together, kernel in self.components():
+            before = seen if together else dense
+            yield before, kernel @ before
+
+    def applied(self, columns):
+        """Return the matrix of each component times columns."""
+        for (together, _), (_, behind) in zip(self.components(), self.halves(columns), strict=True):
+            if together:
+                behind = np.tensordot(self.patterns, behind, axes=(1, 0))
+            yield behind[self.pair, self.bin]
+
+    def overlaps(self):
+        """Return the traces of the products of two components, shape (n, n)."""
+        present = self.dense(np.ones((len(self.pair), 1)))[..., 0]
+        alone, diagonal = present.T @ present, np.sum(self.patterns**2, axis=1)
+        mixed = present.T @ (diagonal[:, None] * present)
+        # the square of the correlation of the pairs at a setting
+        setting = [self.patterns[:, i::2] for i in (0, 1)] if self.patterns.shape[1] else []
+        both = np.zeros_like(alone)
+        for i, first in enumerate(setting):
+            for second in setting[i:]:
+                crossed = (first * second).T @ present
+                both += (1 if second is first else 2) * crossed.T @ crossed
+        parts = list(self.components())
+        pairs = {(True, True): both, (False, False): alone}
+        return np.array(
+            [[np.sum(k * m * pairs.get((a, b), mixed)) for b, m in parts] for a, k in parts]
+        )
+
+
+class Scatter:
+    """
+    Covariance of the residuals of a fit.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Fitted.
+    weighting : Weighting
+        The noise that its fit assumed; only its pattern counts.
+    whitened : Whitened
+        The problem around the solution.
+    """
+
+    def __init__(self, measurement, weighting, whitened):
+        self.measurement = measurement
+        weight = 1.0 if weighting.weight is None else weighting.weight
+        self._level = 1.0 / weight * np.ones(measurement.n_data)
+        residuals = measurement.residuals() * weight
+        #: Derivatives of the data to the determined directions, each one standard error long.
+        self.slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T
+        groups = leave_out_groups(measurement)
+        self.parts = [
+            self._part(i, groups, residuals, whitened.leverage)
+            for i in range(len(measurement.datasets))
+        ]
+        for part in self.parts:
+            part.shares = self._shares(part, residuals[part.rows])
+
+    @property
+    def is_known(self):
+        """Whether the residuals of all datasets tell how they scatter."""
+        known = (np.isfinite(part.amplitude).all() for part in self.parts)
+        return bool(np.isfinite(self._level).all()) and all(known)
+
+    def _part(self, i, groups, residuals, leverage):
+        dataset, rows = self.measurement.datasets[i], self.measurement.segments[i]
+        bins, group = self.measurement.bins[rows], groups[rows]
+        log = np.log(self.measurement.wavelength)
+        distance = np.abs(log[:, None] - log)
+        part = _Part(
+            rows,
+            dataset.group_of_datum,
+            bins,
+            _patterns(dataset, group - group.min()),
+            (np.eye(log.size), np.exp(-distance / _LENGTH), np.ones_like(distance)),
+            _amplitude(bins, residuals[rows], 1 - leverage[rows]),
+        )
+        errors = _errors_at_settings(part, residuals[rows] / part.amplitude)
+        if errors is not None:
+            part.kernels += _found(errors)
+            part.patterns = part.patterns * _uneven(errors)
+        return part
+
+    def _shares(self, part, residuals):
+        """Solve for the shares with which products of residuals are as large as they are."""
+        scaled = (residuals / part.amplitude)[:, None]
+        found = np.array([np.sum(a * b) for a, b in part.halves(scaled)])
+        slopes = self.slopes[part.rows]
+        up, down = slopes * part.amplitude[:, None], slopes / part.amplitude[:, None]
+        # what a component of the scatter (columns) adds to a product of residuals (rows):
+        # tr(A M B M) with M = 1 - U U^T, the residuals of a fit
+        full = part.overlaps()
+        before = [matrix / part.amplitude[:, None] for matrix in part.applied(down)]
+        behind = [matrix * part.amplitude[:, None] for matrix in part.applied(up)]
+        inner = [(slopes.T @ a, slopes.T @ b) for a, b in zip(before, behind, strict=True)]
+        seen = full - 2 * np.array([[np.sum(a * b) for b in behind] for a in before])
+        seen += np.array([[np.sum(a * b.T) for _, b in inner] for a, _ in inner])
+        size = np.diag(full)
+        told = np.diag(seen) > _LEFT * size
+        if not np.isfinite(seen).all():
+            return np.eye(len(size))[0]
+        shares = _solved(seen, found, told)
+        # a share that independent data have by chance, and that cannot be negative, would make all
+        # errors too large; the variance of a product of residuals is twice its trace
+        chance = _CHANCE * np.sqrt(2 / np.maximum(np.diag(seen), 1.0)) * shares.sum()
+        chance[0] = 0.0
+        shares = _solved(seen, found, told & (shares >= chance))
+        # some of it always is independent, and all of it where nothing is told
+        shares[0] = max(shares[0], _INDEPENDENT if shares.any() else 1.0)
+        return shares
+
+    def middle(self):
+        """Return the covariance of the pulls of the residuals on the determined directions."""
+        total = np.zeros((self.slopes.shape[1],) * 2)
+        for part in self.parts:
+            scaled = self.slopes[part.rows] * part.amplitude[:, None]
+            for share, (before, behind) in zip(part.shares, part.halves(scaled), strict=True):
+                if share:
+                    total += share * np.tensordot(before, behind, axes=((0, 1), (0, 1)))
+        # a product of two arrays is symmetric to rounding only
+        return (total + total.T) / 2
+
+    def at_settings(self, i):
+        """
+        Return the error of q and of u that all pairs at a setting share, per wavelength.
+
+        Parameters
+        ----------
+        i : int
+            Number of the dataset.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Standard deviation, shape (n_wavelengths,); NaN where the dataset has no data.
+        """
+        part = self.parts[i]
+        variance = sum(
+            share * np.diag(kernel)
+            for share, (together, kernel) in zip(part.shares, part.components(), strict=True)
+            if together
+        ) + np.zeros(len(part.kernels[0]))
+        found = np.full(variance.size, np.nan)
+        found[part.bin] = np.sqrt(variance)[part.bin] * part.amplitude * self._level[part.rows]
+        return found
+
+
+def _errors_at_settings(part, scaled):
+    """Return q and u of the residuals at each setting, (2 n_settings, n_wavelengths)."""
+    if not part.patterns.shape[1] or not np.isfinite(scaled).all():
+        return None
+    errors = part.patterns.T @ part.dense(scaled[:, None])[..., 0]
+    size = np.sqrt(np.sum(part.patterns**2, axis=0))[:, None]
+    # of one plate angle q or u may not show at all
+    return np.divide(errors, size, out=np.zeros_like(errors), where=size > 0)
+
+
+def _uneven(errors):
+    """Return by how much the error of each setting is above the mean one, half believed."""
+    size = np.repeat(np.sum(errors**2, axis=1).reshape(-1, 2).sum(axis=1), 2)
+    return np.sqrt(0.5 + 0.5 * size / max(size.mean(), 1e-300))
+
+
+def _found(errors):
+    """
+    Return the correlation of wavelengths that the errors at the settings have, if there is one.
+
+    Their principal components that have more of the variance than those of independent wavelengths
+    would by chance (Marchenko & Pastur 1967).
+    """
+    count, size = errors.shape
+    _, singular, shapes = np.linalg.svd(errors, full_matrices=False)
+    share = singular**2 / max(np.sum(singular**2), 1e-300)
+    chance = (np.sqrt(count) + np.sqrt(size)) ** 2 / (count * size)
+    shapes = shapes[share > _MORE * chance] * singular[share > _MORE * chance, None]
+    kernel = shapes.T @ shapes
+    return (kernel * size / np.trace(kernel),) if len(shapes) else ()
+
+
+def _solved(seen, found, taken):
+    """Return the shares of the components that are taken, none negative."""
+    from scipy.optimize import nnls
+
+    shares, norm = np.zeros(len(found)), np.sqrt(np.diag(seen)[taken])
+    if taken.any():
+        shares[taken] = nnls(seen[np.ix_(taken, taken)] / norm[:, None], found[taken] / norm)[0]
+    return shares
+
+
+def _patterns(dataset, group):
+    """Return how an error of q and u at each setting shows in the pairs, (n_pairs, 2 n_groups)."""
+    count = int(group.max()) + 1
+    if count < _FEWEST_SETTINGS:
+        return np.zeros((len(dataset.frames), 0))
+    of_pair = np.zeros(len(dataset.frames), dtype=int)
+    of_pair[dataset.group_of_datum] = group
+    plate = dataset.positions.get("hwp")
+    angle = np.zeros(len(of_pair)) if plate is None else 4 * plate[0]
+    member = of_pair[:, None] == np.arange(count)
+    out = np.empty((len(of_pair), 2 * count))
+    # q and u of each setting next to each other
+    out[:, 0::2], out[:, 1::2] = member * np.cos(angle)[:, None], member * np.sin(angle)[:, None]
+    return out
+
+
+def _amplitude(bins, residuals, spare):
+    """Return the rms of the residuals at the wavelength of each, for the freedom left there."""
+    total, freedom = np.sum(residuals**2), spare.sum()
+    whole = np.sqrt(total / freedom) if freedom >= _LEAST_FREEDOM else np.nan
+    levels = {}
+    for b in np.unique(bins):
+        own = bins == b
+        left = spare[own].sum()
+        levels[b] = np.sqrt(np.sum(residuals[own] ** 2) / left) if left >= _LEAST_FREEDOM else whole
+    floor = _FLOOR * np.median(list(levels.values()))
+    return (
+        np.array([max(levels[b], floor) for b in bins]) if total > 0 else np.full(len(bins), np.nan)
+    )
+
+
+def model_error(measurement, scatter):
+    """
+    Return the error of the model at a setting that it has not seen, for ``Calibration.fit``.
+
+    ``relative_percent`` multiplies the polarization, from sources that are fully polarized;
+    ``absolute_percent`` does not depend on it, from all others. Both are standard errors of Stokes
+    q and u per wavelength; zero, and named in ``missing``, where no dataset tells.
+    """
+    squares = {"relative": [], "absolute": []}
+    if not scatter.is_known:
+        return None
+    for i, dataset in enumerate(measurement.datasets):
+        polarized = kind_of_source(dataset.observations.source) == "polarized"
+        squares["relative" if polarized else "absolute"].append(scatter.at_settings(i) ** 2)
+    found = {"wavelength_nm": (1e3 * measurement.wavelength).tolist(), "missing": []}
+    for key, rows in squares.items():
+        known = np.isfinite(rows) if rows else np.zeros((1, measurement.wavelength.size), bool)
+        count = known.sum(axis=0)
+        total = np.where(known, rows if rows else 0.0, 0.0).sum(axis=0)
+        found[f"{key}_percent"] = (100 * np.sqrt(total / np.maximum(count, 1))).tolist()
+        if not count.any():
+            found["missing"].append(key)
+    return found
+
+
+def kind_of_source(source, chain=None):
+    """
+    Return what a dataset calibrates.
+
+    Parameters
+    ----------
+    source : str or None
+        As the table says.
+    chain : Optic or `~astropy.modeling.CompoundModel`, optional
+        Decides where the table does not say: a polarizer in front is "polarized".
+
+    Returns
+    -------
+    {"polarized", "unpolarized", "star"}
+
+    Examples
+    --------
+    >>> from astropolcal.calibration.noise.scatter import kind_of_source
+    >>> kind_of_source("unpolarized standard star"), kind_of_source("unpolarized")
+    ('star', 'unpolarized')
+    """
+    if is_star(source):
+        return "star"
+    return "unpolarized" if "unpolarized" in (source or "").lower() else "polarized"
+
+
+BLOCKS = ("derotator", "pair")
+
+
+def labels_of(measurement, block):
+    """Return the number of the block of each datum; datasets have their own blocks."""
+    if block not in BLOCKS:
+        raise FitError(f"block = {block!r}; allowed are {', '.join(BLOCKS)}")
+    if block == "derotator":
+        return leave_out_groups(measurement)
+    sizes = [len(dataset.frames) for dataset in measurement.datasets]
+    first = np.cumsum([0, *sizes[:-1]])
+    parts = zip(first, measurement.datasets, strict=True)
+    return np.concatenate([start + dataset.group_of_datum for start, dataset in parts])

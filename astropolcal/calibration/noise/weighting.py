@@ -1,0 +1,580 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Robust fits, and the frames that are at odds with a calibration.
+
+A robust loss lets data that depart far from the model count less, by iterated weights: a
+datum with residual r has the noise that a least-squares fit would need to give it the
+weight of the loss. Nothing is dropped; `outlying_data` says which frames depart.
+
+One noise for all who need it: fit, errors, gauge, tests and sampler.
+
+The noise of a datum is its weight in the fit, the scale of all errors, and the
+width of the likelihood. So that these agree, it is worked out here only, for
+every choice of ``weights``, and stays with the fitted measurement.
+"""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.calibration.identifiability.analysis import physical_scale
+from astropolcal.calibration.identifiability.linearized import Whitened
+from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength
+from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.observations.quality import MAD_TO_SIGMA
+
+__all__ = ["outlying_data"]
+
+# noise of a wavelength is at least this share of the median of its dataset
+_ROBUST_FLOOR = 0.1
+# robust standard deviations beyond which a frame is at odds with the model
+_FAR = 4.0
+# smallest weight, so that no datum is lost altogether
+_LEAST = 1e-4
+
+#: Weight of a datum by its residual in units of the noise; the constants give 95 % of the
+#: efficiency of least squares for normal noise (Holland & Welsch 1977,
+#: doi:10.1080/03610927708827533).
+LOSSES = {
+    "linear": np.ones_like,
+    "huber": lambda r: np.minimum(1.0, 1.345 / np.maximum(np.abs(r), 1e-300)),
+    "cauchy": lambda r: 1 / (1 + (r / 2.385) ** 2),
+    "bisquare": lambda r: np.clip(1 - (r / 4.685) ** 2, 0.0, None) ** 2,
+}
+
+
+def robust_sigma(measurement, loss):
+    """
+    Return the noise of every datum that gives it the weight of a robust loss.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        At the values of a fit.
+    loss : str
+        One of `LOSSES`.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (n_data,).
+
+    Raises
+    ------
+    FitError
+        If the loss is unknown.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
+    >>> data = simulate(charis.chain(), charis.wavelength, frames, seed=1)
+    >>> sigma = robust_sigma(Measurement(charis.chain(), data), "huber")
+    >>> bool((sigma < 0.01).all())
+    True
+    """
+    if loss not in LOSSES:
+        raise FitError(f"loss = {loss!r}; allowed are {', '.join(LOSSES)}")
+    residuals = measurement.residuals()
+    scale = _scales(measurement, residuals)
+    # least squares weighs by 1 / sigma^2: sigma = scale / sqrt(weight of the loss)
+    return scale / np.sqrt(np.maximum(LOSSES[loss](residuals / scale), _LEAST))
+
+
+def _scales(measurement, residuals):
+    """Return the robust standard deviation of each datum's dataset and wavelength."""
+    scale = np.empty(residuals.size)
+    _, _, rows = data_by_wavelength(measurement)
+    for row in rows:
+        scale[row] = MAD_TO_SIGMA * np.median(np.abs(residuals[row])) if np.size(row) else 0.0
+    for where in measurement.segments:
+        least = _ROBUST_FLOOR * np.median(scale[where]) if scale[where].size else 0.0
+        scale[where] = np.maximum(scale[where], max(least, 1e-12))
+    return scale
+
+
+def outlying_data(calibration, limit=_FAR):
+    """
+    Return the pairs of frames that are at odds with a calibration.
+
+    The residuals of a pair, in units of the robust noise of its wavelength, are reduced to
+    their median over the wavelengths, which is what a cloud, a satellite or a wrong angle
+    changes. A pair is at odds if this departs by more than ``limit`` robust standard deviations
+    of all pairs of its dataset.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        A calibration with its data.
+    limit : float
+        In robust standard deviations.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Largest first: ``dataset``, ``frames`` (numbers as text), ``residual`` (median over the
+        wavelengths, percent), ``sigma`` (in robust standard deviations) and ``brightness`` (of
+        the fainter frame, relative to the median frame). Empty if there is none.
+
+    Raises
+    ------
+    CalibrationFileError
+        If the calibration was read from a file, which holds no data.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> len(outlying_data(cal))
+    0
+    """
+    live, rows = calibration.live_measurement(), []
+    residuals = live.residuals()
+    scaled = residuals / _scales(live, residuals)
+    for part, where in zip(live.datasets, live.segments, strict=True):
+        rows += _outliers(part, residuals[where], scaled[where], limit)
+    rows.sort(key=lambda row: -row[3])
+    names = ("dataset", "frames", "residual", "sigma", "brightness")
+    units = {"residual": "percent"}
+    table = QTable(rows=rows or None, names=names, dtype=(str, str, float, float, float))
+    for name, unit in units.items():
+        table[name].unit = unit
+    return QTable(table)
+
+
+def _outliers(part, residuals, scaled, limit):
+    from astropolcal.observations import brightness
+
+    groups = np.unique(part.group_of_datum)
+    members = [part.group_of_datum == g for g in groups]
+    # one number a pair of frames, the median over its wavelengths
+    common = np.array([np.median(scaled[rows]) for rows in members])
+    off = common - np.median(common)
+    # what noise alone gives a median of so many wavelengths
+    least = np.array([1.25 / np.sqrt(rows.sum()) for rows in members])
+    spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off)), least)
+    bright = brightness(part.observations)
+    numbers = np.asarray(part.observations.frames["frame"])
+    found = []
+    for i in np.flatnonzero(np.abs(off) > limit * spread):
+        frames = part.frames[groups[i]]
+        found.append(
+            (
+                part.observations.name,
+                ", ".join(str(n) for n in numbers[frames]),
+                100 * float(np.median(residuals[members[i]])),
+                float(np.abs(off[i]) / spread[i]),
+                float(bright[frames].min()),
+            )
+        )
+    return found
+
+
+# ---- one noise for all who need it: fit, errors, gauge, tests and sampler ----
+
+
+CHOICES = (None, "wavelength", "errors")
+GIVEN = "given"
+# no wavelength counts as less noisy than this share of the median of its dataset
+_FLOOR = 0.1
+# rounds of noise from residuals, and the relative change of it at which they end
+ROUNDS = 10
+_SETTLED = 1e-2
+# fewer degrees of freedom than this tell no noise
+_LEAST_FREEDOM = 0.5
+# normalized data do not reach this; one over a noise does
+_LARGEST = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Weighting:
+    """
+    Noise that a fit assumes of its data.
+
+    Parameters
+    ----------
+    choice : {None, "wavelength", "errors", "given"}
+        Where the noise comes from: one level from the residuals of all data,
+        one a dataset and wavelength from theirs, the errors of the table, or
+        the user.
+    sigma : `~numpy.ndarray`
+        Standard deviation of every datum, shape (n_data,); NaN as long as no
+        fit has told it.
+
+    Examples
+    --------
+    >>> import numpy as np
+
+    >>> equal = Weighting(None, np.full(4, 0.02))
+    >>> print(equal.weight, equal.level)
+    None 0.02
+    >>> Weighting("errors", np.array([0.5, 0.25])).weight.tolist()
+    [2.0, 4.0]
+    """
+
+    choice: str | None
+    sigma: np.ndarray
+
+    @property
+    def is_known(self):
+        """Whether every datum has a noise."""
+        return bool(np.isfinite(self.sigma).all())
+
+    @property
+    def weight(self):
+        """One over the noise of each datum; None where all weigh the same."""
+        return None if self.choice is None or not self.is_known else 1 / self.sigma
+
+    @property
+    def level(self):
+        """Standard deviation of a datum of weight one, against which priors weigh."""
+        return float(self.sigma[0]) if self.weight is None else 1.0
+
+    @property
+    def from_residuals(self):
+        """Whether the noise comes from the residuals of the fit."""
+        return self.choice in (None, "wavelength")
+
+    def agrees(self, other):
+        """Return whether another noise is the same to a hundredth."""
+        change = np.abs(self.sigma - other.sigma)
+        return bool(np.all(change <= _SETTLED * np.maximum(self.sigma, other.sigma)))
+
+    def started(self, measurement):
+        """Return one level for all data, from the residuals before the first fit."""
+        if not self.from_residuals:
+            return self
+        freedom = max(measurement.n_data - measurement.free.size, 1)
+        level = np.sqrt(np.sum(measurement.residuals() ** 2) / freedom) or 1.0
+        return Weighting(self.choice, np.full(measurement.n_data, level))
+
+    def updated(self, measurement, whitened=None):
+        """
+        Return the noise that the residuals of a fit with this noise show.
+
+        ``whitened`` is the linear problem of the measurement with this noise, if at hand.
+        """
+        if not self.from_residuals:
+            return self
+        whitened = around(measurement, self) if whitened is None else whitened
+        if self.choice == "wavelength":
+            sigma = _by_wavelength(measurement, measurement.vector(), whitened.leverage)
+            return Weighting(self.choice, sigma)
+        freedom = measurement.n_data - whitened.n_taken
+        total = np.sum(measurement.residuals() ** 2)
+        level = np.sqrt(total / freedom) if freedom > _LEAST_FREEDOM else np.nan
+        return Weighting(None, np.full(measurement.n_data, level))
+
+
+def around(measurement, weighting, vector=None):
+    """Return the linear problem around a vector, by default the current one."""
+    vector = measurement.vector() if vector is None else vector
+    free, weight = measurement.free, weighting.weight
+    data = measurement.jacobian(vector)
+    priors = None
+    if measurement.n_priors:
+        level = weighting.level if weighting.is_known else weighting.started(measurement).level
+        priors = free.prior_jacobian(vector) * level
+    data = data if weight is None else data * weight
+    return Whitened(data, physical_scale(free), priors, free.at_bounds(vector))
+
+
+# ---- the choices ------------------------------------------------------------------------
+
+
+def first_weighting(measurement, weights):
+    """Return the noise for a choice of weights before anything is fitted."""
+    if isinstance(weights, Weighting):
+        return weights
+    if isinstance(weights, NoiseEstimate):
+        return Weighting(GIVEN, _of_estimate(measurement, weights))
+    if weights is not None and not isinstance(weights, str):
+        return Weighting(GIVEN, _checked(given_noise(measurement, weights)))
+    if weights == GIVEN:
+        raise FitError("weights='given': this measurement was not fitted with a noise given to it")
+    if weights not in CHOICES:
+        raise FitError(
+            f"weights = {weights!r}; allowed are None, 'wavelength', 'errors', or the noise itself"
+        )
+    if weights != "errors":
+        return Weighting(weights, np.full(measurement.n_data, np.nan))
+    bad = ~(np.isfinite(measurement.sigma) & (measurement.sigma > 0))
+    if bad.any():
+        raise FitError(f"weights='errors', but {bad.sum()} of {bad.size} data have no error")
+    return Weighting("errors", measurement.sigma)
+
+
+def noise_of(measurement, weights=None):
+    """
+    Return the noise of every datum for a choice of weights.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement; where the noise comes from residuals, its current
+        values are those of a fit.
+    weights : {None, "wavelength", "errors"}, NoiseEstimate, Weighting or array_like
+        As for `calibrate`. ``"wavelength"`` is the restricted maximum
+        likelihood of one level for each wavelength of each dataset [1]_.
+
+    Returns
+    -------
+    Weighting
+        That of the fit, if `calibrate` fitted the measurement with the same choice.
+
+    Raises
+    ------
+    FitError
+        If the choice is unknown, the table has no errors, or the residuals
+        tell no noise.
+    ParameterError
+        If the noise given has the wrong shape or is not positive.
+
+    References
+    ----------
+    .. [1] Patterson, H. D. & Thompson, R. 1971, "Recovery of inter-block
+       information when block sizes are unequal", Biometrika 58, 545,
+       doi:10.1093/biomet/58.3.545
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> equal, own = (noise_of(cal.measurement, w).sigma for w in (None, "wavelength"))
+    >>> len(set(equal.round(9))), len(set(own.round(9)))
+    (1, 22)
+    """
+    fitted = measurement.weighting
+    same = isinstance(weights, str) or weights is None
+    if fitted is not None and same and fitted.choice == weights:
+        return _told(measurement, fitted)
+    weighting = first_weighting(measurement, weights)
+    if weighting.from_residuals:
+        weighting = weighting.started(measurement)
+        for _ in range(ROUNDS):
+            before, weighting = weighting, _told(measurement, weighting.updated(measurement))
+            if weighting.agrees(before):
+                break
+    return weighting
+
+
+def weighting_of(calibration):
+    """
+    Return the noise that a calibration assumes of its data.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        A calibration with its data.
+
+    Returns
+    -------
+    Weighting
+
+    Raises
+    ------
+    CalibrationFileError
+        If the calibration was read from a file, which holds no data.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> bool(weighting_of(cal).level < 0.01)
+    True
+    """
+    measurement, settings = calibration.live_measurement(), calibration.settings
+    if measurement.weighting is None:
+        given = settings.get("weights") == GIVEN
+        noise = _from_settings(measurement, settings) if given else settings.get("weights")
+        measurement.weighting = noise_of(measurement, noise)
+    return measurement.weighting
+
+
+def _from_settings(measurement, settings):
+    """Return a noise given to a fit of the same data, as far as `describe` has kept it."""
+    if settings.get("loss", "linear") != "linear":
+        # robust imports the noise, as this module does
+
+        return Weighting(GIVEN, robust_sigma(measurement, settings["loss"]))
+    _, _, rows = data_by_wavelength(measurement)
+    kept = [value for part in settings["noise"] for value in part["sigma_percent"]]
+    sigma = np.empty(measurement.n_data)
+    for row, percent in zip(rows, kept, strict=True):
+        sigma[row] = np.nan if percent is None else percent / 100
+    return Weighting(GIVEN, sigma)
+
+
+def _told(measurement, weighting):
+    """Refuse residuals that leave no degree of freedom, or nothing at all."""
+    if not (weighting.is_known and weighting.sigma.min() > 0):
+        rms = _rms(measurement.residuals())
+        raise FitError(
+            f"{measurement.n_data} data, {measurement.free.size} free parameters and an rms "
+            f"residual of {rms:.3g} tell no noise; give noise= or other weights"
+        )
+    return weighting
+
+
+def describe(measurement, weighting):
+    """Return the noise of each dataset and wavelength as plain lists, for the settings."""
+    numbers, wavelength, rows = data_by_wavelength(measurement)
+    rms = [_rms(weighting.sigma[row]) for row in rows]
+    nm = wavelength.to_value(u.nm)
+    return [
+        {
+            "dataset": part.observations.name,
+            "wavelength_nm": [float(w) for w in nm[numbers == i]],
+            "sigma_percent": [100 * rms[j] for j in np.flatnonzero(numbers == i)],
+        }
+        for i, part in enumerate(measurement.datasets)
+    ]
+
+
+def _rms(values):
+    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
+
+
+# ---- from residuals ---------------------------------------------------------------------
+
+
+def residual_noise(measurement, vector=None):
+    r"""
+    Return the noise of every datum as the scatter of a fit's residuals.
+
+    One level for each wavelength of each dataset,
+    :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)`, where the leverage
+    :math:`h_i`, the derivative of a fitted to its observed datum, sums up to
+    the number of parameters determined: data that the parameters follow
+    closely scatter less than their noise [1]_. The leverages are those of a
+    fit with equal weights; see `noise_of` for others.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    vector : array_like, optional
+        Fitted canonical values, by default the measurement's.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (n_data,); at least a tenth of the median of the dataset.
+
+    Raises
+    ------
+    FitError
+        If at some wavelength no datum is left over by the parameters, or the
+        residuals are zero.
+
+    References
+    ----------
+    .. [1] Hoaglin, D. C. & Welsch, R. E. 1978, "The Hat Matrix in Regression
+       and ANOVA", The American Statistician 32, 17, doi:10.2307/2683469
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> bool(residual_noise(cal.measurement).max() < 0.01)
+    True
+    """
+    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
+    equal = Weighting(None, np.full(measurement.n_data, np.nan))
+    return _by_wavelength(measurement, vector, around(measurement, equal, vector).leverage)
+
+
+def _by_wavelength(measurement, vector, leverage):
+    """Return one level a dataset and wavelength, not below the floor."""
+    squares, spare = measurement.residuals(vector) ** 2, 1 - leverage
+    numbers, wavelength, rows = data_by_wavelength(measurement)
+    sigma, levels = np.empty(measurement.n_data), np.full(len(rows), np.nan)
+    for i, row in enumerate(rows):
+        if row.size:
+            freedom, total = spare[row].sum(), squares[row].sum()
+            if freedom < 1 or not total > 0:
+                name = measurement.datasets[numbers[i]].observations.name
+                raise FitError(
+                    f"{name}, {wavelength[i].to_value(u.nm):.1f} nm: {row.size} data leave "
+                    f"{max(freedom, 0):.1f} degrees of freedom and an rms residual of "
+                    f"{np.sqrt(total / row.size):.3g}, which tell no noise; give noise= or other "
+                    "weights"
+                )
+            levels[i] = np.sqrt(total / freedom)
+    for i, row in enumerate(rows):
+        floor = _FLOOR * np.nanmedian(levels[numbers == numbers[i]]) if row.size else 0.0
+        sigma[row] = max(levels[i], floor)
+    return sigma
+
+
+# ---- from the user ------------------------------------------------------------------------
+
+
+def given_noise(measurement, noise):
+    """Return the noise of every datum from one value, one a wavelength or one a datum."""
+    try:
+        noise = u.Quantity(noise).to_value(u.dimensionless_unscaled)
+    except (TypeError, u.UnitConversionError):
+        raise ParameterError(f"noise = {noise!r} is not a number, or has a wrong unit") from None
+    if not np.all(np.isfinite(noise) & (noise > 0)):
+        raise ParameterError(f"noise must be positive and finite; the least is {np.min(noise)}")
+    if noise.shape == measurement.wavelength.shape:
+        return noise[measurement.bins]
+    if noise.shape not in ((), (measurement.n_data,)):
+        raise ParameterError(
+            f"noise of shape {noise.shape}; allowed are one value, {len(measurement.wavelength)} "
+            f"(one a wavelength) or {measurement.n_data} (one a datum)"
+        )
+    return np.broadcast_to(noise, measurement.n_data).astype(float)
+
+
+def _checked(sigma):
+    if np.median(sigma) > _LARGEST:
+        raise ParameterError(
+            f"a noise of {100 * np.median(sigma):.3g} %: weights takes the noise of the data, "
+            "not one over it"
+        )
+    return sigma
+
+
+def _of_estimate(measurement, noise):
+    sigma = noise.sigma_of_data
+    if sigma.shape != (measurement.n_data,):
+        raise FitError(
+            f"the noise is that of {sigma.size} data, the measurement has {measurement.n_data}; "
+            "estimate it from this measurement"
+        )
+    bad = ~(np.isfinite(sigma) & (sigma > 0))
+    if bad.any():
+        raise FitError(f"noise from {noise.method}: {bad.sum()} of {bad.size} data have none")
+    return sigma

@@ -1,0 +1,624 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""The result of a calibration: chains, errors, accuracy, posterior, provenance.
+
+Bring a calibration that was read from a file and its observations together again.
+"""
+
+import warnings
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.calibration.noise.scatter import groups_by
+from astropolcal.calibration.noise.weighting import weighting_of
+from astropolcal.calibration.result.summary import summary, to_dict
+from astropolcal.calibration.result.validity import instrument_of, validity_of
+from astropolcal.calibration.result.verdict import verdict
+from astropolcal.calibration.uncertainty.covariance import status_of
+from astropolcal.calibration.validation.cross_validation import (
+    accuracy_table,
+    cross_validated_residuals,
+)
+from astropolcal.chain import leaves
+from astropolcal.exceptions import CalibrationFileError, ObservationError
+from astropolcal.measurement import Measurement
+from astropolcal.observations import Observations
+
+__all__ = ["Calibration"]
+
+# what is known of each element of a parameter, and what is said of those without an error
+_OF_ELEMENTS = (
+    "std",
+    "identifiable",
+    "at_bound",
+    "std_inward",
+    "conditional_on",
+    "std_released",
+)
+_UNKNOWN = (np.nan, False, False, np.nan, "", np.nan)
+
+
+def _above(name):
+    """Return a module of the layers above, to which some methods of a calibration lead."""
+    return import_module(f"astropolcal.{name}")
+
+
+@dataclass
+class DatasetRecord:
+    """
+    What a calibration remembers of one dataset.
+
+    Parameters
+    ----------
+    name : str
+        Name of the dataset.
+    source : str or None
+        What sent the light.
+    content_hash : str
+        SHA-256 of the table's content.
+    meta : dict
+        The table's meta: instrument, date, optics in the beam.
+    n_frames, n_masked : int
+        Frames, and cells of frame and wavelength that were masked.
+    accuracy : `~astropy.table.QTable`
+        Accuracy per wavelength, see `accuracy_table`.
+
+    Examples
+    --------
+    >>> DatasetRecord("night1", "polarized", "00", {}, 64, 0).name
+    'night1'
+    """
+
+    name: str
+    source: str | None
+    content_hash: str
+    meta: dict
+    n_frames: int
+    n_masked: int
+    accuracy: QTable | None = None
+
+
+@dataclass
+class Calibration:
+    """
+    A calibrated instrument; `calibrate` makes it, ASDF files keep it.
+
+    Parameters
+    ----------
+    chains : list of `~astropy.modeling.CompoundModel`
+        The calibrated chain of each dataset, sharing their optics' values.
+    wavelength : `~astropy.units.Quantity`
+        Grid of the parameters given per wavelength.
+    covariance : Covariance
+        Of the free parameters, with names and units.
+    identifiability : Identifiability
+        Rank and null directions.
+    at_bound : list of str
+        Free parameters that ended at a bound.
+    datasets : list of DatasetRecord
+        The data behind it.
+    settings : dict
+        ``instrument``, ``observable``, ``fitter``, ``strategy``, ``weights``.
+    fit : dict
+        ``seconds``, ``n_data``, ``converged``, ``message``, ``evaluations``.
+    ties : dict of str to Tie
+        Parameters that follow others.
+    stages : list of dict
+        Parameter values after each step of the two-step strategy.
+    measurement : Measurement or None
+        The fitted model; None after reading from a file.
+    provenance : dict
+        Software versions and time of the fit.
+    posterior : Posterior or None
+        Samples of the parameters' posterior, where `sample` made some. A file
+        keeps some of them, see `~astropolcal.calibration.posterior.Posterior.thinned`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> cal.chain["hwp"].w_sio2.unit, len(cal.accuracy)
+    (Unit("mm"), 22)
+    """
+
+    chains: list
+    wavelength: u.Quantity
+    covariance: object
+    identifiability: object
+    at_bound: list
+    datasets: list
+    settings: dict
+    fit: dict
+    ties: dict = field(default_factory=dict)
+    stages: list = field(default_factory=list)
+    measurement: object = None
+    provenance: dict = field(default_factory=dict)
+    posterior: object = None
+
+    @property
+    def chain(self):
+        """The calibrated chain of the first dataset."""
+        return self.chains[0]
+
+    @property
+    def instrument(self):
+        """Name of the instrument, or None."""
+        return self.settings.get("instrument")
+
+    @property
+    def converged(self):
+        """Whether the fitter says that it has arrived."""
+        return bool(self.fit.get("converged"))
+
+    @property
+    def residuals(self):
+        """
+        Residuals of all data, observed minus model, shape (n_data,).
+
+        Raises
+        ------
+        CalibrationFileError
+            If the calibration was read from a file, which holds no data.
+        """
+        return self.live_measurement().residuals()
+
+    def live_measurement(self):
+        """
+        Return the fitted measurement, for what needs the data.
+
+        Returns
+        -------
+        Measurement
+
+        Raises
+        ------
+        CalibrationFileError
+            If the calibration was read from a file, which holds no data.
+        """
+        if self.measurement is None:
+            raise CalibrationFileError(
+                "this calibration was read from a file, which holds no observations; "
+                "with_observations(observations) brings back those it was made from, "
+                "measurement_of(observations) predicts others"
+            )
+        return self.measurement
+
+    def with_observations(self, observations, positions=None):
+        """
+        Return the calibration together with the data that it was made from.
+
+        Parameters
+        ----------
+        observations : Observations or sequence of Observations
+            All of its datasets, in any order. They are recognized by their
+            content, not by their names.
+        positions : dict or sequence of dict, optional
+            Position of every stage for each of them, see
+            `~astropolcal.measurement.Measurement`; by default as the
+            calibration's instrument reads it, or the columns of the tables.
+
+        Returns
+        -------
+        Calibration
+            With ``measurement``, so that residuals, cross-validation and
+            sampling work as before it was written.
+
+        Raises
+        ------
+        CalibrationFileError
+            If a table is missing or is none of the calibration's, or if the
+            residuals are not those of the fit.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal import Calibration, calibrate, instruments
+        >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+        >>> charis = instruments.get("charis")
+        >>> chain = charis.chain(derotator="linear")
+        >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+        >>> data = simulate(chain, charis.wavelength, frames, seed=2)
+        >>> calibrate(chain, data, instrument="charis").write("with_data.asdf")
+        >>> cal = Calibration.read("with_data.asdf").with_observations(data)
+        >>> cal.residuals.size
+        264
+        """
+        measurement = measurement_of_all(self, observations, positions)
+        # so that a cross-validation of the new one does not change the old one's accuracies
+        records = deepcopy(self.datasets)
+        return replace(self, chains=measurement.chains, measurement=measurement, datasets=records)
+
+    def measurement_of(self, observations, dataset=0, positions=None):
+        """
+        Return a measurement of new observations with the calibrated chain.
+
+        Parameters
+        ----------
+        observations : Observations
+            New frames of the same set-up.
+        dataset : int
+            Which of the calibration's chains is meant.
+        positions : dict, optional
+            Position of every stage, see `~astropolcal.measurement.Measurement`.
+
+        Returns
+        -------
+        Measurement
+            Not fitted: its residuals tell how well the calibration predicts.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal import calibrate, instruments
+        >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+        >>> charis = instruments.get("charis")
+        >>> chain = charis.chain(derotator="linear")
+        >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+        >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+        >>> new = simulate(chain, charis.wavelength, frames, seed=3)
+        >>> bool(abs(cal.measurement_of(new).residuals()).max() < 0.01)
+        True
+        """
+        return Measurement(
+            self.chains[dataset],
+            observations,
+            observable=self.settings["observable"],
+            positions=None if positions is None else [positions],
+            ties=self.ties,
+            wavelength=self.wavelength,
+        )
+
+    def cross_validate(self, groups=None):
+        """
+        Fill ``s_cv``: refit without each derotator angle and predict it.
+
+        Parameters
+        ----------
+        groups : `~numpy.ndarray` or str, optional
+            Group of each datum, or what makes a group, see `groups_by`; by
+            default its derotator angle.
+
+        Returns
+        -------
+        Calibration
+            Itself.
+        """
+        live = self.live_measurement()
+        # what was left out before is no longer true, should the refits fail
+        self.fit.pop("groups", None)
+        if groups is not None:
+            self.fit["groups"] = groups if isinstance(groups, str) else "given"
+        if isinstance(groups, str):
+            groups = groups_by(live, groups)
+        held_out = cross_validated_residuals(live, live.vector(), self._weights(), groups)
+        residuals = live.residuals()
+        for i, record in enumerate(self.datasets):
+            before, record.accuracy = record.accuracy, accuracy_table(live, i, residuals, held_out)
+            # predictions of standards stay: they do not depend on what was left out
+            if before is not None and "s_standard" in before.colnames:
+                record.accuracy["s_standard"] = before["s_standard"]
+        return self
+
+    def _weights(self):
+        """Return one over the noise of each datum, None where all weigh the same."""
+        return None if self.settings.get("weights") is None else weighting_of(self).weight
+
+    @property
+    def accuracy(self):
+        """Accuracy per wavelength of the first dataset, a `~astropy.table.QTable`."""
+        return self.datasets[0].accuracy
+
+    # ---- parameters ----------------------------------------------------------
+
+    def parameter_values(self):
+        """
+        Return every parameter of every optic with all that is known of it.
+
+        Returns
+        -------
+        dict of str to dict
+            ``"optic.parameter"`` to ``value``, ``std`` (NaN where not
+            determined), ``unit``, ``bounds``, ``fixed``, ``tied``, ``at_bound``,
+            ``identifiable``; ``status`` (``"determined"``, ``"by priors"``,
+            ``"conditional"``, ``"badly determined"``, ``"open"``,
+            ``"at bound"``, ``"tied"`` or ``"fixed"``); ``std_inward``, how far
+            what is at a bound may go inward at one sigma; and for errors that
+            hang on such a bound ``conditional_on``, the names of what is at
+            it, and ``std_released``, the error without it. Arrays for
+            parameters given per wavelength.
+        """
+        result = {}
+        for chain in self.chains:
+            for leaf in leaves(chain):
+                for key in leaf.param_names:
+                    name = f"{leaf.name}.{key}"
+                    # chains share optics by name, and the values of the fit
+                    if name not in result:
+                        result[name] = self._describe(name, getattr(leaf, key))
+        return result
+
+    def _describe(self, name, parameter):
+        size = int(np.size(parameter.value))
+        # the covariance has rows of free parameters only
+        free = not parameter.fixed and name not in self.ties
+        elements = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
+        shape = np.shape(parameter.value)
+        known = self._known() if free else {}
+        rows = [known.get(element, _UNKNOWN) for element in elements]
+        columns = (np.array(column).reshape(shape) for column in zip(*rows, strict=True))
+        entry = {
+            "value": np.array(parameter.value),
+            "unit": parameter.unit,
+            "bounds": tuple(parameter.bounds),
+            "fixed": bool(parameter.fixed),
+            "tied": self.ties[name].source if name in self.ties else None,
+            **dict(zip(_OF_ELEMENTS, columns, strict=True)),
+        }
+        return entry | {"status": status_of(entry)}
+
+    def _known(self):
+        stds, flags = self.covariance.stds, self.identifiability.identifiable
+        bound, found = set(self.at_bound), self.fit.get("bounds") or {}
+        inward, released = found.get("inward", {}), found.get("released", {})
+        known = {}
+        for i, name in enumerate(self.covariance.names):
+            more = released.get(name, {"without": np.nan, "slack": 0.0, "by": []})
+            # the error with all bounds as exact, as independent data have it, and with none
+            slack = 0.0 if self.settings.get("errors") == "white" else more["slack"]
+            exact = np.sqrt(max(stds[i] ** 2 - slack**2, 0.0))
+            beyond = np.hypot(exact, more["without"])
+            beside = (inward.get(name, np.nan), ", ".join(more["by"]), beyond)
+            known[name] = (stds[i], bool(flags[i]), name in bound, *beside)
+        return known
+
+    @property
+    def parameters(self):
+        """
+        One row a free parameter: name, value, unit, errors, status; a `~astropy.table.QTable`.
+
+        The columns are those of `parameter_values`.
+        """
+        keys, rows = ("value", *_OF_ELEMENTS, "status"), []
+        for name, known in self.parameter_values().items():
+            if known["fixed"] or known["tied"]:
+                continue
+            size, unit = np.size(known["value"]), str(known["unit"] or "")
+            labels = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
+            flat = (np.ravel(known[key]) for key in keys)
+            rows += [(label, *row, unit) for label, *row in zip(labels, *flat, strict=True)]
+        types = (str, float, float, bool, bool, float, str, float, str, str)
+        table = QTable(
+            rows=rows or None, names=("name", *keys, "unit"), dtype=None if rows else types
+        )
+        return table["name", "value", "std", "unit", "status", *_OF_ELEMENTS[1:]]
+
+    # ---- for pipelines ---------------------------------------------------------
+
+    @property
+    def validity(self):
+        """For what it holds, a `~astropolcal.calibration.result.Validity`."""
+        return validity_of(self)
+
+    def system_mueller(self, header=None, **options):
+        """
+        Return the system Mueller matrix of frames, with its covariance.
+
+        Parameters
+        ----------
+        header : `~astropy.io.fits.Header`, mapping, or sequence of those
+            Primary header of a frame, or those of several.
+        **options
+            See `~astropolcal.pipeline.LoadedCalibration.system_mueller`.
+
+        Returns
+        -------
+        SystemMueller
+        """
+        return _above("pipeline.loading").load(self).system_mueller(header, **options)
+
+    # ---- in words and files ----------------------------------------------------
+
+    def verdict(self):
+        """
+        Return whether it can be used, and why not.
+
+        Returns
+        -------
+        `~astropolcal.calibration.result.Verdict`
+        """
+        return verdict(self)
+
+    def summary(self, full=False):
+        """
+        Return a text for the terminal: whether it is usable, how good, what came out.
+
+        Parameters
+        ----------
+        full : bool
+            Whether to add the tables per wavelength, what is not determined in
+            detail, and the gauge.
+
+        Returns
+        -------
+        str
+        """
+        return summary(self, full=full)
+
+    def to_dict(self):
+        """
+        Return the summary for machines, ready for JSON.
+
+        Returns
+        -------
+        dict
+            The keys of ``astropolcal calibrate --json``; not-a-number as None.
+        """
+        return to_dict(self)
+
+    def write(self, path, overwrite=False):
+        """
+        Write the calibration to an ASDF file, atomically.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        CalibrationFileError
+            If the file exists or cannot be written.
+        """
+        _above("converters.files").write_calibration(self, path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read a calibration from an ASDF file, validated.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        CalibrationFileError
+            If the file is missing, damaged, of another version, or not ours.
+        """
+        return _above("converters.files").read_calibration(path)
+
+    def __repr__(self):
+        names = ", ".join(record.name for record in self.datasets)
+        sampled = "" if self.posterior is None else f", {len(self.posterior.names)} sampled"
+        return (
+            f"<Calibration of {self.instrument or 'an instrument'} from {names}: "
+            f"{len(self.covariance)} free parameters, rank {self.identifiability.rank}{sampled}>"
+        )
+
+
+# ---- bring a calibration that was read from a file and its observations together again ----
+
+
+# two computers agree better in s_res; stages in other positions differ by far more
+_SAME_ACCURACY = 1e-3
+_SHOWN = 12
+
+
+def measurement_of_all(calibration, observations, positions=None):
+    """
+    Return the measurement that a calibration was fitted to.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    observations : Observations or sequence of Observations
+        Its datasets, in any order.
+    positions : dict or sequence of dict, optional
+        Position of every stage, for each of ``observations``.
+
+    Raises
+    ------
+    CalibrationFileError
+        If a table is missing or is another one, or the residuals are not those
+        of the calibration.
+    """
+    given = [observations] if isinstance(observations, Observations) else list(observations)
+    positions = [positions] if isinstance(positions, dict) else positions
+    if positions is not None and len(positions) != len(given):
+        raise CalibrationFileError(f"{len(positions)} positions for {len(given)} tables")
+    given = [_prepared(calibration, table) for table in given]
+    order = _order(calibration.datasets, given)
+    tables = [given[i] for i in order]
+    if positions is None:
+        positions = _positions(calibration, tables)
+    else:
+        positions = [positions[i] for i in order]
+    # the same chains, ties and grid as in the fit: what the file holds is enough to predict
+    measurement = Measurement(
+        calibration.chains,
+        tables,
+        observable=calibration.settings["observable"],
+        positions=positions,
+        ties=calibration.ties,
+        wavelength=calibration.wavelength,
+    )
+    _check_residuals(calibration, measurement)
+    return measurement
+
+
+def _prepared(calibration, table):
+    """Return a table with the masks of the instrument, if the calibration was made with them."""
+    # hashes are those of the tables as they were fitted, masks included
+    wanted = {record.content_hash for record in calibration.datasets}
+    instrument = instrument_of(calibration)
+    if table.content_hash in wanted or instrument is None:
+        return table
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            masked = instrument.prepare(table)
+    except ObservationError:
+        return table
+    return masked if masked.content_hash in wanted else table
+
+
+def _order(records, given):
+    """Return which of the tables given is that of each record."""
+    known = [table.content_hash for table in given]
+    wanted = {record.content_hash: record.name for record in records}
+    for table in given:
+        if table.content_hash not in wanted:
+            listed = ", ".join(f"{name} ({hash_[:_SHOWN]})" for hash_, name in wanted.items())
+            raise CalibrationFileError(
+                f"{table.name}: the calibration was not made from this table, whose content "
+                f"hash is {table.content_hash[:_SHOWN]}; it was made from {listed}"
+            )
+    missing = [record for record in records if record.content_hash not in known]
+    if missing:
+        listed = ", ".join(f"{r.name} (content hash {r.content_hash[:_SHOWN]})" for r in missing)
+        raise CalibrationFileError(f"the calibration was also made from {listed}: give that table")
+    # the order of the fit, on which slices of data and residuals depend
+    return [known.index(record.content_hash) for record in records]
+
+
+def _positions(calibration, tables):
+    """Return the positions that the instrument reads; None, the columns, without one."""
+    instrument = instrument_of(calibration)
+    if instrument is None:
+        return None
+    return [instrument.positions(*pair) for pair in zip(tables, calibration.chains, strict=True)]
+
+
+def _check_residuals(calibration, measurement):
+    """Refuse data that the calibration was not fitted to in this way."""
+    residuals = measurement.residuals()
+    for i, record in enumerate(calibration.datasets):
+        if record.accuracy is None:
+            continue
+        found = accuracy_table(measurement, i, residuals)["s_res"].value
+        stored = record.accuracy["s_res"].value
+        if found.shape != stored.shape or not np.allclose(
+            found, stored, rtol=_SAME_ACCURACY, equal_nan=True
+        ):
+            raise CalibrationFileError(
+                f"{record.name}: the residuals are not those of the calibration (median s_res "
+                f"{np.nanmedian(found):.4g} %, in the calibration {np.nanmedian(stored):.4g} %); "
+                "if the stages were not where the table's columns say, give positions="
+            )

@@ -1,0 +1,668 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""A calibration in words for the terminal, and in numbers for machines.
+
+What a summary says of mirrors, of stars that no fit saw, and of what is left open on sky.
+"""
+
+import re
+import textwrap
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.calibration.identifiability.sky import shows_on_sky, sky_words
+from astropolcal.calibration.noise.scatter import what_is_left_out
+from astropolcal.calibration.result.verdict import (
+    HEIGHT,
+    HINT,
+    compact_lines,
+    inward_words,
+    parameter_lines,
+    verdict,
+    without_stars,
+)
+from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
+from astropolcal.calibration.validation.stars import fitted_stars
+from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
+from astropolcal.words import counted
+
+__all__ = []
+
+_WIDTH = 80
+# value and error of so many parameters fill the 80 columns
+_N_COLUMNS = 3
+# errors from which on digits behind the point are too long
+_MANY = 1000
+# what stands beside an error, and in place of one
+_MARKS = {"badly determined": "?", "conditional": "c"}
+_SAID = {"open": "open", "at bound": "bound", "badly determined": "no error"}
+_ACCURACIES = ("s_res", "s_mean", "s_cv", "s_standard")
+# pairs of frames at odds with the fit that a summary names
+_MOST_OUTLIERS = 5
+_ELEMENT = re.compile(r"(\w+\.\w+)\[(\d+)\]")
+
+
+def summary(calibration, targets=TARGETS, full=False):
+    """
+    Return a calibration as text of at most 80 columns.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    targets : sequence of (dolp, aolp)
+        Targets whose accuracy is given, see
+        `~astropolcal.calibration.target_accuracies`.
+    full : bool
+        Whether to say everything; by default the text has less than 24 lines.
+
+    Returns
+    -------
+    str
+        The five lines of `~astropolcal.calibration.verdict`, the parameters and how
+        good the fit is. In full also the accuracy of each dataset, the parameters
+        given per wavelength, what the data do not determine, and the gauge.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> print(summary(cal).splitlines()[0])
+    Usable
+    """
+    found = verdict(calibration, targets)
+    if not full:
+        return "\n".join([*compact_lines(calibration, found, HEIGHT - 1), HINT])
+    known, stars = calibration.parameter_values(), fitted_stars(calibration)
+    parts = [
+        [*found.words, *_more_reasons(found)],
+        _heading(calibration),
+        _global_lines(without_stars(known, stars)),
+        _stars(stars),
+        *map(_accuracy_lines, calibration.datasets, _masked(calibration)),
+        _accuracy_words(calibration),
+        *(_standard_lines(entry) for entry in calibration.fit.get("standards", [])),
+        *(
+            [*star_lines(entry), *_wrap([f"  {entry['words']}"])]
+            for entry in calibration.fit.get("stars", [])
+        ),
+        _target_lines(calibration, targets),
+        *_wavelength_blocks(calibration, known),
+        mirror_lines(calibration),
+        _goodness_lines(calibration),
+        list(_wrap([_with_wavelengths(str(calibration.identifiability), calibration)])),
+        _gauge_lines(calibration),
+        _bound_lines(calibration, known),
+        _posterior_lines(calibration),
+    ]
+    return "\n\n".join("\n".join(part) for part in parts if part)
+
+
+def _stars(stars):
+    """Say what was found of the standard stars, and how far it rests on the catalogue."""
+    words = [f"  {' '.join(star.meta['words'].split())}" for star in stars]
+    return ["Standard stars", *_wrap(words)] if words else []
+
+
+def _more_reasons(found):
+    """Return in full what the first line has no room for."""
+    told = [*found.reasons, *found.cautions]
+    hidden = told and "; ".join(told) not in found.words[0]
+    return list(_wrap(f"  - {words}" for words in told)) if hidden else []
+
+
+def _wrap(lines):
+    """Break long lines at 80 columns, keeping the indentation of list items."""
+    for line in "\n".join(lines).split("\n"):
+        indent = " " * (len(line) - len(line.lstrip(" -")))
+        yield from textwrap.wrap(line, _WIDTH, subsequent_indent=indent) or [""]
+
+
+def _with_wavelengths(text, calibration):
+    """Name elements of parameters by their wavelength instead of their number."""
+    nm = calibration.wavelength.to_value(u.nm)
+    return _ELEMENT.sub(
+        lambda m: f"{m[1]} ({nm[int(m[2])]:.1f} nm)" if int(m[2]) < nm.size else m[0], text
+    )
+
+
+def _heading(calibration):
+    fit, settings = calibration.fit, calibration.settings
+    names = ", ".join(record.name for record in calibration.datasets)
+    state = "converged" if calibration.converged else "NOT CONVERGED"
+    title = f"Calibration of {calibration.instrument or 'an instrument'} from {names}"
+    return [
+        *_wrap([title]),
+        f"{settings['strategy']} fit of {counted(len(calibration.covariance), 'parameter')} to "
+        f"{fit['n_data']} {settings['observable'].replace('_', ' ')}s,",
+        f"{settings['fitter']}, {fit['seconds']:.2f} s, {state}",
+    ]
+
+
+def _global_lines(known):
+    lines = parameter_lines(known, several=False)
+    return ["Parameters for all wavelengths", *lines] if lines else []
+
+
+def _accuracy_lines(record, reasons):
+    table = record.accuracy
+    masked = f", {counted(record.n_masked, 'cell')} masked" if record.n_masked else ""
+    why = "; ".join(f"{reason}: {count}" for reason, count in reasons.items())
+    size = f"{counted(record.n_frames, 'frame')} x {counted(len(table), 'wavelength')}"
+    counts = f"  ({size}{masked}"
+    return [
+        f"Accuracy on {record.name}, in percent of polarization",
+        *_rows({name: _percent(table, name) for name in _ACCURACIES}),
+        *_wrap([f"{counts}; {why})" if why else f"{counts})"]),
+    ]
+
+
+def _masked(calibration):
+    """Return why cells of each dataset are masked; a file of before does not say."""
+    reasons, count = calibration.fit.get("masked") or [], len(calibration.datasets)
+    return reasons if len(reasons) == count else [{}] * count
+
+
+def _accuracy_words(calibration):
+    lines = [
+        "  s_res: residuals, corrected for the parameters fitted; s_mean: s_res/sqrt(n), the "
+        "paper's s_rel",
+        f"  s_cv: rms error on {what_is_left_out(calibration)} left out of the fit",
+        "  s_standard: rms error on datasets that the fit never saw"
+        + ("" if calibration.fit.get("standards") else " (none given)"),
+    ]
+    return list(_wrap(lines))
+
+
+def _percent(table, name):
+    # files that were written before a column existed do not have it
+    return table[name].value if name in table.colnames else np.full(len(table), np.nan)
+
+
+def _rows(columns):
+    """Return median, best and worst of each column, under their names."""
+    head = f"  {'':<10}" + "".join(f"{name:>11}" for name in columns)
+    rows = [
+        f"  {label:<10}" + "".join(f" {_of(np.abs(v), function)}" for v in columns.values())
+        for label, function in (("median", np.median), ("best", np.min), ("worst", np.max))
+    ]
+    return [head, *rows]
+
+
+def _of(values, function):
+    known = values[np.isfinite(values)]
+    return f"{function(known):10.3f}" if known.size else f"{'-':>10}"
+
+
+def _standard_lines(entry):
+    columns = {
+        "s_standard": entry["s_standard_percent"],
+        "|bias|": entry["bias_percent"],
+        "scatter": entry["scatter_percent"],
+        "s_cv": entry["s_cv_percent"],
+        "/ s_cv": entry["chi"],
+    }
+    lines = [
+        f"Prediction of {entry['name']} (not fitted), in percent",
+        *_rows({name: np.array(values, dtype=float) for name, values in columns.items()}),
+        f"  {entry['words']} ({counted(entry['n_frames'], 'frame')} x "
+        f"{counted(len(entry['n']), 'wavelength')})",
+    ]
+    return list(_wrap(lines))
+
+
+def _target_lines(calibration, targets):
+    """Return a table with one row a target: median and worst of the wavelengths."""
+    tables = target_accuracies(calibration, targets)
+    if not tables:
+        return []
+    heads = ("s_Q", "s_U", "s_p", "(worst)", "s_chi", "(worst)")
+    lines = [
+        "Accuracy for a target in percent, s_chi in deg, median over the wavelengths",
+        f"  {'DoLP':>6}{'AoLP':>10}" + "".join(f"{name:>10}" for name in heads),
+        *(_target_row(table) for table in tables),
+    ]
+    infinite = any(np.isinf(table[key]).any() for table in tables for key in ("s_p", "s_chi"))
+    if infinite:
+        known = target_accuracies(calibration, targets, open_directions="ignore")
+        lines += ["  as if what the data leave open were known:", *map(_target_row, known)]
+    lines.append(f"  {tables[0].meta['words']}")
+    if any(table.meta["aolp"] is None for table in tables):
+        lines.append("  AoLP any: at whichever angle the accuracy is worst")
+    lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration, infinite)]
+    return list(_wrap(lines))
+
+
+def _target_row(table):
+    angle = table.meta["aolp"]
+    dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
+    row = f"  {dolp:4.3g} %" + (
+        f"{'any':>10}" if angle is None else f"{angle.to_value(u.deg):10.4g}"
+    )
+    for key in ("s_Q", "s_U", "s_p", "s_chi"):
+        # s_Q and s_U only lead to s_p: their worst values would crowd the table
+        worst = (np.max,) if key in ("s_p", "s_chi") else ()
+        for function in (np.median, *worst):
+            row += f"{_short(table[key].value, function):>10}"
+    return row
+
+
+def _short(values, function):
+    known = values[~np.isnan(values)]
+    return f"{function(known):.2g}" if known.size else "-"
+
+
+def _wavelength_blocks(calibration, known):
+    """Return tables with one row a wavelength, and in each as many parameters as fit."""
+    several = [(n, e) for n, e in known.items() if e["value"].ndim and not e["fixed"]]
+    marks = "? badly determined, c conditional on a bound"
+    for i in range(0, len(several), _N_COLUMNS):
+        title = [] if i else [f"Parameters for each wavelength ({marks})"]
+        yield title + _block(calibration, dict(several[i : i + _N_COLUMNS]))
+
+
+def _block(calibration, shown):
+    rows, s_mean = _table_head(shown), _by_wavelength(calibration.datasets)
+    for i, wavelength in enumerate(calibration.wavelength.to_value(u.nm)):
+        mean = s_mean.get(round(wavelength, 2), np.nan)
+        row = f"{wavelength:8.1f}" + (f"{mean:8.3f}" if np.isfinite(mean) else f"{'-':>8}")
+        rows.append((row + "".join(_cell(entry, i) for entry in shown.values())).rstrip())
+    return rows
+
+
+def _cell(entry, i):
+    """Return value and error of one wavelength; 21 characters."""
+    # degrees to 0.01, shares of one to 0.0001
+    digits, std, status = 2 if entry["unit"] else 4, entry["std"][i], entry["status"][i]
+    value = f"{entry['value'][i]:z10.{digits}f}"
+    if np.isfinite(std):
+        error = f"{std:.{digits}f}" if std < _MANY else f"{std:.0e}"
+        return f"{value} +- {error}".ljust(20) + _MARKS.get(status, " ")
+    # what follows another parameter has no error of its own
+    return f"{value} {_SAID.get(status, '')}".ljust(21)
+
+
+def _table_head(shown):
+    optics, keys = zip(*(name.split(".") for name in shown), strict=True)
+    units = [str(entry["unit"] or "") for entry in shown.values()]
+    return [
+        f"{first:>8}{second:>8}" + "".join(f"{text[:20]:>17}    " for text in texts).rstrip()
+        for first, second, texts in (("", "", optics), ("", "s_mean", keys), ("nm", "%", units))
+    ]
+
+
+def _by_wavelength(datasets):
+    """Return s_mean at each wavelength, of the first dataset that has it."""
+    found = {}
+    for accuracy in (record.accuracy for record in datasets):
+        nm = accuracy["wavelength"].to_value(u.nm)
+        for w, s in zip(nm, accuracy["s_mean"].value, strict=True):
+            if np.isfinite(s):
+                found.setdefault(round(w, 2), s)
+    return found
+
+
+def _goodness_lines(calibration):
+    found = calibration.fit.get("lack_of_fit") or []
+    lines = [f"  - {test['words']}" for test in found]
+    lines += _outlier_lines(calibration.fit.get("outliers") or [])
+    return list(_wrap(["Goodness of fit", *lines])) if lines else []
+
+
+def _outlier_lines(outliers):
+    """Name the pairs of frames at odds with the fit, which are not left out."""
+    lines = [
+        f"  - frames {one['frames']} of {one['dataset']} are at odds with the fit, by "
+        f"{one['residual_percent']:+.2g} % ({one['sigma']:.0f} robust sigma, brightness "
+        f"{one['brightness']:.2f}); they are not left out"
+        for one in outliers[:_MOST_OUTLIERS]
+    ]
+    more = len(outliers) - _MOST_OUTLIERS
+    return lines + ([f"  - and {more} more pairs at odds with the fit"] if more > 0 else [])
+
+
+def _gauge_lines(calibration):
+    gauge = calibration.settings.get("gauge")
+    return list(_wrap([_with_wavelengths(f"Gauge: {gauge}", calibration)])) if gauge else []
+
+
+def _bound_lines(calibration, known):
+    """Name what is at a bound, how far it may go inward, and whose errors hang on that."""
+    lines = []
+    for name, entry in known.items():
+        where = np.flatnonzero(np.ravel(entry["at_bound"]))
+        inward, values = (np.ravel(entry[key])[where] for key in ("std_inward", "value"))
+        ends = [inward_words(entry, *pair) for pair in zip(values, inward, strict=True)]
+        places = _places(calibration, entry, where)
+        told = zip(places, ends, strict=True)
+        lines += [f"  - {name}{place}{end and ': '}{end}" for place, end in told]
+    hanging = {}
+    for name, entry in known.items():
+        for i in np.flatnonzero(np.ravel(entry["status"]) == "conditional"):
+            by = str(np.ravel(entry["conditional_on"])[i])
+            times = (np.ravel(entry["std_released"]) / np.ravel(entry["std"]))[i]
+            hanging.setdefault((by, name), []).append(times)
+    lines += [
+        f"  - the error of {name}{_of_several(times)} is conditional on {by} at its bound; without "
+        f"it {_times(times)} times as large"
+        for (by, name), times in hanging.items()
+    ]
+    lines = [_with_wavelengths(line, calibration) for line in lines]
+    return list(_wrap(["At a bound", *lines])) if lines else []
+
+
+def _places(calibration, entry, where):
+    nm = calibration.wavelength.to_value(u.nm)
+    return [f" ({nm[i]:.1f} nm)" if entry["value"].ndim else "" for i in where]
+
+
+def _of_several(times):
+    return f" at {len(times)} wavelengths" if len(times) > 1 else ""
+
+
+def _times(times):
+    low, high = min(times), max(times)
+    return f"{low:.2g}" if low == high else f"{low:.2g} to {high:.2g}"
+
+
+def _posterior_lines(calibration):
+    if calibration.posterior is None:
+        return []
+    return list(
+        _wrap(["Posterior", *(f"  {s}" for s in calibration.posterior.words().split("\n"))])
+    )
+
+
+def _fitted_star(table):
+    columns = {f"{key}_percent": table[key].value for key in table.colnames[1:]}
+    nm = table["wavelength"].to_value(u.nm)
+    return {"name": table.meta["name"], "from_data": table.meta["from_data"],
+            "wavelength_nm": nm} | columns  # fmt: skip
+
+
+# ---- for machines ------------------------------------------------------------------
+
+
+def to_dict(calibration, targets=TARGETS):
+    """
+    Return a calibration as plain numbers, lists and strings, ready for JSON.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    targets : sequence of (dolp, aolp)
+        Targets whose accuracy is given, see
+        `~astropolcal.calibration.target_accuracies`.
+
+    Returns
+    -------
+    dict
+        Keys ``verdict, instrument, observable, fitter, strategy, seconds, n_data,
+        n_free, rank, converged, datasets, standards, targets, parameters,
+        null_directions`` and others; what is not a number is None.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> to_dict(cal)["n_free"]
+    49
+    """
+    settings, fit = calibration.settings, calibration.fit
+    content = {
+        "verdict": verdict(calibration, targets).to_dict(),
+        "instrument": calibration.instrument,
+        "observable": settings["observable"],
+        "fitter": settings["fitter"],
+        "strategy": settings["strategy"],
+        "weights": settings["weights"],
+        "gauge": settings.get("gauge"),
+        "seconds": fit["seconds"],
+        "converged": calibration.converged,
+        "n_data": fit["n_data"],
+        "n_free": len(calibration.covariance),
+        "rank": calibration.identifiability.rank,
+        "lack_of_fit": fit.get("lack_of_fit") or [],
+        "outliers": fit.get("outliers") or [],
+        "datasets": [
+            _dataset(record) | {"masked": reasons}
+            for record, reasons in zip(calibration.datasets, _masked(calibration), strict=True)
+        ],
+        "left_out": what_is_left_out(calibration),
+        "stars": fit.get("stars", []),
+        "mirrors": mirrors(calibration),
+        "fitted_stars": [_fitted_star(table) for table in fitted_stars(calibration)],
+        "standards": [_standard(entry) for entry in fit.get("standards", [])],
+        "targets": [_target(table) for table in target_accuracies(calibration, targets)],
+        "parameters": {
+            name: _parameter(entry) for name, entry in calibration.parameter_values().items()
+        },
+        "open_on_sky": open_on_sky(calibration),
+        "null_directions": calibration.identifiability.directions,
+        "near_null_directions": calibration.identifiability.near_null,
+        "sampling": list(calibration.identifiability.sampling),
+        "mirror_solutions": list(calibration.identifiability.mirrors),
+        "mirror_branches": calibration.identifiability.branches,
+        "at_bound": list(calibration.at_bound),
+        "posterior": calibration.posterior and calibration.posterior.report(),
+        "stages": calibration.stages,
+        "provenance": dict(calibration.provenance),
+    }
+    return _plain(content)
+
+
+def _dataset(record):
+    table = record.accuracy
+    return {
+        "name": record.name,
+        "source": record.source,
+        "content_hash": record.content_hash,
+        "n_frames": record.n_frames,
+        "n_masked": record.n_masked,
+        "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
+        "n": _plain(table["n"]),
+        "k": _plain(table["k"]),
+        **{f"{key}_percent": _plain(_percent(table, key)) for key in _ACCURACIES},
+    }
+
+
+def _standard(entry):
+    # nothing is fitted to a standard: with k = 0 its s_res is the error of prediction
+    return _plain(entry) | {"s_res_percent": _plain(entry["s_standard_percent"])}
+
+
+def _target(table):
+    angle = table.meta["aolp"]
+    shares = [key for key in table.colnames if key not in ("wavelength", "s_chi")]
+    return {
+        "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
+        "aolp_deg": None if angle is None else float(angle.to_value(u.deg)),
+        "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
+        **{f"{key}_percent": _plain(table[key].value) for key in shares},
+        "s_chi_deg": _plain(table["s_chi"].value),
+        "words": table.meta["words"],
+    }
+
+
+def _parameter(entry):
+    return {key: _plain(value) for key, value in entry.items() if key != "unit"} | {
+        "unit": str(entry["unit"]) if entry["unit"] is not None else ""
+    }
+
+
+def _plain(value):
+    """Turn arrays, quantities and numpy scalars into what JSON knows; NaN into None."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, u.Quantity):
+        return {"value": _plain(value.value), "unit": str(value.unit)}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+# ---- mirrors, stars that no fit saw, and what is left open on sky ----
+
+
+_LINE_WIDTH = 80
+_N_MIRROR_ROWS = 5
+# a diattenuation of so many times that of any metal is pointed at
+_ABOVE = 3
+# so many wavelengths are all shown
+_ALL_ROWS = 12
+# so many open directions are named under the accuracies for a target, and as many bad ones
+_N_OPEN = 3
+_STAR_HEAD = ("DoLP (%)", "catalogue", "AoLP (deg)", "catalogue")
+
+
+def mirror_lines(calibration):
+    """Return diattenuations of mirrors beside those of bare metals, at a few wavelengths."""
+    tables = [mirror_values(calibration, name) for name in mirror_names(calibration)]
+    if not tables:
+        return []
+    shown = {table.meta["name"]: table for table in tables}
+    # a grid of several tables need not ascend
+    order = np.argsort(calibration.wavelength)
+    step = 1 if order.size <= _ALL_ROWS else -(-order.size // _N_MIRROR_ROWS)
+    shortened = f"; one in {step} of {order.size} wavelengths" if step > 1 else ""
+    head = "       nm" + "".join(f"{name:>17}" for name in shown)
+    lines = [f"Diattenuation in percent; the metals bare, at 45 deg{shortened}"]
+    lines.append(head + "".join(f"{metal:>10}" for metal in METALS))
+    for i in order[::step]:
+        line = f"{calibration.wavelength[i].to_value(u.nm):9.1f}"
+        line += "".join(f"{_with_error(table, 'diattenuation', i):>17}" for table in tables)
+        metals = (tables[0][f"diattenuation_{metal}"][i] for metal in METALS)
+        lines.append(line + "".join(f"{value.to_value(u.percent):10.2f}" for value in metals))
+    # the table may be wider, a sentence need not
+    return lines + [s for t in tables for s in textwrap.wrap(_above_metals(t), _LINE_WIDTH)]
+
+
+def _above_metals(table):
+    """Say where a mirror polarizes far more than any metal does, with certainty."""
+    percent = {
+        key: table[key].to_value(u.percent)
+        for key in table.colnames
+        if key.startswith("diattenuation")
+    }
+    most = np.max([np.abs(percent[f"diattenuation_{metal}"]) for metal in METALS], axis=0)
+    # what is held has no error
+    least = np.abs(percent["diattenuation"])
+    least = least - 3 * np.nan_to_num(percent["diattenuation_err"], posinf=np.inf)
+    above = least / most
+    i = int(np.argmax(above))
+    if not above[i] > _ABOVE:
+        return ""
+    return (
+        f"{table.meta['name']}: {percent['diattenuation'][i]:.2f} % at "
+        f"{table['wavelength'][i].to_value(u.nm):.1f} nm is more than {_ABOVE} times what a bare "
+        "metal has: a coating, or something else that the model lacks"
+    )
+
+
+def _with_error(table, key, i):
+    value, std = (table[name][i].value for name in (key, f"{key}_err"))
+    return f"{value:.3f} +- {std:.3f}" if np.isfinite(std) else f"{value:.3f}"
+
+
+def star_lines(entry):
+    """Return what a star of known polarization says of the calibration."""
+    lines = [
+        f"{entry['star']} against the catalogue; no fit saw {entry['name']}",
+        "       nm" + "".join(f"{t:>17}" for t in _STAR_HEAD),
+    ]
+    for i, lam in enumerate(entry["wavelength_nm"]):
+        line = f"{lam:9.1f}"
+        for key, unit, digits in (("dolp", "percent", 3), ("aolp", "deg", 1)):
+            for name in (key, f"{key}_known"):
+                value, std = entry[f"{name}_{unit}"][i], entry[f"{name}_err_{unit}"][i]
+                text = "-" if not np.isfinite(value) else f"{value:.{digits}f}"
+                text += f" +- {std:.{digits}f}" if np.isfinite(std) and text != "-" else ""
+                line += f"{text:>17}"
+        lines.append(line)
+    return lines
+
+
+def mirrors(calibration):
+    """Return the values of all mirrors for machines."""
+    tables = [mirror_values(calibration, name) for name in mirror_names(calibration)]
+    return [_entry(table) for table in tables]
+
+
+def _entry(table):
+    columns = {"wavelength_nm": table["wavelength"].to_value(u.nm)}
+    for key in table.colnames[1:]:
+        unit = "percent" if key.startswith("diattenuation") else "deg"
+        columns[f"{key}_{unit}"] = table[key].value
+    return {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns
+
+
+# ---- what an accuracy for a target is made of -----------------------------------------------
+
+
+def open_on_sky(calibration):
+    """
+    Return what is open or badly determined and changes what is measured on sky.
+
+    Of each direction ``kind``, ``words`` and the changes ``aolp_deg`` and
+    ``dolp_percent``, least and largest of the wavelengths; the worst first.
+    """
+    finding = calibration.identifiability
+    return [
+        {"kind": kind, "words": words(direction)} | direction["sky"]
+        for kind, words, directions in (
+            ("open", _open_words, finding.directions),
+            ("badly determined", _near_words, finding.near_null),
+        )
+        for direction in sorted(directions, key=_turn, reverse=True)
+        if direction.get("sky") and shows_on_sky(direction["sky"])
+    ]
+
+
+def open_lines(calibration, infinite=True):
+    """Say what makes an accuracy for a target infinite or large, one line a kind."""
+    found, lines = open_on_sky(calibration), []
+    for kind, says in (
+        (
+            "open",
+            "infinite by what the data leave open"
+            if infinite
+            else "resting on priors, as the data leave it open",
+        ),
+        ("badly determined", "large by what is badly determined"),
+    ):
+        words = [one["words"] for one in found if one["kind"] == kind]
+        more = [f"and {len(words) - _N_OPEN} more, see below"] if len(words) > _N_OPEN else []
+        if words:
+            lines.append(f"  {says}: {'; '.join([*words[:_N_OPEN], *more])}")
+    return lines
+
+
+def _turn(direction):
+    return max(map(abs, (direction.get("sky") or {}).get("aolp_deg", [0.0])))
+
+
+def _open_words(direction):
+    lead = direction["words"].partition(" cannot be told")[0].partition(" changes no datum")[0]
+    return f"{lead}: {sky_words(direction['sky'])}"
+
+
+def _near_words(direction):
+    lead = direction["words"].partition(" at the noise of this fit")[0]
+    return f"{lead}: {sky_words(direction['sky'])}"

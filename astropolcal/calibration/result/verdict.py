@@ -1,0 +1,595 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Whether a calibration can be used, and if not why, in five lines for the top of a summary.
+
+A summary that fits a terminal of 80 columns and 24 lines.
+"""
+
+import textwrap
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.calibration.noise.scatter import kind_of_source
+from astropolcal.calibration.uncertainty.covariance import STATUSES
+from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
+from astropolcal.calibration.validation.stars import fitted_stars
+from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
+from astropolcal.words import counted
+
+__all__ = ["Verdict"]
+
+_WIDTH = 80
+# what holds at more than this share of the wavelengths holds of the calibration
+_MOST = 0.5
+# bare metals polarize by a few percent at most, coated ones by little more
+_NO_MIRROR = 30 * u.percent
+# so many angles common to all wavelengths at their bounds are no chance
+_ANGLES = 2
+# residuals at least as large happen by chance less often
+_UNLIKELY = 0.01
+# the mounts are known better than this before any fit, and it turns 6 % of Q into U
+_ABSURD_ANGLE = 10 * u.deg
+# real data of three instruments leave 0.1 to 1.5 %, exchanged beams and wrong signs leave tens
+_MISFIT = 5 * u.percent
+# a turn or a change of the DoLP by less, in degree or percent of itself, does not show
+_SHOWS = 0.005
+# residuals of so many times the noise are worth a word: the noise is not known better
+_CLEARLY = 2
+
+
+@dataclass
+class Verdict:
+    """
+    Whether a calibration can be used.
+
+    Parameters
+    ----------
+    usable : bool
+        Whether nothing was found that makes the result unusable as it is.
+    reasons : list of str
+        Why it is not usable; the most telling first.
+    cautions : list of str
+        What to mind in one that is.
+    words : list of str
+        Five lines of at most 80 columns: the verdict, the accuracy on sky, what is
+        determined, what is not, and which observation would help most.
+
+    Examples
+    --------
+    >>> Verdict(False, ["the fit did not converge"], [], ["NOT USABLE AS IT IS: ..."]).usable
+    False
+    """
+
+    usable: bool
+    reasons: list
+    cautions: list
+    words: list
+
+    def to_dict(self):
+        """
+        Return it for machines.
+
+        Returns
+        -------
+        dict
+            Keys ``usable``, ``reasons``, ``cautions``, ``words``.
+        """
+        return dict(vars(self))
+
+
+def verdict(calibration, targets=TARGETS):
+    """
+    Return whether a calibration can be used, and why not.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    targets : sequence of (dolp, aolp)
+        Targets whose accuracy the words give, see
+        `~astropolcal.calibration.target_accuracies`.
+
+    Returns
+    -------
+    Verdict
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> found = verdict(cal)
+    >>> found.usable, len(found.words)
+    (True, 5)
+    """
+    known = calibration.parameter_values()
+    free = {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
+    tables = target_accuracies(calibration, targets)
+    # whether it is usable does not hang on what was asked for
+    bright = target_accuracies(calibration, TARGETS[:1])
+    sky = _open_on_sky(calibration, free)
+    # what must be wrong with the set-up or its description comes before what is not known
+    wrong = [
+        _nothing(calibration),
+        _angles(calibration, free),
+        *_mirrors(calibration, known),
+        _misfit(calibration),
+    ]
+    hanging = _hanging(free)
+    unknown = [*_absurd(free), _open_words(sky), *_too_far(bright, sky), hanging]
+    stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
+    reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
+    # what is not known runs to its bounds, too
+    wrong = any(wrong) or bool(stuck and not any(unknown))
+    cautions = [] if reasons else _cautions(calibration, free)
+    words = [
+        _first(reasons, cautions),
+        "On sky      unknown, as something is wrong" if wrong else _accuracy(tables, sky),
+        *_determined(calibration, free),
+        f"Next        {_next(calibration, free, wrong, sky)}",
+    ]
+    return Verdict(not reasons, reasons, cautions, [shortened(line) for line in words])
+
+
+def shortened(line, width=_WIDTH):
+    """Cut a line off at a word; blanks at its begin and inside stay."""
+    if len(line) <= width:
+        return line
+    return line[: width - 3].rpartition(" ")[0].rstrip(",;: ") + " ..."
+
+
+def _first(reasons, cautions):
+    told = reasons or cautions
+    head = "NOT USABLE AS IT IS" if reasons else "Usable"
+    line = f"{head}: {'; '.join(told)}" if told else head
+    if len(line) <= _WIDTH or len(told) == 1:
+        return line
+    more = f" (and {len(told) - 1} more)"
+    return shortened(f"{head}: {told[0]}", _WIDTH - len(more)) + more
+
+
+# ---- reasons ------------------------------------------------------------------------------
+
+
+def _nothing(calibration):
+    finding = calibration.identifiability
+    if finding.rank == 0:
+        return "no free parameter changes any datum"
+    n_data = calibration.fit.get("n_data", np.inf)
+    return "no datum is left over to tell the noise" if n_data <= finding.rank else ""
+
+
+def _stuck(free):
+    """Name the parameters that are at a bound nearly everywhere."""
+    stuck = [
+        f"{name} ({np.sum(entry['at_bound'])} of {entry['value'].size})"
+        for name, entry in free.items()
+        if entry["value"].ndim and np.mean(entry["at_bound"]) > _MOST
+    ]
+    return f"at a bound at most wavelengths: {', '.join(stuck)}" if stuck else ""
+
+
+def _orientations(free):
+    """Return the free angles common to all wavelengths."""
+    return {
+        name: entry
+        for name, entry in free.items()
+        if not entry["value"].ndim
+        and entry["unit"] is not None
+        and u.Unit(entry["unit"]).is_equivalent(u.rad)
+    }
+
+
+def _angles(calibration, free):
+    """Say that most of the angles are at a bound, and the residuals larger than the noise."""
+    angles = _orientations(free)
+    stuck = [name for name, entry in angles.items() if entry["at_bound"]]
+    if len(stuck) < _ANGLES or len(stuck) <= _MOST * len(angles) or not _excess(calibration):
+        return ""
+    return (
+        f"most angles at their bounds: are beams or signs exchanged? ({', '.join(stuck)}; "
+        f"residuals {_excess(calibration):.3g} times the noise)"
+    )
+
+
+def _excess(calibration):
+    """Return by how many times the residuals exceed the noise for certain; 0 where they do not."""
+    tests = calibration.fit.get("lack_of_fit") or []
+    times = [test["times_noise"] for test in tests if test["p_value"] < _UNLIKELY]
+    # with several estimates of the noise that which excuses most
+    return min(times) if times and len(times) == len(tests) else 0.0
+
+
+def _mirrors(calibration, known):
+    """Say of each mirror that polarizes as no mirror does, where the source is not to."""
+    sources = [r for r in calibration.datasets if kind_of_source(r.source) != "polarized"]
+    told = " or ".join(f"{r.name} really {str(r.source)!r}" for r in sources)
+    return [
+        f"{name} polarizes by more than {_NO_MIRROR.value:g} %, as no mirror does: is {told}?"
+        for name in (mirror_names(calibration) if sources else ())
+        if _too_much(calibration, known, name)
+    ]
+
+
+def _too_much(calibration, known, name):
+    """Return whether a fitted mirror polarizes too much with certainty, at most wavelengths."""
+    if known.get(f"{name}.diattenuation", {"fixed": False})["fixed"]:
+        return False
+    table = mirror_values(calibration, name)
+    # without an error where it is at a bound, and where only a product with another is known
+    error = np.nan_to_num(table["diattenuation_err"].value, posinf=np.inf)
+    least = np.abs(table["diattenuation"].value) - 3 * error
+    return np.mean(least * table["diattenuation"].unit > _NO_MIRROR) > _MOST
+
+
+def _misfit(calibration):
+    """Say that the model does not describe the data at all."""
+    left = [_median(r.accuracy["s_res"].to_value(u.percent)) for r in calibration.datasets]
+    worst = np.nanmax([0.0, *left])
+    if not worst > _MISFIT.value or not _excess(calibration):
+        return ""
+    return f"the model misses the data by {worst:.2g} %, {_excess(calibration):.2g} times the noise"
+
+
+def _absurd(free):
+    """Name orientations and other parameters whose errors say that nothing is known."""
+    told = []
+    for name, entry in _orientations(free).items():
+        std = float(entry["std"]) * u.Unit(entry["unit"])
+        if std > _ABSURD_ANGLE:
+            told.append(f"{name} is known to {std.to_value(u.deg):.3g} deg only")
+    wide = [n for n, e in free.items() if np.mean(e["std"] > _width(e)) > _MOST]
+    return [*told, f"errors larger than the bounds: {', '.join(wide)}"] if wide else told
+
+
+def _hanging(free):
+    """Name the orientations at a bound on which others hang: these are where the bound is."""
+    angles = _orientations(free)
+    told = [str(e["conditional_on"]) for e in angles.values() if e["status"] == "conditional"]
+    names = dict.fromkeys(name for by in told for name in by.split(", ") if name in angles)
+    return f"orientations hang on the bound of {', '.join(names)}" if names else ""
+
+
+def _width(entry):
+    low, high = entry["bounds"]
+    return np.inf if low is None or high is None else high - low
+
+
+def _open_leads(calibration, free, shown=False):
+    """Return what leads the open directions, and their change on sky if known, or if it shows."""
+    found = {}
+    for direction in calibration.identifiability.directions:
+        sky, lead = direction.get("sky"), direction["words"].partition(" ")[0]
+        stem, _, index = lead.rstrip("]").partition("[")
+        # a prior or a bound may have closed what the data leave open
+        is_open = stem in free and np.ravel(free[stem]["status"])[int(index or 0)] == "open"
+        if is_open and not (shown and sky and not _seen(sky)):
+            found[lead] = sky or {}
+    return found
+
+
+def _seen(sky):
+    """Return what of AoLP and DoLP changes by what shows."""
+    kinds = (("aolp_deg", "AoLP"), ("dolp_percent", "DoLP"))
+    return [what for key, what in kinds if max(map(abs, sky[key])) >= _SHOWS]
+
+
+def _open_on_sky(calibration, free):
+    """Return what of AoLP and DoLP is open on sky, at most wavelengths, and along which leads."""
+    found = {}
+    for lead, sky in _open_leads(calibration, free).items():
+        for what in _seen(sky) if sky else ():
+            found.setdefault(what, []).append(lead)
+    # what leads at a single wavelength opens that one only
+    many = _MOST * len(calibration.wavelength)
+    return {
+        what: leads
+        for what, leads in found.items()
+        if any("[" not in lead for lead in leads) or len(leads) > many
+    }
+
+
+def _open_words(sky):
+    if not sky:
+        return ""
+    what, lead = " and ".join(sky), next(iter(sky.values()))[0]
+    return f"{what} on sky {'are' if len(sky) > 1 else 'is'} open ({lead})"
+
+
+def _too_far(tables, sky):
+    """Say what of a bright target is known too badly to be called known."""
+    if not tables:
+        return []
+    (table,) = tables
+    dolp = u.Quantity(table.meta["dolp"]).to_value(u.percent)
+    told = []
+    for key, what, unit, most in (
+        ("s_p", "DoLP", "%", dolp),
+        ("s_chi", "AoLP", "deg", _ABSURD_ANGLE.value),
+    ):
+        value = _median(table[key].value)
+        # what is open has been said, with its name
+        if value > most and what not in sky:
+            known = f"known to {value:.2g} {unit} only" if np.isfinite(value) else "open"
+            told.append(f"the {what} of {dolp:g} % on sky is {known}")
+    return told
+
+
+def _median(values):
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def _cautions(calibration, free):
+    """Say what to mind in a calibration that is usable."""
+    tests, excess = calibration.fit.get("lack_of_fit") or [], _excess(calibration)
+    stuck = [n for n, e in free.items() if not e["value"].ndim and e["at_bound"]]
+    told = [f"residuals {excess:.2g} times the noise"] if excess > _CLEARLY else []
+    told += [f"at its bound: {', '.join(stuck)}"] if stuck else []
+    if any("disagree with the priors" in test["words"] for test in tests):
+        told.append("data and priors disagree")
+    return told
+
+
+# ---- accuracy, what is determined, what to do -----------------------------------------------
+
+
+def _accuracy(tables, sky):
+    """Return what is known of light from the sky, medians over the wavelengths."""
+    if not tables:
+        return "On sky      unknown: the chain has no half-wave plate"
+    dolps = ", ".join(f"{u.Quantity(t.meta['dolp']).to_value(u.percent):.3g}" for t in tables)
+    s_p, s_chi = (
+        [_number(_median(t[key].value), what in sky, *limits) for t in tables]
+        for key, what, limits in (("s_p", "DoLP", (3, 100)), ("s_chi", "AoLP", (2, 45)))
+    )
+    degree, angle = _listed(s_p, "%"), _listed(s_chi, "deg")
+    return f"On sky      {dolps} % {'' if degree == 'open' else 'to '}{degree}, AoLP {angle}"
+
+
+def _number(value, is_open, decimals, most):
+    """Return two digits with at most some decimals; what is infinite is open."""
+    if is_open or np.isinf(value):
+        return "open"
+    least = 10.0**-decimals
+    if not least <= value <= most:
+        return "-" if np.isnan(value) else f"<{least:g}" if value < least else f">{most}"
+    return f"{round(float(f'{value:.2g}'), decimals):g}"
+
+
+def _listed(numbers, unit):
+    alike = len(set(numbers)) == 1
+    unit = "" if alike and numbers[0] in ("open", "-") else f" {unit}"
+    return (numbers[0] if alike else ", ".join(numbers)) + unit
+
+
+def _determined(calibration, free):
+    """Say how many parameters are determined, and how many are not and why, by name."""
+    total = sum(entry["value"].size for entry in free.values())
+    good, names = _with_status(free, "determined")
+    held, _ = _with_status(free, "by priors")
+    more = f", {held} with priors" if held else ""
+    yield f"Determined  {good} of {total}{more}{': ' if good else ''}{names}"
+    # what is open comes first
+    bad = {s: _with_status(free, s) for s in (*STATUSES[3:6], STATUSES[2])}
+    counts = [f"{n} {status}" for status, (n, _) in bad.items() if n]
+    if bad["open"][0] and not _open_leads(calibration, free, shown=True):
+        counts[0] += " (not seen on sky)"
+    names = ", ".join(names for n, names in bad.values() if n)
+    yield f"Not         {', '.join(counts)}: {names}" if counts else "Not         none"
+
+
+def _with_status(free, status):
+    """Return how many elements have a status, and the parameters they belong to."""
+    counts = {name: int(np.sum(entry["status"] == status)) for name, entry in free.items()}
+    shown = [
+        name if n == free[name]["value"].size else f"{name} ({n})"
+        for name, n in counts.items()
+        if n
+    ]
+    return sum(counts.values()), ", ".join(shown)
+
+
+def _next(calibration, free, wrong, sky):
+    """Return the one thing that would help most."""
+    kinds = {kind_of_source(r.source) for r in calibration.datasets}
+    unknown = any(_absurd(free)) or bool(sky)
+    advice = (
+        (calibration.identifiability.rank == 0, "check that every optic that turns has its mount="),
+        (wrong, "check mounts, beams, angles, source; or run astropolcal diagnose"),
+        (
+            unknown and "polarized" not in kinds,
+            "the internal source with its polarizer, at several derotator angles",
+        ),
+        (_hanging(free), "a polarized standard star, or bounds as wide as what is not known"),
+        ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
+        (unknown or not calibration.converged, "more angles of derotator and half-wave plate"),
+        (
+            "star" not in kinds,
+            "an unpolarized standard star; the telescope counts as published, without error",
+        ),
+        ("unpolarized" not in kinds, "the internal source without its polarizer"),
+        (
+            any(entry["status"] == "by priors" for entry in _orientations(free).values()),
+            "a polarized standard star: the AoLP rests on how optics are mounted",
+        ),
+        (_excess(calibration) > _CLEARLY, "astropolcal diagnose: what does the model lack?"),
+        (True, "a dataset that no fit saw, as a test (--standard FILE)"),
+    )
+    return next(words for applies, words in advice if applies)
+
+
+def _mount(calibration, free, sky):
+    """Return the angle to hold where the zero of the AoLP is open: the last that takes part."""
+    moved = [
+        direction["parameters"]
+        for direction in calibration.identifiability.directions
+        for lead in sky.get("AoLP", [])[:1]
+        if direction["words"].startswith(f"{lead} ")
+    ]
+    angles = [name for names in moved for name in names if name in _orientations(free)]
+    return f", or --fix {angles[-1]} if its mount is known" if angles else ""
+
+
+# ---- a summary that fits a terminal of 80 columns and 24 lines ----
+
+
+# the terminal's 24 lines less the prompt
+HEIGHT = 23
+HINT = "--full (full=True) adds tables per wavelength, the gauge and mirror solutions"
+_LINE_WIDTH = 80
+_COLUMN = 28
+# estimates of the noise, in few words
+_NOISES = {"errors": "stated errors"}
+
+
+def compact_lines(calibration, found, height=HEIGHT):
+    """Return the verdict, the parameters, the fit and its goodness in so many lines."""
+    stars = fitted_stars(calibration)
+    known = without_stars(calibration.parameter_values(), stars)
+    single = parameter_lines(known, several=False)
+    found_of = (shortened(f"  {star.meta['words']}") for star in stars)
+    rows = [*single, *found_of, *parameter_lines(known)[len(single) :]]
+    rest = [_heading(calibration), _fit(calibration), *_goodness(calibration)]
+    room = height - len(found.words) - len(rest) - 2
+    if len(rows) > room:
+        rows = [*rows[: room - 1], f"  and {len(rows) - room + 1} more lines"]
+    return [*found.words, "", *rows, "", *(shortened(line) for line in rest)]
+
+
+def _heading(calibration):
+    names = [record.name for record in calibration.datasets]
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return f"Calibration of {calibration.instrument or 'an instrument'} from {names[0]}{more}"
+
+
+def _fit(calibration):
+    fit, n = calibration.fit, len(calibration.covariance)
+    outliers = len(fit.get("outliers") or [])
+    return (
+        f"Fit         {counted(n, 'parameter')}, {fit['n_data']} data, rank "
+        f"{calibration.identifiability.rank}, {calibration.settings['strategy']}, "
+        + ("converged" if calibration.converged else "NOT CONVERGED")
+        + (f"; {counted(outliers, 'pair')} of frames at odds" if outliers else "")
+        + ("" if calibration.posterior is None else ", sampled")
+    )
+
+
+def _goodness(calibration):
+    s_res, s_cv = (_worst(calibration, key) for key in ("s_res", "s_cv"))
+    left_out = f", s_cv {s_cv:.2g} %" if np.isfinite(s_cv) else ""
+    datasets = "worst dataset, " if len(calibration.datasets) > 1 else ""
+    yield f"Residuals   s_res {s_res:.2g} %{left_out} ({datasets}median wavelength)"
+    tests = calibration.fit.get("lack_of_fit") or []
+    if tests:
+        told = [
+            f"{test['times_noise']:.2g} x {_NOISES.get(test['noise'], test['noise'])} "
+            f"(p = {test['p_value']:.1g})"
+            for test in tests
+        ]
+        yield f"Scatter     {', '.join(told)}"
+    # what no fit saw is why it was given
+    for entry in calibration.fit.get("standards", []):
+        yield f"Predicted   {entry['name']}: {entry['words']}"
+    for entry in calibration.fit.get("stars", []):
+        yield f"Catalogue   {entry['words']}"
+
+
+def _worst(calibration, key):
+    """Return the largest of the datasets' medians over the wavelengths."""
+    medians = []
+    for table in (record.accuracy for record in calibration.datasets):
+        known = table[key].value[np.isfinite(table[key].value)] if key in table.colnames else []
+        medians += [np.median(known)] if len(known) else []
+    return max(medians, default=np.nan)
+
+
+# ---- parameters -----------------------------------------------------------------------------
+
+
+def without_stars(known, stars):
+    """Return the parameters that are not those of a standard star, which say it in many numbers."""
+    names = tuple(f"{star.meta['name']}." for star in stars)
+    return {name: entry for name, entry in known.items() if not name.startswith(names)}
+
+
+def parameter_lines(known, several=True):
+    """Return a line for each free parameter, those given per wavelength last, if at all."""
+    free = {name: entry for name, entry in known.items() if not entry["fixed"]}
+    lines = [
+        line
+        for name, entry in free.items()
+        if not entry["value"].ndim
+        for line in _wrapped(name, number(entry))
+    ]
+    if several:
+        rows = {name: entry for name, entry in free.items() if entry["value"].ndim}
+        lines += [shortened(f"  {name:<{_COLUMN}}{_range(entry)}") for name, entry in rows.items()]
+    return lines
+
+
+def _wrapped(name, text):
+    first = f"  {name:<{_COLUMN}}"
+    indent = " " * (_COLUMN + 5)
+    return textwrap.wrap(
+        first + text, _LINE_WIDTH, subsequent_indent=indent, drop_whitespace=True,
+        break_on_hyphens=False,
+    )  # fmt: skip
+
+
+def number(entry):
+    """Return value, error, unit and status of a parameter common to all wavelengths."""
+    value, std, unit = float(entry["value"]), float(entry["std"]), str(entry["unit"] or "")
+    status = str(entry["status"])
+    # z: what rounds to zero has no sign
+    text = f"{value:z12.5f}"
+    if status == "tied":
+        return f"{text} {unit} (follows {entry['tied']})"
+    if status == "at bound":
+        inward = inward_words(entry, value, float(entry["std_inward"]))
+        return f"{text} {unit} ({'; '.join(filter(None, ['at its bound', inward]))})"
+    if not np.isfinite(std):
+        return f"{text} {unit} ({'open: not determined alone' if status == 'open' else status})"
+    error = f"{std:.5f}" if std < 10 else f"{std:.4g}"
+    text = f"{text} +- {error} {unit}".rstrip()
+    if status == "conditional":
+        return f"{text} ({conditional(entry)})"
+    return text if status == "determined" else f"{text} ({status})"
+
+
+def inward_words(entry, value, inward):
+    """Say how far what is at a bound may go inward at one sigma; empty where that is not known."""
+    if not np.isfinite(inward):
+        return "not limited" if np.isinf(inward) else ""
+    low, high = entry["bounds"]
+    at_low = high is None or (low is not None and value - low < high - value)
+    # two digits of the way inward
+    digits = max(2, 1 - int(np.floor(np.log10(inward)))) if inward > 0 else 5
+    return f"below {value + inward:.{digits}f}" if at_low else f"above {value - inward:.{digits}f}"
+
+
+def conditional(entry):
+    """Say on what an error hangs, and what it is without."""
+    released = float(entry["std_released"])
+    without = f"{released:.2g}" if np.isfinite(released) else "open"
+    return f"conditional on {entry['conditional_on']} at its bound; without it {without}"
+
+
+def _range(entry):
+    """Return least and largest value over the wavelengths, and how many have which status."""
+    values, unit = entry["value"], str(entry["unit"] or "")
+    digits = 2 if entry["unit"] else 4
+    text = f"{values.min():z.{digits}f} to {values.max():z.{digits}f} {unit}".rstrip()
+    statuses, counts = np.unique(entry["status"], return_counts=True)
+    std = entry["std"][np.isfinite(entry["std"])]
+    error = f" +- {np.median(std):.2g}" if std.size else ""
+    if len(statuses) == 1:
+        return f"{text}{error} ({statuses[0]})"
+    told = (f"{n} {s}" for s, n in zip(statuses, counts, strict=True) if s != "determined")
+    return f"{text}{error} ({', '.join(told)})"

@@ -1,0 +1,313 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Rows of the measurement matrix of a chain, and how the Stokes parameters found with it change.
+
+Pieces of a system Mueller matrix: where a chain begins, its wavelengths, its errors.
+"""
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.chain import join, leaves
+from astropolcal.exceptions import ParameterError, WavelengthRangeError
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.optics import COORDINATES
+from astropolcal.propagation import Propagator
+from astropolcal.units import canonical_factor
+
+__all__ = []
+
+# columns of I and of Q and U, to which an error of the model is independent or in proportion
+_INTENSITY, _LINEAR = (0,), (1, 2)
+
+
+class Rows:
+    """Measurement rows of a chain at canonical positions and wavelengths, and how they move."""
+
+    def __init__(self, chain, lam, placed, free=None, mix=None, nodes=(1.0,)):
+        self.chain, self.free = chain, free
+        self._leaves = leaves(chain)
+        self._own = [leaf.canonical_values() for leaf in self._leaves]
+        self._mix, self._nodes = np.eye(len(lam)) if mix is None else mix, np.asarray(nodes)
+        # fluxes of I, Q, U and V alone: a flux is linear in the light, these are its coefficients
+        self._light = [Propagator(chain, lam, placed, source) for source in np.eye(4)]
+        self._shape = len(lam), self._light[0].shape[1] // len(self._nodes)
+
+    def rows(self, vector=None, n=4):
+        """
+        Return the rows of both beams.
+
+        Parameters
+        ----------
+        vector : `~numpy.ndarray`, optional
+            Free parameters of the calibration in canonical units; by default its own values.
+        n : int
+            For how many of I, Q, U, V.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (2, n_wavelengths, n_frames, n), the right beam first.
+        """
+        values = self._values(vector)
+        fluxes = [np.stack(light.fluxes(values)) for light in self._light[:n]]
+        return np.stack([self._over_nodes(flux) for flux in fluxes], axis=-1)
+
+    def derivatives(self, n=4):
+        """
+        Return how the rows change with each free parameter of the chain.
+
+        Parameters
+        ----------
+        n : int
+            For how many of I, Q, U, V.
+
+        Returns
+        -------
+        dict of str to `~numpy.ndarray`
+            ``"optic.parameter"`` to derivative per canonical unit (radian, micrometre or 1), of
+            the shape of `rows`; for a parameter given per wavelength, to the value at that
+            wavelength.
+        """
+        wanted = self._wanted()
+        if not wanted:
+            return {}
+        values, shape = self._values(None), self._light[0].shape
+        result = {name: np.empty((2, *self._shape, n)) for name in wanted.values()}
+        ones, zeros = np.ones(shape), np.zeros(shape)
+        for k, light in enumerate(self._light[:n]):
+            # one forward sweep serves the derivatives of both beams
+            sweep = light.forward(values)
+            for beam, weights in enumerate([(ones, zeros), (zeros, ones)]):
+                found = sweep.derivatives(list(wanted), weights)
+                for place, name in wanted.items():
+                    # what lies behind the splitter of the other beam leaves no trace
+                    slope = found.get(place, np.zeros(shape))
+                    result[name][beam, ..., k] = self._over_nodes(slope)
+        return result
+
+    def spread(self, slopes):
+        """
+        Lay derivatives by name out over the calibration's free parameters.
+
+        Parameters
+        ----------
+        slopes : dict of str to `~numpy.ndarray`
+            Derivatives per canonical unit, the first axis that of the wavelengths.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Derivatives per declared unit, with a last axis for the free parameters.
+        """
+        shape = next(iter(slopes.values())).shape if slopes else self._shape
+        result = np.zeros((*shape, self.free.size))
+        for name, slope in slopes.items():
+            slot, factor, _ = self.free.lookup(name)
+            # tie (own value by the source) and unit (canonical by declared)
+            part = slope * factor * slot.factor
+            if slot.per_wavelength:
+                # w: wavelengths of the data, weighted means of those of the calibration, i
+                result[..., slot.slice] += np.einsum("w...,wi->w...i", part, self._mix)
+            else:
+                result[..., slot.start] += part
+        return result
+
+    def changes(self, gain, n=3, scale=1.0):
+        r"""
+        Return how the Stokes parameters that a solution finds change with the free parameters.
+
+        :math:`\delta\hat{\mathbf S} = -G\,\delta A\,\mathbf S`
+
+        Parameters
+        ----------
+        gain : `~numpy.ndarray`
+            What turns fluxes into Stokes parameters, (n_wavelengths, n_found, 2, n_frames).
+        n : int
+            How many of I, Q, U, V the light has.
+        scale : `~numpy.ndarray` or float
+            What multiplies the rows.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Per declared unit, (n_wavelengths, n_found, n, n_free).
+        """
+        slopes = {
+            # dS = -G dA S; b: beams, f: frames, s: components of the light
+            name: -np.einsum("wkbf,bwfs->wks", gain, (slope * scale)[..., :n], optimize=True)
+            for name, slope in self.derivatives(max(n, 3)).items()
+        }
+        if not slopes:
+            return np.zeros((len(gain), gain.shape[1], n, self.free.size))
+        return self.spread(slopes)
+
+    def _names(self):
+        return [f"{leaf.name}.{key}" for leaf in self._leaves for key in leaf.param_names]
+
+    def _slot(self, name):
+        return None if self.free is None else self.free.lookup(name)[0]
+
+    def _wanted(self):
+        places = (
+            (i, j) for i, leaf in enumerate(self._leaves) for j in range(len(leaf.param_names))
+        )
+        named = zip(places, self._names(), strict=True)
+        return {place: name for place, name in named if self._slot(name) is not None}
+
+    def _values(self, vector):
+        """Return the values of every optic at the wavelengths of the data."""
+        names = iter(self._names())
+        values = []
+        for own in self._own:
+            values.append([self._at(next(names), value, vector) for value in own])
+        return values
+
+    def _at(self, name, value, vector):
+        slot = None if vector is None else self._slot(name)
+        if slot is not None:
+            _, factor, offset = self.free.lookup(name)
+            # a tied parameter follows its source: value = factor * source + offset
+            value = np.reshape(factor * vector[slot.slice] + offset, value.shape)
+        if value.size == 1:
+            return value.reshape(())
+        if value.size != self._mix.shape[1]:
+            raise ParameterError(
+                f"{name} has {value.size} values; allowed are 1 or {self._mix.shape[1]}, "
+                "one a wavelength"
+            )
+        return self._mix @ value
+
+    def _over_nodes(self, array):
+        """Average over the nodes of the exposures, the last axis but one of columns."""
+        array = array.reshape(*array.shape[:-1], len(self._nodes), self._shape[1])
+        return np.einsum("...nf,n->...f", array, self._nodes)
+
+
+def model_error(fit, lam, n=3):
+    """
+    Return what the model lacks, as further directions of the Stokes parameters.
+
+    Shape (n_directions, n_wavelengths, n, n), from ``model_error`` of what a calibration knows of
+    its fit: each of q and u errs in proportion to q and to u, and by a share of the intensity.
+    At all wavelengths together, as what the model lacks is smooth; between those that are known
+    the errors are interpolated.
+    """
+    known = (fit or {}).get("model_error")
+    if not known:
+        return np.zeros((0, len(lam), n, n))
+    own = np.asarray(known["wavelength_nm"], dtype=float) / 1e3
+    order = np.argsort(own)
+    directions = []
+    for key, columns in (("relative_percent", _LINEAR), ("absolute_percent", _INTENSITY)):
+        values = np.asarray(known[key], dtype=float)[order] / 100
+        for row in _LINEAR:
+            for column in columns:
+                direction = np.zeros((len(lam), n, n))
+                direction[:, row, column] = np.interp(lam, own[order], values)
+                directions.append(direction)
+    return np.array(directions)
+
+
+# ---- pieces of a system Mueller matrix: where a chain begins, its wavelengths, its errors ----
+
+
+_TELESCOPE = ("parallactic", "altitude")
+_SAME_WAVELENGTH = 1e-6
+
+
+def match_wavelengths(grid, chain, wavelength):
+    """Return the wavelengths, and the bin of each; None where the law gives all."""
+    if wavelength is None:
+        return grid, np.arange(grid.size)
+    try:
+        lam = np.atleast_1d(u.Quantity(wavelength)).to(grid.unit)
+    except (TypeError, u.UnitConversionError):
+        raise ParameterError(f"wavelength = {wavelength!r} needs a unit such as nm") from None
+    # relative, (n_wanted, n_grid)
+    far = np.abs(lam[:, None] - grid) / grid
+    bins = far.argmin(axis=1)
+    off = far.min(axis=1) > _SAME_WAVELENGTH
+    if not off.any():
+        return lam, bins
+    several = [
+        f"{leaf.name}.{key}"
+        for leaf in leaves(chain)
+        for key in leaf.param_names
+        if np.size(getattr(leaf, key).value) > 1
+    ]
+    if several:
+        raise WavelengthRangeError(
+            f"{lam[off][0]:.2f} is none of the {grid.size} calibrated wavelengths, and "
+            f"{several[0]} is known at these only: {grid.min():.2f} to {grid.max():.2f}"
+        )
+    # laws of glass and metal interpolate between calibrated wavelengths, but are not trusted beyond
+    outside = (lam < grid.min()) | (lam > grid.max())
+    if (outside & off).any():
+        raise WavelengthRangeError(
+            f"{lam[outside & off][0]:.2f} is outside the calibrated range, "
+            f"{grid.min():.2f} to {grid.max():.2f}"
+        )
+    return lam, None
+
+
+def errors(calibration, axes, value, slopes, bins):
+    """Return the factor of the covariance, and which elements are open or blind."""
+    grid = calibration.wavelength
+    free = FreeParameters(calibration.chains, len(grid), calibration.ties)
+    shape = value.shape
+    factor = np.empty((*shape, len(axes.sigmas)))
+    is_open, is_blind = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    for w in range(shape[-3]):
+        at = (..., w, slice(None), slice(None))
+        place = None if bins is None else bins[w]
+        # derivatives per degree, micrometre or percent, (n_elements of the matrices, n_free)
+        scaled = _along(free, slopes, at, place, value[at].shape) * axes.steps
+        spread = axes.spread(scaled @ axes.known.T, scaled @ axes.open.T, scaled @ axes.blind.T)
+        here = value[at].shape
+        factor[(*at, slice(None))] = spread.moved.reshape(*here, -1)
+        is_open[at] = spread.is_open.reshape(here)
+        is_blind[at] = spread.is_blind.reshape(here)
+    return factor, is_open, is_blind
+
+
+def _along(free, slopes, at, place, shape):
+    """Return derivatives to the flat vector at a wavelength, (n_elements, n_free)."""
+    result = np.zeros((int(np.prod(shape)), free.size))
+    for name, slope in slopes.items():
+        slot, factor, _ = free.lookup(name)
+        if slot is None:
+            continue
+        own = getattr(free.values_of(name), "unit", None)
+        # at one wavelength only its own value of a parameter per wavelength matters
+        column = slot.start + (place if slot.per_wavelength else 0)
+        # per unit of the follower -> canonical -> the source of the tie -> per unit of the source
+        result[:, column] += slope.value[at].ravel() / canonical_factor(own) * factor * slot.factor
+    return result
+
+
+def split_chain(chain):
+    """Return the optics in front of the first stage of the instrument, and the others."""
+    found = leaves(chain)
+    # up to there it is the telescope or the calibration source
+    start = next(
+        (i for i, leaf in enumerate(found) if leaf.stage not in (None, *_TELESCOPE, *COORDINATES)),
+        0,
+    )
+    return found[:start], found[start:]
+
+
+def at_bins(chain, bins, size):
+    """Return a copy of the chain at some bins of the parameters given per wavelength."""
+    chain = chain.copy()
+    if bins is None or np.array_equal(bins, np.arange(size)):
+        return chain
+    return join(_sliced(leaf, bins, size) for leaf in leaves(chain))
+
+
+def _sliced(leaf, bins, size):
+    """Return an optic at some bins of its parameters given per wavelength."""
+    several = [key for key in leaf.param_names if np.size(getattr(leaf, key).value) == size > 1]
+    values = {key: getattr(leaf, key) for key in several}
+    return leaf.with_parameters(
+        **{key: own.value[bins] * (own.unit or 1) for key, own in values.items()}
+    )

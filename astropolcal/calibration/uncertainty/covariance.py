@@ -1,0 +1,716 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Covariance of calibrated parameters, with their names and units.
+
+The matrix has no number for a parameter that the data leave open. What the
+data do know of such parameters (a sum of two angles, say) is kept beside it:
+the determined directions with their errors (``factor``) and the open ones
+(``null``). With these, the error of anything derived from the parameters is
+right: finite where the open directions do not move it, infinite where they do.
+
+Errors at a bound, and next to one.
+
+A parameter at its bound has no standard error: chi-square still falls beyond. How far it may go
+inward is known, and is its one-sided error. The errors of all others include that it may; where
+that matters, they say so, and the error without any bound stands beside theirs.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from astropolcal.calibration.identifiability.linearized import LARGE, declared_step, step_of
+from astropolcal.calibration.noise.scatter import Scatter
+from astropolcal.calibration.noise.weighting import Weighting, around, weighting_of
+from astropolcal.exceptions import ParameterError
+from astropolcal.units import canonical_factor
+
+__all__ = ["Covariance"]
+
+# share of both standard errors by which a covariance may differ from its transpose: far above
+# rounding, and too little to change anything
+_ASYMMETRY = 1e-6
+# a quantity that changes by less than this share of its slope stands still
+_STILL = 1e-5
+# directions that no residual pulls keep this share of the largest error, so that they stay known
+_LEAST = 1e-6
+
+
+class Covariance:
+    """
+    Covariance matrix of named parameters, in their declared units.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Name of each row, such as ``hwp.w_sio2`` or ``derotator.horizontal[3]``.
+    units : sequence of `~astropy.units.Unit` or None
+        Unit of each.
+    matrix : array_like
+        Shape (n, n); NaN in the rows and columns of parameters that the data
+        do not determine.
+    factor : array_like, optional
+        Directions that the data determine, each as long as its standard
+        error, shape (rank, n); ``factor.T @ factor`` is the covariance as far
+        as it is known. Of those at a bound it has how far they may go inward.
+    null : array_like, optional
+        Directions that stay open, shape (n_open, n).
+
+    Raises
+    ------
+    ParameterError
+        If the shapes differ or the matrix is not symmetric.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+
+    >>> covariance = Covariance(["hwp.theta"], [u.deg], [[0.04]])
+    >>> covariance.std("hwp.theta")
+    <Quantity 0.2 deg>
+    """
+
+    #: Determined and open directions; None where only the matrix is known.
+    factor = null = None
+
+    def __init__(self, names, units, matrix, factor=None, null=None):
+        self.names = list(names)
+        self.units = list(units)
+        self.matrix = np.array(matrix, dtype=float)
+        n = len(self.names)
+        if self.matrix.shape != (n, n) or len(self.units) != n:
+            raise ParameterError(
+                f"covariance of {n} names and {len(self.units)} units has shape {self.matrix.shape}"
+            )
+        self._check_symmetry()
+        if factor is not None:
+            self.factor = self._rows("factor", factor)
+        if null is not None:
+            self.null = self._rows("null", null)
+
+    def _check_symmetry(self):
+        """Refuse what differs from its transpose by more than a share of both errors."""
+        variances = np.diag(self.matrix)
+        # the parameters have units of their own, and with them the rounding errors
+        stds = np.sqrt(np.where(np.isfinite(variances), np.abs(variances), 0.0))
+        with np.errstate(invalid="ignore", over="ignore"):
+            same = np.abs(self.matrix - self.matrix.T) <= _ASYMMETRY * np.outer(stds, stds)
+        # equal infinities have no difference
+        missing = np.isnan(self.matrix)
+        same |= (self.matrix == self.matrix.T) | (missing & missing.T)
+        if not same.all():
+            row, column = np.argwhere(~same)[0]
+            raise ParameterError(
+                f"a covariance matrix must be symmetric: that of {self.names[row]} and "
+                f"{self.names[column]} is {self.matrix[row, column]:g} and "
+                f"{self.matrix[column, row]:g}"
+            )
+
+    def _rows(self, key, rows):
+        """Return directions as an array of rows."""
+        rows = np.array(rows, dtype=float).reshape(-1, len(self.names))
+        if not np.isfinite(rows).all():
+            raise ParameterError(f"{key} of a covariance has a value that is not finite")
+        return rows
+
+    @classmethod
+    def from_canonical(cls, free, matrix):
+        """
+        Make it from a matrix in canonical units.
+
+        Parameters
+        ----------
+        free : FreeParameters
+            The free parameters that the rows belong to.
+        matrix : `~numpy.ndarray`
+            Shape (n_free, n_free), in radian, micrometre or 1.
+
+        Returns
+        -------
+        Covariance
+        """
+        units = [slot.unit for slot in free.slots for _ in range(slot.size)]
+        per_unit = np.array([1 / canonical_factor(unit) for unit in units])
+        # one factor for the row and one for the column
+        return cls(free.names, units, matrix * np.outer(per_unit, per_unit))
+
+    def __len__(self):
+        return len(self.names)
+
+    def __repr__(self):
+        known = int(np.isfinite(np.diag(self.matrix)).sum())
+        return f"<Covariance of {len(self)} parameters, {known} of them determined>"
+
+    def __eq__(self, other):
+        if not isinstance(other, Covariance):
+            return NotImplemented
+        same = self.names == other.names and self.units == other.units
+        arrays = ((getattr(self, key), getattr(other, key)) for key in ("matrix", "factor", "null"))
+        return same and all(
+            (a is None and b is None)
+            or (a is not None and b is not None and np.array_equal(a, b, equal_nan=True))
+            for a, b in arrays
+        )
+
+    __hash__ = None
+
+    @property
+    def stds(self):
+        """Standard deviations in the declared units, NaN where not determined."""
+        return np.sqrt(np.diag(self.matrix))
+
+    def std(self, name):
+        """
+        Return the standard deviation of one parameter.
+
+        Parameters
+        ----------
+        name : str
+            One of ``names``.
+
+        Returns
+        -------
+        `~astropy.units.Quantity` or float
+            NaN where the data do not determine it.
+
+        Raises
+        ------
+        ParameterError
+            If there is no such parameter.
+
+        Examples
+        --------
+        >>> one = Covariance(["wollaston.efficiency"], [None], [[1e-4]])
+        >>> float(one.std("wollaston.efficiency"))
+        0.01
+        """
+        if name not in self.names:
+            raise ParameterError(f"no parameter {name!r} in the covariance")
+        i = self.names.index(name)
+        value = self.stds[i]
+        return value if self.units[i] is None else value * self.units[i]
+
+    @property
+    def correlation(self):
+        """Correlation matrix, shape (n, n), NaN where not determined."""
+        stds = self.stds
+        return self.matrix / np.outer(stds, stds)
+
+    def propagate(self, slopes):
+        """
+        Return the covariance of quantities that depend on the parameters.
+
+        Parameters
+        ----------
+        slopes : array_like
+            Derivative of each quantity to each parameter in its declared unit,
+            shape (n_quantities, n) or (n,) for one quantity.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            Shape (n_quantities, n_quantities), or a scalar for one quantity.
+            On the diagonal infinity for what moves along an open direction,
+            NaN for what depends on parameters at a bound alone, or on
+            undetermined ones where ``factor`` is not known; outside of the
+            diagonal NaN in the rows and columns of both.
+
+        Raises
+        ------
+        ParameterError
+            If the slopes have another shape.
+
+        Examples
+        --------
+        Of two angles the data know the sum only:
+
+        >>> import astropy.units as u
+        >>> import numpy as np
+
+        >>> covariance = Covariance(["a.theta", "b.theta"], [u.deg, u.deg],
+        ...                         np.full((2, 2), np.nan), factor=[[0.1, 0.1]], null=[[1, -1]])
+        >>> float(covariance.propagate([1, 1]).round(3)), float(covariance.propagate([1, 0]))
+        (0.04, inf)
+        """
+        slopes = np.asarray(slopes, dtype=float)
+        if slopes.ndim not in (1, 2) or slopes.shape[-1] != len(self):
+            raise ParameterError(
+                f"slopes of shape {slopes.shape} do not fit a covariance of {len(self)} parameters"
+            )
+        matrix = self._spread(np.atleast_2d(slopes)).covariance()
+        return matrix[0, 0] if slopes.ndim == 1 else matrix
+
+    def _spread(self, slopes):
+        axes = self._axes()
+        scaled = slopes * axes.steps
+        return axes.spread(scaled @ axes.known.T, scaled @ axes.open.T, scaled @ axes.blind.T)
+
+    def _axes(self):
+        """Split the space of the parameters, each in degree, micrometre or percent."""
+        steps = np.array([declared_step(unit) for unit in self.units])
+        # NaN on the diagonal marks what has no error; why is told by `null` and `factor`
+        undetermined = ~np.isfinite(np.diag(self.matrix))
+        empty = np.zeros((0, len(self)))
+        null = empty if self.null is None else self.null / steps
+        if self.factor is not None:
+            factor = self.factor / steps
+            # at a bound: neither in what is known nor in what is open
+            moves = np.abs(np.concatenate([factor, null])).max(axis=0, initial=0.0) > 0
+            blind = undetermined & ~moves
+        else:
+            factor, blind = self._factor_of_matrix(steps, ~undetermined), undetermined
+        # rows of `factor` are principal directions times their standard errors; here they part
+        sigmas = np.linalg.norm(factor, axis=1)
+        known = factor / np.where(sigmas > 0, sigmas, 1.0)[:, None]
+        return _Axes(steps, known, sigmas, null, np.eye(len(self))[blind], self.factor is None)
+
+    def _factor_of_matrix(self, steps, known):
+        """Return the determined directions of the parameters that have an error."""
+        matrix = self.matrix[np.ix_(known, known)] / np.outer(steps[known], steps[known])
+        # a symmetric matrix: eigenvectors are the directions, roots of eigenvalues their errors
+        variance, vectors = np.linalg.eigh(matrix)
+        factor = np.zeros((len(variance), len(self)))
+        factor[:, known] = (vectors * np.sqrt(variance.clip(0))).T
+        return factor
+
+
+@dataclass
+class _Axes:
+    """Orthonormal directions in parameter space: known, open, and blind (no statement)."""
+
+    steps: np.ndarray
+    known: np.ndarray
+    sigmas: np.ndarray
+    open: np.ndarray
+    blind: np.ndarray
+    partial: bool
+
+    def spread(self, along_known, along_open, along_blind):
+        """Return the spread of quantities from their slopes along the axes, (k, n_axes) each."""
+        parts = [along_known, along_open, along_blind]
+        size = np.sqrt(sum(np.sum(part**2, axis=1) for part in parts))
+        # a rounding error along an open direction is no movement
+        limit = _STILL * size
+        is_open = np.abs(along_open).max(axis=1, initial=0.0) > limit
+        blind = np.abs(along_blind).max(axis=1, initial=0.0) > limit
+        if not self.partial:
+            # with a parameter at its bound taken as known there is an error, unless it is all
+            blind &= np.abs(along_known).max(axis=1, initial=0.0) <= limit
+        return _Spread(along_known * self.sigmas, is_open, blind & ~is_open)
+
+
+@dataclass
+class _Spread:
+    """How far quantities move for one sigma along each known direction, (k, rank)."""
+
+    moved: np.ndarray
+    is_open: np.ndarray
+    is_blind: np.ndarray
+
+    def stds(self):
+        std = np.sqrt(np.sum(self.moved**2, axis=1))
+        return np.where(self.is_open, np.inf, np.where(self.is_blind, np.nan, std))
+
+    def covariance(self):
+        matrix = self.moved @ self.moved.T
+        unknown = self.is_open | self.is_blind
+        # a covariance with something infinite has no value
+        matrix[unknown] = matrix[:, unknown] = np.nan
+        diagonal = np.arange(len(matrix))[self.is_open]
+        matrix[diagonal, diagonal] = np.inf
+        return matrix
+
+
+def full_covariance(calibration):
+    """
+    Return the covariance of a calibration with its determined and open directions.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration. One read from a file gives the directions only if the
+        file holds them; otherwise errors are known for what depends on
+        determined parameters, and the rest is NaN or infinite.
+
+    Returns
+    -------
+    Covariance
+        With the matrix of ``calibration.covariance``, ``factor`` and ``null``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> full_covariance(cal).factor.shape
+    (49, 49)
+    """
+    known = calibration.covariance
+    if known.factor is not None:
+        return known
+    if calibration.measurement is None:
+        return Covariance(known.names, known.units, known.matrix, null=_open_of_file(calibration))
+    weighting = weighting_of(calibration)
+    whitened = around(calibration.measurement, weighting)
+    how = white_covariance if calibration.settings.get("errors") == "white" else covariance_around
+    return how(calibration.measurement, whitened, weighting)
+
+
+def covariance_around(measurement, whitened, weighting, scatter=None):
+    """
+    Return the covariance with its directions, of a problem that is decomposed once.
+
+    It is the sandwich (White 1980, Econometrica 48, 817) of how the residuals scatter and hang
+    together at the wavelengths, pairs and settings of each dataset; where residuals do not tell
+    it, that of independent data. What is at a bound may go inward by its one-sided error.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    whitened : Whitened
+        The problem around its solution.
+    weighting : Weighting
+        The noise; without any there is no error.
+    scatter : Scatter, optional
+        Of the residuals, if it is at hand.
+
+    Returns
+    -------
+    Covariance
+    """
+    scatter = Scatter(measurement, weighting, whitened) if scatter is None else scatter
+    if not scatter.is_known:
+        return white_covariance(measurement, whitened, weighting)
+    prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T * weighting.level
+    slack = slack_of_bounds(measurement, whitened)
+    return sandwich(measurement, whitened, scatter.middle() + prior.T @ prior, slack)
+
+
+def white_covariance(measurement, whitened, weighting):
+    """Return the covariance of independent data with the noise that the fit assumed."""
+    free, level = measurement.free, weighting.level
+    known = Covariance.from_canonical(free, whitened.covariance() * level**2)
+    per_unit = whitened.scale / free.factors()
+    factor = whitened.factor() * (level * per_unit) if np.isfinite(level) else None
+    return Covariance(
+        known.names, known.units, known.matrix, factor=factor, null=whitened.null() * per_unit
+    )
+
+
+def sandwich(measurement, whitened, middle, slack=None):
+    """
+    Return the covariance from that of the pulls on the determined directions.
+
+    ``slack`` has further directions, each one standard error long, in the steps of the problem.
+    """
+    variances, vectors = np.linalg.eigh(middle)
+    stds = np.sqrt(variances.clip(0))
+    # with fewer groups than directions a sum of outer products is singular
+    stds = np.maximum(stds, _LEAST * stds.max(initial=0.0))
+    rows = (stds[:, None] * vectors.T) @ whitened.factor()
+    rows = rows if slack is None else np.concatenate([rows, slack])
+    # back to orthogonal directions, as `Covariance` keeps them
+    _, sizes, principal = np.linalg.svd(rows, full_matrices=False)
+    free = measurement.free
+    units = [slot.unit for slot in free.slots for _ in range(slot.size)]
+    per_unit = whitened.scale / free.factors()
+    factor, null = sizes[:, None] * principal * per_unit, whitened.null() * per_unit
+    matrix = np.full((free.size, free.size), np.nan)
+    columns = whitened.live[whitened.errors.determined]
+    determined = factor[:, columns]
+    matrix[np.ix_(columns, columns)] = determined.T @ determined
+    return Covariance(free.names, units, matrix, factor=factor, null=null)
+
+
+def residual_variance(calibration):
+    """Return the variance of a datum of weight one: 1 where every datum has its own noise."""
+    return weighting_of(calibration).level ** 2
+
+
+def prior_noise(measurement, weights):
+    """Return the noise against which priors weigh in a fit; the residuals' if not known."""
+    if weights is not None or not measurement.n_priors:
+        return 1.0
+    fitted = measurement.weighting
+    if fitted is not None and fitted.choice is None and fitted.is_known:
+        return fitted.level
+    return Weighting(None, np.full(measurement.n_data, np.nan)).started(measurement).level
+
+
+def _open_of_file(calibration):
+    """Return the open directions that a file names, less those that a prior has closed."""
+    known = calibration.covariance
+    steps = np.array([declared_step(unit) for unit in known.units])
+    null = np.asarray(calibration.identifiability.null_vectors).reshape(-1, len(known))
+    undetermined = ~np.isfinite(np.diag(known.matrix))
+    undetermined &= [name not in set(calibration.at_bound) for name in known.names]
+    is_open = (np.abs(null[:, undetermined]) > _STILL).any(axis=1)
+    return null[is_open] * steps
+
+
+# ---- errors at a bound, and next to one ----
+
+
+#: What may be said of a parameter, in the order in which it is decided.
+STATUSES = (
+    "fixed",
+    "tied",
+    "at bound",
+    "open",
+    "badly determined",
+    "conditional",
+    "by priors",
+    "determined",
+)
+
+# an error that grows by less than this when the bounds are released hardly hangs on them
+_MATTERS = 1.1
+# derivatives that others take up to this share of the largest singular value are open
+_OPEN = 1e-9
+# as far from one bound as 68 % of what is anywhere between two
+_ANYWHERE = 0.6827
+# the spread of what is anywhere between two bounds, as a share of their distance
+_UNIFORM = 1 / np.sqrt(12)
+
+
+def errors_at_bounds(measurement, whitened):
+    r"""
+    Return one-sided errors of parameters at a bound, and what they do to the other errors.
+
+    In the linear problem around the solution, with all others refitted, chi-square in units of the
+    noise rises inward by :math:`2 g t + t^2 / s^2`: *g* is the gradient that pushes the parameter
+    against its bound, *s* its error were there no bound. The one-sided error is where that is one.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The fitted measurement, with its ``weighting``.
+    whitened : Whitened
+        The linear problem around its solution.
+
+    Returns
+    -------
+    dict
+        ``inward``: name to the one-sided error in the parameter's unit, infinite where the data do
+        not limit it before the opposite bound. ``released``: name of every other parameter whose
+        error grows by more than a tenth without the bounds, to the ratio of the two errors,
+        ``times``, with the bound as exact in the smaller one; the names of those at a bound that
+        matter, ``by``; and what they add to its error in its unit, as far as they may go inward,
+        ``slack``, and if there were no bounds, ``without``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.calibration.noise.weighting import around
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> data = simulate(chain, charis.wavelength, frames, seed=2)
+    >>> polarizer = chain["calibration_polarizer"]
+    >>> polarizer.theta, polarizer.theta.bounds = 91 * u.deg, (90.2, 95)
+    >>> cal = calibrate(chain, data, fix={"hwp.theta": None, "derotator.theta": None})
+    >>> problem = around(cal.measurement, cal.measurement.weighting)
+    >>> list(errors_at_bounds(cal.measurement, problem)["inward"])
+    ['calibration_polarizer.theta']
+    """
+    if not whitened.held.any():
+        return {"inward": {}, "released": {}}
+    held, columns, response, steps, widths = _inward(measurement, whitened)
+    names, per_unit = measurement.free.names, whitened.scale / measurement.free.factors()
+    released = _released(names, whitened, held, columns, response)
+    slack = np.linalg.norm(_moved(whitened, held, response, steps, widths), axis=0) * per_unit
+    root = np.linalg.pinv(np.linalg.qr(columns, mode="r")) * measurement.weighting.level
+    without = np.linalg.norm(response @ root, axis=1) * per_unit[whitened.live]
+    for name, told in released.items():
+        i = names.index(name)
+        told["slack"] = float(slack[i])
+        beyond = np.flatnonzero(whitened.live == i)[0]
+        told["without"] = float(without[beyond]) if np.isfinite(told["times"]) else np.inf
+    inward = {names[k]: float(t * per_unit[k]) for k, t in zip(held, steps, strict=True)}
+    return {"inward": inward, "released": released}
+
+
+def slack_of_bounds(measurement, whitened):
+    """
+    Return how the parameters move while one at its bound goes inward by its one-sided error.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The fitted measurement, with its ``weighting``.
+    whitened : Whitened
+        The linear problem around its solution.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (n_held, n_free), in steps of a degree, micrometre or percent.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> import numpy as np
+
+    >>> nothing = SimpleNamespace(held=np.zeros(3, dtype=bool), scale=np.ones(3))
+    >>> slack_of_bounds(None, nothing).shape
+    (0, 3)
+    """
+    if not whitened.held.any():
+        return np.zeros((0, whitened.scale.size))
+    held, _, response, steps, widths = _inward(measurement, whitened)
+    return _moved(whitened, held, response, steps, widths)
+
+
+def _inward(measurement, whitened):
+    """Return what is held, its derivatives, how others follow, one-sided errors and widths."""
+    held = np.flatnonzero(whitened.held)
+    columns, residual, response = _without_others(measurement, whitened, held)
+    low, high = measurement.free.bounds()
+    inward = np.where(_at_low(measurement, held), 1.0, -1.0)
+    widths = (high - low)[held] / whitened.scale[held]
+    steps = _one_sided(columns * inward, residual, measurement.weighting.level, widths)
+    return held, columns, response, steps, widths
+
+
+def _moved(whitened, held, response, steps, widths):
+    # what the data do not limit is anywhere up to the opposite bound
+    steps = np.where(np.isfinite(steps), steps, _ANYWHERE * widths)
+    rows = np.zeros((held.size, whitened.scale.size))
+    rows[:, whitened.live] = response.T
+    rows[np.arange(held.size), held] = 1.0
+    # without an opposite bound either, it stays where it is
+    return rows * np.where(np.isfinite(steps), steps, 0.0)[:, None]
+
+
+def _at_low(measurement, held):
+    """Return which of those at a bound are at the lower one."""
+    vector, (low, high) = measurement.vector(), measurement.free.bounds()
+    return (vector - low <= high - vector)[held]
+
+
+def _without_others(measurement, whitened, held):
+    """Return derivatives and residuals less what the live parameters take up, and how these go."""
+    vector, weighting = measurement.vector(), measurement.weighting
+    rows = np.concatenate([whitened.rows, whitened.prior_rows])
+    weight = 1.0 if weighting.weight is None else weighting.weight
+    data = -weight * measurement.residuals(vector)
+    priors = weighting.level * measurement.free.prior_residuals(vector)
+    residual = np.concatenate([data, priors])
+    # orthonormal: each determined direction in units of its standard error
+    basis = rows[:, whitened.live] @ whitened.errors.half.T
+    along = basis.T @ rows[:, held]
+    columns = rows[:, held] - basis @ along
+    size = np.linalg.norm(columns, axis=0)
+    columns[:, size <= _OPEN * whitened.together.singular.max(initial=0.0)] = 0.0
+    # a step of what is held moves the live ones by this, shape (n_live, n_held)
+    return columns, residual - basis @ (basis.T @ residual), -whitened.errors.half.T @ along
+
+
+def _one_sided(columns, residual, level, widths):
+    """Return how far each may go inward until chi-square over the noise has risen by one."""
+    # the triangular factor is as good as all rows
+    square = np.linalg.qr(np.column_stack([columns, residual]), mode="r")
+    columns, residual = square[:, :-1], square[:, -1]
+    return [_rises(columns, residual, level, i, width) for i, width in enumerate(widths)]
+
+
+def _rises(columns, residual, level, i, width):
+    # a calibration is read where there is no scipy
+    from scipy.optimize import brentq, nnls
+
+    own, others = columns[:, i], np.delete(columns, i, axis=1)
+    if not np.isfinite(level) or not own.any():
+        return np.nan if own.any() else np.inf
+
+    def excess(t):
+        # the others at a bound may go inward, too
+        here = residual + t * own
+        # `nnls` of no columns breaks the memory of scipy 1.17
+        rest = nnls(others, -here)[1] ** 2 if others.size else here @ here
+        return rest - residual @ residual - level**2
+
+    # with the others held chi-square is a parabola, so this is where it ends at the earliest
+    slope, curvature = own @ residual, own @ own
+    least = (np.sqrt(slope**2 + curvature * level**2) - slope) / curvature
+    most = least
+    while excess(most) < 0 and most < width:
+        most *= 2
+    if least >= width or excess(min(most, width)) < 0:
+        return np.inf
+    return least if most == least else brentq(excess, least, min(most, width))
+
+
+def _released(names, whitened, held, columns, response):
+    """Return of what is not at a bound by how much its error grows without the bounds."""
+    before = np.sum(whitened.errors.half**2, axis=0)
+    after = np.sum(whitened.together.half**2, axis=0)[whitened.live]
+    after[~whitened.together.determined[whitened.live]] = np.inf
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times = np.sqrt(after / before)
+        each = response**2 / np.sum(columns**2, axis=0) / before[:, None]
+    each = np.nan_to_num(each, nan=0.0, posinf=np.inf)
+    found = {}
+    for row in np.flatnonzero(whitened.errors.determined & (times > _MATTERS)):
+        # each released alone; where only all of them together matter, the one that does most
+        enough = min(_MATTERS**2 - 1, each[row].max())
+        by = [names[k] for k in held[each[row] >= enough]]
+        found[names[whitened.live[row]]] = {"times": float(times[row]), "by": by}
+    return found
+
+
+def status_of(entry):
+    """
+    Say of each element of a parameter whether it can be trusted.
+
+    Parameters
+    ----------
+    entry : dict
+        As `~astropolcal.calibration.Calibration.parameter_values` has it: ``std``,
+        ``std_released``, ``unit``, ``bounds``, ``fixed``, ``tied``, ``at_bound``,
+        ``identifiable``.
+
+    Returns
+    -------
+    `~numpy.ndarray` of str
+        One of `STATUSES` each, of the shape of ``std``. Badly determined is what has an error of
+        more than 5 deg, 0.05 mm or 0.05, or larger than that of something anywhere between its
+        bounds.
+
+    Examples
+    --------
+    >>> import numpy as np
+
+    >>> entry = {"std": np.array([0.01, 0.2]), "std_released": np.full(2, np.nan), "unit": None}
+    >>> entry |= {"fixed": False, "tied": None, "at_bound": np.zeros(2, dtype=bool)}
+    >>> entry |= {"bounds": (0, 1), "identifiable": np.ones(2, dtype=bool)}
+    >>> status_of(entry).tolist()
+    ['determined', 'badly determined']
+    """
+    shape = np.shape(entry["std"])
+    if entry["fixed"] or entry["tied"]:
+        return np.full(shape, "tied" if entry["tied"] else "fixed")
+    std, (_, size, words) = np.asarray(entry["std"]), step_of(entry["unit"])
+    low, high = entry["bounds"]
+    width = np.inf if low is None or high is None else high - low
+    large = min(LARGE[words] / size * declared_step(entry["unit"]), width * _UNIFORM)
+    return np.select(
+        [
+            entry["at_bound"],
+            # without any freedom left nothing tells the noise, and so no error
+            ~np.isfinite(std) & ~np.asarray(entry["identifiable"]),
+            ~(std <= large),
+            ~np.isnan(entry["std_released"]),
+            # the data alone leave it open
+            ~np.asarray(entry["identifiable"]),
+        ],
+        STATUSES[2:7],
+        STATUSES[7],
+    )

@@ -1,0 +1,797 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Quantities that follow from a calibration, with their errors.
+
+To first order: with g the derivative of a quantity to the parameters and C
+their covariance, the variance is g C g. A quantity that moves along a
+direction which the data leave open has an infinite error, however small the
+change: no pseudo-inverse hides it.
+
+Retardances, efficiencies, matrices, predictions and sky Stokes parameters with their errors.
+
+Diattenuation and retardance of calibrated mirrors, beside those of bare metals.
+"""
+
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.calibration.identifiability.linearized import led
+from astropolcal.calibration.uncertainty.covariance import full_covariance
+from astropolcal.chain import (
+    find_optic,
+    join,
+    leaves,
+    system_mueller,
+    system_mueller_derivatives,
+    with_beam,
+)
+from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.optics import (
+    COORDINATES,
+    Diattenuator,
+    DiattenuatorRetarder,
+    MetalMirror,
+    PowerLawMirror,
+)
+from astropolcal.units import canonical_factor
+
+__all__ = [
+    "Derived",
+    "derived_data",
+    "derived_efficiency",
+    "derived_mueller",
+    "derived_retardance",
+    "derived_sky",
+    "propagate",
+]
+
+# step of a central difference along a direction, in degree, micrometre or percent
+_STEP = 1e-2
+
+
+@dataclass
+class Derived:
+    """
+    A quantity that follows from a calibration, with its error.
+
+    Parameters
+    ----------
+    value : `~astropy.units.Quantity` or `~numpy.ndarray`
+        The quantity, of any shape.
+    std : `~astropy.units.Quantity` or `~numpy.ndarray`
+        Standard error from the calibration, of the same shape: infinite where
+        the data leave it open; NaN where it depends on parameters at a bound
+        alone, or where a calibration file does not say.
+    covariance : callable
+        Called without arguments, the covariance of the flattened quantity in
+        squares of its unit, shape (size, size).
+    open_directions : dict of str to array
+        For each open direction that moves the quantity, named by its leading
+        parameter, the change of the quantity for +1 degree (micrometre,
+        percent) of that parameter.
+
+    Examples
+    --------
+    >>> import numpy as np
+
+    >>> Derived(np.array([0.9]), np.array([0.01]), lambda: np.array([[1e-4]])).is_determined
+    array([ True])
+    """
+
+    value: object
+    std: object
+    covariance: object
+    open_directions: dict = field(default_factory=dict)
+
+    @property
+    def is_determined(self):
+        """Whether the data determine each element, a bool array of the shape of ``value``."""
+        return np.isfinite(np.asarray(u.Quantity(self.std).value))
+
+    def __str__(self):
+        lines = [
+            f"{np.size(self.value)} values, {int(np.sum(self.is_determined))} of them with an error"
+        ]
+        lines += [
+            f"  - open: {name} by +1 moves them by up to {np.abs(change).max():.3g}"
+            for name, change in self.open_directions.items()
+        ]
+        return "\n".join(lines)
+
+
+def propagate(calibration, function, derivatives=None):
+    """
+    Return any function of the calibrated chains with its error.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    function : callable
+        Takes the chain of each dataset as one argument, returns a number, an
+        array or a `~astropy.units.Quantity`. Smooth near the solution.
+    derivatives : callable, optional
+        Takes the same; returns a dict of ``"optic.parameter"`` to the
+        derivative of the function per unit of that parameter, as plain
+        numbers of the shape of the function's value, with one more axis at the
+        end for a parameter given per wavelength. Without it central differences
+        are taken along the directions of the covariance.
+
+    Returns
+    -------
+    Derived
+
+    Raises
+    ------
+    ParameterError
+        If a derivative is of a parameter that is not free, or of wrong shape.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import propagate
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> ratio = propagate(cal, lambda chain: chain["hwp"].w_sio2.value / chain["hwp"].w_mgf2.value)
+    >>> bool(0 < ratio.std < 1e-3)
+    True
+    """
+    chains = [chain.copy() for chain in calibration.chains]
+    free = FreeParameters(chains, len(calibration.wavelength), calibration.ties)
+    value = function(*chains)
+    if derivatives is not None:
+        known = slopes_of(free, derivatives(*chains), np.shape(value))
+        return derive(calibration, free, value, known)
+    unit = value.unit if isinstance(value, u.Quantity) else None
+    start, canonical = free.start(), free.factors()
+
+    def slope(direction):
+        ends = []
+        for sign in (1, -1):
+            # direction is in steps, `steps` leads to declared units,
+            # `canonical` on to those of the vector
+            free.put_back(start + sign * _STEP * direction * axes.steps * canonical)
+            end = function(*chains)
+            ends.append(np.ravel(end.to_value(unit) if unit is not None else end))
+        return (ends[0] - ends[1]) / (2 * _STEP)
+
+    axes = full_covariance(calibration)._axes()
+    parts = [
+        np.stack([slope(row) for row in rows], axis=1)
+        if len(rows)
+        else np.zeros((np.size(value), 0))
+        for rows in (axes.known, axes.open, axes.blind)
+    ]
+    # the basis of open directions is arbitrary; a user asks what one degree of a parameter does
+    changes = parts[1] @ _to_leads(free, axes.open) if len(axes.open) else None
+    return _package(free, axes, value, axes.spread(*parts), changes)
+
+
+def slopes_of(free, derivatives, shape):
+    """Lay derivatives by name out over the flat vector, shape (size, n_free)."""
+    size = int(np.prod(shape, dtype=int))
+    slopes = np.zeros((size, free.size))
+    for name, derivative in derivatives.items():
+        slot, factor, _ = free.lookup(name)
+        if slot is None:
+            raise ParameterError(f"derivative of {name}: no such free parameter")
+        expected = (*shape, slot.size) if slot.per_wavelength else shape
+        if np.shape(derivative) != expected:
+            raise ParameterError(
+                f"derivative of {name} has shape {np.shape(derivative)}; expected is {expected}"
+            )
+        # a follower moves with the parameter it is tied to, in canonical units
+        own = free.values_of(name)
+        per_own = canonical_factor(own.unit) if isinstance(own, u.Quantity) else 1.0
+        block = np.reshape(np.asarray(derivative, dtype=float), (size, slot.size))
+        slopes[:, slot.slice] += block / per_own * factor * slot.factor
+    return slopes
+
+
+def derive(calibration, free, value, slopes):
+    """Return a quantity with its error from its derivatives per declared unit."""
+    axes = full_covariance(calibration)._axes()
+    scaled = slopes * axes.steps
+    along_open = scaled @ axes.open.T
+    spread = axes.spread(scaled @ axes.known.T, along_open, scaled @ axes.blind.T)
+    changes = along_open @ _to_leads(free, axes.open) if len(axes.open) else None
+    return _package(free, axes, value, spread, changes)
+
+
+def _to_leads(free, null):
+    """Return what turns changes along the open directions into those per leading parameter."""
+    reduced = np.array([vector for vector, _ in led(free, null)])
+    return null @ reduced.T
+
+
+def _package(free, axes, value, spread, changes):
+    shape, moved = np.shape(value), {}
+    if changes is not None and spread.is_open.any():
+        names = [lead for _, lead in led(free, axes.open)]
+        limit = 1e-5 * np.abs(changes).max()
+        moved = {
+            name: change.reshape(shape)
+            for name, change in zip(names, changes.T, strict=True)
+            if np.abs(change).max() > limit
+        }
+    std = spread.stds().reshape(shape)
+    std = std * value.unit if isinstance(value, u.Quantity) else std
+    return Derived(value, std[()], spread.covariance, moved)
+
+
+# ---- ready-made quantities ----
+
+
+def derived_retardance(calibration, optic, wavelength=None, dataset=0):
+    r"""
+    Return the retardance of an optic with its error.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    optic : str
+        Name of a retarder: one that follows a law, a linear, or an elliptical
+        one, whose total retardance :math:`\sqrt{\Delta_H^2+\Delta_{45}^2+\Delta_R^2}`
+        is meant.
+    wavelength : `~astropy.units.Quantity`, optional
+        By default the calibration's grid; between its points, parameters given
+        per wavelength are interpolated linearly.
+    dataset : int
+        Which of the calibration's chains.
+
+    Returns
+    -------
+    Derived
+        In degree, of the shape of ``wavelength``.
+
+    Raises
+    ------
+    ChainError
+        If there is no such optic, or it is no retarder.
+    WavelengthRangeError
+        If a wavelength is outside the grid of its parameters or the law's range.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> half_wave = derived_retardance(cal, "hwp", 1.65 * u.um)
+    >>> bool(half_wave.std < 0.1 * u.deg)
+    True
+    """
+    chain = calibration.chains[dataset]
+    leaf = find_optic(chain, optic)
+    lam = calibration.wavelength if wavelength is None else u.Quantity(wavelength)
+    components = [
+        key for key in ("retardance", "horizontal", "diagonal", "circular")
+        if key in leaf.param_names
+    ]  # fmt: skip
+    if not components:
+        if not callable(getattr(leaf, "retardance", None)):
+            raise ChainError(f"optic {optic!r} is a {type(leaf).__name__}, which has no retardance")
+        return propagate(
+            calibration, lambda *chains: find_optic(chains[dataset], optic).retardance(lam)
+        )
+    parts, weights = _at_wavelengths(calibration, leaf, components, lam)
+    if len(components) == 1:
+        value, slopes = parts[0], np.ones((1, *np.shape(lam)))
+    else:
+        value = np.sqrt(np.sum(parts**2, axis=0))
+        # d|Delta| / d Delta_k = Delta_k / |Delta|
+        slopes = parts / np.where(value > 0, value, 1.0)
+    return _of_parameters(calibration, leaf, components, value * u.deg, slopes, weights)
+
+
+def derived_efficiency(calibration, wavelength=None, dataset=0):
+    """
+    Return the modulation efficiency of the beam splitter with its error.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    wavelength : `~astropy.units.Quantity`, optional
+        By default the calibration's grid; between its points the efficiency is
+        interpolated linearly.
+    dataset : int
+        Which of the calibration's chains.
+
+    Returns
+    -------
+    Derived
+        Of the shape of ``wavelength``.
+
+    Raises
+    ------
+    ChainError
+        If no optic has an efficiency.
+    WavelengthRangeError
+        If a wavelength is outside the grid.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> derived_efficiency(cal).value.shape
+    (22,)
+    """
+    found = [o for o in leaves(calibration.chains[dataset]) if "efficiency" in o.param_names]
+    if not found:
+        raise ChainError("no optic of the chain has an efficiency")
+    lam = calibration.wavelength if wavelength is None else u.Quantity(wavelength)
+    (value,), weights = _at_wavelengths(calibration, found[0], ["efficiency"], lam)
+    slopes = np.ones((1, *np.shape(lam)))
+    return _of_parameters(calibration, found[0], ["efficiency"], value, slopes, weights)
+
+
+def _at_wavelengths(calibration, leaf, keys, lam):
+    """Return parameters (degree or 1) at wavelengths, and the share of each grid point."""
+    grid = calibration.wavelength.to_value(u.nm)
+    order = np.argsort(grid)
+    wanted = np.atleast_1d(lam.to_value(u.nm))
+    # one number for all wavelengths holds anywhere
+    several = any(np.size(getattr(leaf, key).value) > 1 for key in keys)
+    slack = 1e-6 * grid.max()
+    outside = (wanted < grid.min() - slack) | (wanted > grid.max() + slack)
+    if several and outside.any():
+        raise WavelengthRangeError(
+            f"wavelength {wanted[outside][0]:.2f} nm is outside the calibrated range "
+            f"{grid.min():.2f} to {grid.max():.2f} nm"
+        )
+    # interpolation is linear in the values: row i says how much of grid point i goes into each
+    # wavelength, (n_grid, n_wanted)
+    rows = [np.interp(wanted, grid[order], unit[order]) for unit in np.eye(grid.size)]
+    weights = np.stack(rows, axis=1)
+    parts = []
+    for key in keys:
+        parameter = getattr(leaf, key)
+        factor = 1.0 if parameter.unit is None else parameter.unit.to(u.deg)
+        value = np.ravel(parameter.value) * factor
+        parts.append(weights @ value if value.size > 1 else np.full(wanted.size, value[0]))
+    return np.array(parts).reshape(len(keys), *np.shape(lam)), weights
+
+
+def _of_parameters(calibration, leaf, keys, value, slopes, weights):
+    """Return a quantity that depends on parameters of one optic at the same wavelength."""
+    free = _free(calibration)
+    derivatives = {}
+    for key, slope in zip(keys, slopes, strict=True):
+        parameter = getattr(leaf, key)
+        factor = 1.0 if parameter.unit is None else parameter.unit.to(u.deg)
+        slot, *_ = free.lookup(f"{leaf.name}.{key}")
+        if slot is not None:
+            own = np.ravel(slope)[:, None] * weights if slot.per_wavelength else np.ravel(slope)
+            shape = (*np.shape(value), slot.size) if slot.per_wavelength else np.shape(value)
+            derivatives[f"{leaf.name}.{key}"] = (own * factor).reshape(shape)
+    slopes = slopes_of(free, derivatives, np.shape(value))
+    return derive(calibration, free, value[()], slopes)
+
+
+def derived_mueller(calibration, positions=None, wavelength=None, beam="right", dataset=0):
+    """
+    Return the system Mueller matrix with the error of each element.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    positions : dict of str to `~astropy.units.Quantity`, optional
+        Position of every stage, scalar or shape (n_frames,).
+    wavelength : `~astropy.units.Quantity`, optional
+        By default the calibration's grid, which is also the only choice where
+        parameters are given per wavelength.
+    beam : {"right", "left"}
+        The beam.
+    dataset : int
+        Which of the calibration's chains.
+
+    Returns
+    -------
+    Derived
+        Shape (n_frames, n_wavelengths, 4, 4), see
+        `~astropolcal.chain.system_mueller`.
+
+    Raises
+    ------
+    ChainError, ParameterError
+        As `~astropolcal.chain.system_mueller`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> derived_mueller(cal, {"hwp": 0 * u.deg, "derotator": 45 * u.deg}).std.shape
+    (22, 4, 4)
+    """
+    lam = _grid(calibration, wavelength)
+    chain = with_beam(calibration.chains[dataset], beam)
+    value = system_mueller(chain, lam, positions)
+    slopes = {
+        name: slope.value
+        for name, slope in system_mueller_derivatives(chain, lam, positions).items()
+    }
+    axis = None if lam.ndim == 0 else -3
+    free = _free(calibration)
+    return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
+
+
+def _grid(calibration, wavelength):
+    """Return the wavelengths of a matrix; those of the calibration if parameters are on them."""
+    grid = calibration.wavelength
+    if wavelength is None:
+        return grid
+    lam = u.Quantity(wavelength)
+    several = [slot for slot in _free(calibration).slots if slot.per_wavelength]
+    if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=1e-6)):
+        raise ParameterError(
+            f"{several[0].name} is known at the {grid.size} calibrated wavelengths only: "
+            "leave out wavelength"
+        )
+    return lam
+
+
+def _free(calibration):
+    return FreeParameters(calibration.chains, len(calibration.wavelength), calibration.ties)
+
+
+def _spread_out(free, slopes, axis):
+    """Give the derivatives to parameters per wavelength their own axis; drop the fixed ones."""
+    spread, shape = {}, ()
+    for name, slope in slopes.items():
+        shape = slope.shape
+        slot, *_ = free.lookup(name)
+        if slot is None:
+            continue
+        if slot.per_wavelength:
+            wide = np.zeros((*shape, slot.size))
+            for i in range(slot.size):
+                here = (*[slice(None)] * (len(shape) + axis), i)
+                # the matrices of wavelength i depend on the i-th value of the parameter alone
+                wide[(*here, ..., i)] = slope[here]
+            slope = wide
+        spread[name] = slope
+    return spread, shape
+
+
+def derived_data(calibration, observations=None, dataset=0):
+    """
+    Return predicted data with the error that the calibration gives them.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    observations : Observations, optional
+        Frames to predict; by default those that were fitted, of all datasets.
+    dataset : int
+        With ``observations``, which of the calibration's chains they belong to.
+
+    Returns
+    -------
+    Derived
+        Shape (n_data,).
+
+    Raises
+    ------
+    CalibrationFileError
+        If the calibration was read from a file and no observations are given.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> bool(derived_data(cal).is_determined.all())
+    True
+    """
+    if observations is None:
+        measurement = calibration.live_measurement()
+    else:
+        measurement = calibration.measurement_of(observations, dataset)
+    vector = measurement.vector()
+    # per declared unit, (n_data, n_free)
+    jacobian = measurement.jacobian(vector).T * measurement.free.factors()
+    free = _free(calibration)
+    slopes = np.zeros((measurement.n_data, free.size))
+    columns = {name: i for i, name in enumerate(free.names)}
+    # a dataset's chain may have fewer parameters than the whole calibration
+    slopes[:, [columns[name] for name in measurement.free.names]] = jacobian
+    return derive(calibration, free, measurement.predict(vector).copy(), slopes)
+
+
+def derived_sky(
+    calibration, q, u, positions, *, wavelength=None, modulator="hwp", chain=None, dataset=0
+):
+    """
+    Return the Stokes parameters recovered for a source, with the calibration's error.
+
+    A source of known q and u gives normalized double differences, which are
+    linearized and inverted with the calibrated chain by least squares; the
+    error is what a wrong calibration does to the result. Noise of the frames
+    is not included.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    q, u : float
+        Normalized Stokes parameters of the source, V = 0.
+    positions : dict of str to `~astropy.units.Quantity`
+        Position of every stage in the plus frames, scalar or shape (n_pairs,);
+        the modulator stands 45 degrees further in the minus frames.
+    wavelength : `~astropy.units.Quantity`, optional
+        By default the calibration's grid.
+    modulator : str
+        Stage of the half-wave plate.
+    chain : `~astropy.modeling.CompoundModel`, optional
+        Chain of the sky observation, whose optics bear the names and values of
+        the calibrated ones; by default the calibrated chain from its first
+        optic on a stage, so without those of the calibration source.
+    dataset : int
+        Which of the calibration's chains.
+
+    Returns
+    -------
+    Derived
+        q and u for each wavelength, shape (n_wavelengths, 2), or (2,) for a
+        scalar wavelength.
+
+    Raises
+    ------
+    ChainError
+        If a stage has no position, or the chain no optic on a stage.
+    ParameterError
+        If the positions do not determine q and u, or the source is unphysical.
+
+    Examples
+    --------
+    >>> import astropy.units as units
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * units.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> positions = {"hwp": [0, 22.5] * units.deg, "derotator": 60 * units.deg}
+    >>> derived_sky(cal, 0.01, 0.0, positions).value.shape
+    (22, 2)
+    """
+    if not np.hypot(q, u) <= 1:
+        raise ParameterError(f"q = {q}, u = {u}: more than 100 % of polarization")
+    lam = _grid(calibration, wavelength)
+    sky = _sky_chain(calibration.chains[dataset]) if chain is None else chain
+    numerator, denominator = _double_difference_rows(sky, lam, positions, modulator)
+    stokes = np.array([1.0, q, u, 0.0])
+    total = denominator[""] @ stokes
+    ratio = numerator[""] @ stokes / total
+    # derivative of the quotient n s / d s to the Stokes vector s: (n - x d) / (d s)
+    rows = (numerator[""] - ratio[..., None] * denominator[""]) / total[..., None]
+    # of q and u only, shape (n_wavelengths, 2, n_pairs): least squares where there are more pairs
+    inverse = _inverse(rows[..., 1:3])
+    slopes = {}
+    for name in numerator:
+        if name:
+            change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
+            slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
+    value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
+    free = _free(calibration)
+    axis = None if np.ndim(lam) == 0 else -2
+    return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
+
+
+def _sky_chain(chain):
+    """Return the optics from the first on a stage: those before belong to the source."""
+    found = leaves(chain)
+    first = next(
+        (i for i, leaf in enumerate(found) if leaf.stage not in (None, *COORDINATES)), None
+    )
+    if first is None:
+        raise ChainError("the chain has no optic on a stage; give the chain of the sky observation")
+    return join(found[first:])
+
+
+def _double_difference_rows(chain, lam, positions, modulator):
+    """
+    Return rows of difference and sum of the four beams, and their derivatives.
+
+    Two dicts, ``""`` for the rows and ``"optic.parameter"`` for derivatives, of
+    shape (n_pairs, n_wavelengths, 4).
+    """
+    if modulator not in positions:
+        raise ChainError(f"no position of {modulator!r}; positions has {sorted(positions)}")
+    shape = np.broadcast_shapes(*(np.shape(angle) for angle in positions.values()), (1,))
+    angles = {
+        name: np.broadcast_to(u.Quantity(angle), shape, subok=True)
+        for name, angle in positions.items()
+    }
+    numerator, denominator = {}, {}
+    for beam, sign in (("right", 1), ("left", -1)):
+        arm = with_beam(chain, beam)
+        for turned, half in ((0, 1), (45, -1)):
+            at = angles | {modulator: angles[modulator] + turned * u.deg}
+            rows = {"": system_mueller(arm, lam, at)}
+            rows |= system_mueller_derivatives(arm, lam, at)
+            for name, matrix in rows.items():
+                row = np.asarray(getattr(matrix, "value", matrix))[..., 0, :]
+                numerator[name] = numerator.get(name, 0.0) + sign * half * row
+                denominator[name] = denominator.get(name, 0.0) + row
+    return numerator, denominator
+
+
+def _inverse(rows):
+    """Return the least-squares inverse over the pairs, (n_wavelengths, 2, n_pairs)."""
+    stacked = np.moveaxis(rows, 0, -2)
+    singular = np.linalg.svd(stacked, compute_uv=False)
+    if stacked.shape[-2] < 2 or np.any(singular[..., 1] < 1e-6 * singular[..., 0]):
+        raise ParameterError(
+            "the positions do not determine q and u: give pairs at two half-wave-plate angles, "
+            "such as 0 and 22.5 deg"
+        )
+    return np.linalg.pinv(stacked)
+
+
+# ---- diattenuation and retardance of calibrated mirrors, beside those of bare metals ----
+
+
+#: Metals that mirrors are compared with.
+METALS = ("silver", "gold", "aluminium")
+
+_MIRRORS = (Diattenuator, DiattenuatorRetarder, MetalMirror, PowerLawMirror)
+
+
+def mirror_names(calibration):
+    """
+    Return the names of the mirrors, and of other diattenuators, of a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+
+    Returns
+    -------
+    list of str
+        In the order the light travels; without those that are fixed and do nothing.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, optics
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> chain = (optics.Diattenuator(diattenuation=[0.01] * 3, name="fold_mirror")
+    ...          | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(fixed={"efficiency": True}, name="wollaston"))
+    >>> chain["hwp"].retardance.fixed = True
+    >>> data = simulate(chain, [1.2, 1.6, 2.2] * u.um, half_wave_plate_cycles(), seed=2)
+    >>> cal = calibrate(chain, data)
+    >>> mirror_names(cal)
+    ['fold_mirror']
+    """
+    found = {leaf.name: leaf for chain in calibration.chains for leaf in leaves(chain)}
+    return [name for name, leaf in found.items() if isinstance(leaf, _MIRRORS)]
+
+
+def mirror_values(calibration, name, incidence=45 * u.deg):
+    """
+    Return diattenuation and retardance of a mirror, with errors, beside those of metals.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    name : str
+        The mirror, see `mirror_names`.
+    incidence : `~astropy.units.Quantity`
+        Angle of incidence for the metals.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        One row a wavelength: ``wavelength``; ``diattenuation`` and its error; ``retardance`` and
+        its error, where the optic has one (0 to 360 deg, 180 of an ideal mirror); and of each
+        metal, bare, with the indices of Rakić et al. (1998), ``diattenuation_silver``,
+        ``retardance_silver`` and so on. Errors are NaN where the data do not determine a
+        value alone, and where it is held. Meta ``name``, and ``held``: whether the retardance is.
+
+    Raises
+    ------
+    ChainError
+        If there is no such mirror.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, optics
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> chain = (optics.Diattenuator(diattenuation=[0.01] * 3, name="fold_mirror")
+    ...          | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+    ...          | optics.WollastonPrism(fixed={"efficiency": True}, name="wollaston"))
+    >>> chain["hwp"].retardance.fixed = True
+    >>> data = simulate(chain, [1.2, 1.6, 2.2] * u.um, half_wave_plate_cycles(), seed=2)
+    >>> cal = calibrate(chain, data)
+    >>> table = mirror_values(cal, "fold_mirror")
+    >>> table["diattenuation"][0].round(2), table["diattenuation_gold"][0].round(2)
+    (<Quantity 1. %>, <Quantity 0.94 %>)
+    """
+    known = mirror_names(calibration)
+    if name not in known:
+        raise ChainError(f"no mirror {name!r}; the calibration has {', '.join(known) or 'none'}")
+    wavelength = calibration.wavelength
+    table = QTable({"wavelength": wavelength})
+    leaf = _leaf(calibration.chains, name)
+    percent = 100 * u.percent
+    for key, unit in (("diattenuation", percent), ("retardance", u.deg)):
+        if hasattr(leaf, key):
+            value, std = _with_error(calibration, name, key)
+            table[key], table[f"{key}_err"] = value * unit, std * unit
+    table.meta |= {"name": name, "held": _is_held(leaf)}
+    for metal in METALS:
+        mirror = MetalMirror(material=metal, incidence=incidence)
+        table[f"diattenuation_{metal}"] = mirror.diattenuation(wavelength) * percent
+        table[f"retardance_{metal}"] = mirror.retardance(wavelength)
+    return table
+
+
+def _leaf(chains, name):
+    return next(leaf for chain in chains for leaf in leaves(chain) if leaf.name == name)
+
+
+def _is_held(leaf):
+    """Return whether the retardance is not fitted."""
+    if not isinstance(leaf, DiattenuatorRetarder):
+        return all(getattr(leaf, key).fixed for key in leaf.own_names)
+    return bool(leaf.retardance.fixed)
+
+
+def _with_error(calibration, name, key):
+    """Return a value and its error, plain (degree), shape (n_wavelengths,)."""
+    size, own = len(calibration.wavelength), calibration.parameter_values().get(f"{name}.{key}")
+    if own is not None:
+        return (np.broadcast_to(own[part], size).astype(float) for part in ("value", "std"))
+
+    def law(*chains):
+        value = getattr(_leaf(chains, name), key)(calibration.wavelength)
+        return value.to_value(u.deg) if isinstance(value, u.Quantity) else value
+
+    def slopes(*chains):
+        leaf = _leaf(chains, name)
+        found = leaf.law_slopes(calibration.wavelength)[key]
+        # the thickness of a film cannot be stepped below zero, so no differences are taken
+        return {f"{name}.{own}": found[own] for own in found if not getattr(leaf, own).fixed}
+
+    derived = propagate(calibration, law, slopes)
+    return np.asarray(derived.value), np.asarray(derived.std)

@@ -1,0 +1,798 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Quick fits from a known solution: with other weights, or with parameters held.
+
+Profile likelihood: chi-square along one parameter, all others refitted.
+
+Where a parameter enters the model non-linearly, the interval in which the
+profile rises by one is a better statement than a standard error, and need not
+be symmetric. Where the data leave a parameter open the profile is flat.
+
+Bootstrap over blocks of frames: errors that do not trust the noise model.
+
+Frames of one half-wave-plate cycle share what the model lacks (a lamp that
+drifts, a derotator that stands slightly wrong), so their residuals are not
+independent, and errors from the Jacobian are too small. Drawing whole cycles
+with replacement keeps that dependence (Kuensch 1989, Ann. Statist. 17, 1217,
+https://doi.org/10.1214/aos/1176347265).
+
+Standard errors of parameters: of the full covariance, robust, and as published ones are.
+
+The sandwich estimate reads from the residuals of whole groups of data how far each
+group pulls the parameters (White 1980; Liang & Zeger 1986).
+"""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.calibration.identifiability.analysis import physical_scale
+from astropolcal.calibration.identifiability.linearized import declared_step, decompose
+from astropolcal.calibration.noise.scatter import labels_of
+from astropolcal.calibration.noise.weighting import around, weighting_of
+from astropolcal.calibration.uncertainty.covariance import (
+    Covariance,
+    full_covariance,
+    residual_variance,
+    sandwich,
+    white_covariance,
+)
+from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.simulation import check_seed
+from astropolcal.units import to_unit
+
+__all__ = ["Profile", "Resampled", "bootstrap", "profile", "robust_covariance", "standard_errors"]
+
+_FEWEST_BLOCKS = 3
+_MAX_EVALUATIONS = 100
+
+
+class Refit:
+    """The least-squares problem of a calibration: data, priors, bounds."""
+
+    def __init__(self, calibration):
+        self.measurement = calibration.live_measurement()
+        self.solution = self.measurement.vector()
+        weighting = weighting_of(calibration)
+        weights = weighting.weight
+        # with equal weights residuals stay dimensionless, and the
+        # noise multiplies the priors instead
+        self.weights = np.ones(self.measurement.n_data) if weights is None else weights
+        self._noise = weighting.level
+        self._low, self._high = self.measurement.free.bounds()
+
+    def residuals(self, vector, weights):
+        """Return weighted residuals of data and priors."""
+        data = weights * (self.measurement.predict(vector) - self.measurement.observed)
+        return np.concatenate([data, self._noise * self.measurement.free.prior_residuals(vector)])
+
+    def jacobian(self, vector, weights):
+        """Return the derivative of `residuals`, (n_data + n_priors, n_free)."""
+        data = self.measurement.jacobian(vector) * weights
+        priors = self.measurement.free.prior_jacobian(vector) * self._noise
+        return np.concatenate([data, priors], axis=1).T
+
+    def fit(self, start, counts=None, held=()):
+        """
+        Fit from a start.
+
+        ``counts`` tells how often each datum occurs, ``held`` which elements
+        stay as they are. Returns the vector, chi-square, and whether it arrived.
+        """
+        from scipy.optimize import least_squares
+
+        # a datum drawn k times adds k r^2 to chi-square; one never drawn adds nothing
+        weights = self.weights if counts is None else self.weights * np.sqrt(counts)
+        live = np.setdiff1d(np.arange(start.size), held)
+        vector = start.copy()
+
+        def place(part):
+            vector[live] = part
+            return vector
+
+        found = least_squares(
+            lambda part: self.residuals(place(part), weights),
+            # least_squares refuses a start outside of the bounds by a rounding error
+            np.clip(start[live], self._low[live], self._high[live]),
+            jac=lambda part: self.jacobian(place(part), weights)[:, live],
+            bounds=(self._low[live], self._high[live]),
+            # a radian, a micrometre and a 1 move the data by very different amounts
+            x_scale=self._scale(start, weights)[live],
+            max_nfev=_MAX_EVALUATIONS,
+        )
+        return place(found.x).copy(), 2 * found.cost, found.status > 0
+
+    def _scale(self, vector, weights):
+        """Return the natural step of each parameter; 1 for one that moves nothing."""
+        size = np.linalg.norm(self.jacobian(vector, weights), axis=0)
+        return 1 / np.where(size > 0, size, 1.0)
+
+
+# ---- profile likelihood: chi-square along one parameter, all others refitted ----
+
+
+# half width of the default scan, in standard errors; in degree, micrometre, percent if open
+_WIDTH = 3.0
+_OPEN_WIDTH = 1.0
+
+
+@dataclass
+class Profile:
+    """
+    Profile of chi-square along one parameter.
+
+    Parameters
+    ----------
+    name : str
+        The parameter.
+    best : `~astropy.units.Quantity` or float
+        Its calibrated value.
+    values : `~astropy.units.Quantity` or `~numpy.ndarray`
+        Where it was held, ascending, with the calibrated value among them.
+    delta_chi2 : `~numpy.ndarray`
+        Rise of chi-square over the calibration's, in units of the residual
+        variance where the errors of the data are not given.
+    vectors : `~numpy.ndarray`
+        All parameters in canonical units at each value, shape (n_values, n_free).
+    bounds : tuple of float
+        Bounds of the parameter in its unit.
+
+    Examples
+    --------
+    >>> import numpy as np
+
+    >>> made = Profile("wollaston.efficiency", 0.9, np.array([0.8, 0.9, 1.0]),
+    ...                np.array([4.0, 0.0, 4.0]), np.zeros((3, 1)))
+    >>> [round(end, 3) for end in made.interval()]
+    [0.85, 0.95]
+    """
+
+    name: str
+    best: object
+    values: object
+    delta_chi2: np.ndarray
+    vectors: np.ndarray
+    bounds: tuple = (-np.inf, np.inf)
+
+    def interval(self, rise=1.0):
+        """
+        Return where the profile has risen.
+
+        Parameters
+        ----------
+        rise : float
+            Rise of chi-square; 1 for one sigma.
+
+        Returns
+        -------
+        low, high : `~astropy.units.Quantity` or float
+            Infinite on a side where the profile stays below ``rise`` as far
+            as it was followed.
+        """
+        values = np.asarray(getattr(self.values, "value", self.values))
+        unit = getattr(self.values, "unit", None)
+        here = int(np.argmin(np.abs(values - getattr(self.best, "value", self.best))))
+        # of a parabola the root is a straight line, so that interpolation is exact
+        root = np.sqrt(np.clip(self.delta_chi2, 0, None))
+        # left half turned round, so that both sides are searched outwards from the best value
+        ends = (
+            -_crossing(-values[here::-1], root[here::-1], np.sqrt(rise)),
+            _crossing(values[here:], root[here:], np.sqrt(rise)),
+        )
+        return ends if unit is None else tuple(end * unit for end in ends)
+
+    @property
+    def words(self):
+        """The finding in a sentence."""
+        low, high = self.interval()
+        ends = f"{self.values[0]:.6g} and {self.values[-1]:.6g}"
+        if np.isinf(low) and np.isinf(high):
+            return (
+                f"{self.name} is unbounded: between {ends} chi-square rises by at most "
+                f"{self.delta_chi2.max():.2g}, so the data do not determine it"
+            )
+        if np.isinf(low) or np.isinf(high):
+            return self._one_sided(low, high)
+        return f"{self.name} = {self.best:.6g}, between {low:.6g} and {high:.6g} at one sigma"
+
+    def _one_sided(self, low, high):
+        if np.isinf(low):
+            least, end, last, bound = "at most", high, self.values[0], self.bounds[0]
+        else:
+            least, end, last, bound = "at least", low, self.values[-1], self.bounds[1]
+        at_bound = np.isclose(getattr(last, "value", last), bound)
+        stop = "its bound" if at_bound else "the last value"
+        return (
+            f"{self.name} is {least} {end:.6g} at one sigma; chi-square does not limit it "
+            f"up to {stop} {last:.6g}"
+        )
+
+    def __str__(self):
+        return self.words
+
+
+def _crossing(values, root, rise):
+    """Return where the root of the profile first exceeds ``rise``, between two values."""
+    above = np.flatnonzero(root > rise)
+    if not above.size:
+        return np.inf
+    i = above[0]
+    if i == 0:
+        return float(values[0])
+    share = (rise - root[i - 1]) / (root[i] - root[i - 1])
+    return float(values[i - 1] + share * (values[i] - values[i - 1]))
+
+
+def profile(calibration, name, values=None, n=21):
+    """
+    Return chi-square along one parameter, with all others refitted.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        A calibration with its data.
+    name : str
+        One of ``calibration.covariance.names``, such as ``"hwp.w_sio2"`` or
+        ``"derotator.horizontal[3]"``.
+    values : `~astropy.units.Quantity` or array_like, optional
+        Where to hold it; by default three standard errors to either side, of what
+        is at a bound one-sided ones, or 1 degree (micrometre, percent) where it has
+        none, within its bounds.
+    n : int
+        Number of values if none are given.
+
+    Returns
+    -------
+    Profile
+
+    Raises
+    ------
+    ParameterError
+        If there is no such parameter, or a value has the wrong unit or is
+        outside the bounds.
+    FitError
+        If ``n`` is below 3.
+    CalibrationFileError
+        If the calibration was read from a file, which holds no data.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import profile
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> low, high = profile(cal, "hwp.w_sio2", n=7).interval()
+    >>> bool(low < cal.chain["hwp"].w_sio2.quantity < high)
+    True
+    """
+    covariance = calibration.covariance
+    if name not in covariance.names:
+        raise ParameterError(f"no free parameter {name!r}; there are {_some(covariance.names)}")
+    if n < 3:
+        raise FitError(f"n = {n}; a profile needs at least 3 values")
+    index = covariance.names.index(name)
+    refit = Refit(calibration)
+    unit = covariance.units[index]
+    factor = refit.measurement.free.factors()[index]
+    best = refit.solution[index] / factor
+    low, high = (bounds[index] / factor for bounds in refit.measurement.free.bounds())
+    if values is None:
+        inward = (calibration.fit.get("bounds") or {"inward": {}})["inward"]
+        std = inward.get(name, covariance.stds[index])
+        grid = _grid(best, std, declared_step(unit), n)
+        grid = np.unique(np.clip(grid, low, high))
+    else:
+        grid = np.unique(np.append(to_unit(values, unit, name), best))
+        if grid[0] < low or grid[-1] > high:
+            raise ParameterError(f"{name}: values outside its bounds {low:g} to {high:g}")
+    chi2, vectors = _follow(refit, index, grid * factor, int(np.argmin(np.abs(grid - best))))
+    rise = (chi2 - chi2.min()) / residual_variance(calibration)
+    quantity = 1 if unit is None else u.Unit(unit)
+    return Profile(name, best * quantity, grid * quantity, rise, vectors, (low, high))
+
+
+def _some(names):
+    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+
+
+def _grid(best, std, step, n):
+    """Return values around the best; an odd number of them, so that it is one."""
+    half = _WIDTH * std if np.isfinite(std) else _OPEN_WIDTH * step
+    return best + half * np.linspace(-1, 1, n + 1 - n % 2)
+
+
+def _follow(refit, index, values, here):
+    """Refit at every value, starting from the solution and going outward on both sides."""
+    chi2, vectors = np.empty(values.size), np.empty((values.size, refit.solution.size))
+    for side in (range(here, values.size), range(here, -1, -1)):
+        # each fit starts from its neighbour's, so that it stays in the same valley
+        vector = refit.solution
+        for i in side:
+            start = vector.copy()
+            start[index] = values[i]
+            vector, chi2[i], _ = refit.fit(start, held=[index])
+            vectors[i] = vector
+    return chi2, vectors
+
+
+# ---- bootstrap over blocks of frames: errors that do not trust the noise model ----
+
+
+# resamples drawn for each one wanted before giving up
+_PATIENCE = 5
+# a direction counts as lost if its singular value falls to this share of the original's
+_LOST = 1e-7
+
+
+@dataclass
+class Resampled:
+    """
+    Parameters of refits to resampled data.
+
+    Parameters
+    ----------
+    names : list of str
+        Name of each parameter.
+    units : list of `~astropy.units.Unit` or None
+        Unit of each.
+    samples : `~numpy.ndarray`
+        Shape (n_resamples, n), in these units; NaN for parameters that the
+        data do not determine, whose spread would be an accident of the fitter.
+    block : str
+        What was drawn: ``"derotator"`` or ``"pair"``.
+    n_blocks : int
+        How many of them the data have.
+    n_rejected : int
+        Resamples that did not determine what the data determine, or whose fit
+        did not converge; others were drawn in their place.
+
+    Examples
+    --------
+    >>> import numpy as np
+
+    >>> made = Resampled(["wollaston.efficiency"], [None], np.array([[0.97], [0.99]]), "pair", 8, 0)
+    >>> float(made.stds[0].round(4))
+    0.0141
+    """
+
+    names: list
+    units: list
+    samples: np.ndarray
+    block: str
+    n_blocks: int
+    n_rejected: int
+
+    @property
+    def stds(self):
+        """Standard deviation of each parameter, NaN where not determined."""
+        return self.samples.std(axis=0, ddof=1)
+
+    @property
+    def covariance(self):
+        """The sample covariance, a `Covariance`."""
+        centred = self.samples - self.samples.mean(axis=0)
+        return Covariance(self.names, self.units, centred.T @ centred / (len(self.samples) - 1))
+
+    def std(self, name):
+        """
+        Return the standard deviation of one parameter.
+
+        Parameters
+        ----------
+        name : str
+            One of ``names``.
+
+        Returns
+        -------
+        `~astropy.units.Quantity` or float
+
+        Raises
+        ------
+        ParameterError
+            If there is no such parameter.
+        """
+        return self.covariance.std(name)
+
+    def interval(self, level=0.6827):
+        """
+        Return the percentile interval of each parameter.
+
+        Parameters
+        ----------
+        level : float
+            Share of the resamples inside.
+
+        Returns
+        -------
+        low, high : `~numpy.ndarray`
+            Shape (n,), in ``units``.
+        """
+        if not 0 < level < 1:
+            raise FitError(f"level = {level}; allowed is a share between 0 and 1")
+        return tuple(np.quantile(self.samples, [(1 - level) / 2, (1 + level) / 2], axis=0))
+
+    def __repr__(self):
+        return (
+            f"<Resampled: {len(self.samples)} bootstrap resamples of {self.n_blocks} "
+            f"{self.block} blocks, {len(self.names)} parameters>"
+        )
+
+
+def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
+    """
+    Refit resampled data, drawn in blocks of frames with replacement.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        A calibration with its data.
+    n : int
+        Number of resamples.
+    block : {"derotator", "pair"}
+        What is drawn: all frames at a derotator angle, or single pairs of
+        frames, each with all wavelengths. Every dataset keeps its number of
+        blocks. ``"pair"`` assumes that pairs are independent.
+    seed : int or `~numpy.random.Generator`, optional
+        Seed.
+    progress : callable, optional
+        Called with the number of fits done and wanted after each.
+
+    Returns
+    -------
+    Resampled
+
+    Raises
+    ------
+    FitError
+        If the block is unknown, ``n`` is below 2, a dataset has fewer than
+        three blocks, or hardly any resample can be fitted.
+    CalibrationFileError
+        If the calibration was read from a file, which holds no data.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import bootstrap
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 50, 65, 80, 95] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> bootstrap(cal, n=10, seed=1)
+    <Resampled: 10 bootstrap resamples of 5 derotator blocks, 49 parameters>
+    """
+    if n < 2:
+        raise FitError(f"n = {n}; a bootstrap needs at least 2 resamples")
+    refit = Refit(calibration)
+    groups = _blocks(refit.measurement, block)
+    rng = np.random.default_rng(check_seed(seed))
+    # what all data determine, a resample must determine too
+    wanted = _singular_values(refit, 1.0)
+    samples, rejected = [], 0
+    while len(samples) < n:
+        counts = _draw(rng, groups)
+        vector = _resample(refit, counts, wanted)
+        if vector is None:
+            rejected += 1
+            _check_patience(rejected, n)
+            continue
+        samples.append(vector)
+        if progress is not None:
+            progress(len(samples), n)
+    return _result(calibration, refit, np.array(samples), block, groups, rejected)
+
+
+def _blocks(measurement, block):
+    """Return for each dataset its slice of the data and the block of each datum."""
+    labels, found = labels_of(measurement, block), []
+    for dataset, segment in zip(measurement.datasets, measurement.segments, strict=True):
+        _, numbers = np.unique(labels[segment], return_inverse=True)
+        if numbers.max() + 1 < _FEWEST_BLOCKS:
+            raise FitError(
+                f"{dataset.observations.name} has {numbers.max() + 1} {block} blocks; a bootstrap "
+                f"needs {_FEWEST_BLOCKS}, and many more to be accurate"
+            )
+        found.append((segment, numbers))
+    return found
+
+
+def _draw(rng, groups):
+    """Return how often each datum occurs in a resample."""
+    parts = []
+    for _, numbers in groups:
+        n_blocks = numbers.max() + 1
+        # as many blocks as there are, with replacement
+        drawn = np.bincount(rng.integers(n_blocks, size=n_blocks), minlength=n_blocks)
+        parts.append(drawn[numbers])
+    return np.concatenate(parts).astype(float)
+
+
+def _resample(refit, counts, wanted):
+    """Return the fit to a resample; None if it determines less than all data, or fails."""
+    if np.any(_singular_values(refit, np.sqrt(counts))[: wanted.size] < _LOST * wanted):
+        return None
+    vector, _, arrived = refit.fit(refit.solution, counts)
+    return vector if arrived else None
+
+
+def _singular_values(refit, scale):
+    """Return the singular values that are not zero, of columns of natural size."""
+    jacobian = refit.jacobian(refit.solution, refit.weights * scale)
+    size = np.linalg.norm(jacobian, axis=0)
+    singular = np.linalg.svd(jacobian / np.where(size > 0, size, 1.0), compute_uv=False)
+    return singular[singular > 1e-9 * singular[0]] if np.ndim(scale) == 0 else singular
+
+
+def _check_patience(rejected, n):
+    if rejected > _PATIENCE * n + 10:
+        raise FitError(
+            f"{rejected} resamples could not be fitted: the data have too few blocks for the model"
+        )
+
+
+def _result(calibration, refit, vectors, block, groups, rejected):
+    known = full_covariance(calibration)
+    samples = vectors / refit.measurement.free.factors()
+    is_open = (np.abs(known._axes().open) > 1e-5).any(axis=0)
+    # where the data leave a direction open, a fit ends anywhere along it
+    samples[:, is_open] = np.nan
+    n_blocks = sum(int(numbers.max()) + 1 for _, numbers in groups)
+    return Resampled(known.names, known.units, samples, block, n_blocks, rejected)
+
+
+# ---- standard errors of parameters: of the full covariance, robust, and as published ones are ----
+
+
+METHODS = ("covariance", "white", "robust", "van-holstein")
+CORRECTIONS = ("leverage", "number")
+_FEWEST_GROUPS = 3
+# a share of a residual below this is what the fit has taken away, and no scatter
+_TAKEN = 1e-6
+
+
+def standard_errors(calibration, method=None, groups=None):
+    r"""
+    Return the standard errors of the free parameters.
+
+    ``"covariance"`` is that of the calibration, by default from how its residuals scatter and hang
+    together. ``"white"`` takes them to be independent, with the noise of its weights.
+    ``"robust"`` lets groups of residuals hang together in any way, see `robust_covariance`.
+    ``"van-holstein"`` is the error that calibrations of SPHERE/IRDIS and CHARIS quote (van Holstein
+    et al. 2020, A&A 633, A64,
+    Appendix E): each wavelength is a fit of its own in which the parameters
+    common to all wavelengths are known, with covariance
+
+    .. math:: s_\mathrm{res}^2 (J^T J)^{-1}, \qquad
+              s_\mathrm{res}^2 = \frac{\sum_i r_i^2}{n - k},
+
+    where J is the derivative of the n data of that wavelength to its k
+    parameters. It is too small where the common parameters are uncertain, which
+    is why the parameters held are named in the table's meta.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; with its data for all but ``"covariance"``.
+    method : {"covariance", "white", "robust", "van-holstein"}, optional
+        Which error; by default ``"covariance"``, or ``"robust"`` with groups.
+    groups : str or array_like, optional
+        For ``"robust"``, see `robust_covariance`; by default ``"derotator"``.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Columns ``name``, ``std`` and ``unit``, one row a parameter; NaN for
+        those at a bound, that the data leave open, or (van Holstein) that are
+        common to all wavelengths. ``meta`` has ``method``, ``held`` and, for
+        ``"robust"``, ``groups``.
+
+    Raises
+    ------
+    FitError
+        If the method is unknown, or groups are given for another than
+        ``"robust"`` or are not possible ones.
+    CalibrationFileError
+        If the data are needed but were not kept.
+
+    Notes
+    -----
+    The formula is that of the published software of McIntosh et al. (2026),
+    which says that it follows the appendix; it there falls back on a
+    pseudo-inverse where the matrix is singular, here there is no number then.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> standard_errors(cal, method="van-holstein").meta["held"][:2]
+    ['calibration_polarizer.theta', 'hwp.theta']
+    """
+    method = ("covariance" if groups is None else "robust") if method is None else method
+    if method not in METHODS:
+        raise FitError(f"method = {method!r}; allowed are {', '.join(METHODS)}")
+    if groups is not None and method != "robust":
+        raise FitError(f"method = {method!r} knows no groups; 'robust' does")
+    covariance = calibration.covariance
+    stds, held, meta = covariance.stds, [], {}
+    if method == "white":
+        weighting, live = weighting_of(calibration), calibration.live_measurement()
+        stds = white_covariance(live, around(live, weighting), weighting).stds
+    if method == "robust":
+        groups = "derotator" if groups is None else groups
+        stds = robust_covariance(calibration, groups).stds
+        meta = {"groups": groups if isinstance(groups, str) else "as given"}
+    if method == "van-holstein":
+        stds = _per_wavelength(calibration)
+        slots = calibration.measurement.free.slots
+        held = [slot.name for slot in slots if not slot.per_wavelength]
+    units = [str(unit or "") for unit in covariance.units]
+    return QTable(
+        {"name": covariance.names, "std": stds, "unit": units},
+        meta={"method": method, "held": held} | meta,
+    )
+
+
+# ---- robust -----------------------------------------------------------------------------
+
+
+def robust_covariance(calibration, groups="derotator", correction="leverage"):
+    r"""
+    Return a covariance that allows residuals to be correlated within groups.
+
+    With the derivative J of the weighted data, :math:`B = (J^T J)^{-1}` and the
+    weighted residuals :math:`e_g` of group g it is the sandwich
+
+    .. math:: B \left(\sum_g J_g^T A_g e_g e_g^T A_g^T J_g\right) B
+
+    (White 1980 [1]_ for groups of one datum, Liang & Zeger 1986 [2]_ for any).
+    Nothing is assumed of the residuals of a group but that they are
+    independent of other groups', which takes many groups. As the fit follows its
+    data, residuals are too small, and few groups more so. ``"leverage"`` undoes it
+    with :math:`A_g = (1 - J_g B J_g^T)^{-1/2}`, which is exact for independent
+    residuals (Bell & McCaffrey 2002 [3]_); ``"number"`` multiplies the
+    whole by :math:`\frac{G}{G-1}\frac{n-1}{n-k}` for G groups, n data and k
+    parameters.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        A calibration with its data.
+    groups : {"derotator", "pair"} or array_like
+        What is correlated: all data at a derotator angle, those of a pair of
+        frames, or the label of each datum, shape (n_data,).
+    correction : {"leverage", "number"}
+        Correction for a small number of groups.
+
+    Returns
+    -------
+    Covariance
+        In the gauge of the calibration's. It has no more independent
+        directions than groups: for a combination of many parameters take a
+        `bootstrap`.
+
+    Raises
+    ------
+    FitError
+        If there are fewer than three groups, the labels are not one a datum,
+        or a choice is unknown.
+    CalibrationFileError
+        If the calibration was read from a file, which holds no data.
+
+    Notes
+    -----
+    Priors enter B, and with their own variance the sum in the middle. An
+    error from G groups is itself uncertain by about :math:`1/\sqrt{2(G-1)}`.
+
+    References
+    ----------
+    .. [1] White, H. 1980, Econometrica 48, 817, doi:10.2307/1912934
+    .. [2] Liang, K.-Y. & Zeger, S. L. 1986, Biometrika 73, 13,
+       doi:10.1093/biomet/73.1.13
+    .. [3] Bell, R. M. & McCaffrey, D. F. 2002, Survey Methodology 28, 169
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 50, 65, 80, 95] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> robust = robust_covariance(cal, groups="pair")
+    >>> bool(0.5 < robust.std("hwp.w_sio2") / cal.covariance.std("hwp.w_sio2") < 2)
+    True
+    """
+    if correction not in CORRECTIONS:
+        raise FitError(f"correction = {correction!r}; allowed are {', '.join(CORRECTIONS)}")
+    weighting, measurement = weighting_of(calibration), calibration.measurement
+    labels = _labels(measurement, groups)
+    whitened = around(measurement, weighting)
+    residuals = measurement.residuals()
+    if weighting.weight is not None:
+        residuals = residuals * weighting.weight
+    # derivatives to the determined directions, each in units of its standard error
+    slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T
+    # (n_groups, rank): how far each group alone pulls the solution, in standard errors
+    pulls = np.array(
+        [_pull(slopes[labels == g], residuals[labels == g], correction) for g in set(labels)]
+    )
+    # of one array with itself: a product of two copies is symmetric to rounding only
+    middle = pulls.T @ pulls
+    if correction == "number":
+        n, k, n_groups = len(labels), slopes.shape[1], len(pulls)
+        middle *= n_groups / (n_groups - 1) * (n - 1) / max(n - k, 1)
+    # priors are taken at their word: their variance is not read from residuals
+    prior = weighting.level * whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T
+    middle += prior.T @ prior
+    return sandwich(measurement, whitened, middle)
+
+
+def _labels(measurement, groups):
+    labels = labels_of(measurement, groups) if isinstance(groups, str) else np.asarray(groups)
+    if labels.shape != (measurement.n_data,):
+        raise FitError(
+            f"groups of shape {labels.shape}; allowed are ({measurement.n_data},), one a datum"
+        )
+    _, numbers = np.unique(labels, return_inverse=True)
+    if numbers.max() + 1 < _FEWEST_GROUPS:
+        raise FitError(
+            f"{numbers.max() + 1} groups; a robust covariance needs {_FEWEST_GROUPS}, and many "
+            "more to be accurate"
+        )
+    return numbers
+
+
+def _pull(slopes, residuals, correction):
+    """Return how far a group pulls along each determined direction."""
+    if correction == "leverage":
+        # of the hat matrix in the group only the directions of its slopes count
+        left, singular, _ = np.linalg.svd(slopes, full_matrices=False)
+        spare = 1 - singular**2
+        grown = np.where(spare > _TAKEN, 1 / np.sqrt(np.maximum(spare, _TAKEN)), 0.0)
+        residuals = residuals + left @ ((grown - 1) * (left.T @ residuals))
+    return slopes.T @ residuals
+
+
+# ---- as published --------------------------------------------------------------------------
+
+
+def _per_wavelength(calibration):
+    """Return the errors of fits wavelength by wavelength, in declared units."""
+    measurement = calibration.live_measurement()
+    free, weights = measurement.free, weighting_of(calibration).weight
+    weights = 1.0 if weights is None else weights
+    jacobian = measurement.jacobian(measurement.vector()) * weights
+    residuals = measurement.residuals() * weights
+    at_bound, names = set(calibration.at_bound), free.names
+    stds = np.full(free.size, np.nan)
+    for i in range(len(measurement.wavelength)):
+        own = [slot.start + i for slot in free.slots if slot.per_wavelength]
+        own = np.array([j for j in own if names[j] not in at_bound], dtype=int)
+        rows = measurement.bins == i
+        if own.size and rows.sum() > own.size:
+            scale = physical_scale(free)[own]
+            unit_noise = _stds(jacobian[np.ix_(own, rows)].T * scale) * scale
+            # the common parameters count as known, so that only a wavelength's own take freedom
+            variance = np.sum(residuals[rows] ** 2) / (rows.sum() - own.size)
+            stds[own] = np.sqrt(variance) * unit_noise
+    return stds / free.factors()
+
+
+def _stds(jacobian):
+    """Return the errors for unit noise, NaN for what the data leave open."""
+    found = decompose(jacobian)
+    return np.where(found.determined, np.linalg.norm(found.half, axis=0), np.nan)

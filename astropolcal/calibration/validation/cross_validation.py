@@ -1,0 +1,537 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Accuracy of a calibration per wavelength: s_res, s_mean, s_cv and s_standard.
+
+The first two look back at the data of the fit. The others are errors of
+predictions: of settings that were left out of the fit, and of a dataset that the
+fit never saw (a standard).
+
+Goodness of fit: whether the residuals exceed the noise.
+
+Chi-square where the noise is known, F where it is itself estimated.
+"""
+
+import warnings
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.modeling.fitting import TRFLSQFitter
+from astropy.table import QTable
+
+from astropolcal.calibration.identifiability.analysis import null_space, physical_scale
+from astropolcal.calibration.identifiability.linearized import Whitened
+from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_from_errors
+from astropolcal.calibration.noise.scatter import leave_out_groups
+from astropolcal.calibration.noise.weighting import weighting_of
+from astropolcal.calibration.uncertainty.covariance import prior_noise
+from astropolcal.exceptions import FitError
+
+__all__ = ["LackOfFit", "lack_of_fit"]
+
+# a datum that moves by less than this share of the largest slope does not move
+_STILL = 1e-6
+# what is named of a direction, as a share of its length
+_WORTH_A_WORD = 0.1
+_MOST_NAMES = 4
+# of more groups than this none moves the parameters far
+_MANY = 16
+# a leverage this near to one is that of data which alone determine something
+_ALONE = 1e-7
+
+
+def accuracy_table(measurement, dataset, residuals, held_out=None):
+    r"""
+    Return the accuracies of one dataset at each wavelength.
+
+    ``s_res`` is the corrected sample standard deviation of the residuals,
+    :math:`\sqrt{\sum r_i^2/(n-k)}`; ``s_mean`` is ``s_res`` over
+    :math:`\sqrt{n}`, the paper's s_rel (paper, Sec. 2.3), with k the number of
+    free parameters that act at that wavelength; ``s_cv`` is the rms of
+    residuals predicted for frames left out in groups; ``s_standard``, which
+    `add_standard` fills, that of datasets that the fit never saw.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    dataset : int
+        Which of its datasets.
+    residuals : `~numpy.ndarray`
+        Residuals of all data, shape (n_data,).
+    held_out : `~numpy.ndarray`, optional
+        Residuals of all data when left out of the fit; NaN where none.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Columns ``wavelength``, ``n``, ``k``, ``s_res``, ``s_mean``, ``s_cv``,
+        ``s_standard``, the last four in percent, NaN where there are too few
+        data or none.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
+    >>> observations = simulate(charis.chain(), charis.wavelength, frames)
+    >>> measurement = Measurement(charis.chain(), observations)
+    >>> accuracy_table(measurement, 0, measurement.residuals()).colnames
+    ['wavelength', 'n', 'k', 's_res', 's_mean', 's_cv', 's_standard']
+    """
+    part = measurement.datasets[dataset]
+    residuals = residuals[measurement.segments[dataset]]
+    held_out = None if held_out is None else held_out[measurement.segments[dataset]]
+    rows = [part.bin_of_datum == b for b in part.bins]
+    n = np.array([row.sum() for row in rows])
+    k = part.n_parameters_per_wavelength
+    squares = np.array([np.sum(residuals[row] ** 2) for row in rows])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # n - k as for independent data: every parameter that acts here takes one degree of freedom,
+        # also one common to all wavelengths, as in the paper
+        s_res = np.where(n > k, np.sqrt(squares / np.where(n > k, n - k, 1)), np.nan)
+        s_mean = s_res / np.sqrt(n)
+    s_cv = [np.nan if held_out is None else _rms(held_out[row]) for row in rows]
+    return QTable(
+        {
+            "wavelength": part.observations.wavelength,
+            "n": n,
+            "k": np.full(len(n), k),
+            "s_res": (s_res * 100) * u.percent,
+            "s_mean": (s_mean * 100) * u.percent,
+            "s_cv": (np.array(s_cv) * 100) * u.percent,
+            "s_standard": np.full(len(n), np.nan) * u.percent,
+        }
+    )
+
+
+def _rms(values):
+    known = values[np.isfinite(values)]
+    return np.sqrt(np.mean(known**2)) if known.size else np.nan
+
+
+def cross_validated_residuals(measurement, vector, weights=None, groups=None):
+    """
+    Return the residual of every datum predicted by a fit that left its group out.
+
+    Up to 16 groups each have a fit; of more, which weigh little, the fits are
+    linear steps from that of all data.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    vector : `~numpy.ndarray`
+        The fitted values, where each fit starts.
+    weights : `~numpy.ndarray`, optional
+        Weight of each datum.
+    groups : `~numpy.ndarray`, optional
+        Group of each datum; by default `leave_out_groups`.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Shape (n_data,). NaN where the other groups do not determine the
+        prediction, and everywhere if there are fewer than three derotator angles
+        or, of groups that are given, fewer than two.
+
+    Raises
+    ------
+    FitError
+        If given groups are not one a datum, have a single member, or cannot be
+        predicted from the others.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> from astropolcal.measurement import Measurement
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> measurement = Measurement(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> residuals = cross_validated_residuals(measurement, measurement.vector())
+    >>> bool(abs(residuals).max() < 0.01)
+    True
+    """
+    # two derotator angles are too few to predict one from the other; nights need not be
+    fewest = 3 if groups is None else 2
+    labels = leave_out_groups(measurement) if groups is None else _checked(measurement, groups)
+    held_out = np.full(measurement.n_data, np.nan)
+    found = np.unique(labels)
+    if len(found) < fewest:
+        return held_out
+    jacobian = measurement.jacobian(vector)
+    if len(found) > _MANY:
+        return _held_out_linearly(measurement, vector, jacobian, weights, labels, groups)
+    for label in found:
+        out = labels == label
+        moved, blind = _undetermined(measurement, vector, jacobian, out, weights)
+        if groups is not None and blind.any():
+            raise FitError(_not_predicted(measurement, label, out, moved))
+        fitted = _fit_without(measurement, vector, out, weights)
+        # along what the others leave open the fit still stands where all data have put it
+        held_out[out] = np.where(blind, np.nan, measurement.residuals(fitted)[out])
+    return held_out
+
+
+def _held_out_linearly(measurement, vector, jacobian, weights, labels, groups):
+    """
+    Return what a fit without each of many groups predicts, by one step of linear algebra.
+
+    The residuals of a group g become (1 - H_g)^-1 r_g, with H_g its part of the hat matrix: exact
+    for a linear model, and a small group moves no parameter far.
+    """
+    weight = np.ones(measurement.n_data) if weights is None else np.asarray(weights, dtype=float)
+    free = measurement.free
+    priors = free.prior_jacobian(vector) * prior_noise(measurement, weights)
+    problem = Whitened(jacobian * weight, physical_scale(free), priors, free.at_bounds(vector))
+    root = problem.rows[:, problem.live] @ problem.errors.half.T
+    residuals = measurement.residuals(vector) * weight
+    order = np.argsort(labels, kind="stable")
+    ends = np.flatnonzero(labels[order][1:] != labels[order][:-1]) + 1
+    held_out = np.empty(measurement.n_data)
+    for rows in np.split(order, ends):
+        # (1 - H_g)^-1 r_g without inverting a matrix of the size of the group: H_g = R R^T, and its
+        # eigenvalues are those of R^T R, (rank, rank)
+        own = root[rows]
+        values, axes = np.linalg.eigh(own.T @ own)
+        seen = own @ axes
+        # along these the others determine nothing
+        alone = values > 1 - _ALONE
+        blind = (np.abs(seen[:, alone]) > _STILL).any(axis=1)
+        if groups is not None and blind.any():
+            out = labels == labels[rows[0]]
+            moved, _ = _undetermined(measurement, vector, jacobian, out, weights)
+            raise FitError(_not_predicted(measurement, labels[rows[0]], out, moved))
+        gain = np.where(alone, 0.0, 1 / np.where(alone, 1.0, 1 - values))
+        # (1 - R R^T)^-1 = 1 + R (1 - R^T R)^-1 R^T
+        change = seen @ (gain * (seen.T @ residuals[rows]))
+        held_out[rows] = np.where(blind, np.nan, (residuals[rows] + change) / weight[rows])
+    return held_out
+
+
+def _checked(measurement, groups):
+    groups = np.asarray(groups)
+    if groups.shape != (measurement.n_data,):
+        raise FitError(
+            f"groups of shape {groups.shape}; allowed is ({measurement.n_data},), one a datum"
+        )
+    labels, counts = np.unique(groups, return_counts=True)
+    if (counts < 2).any():
+        raise FitError(
+            f"cross-validation: group {labels[counts < 2][0]} has a single member; "
+            "at least 2 data are needed"
+        )
+    return groups
+
+
+def _undetermined(measurement, vector, jacobian, out, weights):
+    """
+    Return the moves that only the data left out can see, and which of these see them.
+
+    The moves are canonical, shape (n_moves, n_free).
+    """
+    scale = physical_scale(measurement.free)
+    kept = jacobian[:, ~out] * (1.0 if weights is None else weights[~out])
+    kept = np.concatenate([kept, measurement.free.prior_jacobian(vector)], axis=1)
+    null = null_space(measurement.free, kept) * scale
+    # which combinations of what the others leave open do the data left out see, and how strongly
+    left, seen, right = np.linalg.svd(null @ jacobian[:, out], full_matrices=False)
+    limit = _STILL * np.abs(jacobian * scale[:, None]).max(initial=0.0)
+    moves = seen > limit
+    change = seen[moves, None] * right[moves]
+    return left.T[moves] @ null, (np.abs(change) > limit).any(axis=0)
+
+
+def _not_predicted(measurement, label, out, moved):
+    share = np.abs(moved / physical_scale(measurement.free)).max(axis=0)
+    slots = [s for s in measurement.free.slots if share[s.slice].max() > _WORTH_A_WORD]
+    return (
+        f"cross-validation: without group {label} ({out.sum()} data) the others do not determine "
+        f"{_listed([slot.name for slot in slots])}; group by something else"
+    )
+
+
+def _listed(names):
+    more = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
+def _fit_without(measurement, vector, out, weights):
+    model = measurement.copy()
+    model.parameters = vector
+    noise = prior_noise(model, weights)
+    index, observed, weights = model.fit_arguments(weights, noise, keep=~out)
+    with warnings.catch_warnings():
+        # a fit that stops early still gives an honest, if poorer, prediction
+        warnings.simplefilter("ignore")
+        TRFLSQFitter()(model, index, observed, weights=weights, maxiter=50, inplace=True)
+    return model.vector()
+
+
+# ---- goodness of fit: whether the residuals exceed the noise ----
+
+
+# a singular value below this share of the largest belongs to a null direction
+_RANK = 1e-9
+# fewer degrees of freedom than this give no test
+_LEAST_FREEDOM = 0.5
+# what happens by chance less often than this is no chance
+_UNLIKELY = 0.01
+
+
+@dataclass(frozen=True)
+class LackOfFit:
+    """
+    How far residuals exceed the noise.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        Columns ``dataset``, ``wavelength``, ``n``, ``chi2``, ``expected``, ``dof``,
+        ``chi2_reduced``, ``dof_noise`` and ``p_value``.
+    chi2, expected : float
+        Of all data and priors together, and what it is on average if the model
+        is true.
+    p_value : float
+        Probability of residuals at least as large, were the model true and the
+        noise right.
+    words : str
+        The verdict in a sentence, and what the noise includes.
+    priors : dict or None
+        ``chi2``, ``expected`` and ``p_value`` of the priors alone; None without
+        priors that are not flat.
+
+    Examples
+    --------
+    >>> from astropy.table import QTable
+
+    >>> LackOfFit(QTable(), 12.0, 10.0, 0.285, "the residuals agree with the noise").p_value
+    0.285
+    """
+
+    table: QTable
+    chi2: float
+    expected: float
+    p_value: float
+    words: str
+    priors: dict | None = None
+
+
+def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=True):
+    r"""
+    Test whether residuals are larger than the noise.
+
+    The statistic is :math:`\chi^2 = \sum r^2/\sigma^2`. With S the diagonal matrix of
+    :math:`\sigma`, J the Jacobian and W the weights squared, residuals are
+    :math:`A\epsilon`, :math:`A = S^{-1}(1 - J (J^TWJ)^+ J^TW)S`, and with
+    :math:`C = AA^T` restricted to a wavelength chi-square has the mean
+    :math:`\operatorname{tr} C` and the variance :math:`2\operatorname{tr} C^2`
+    (Satterthwaite 1946, Biometrics Bull. 2, 110, doi:10.2307/3002019). So
+    parameters shared by all wavelengths and a fit whose weights are not those of
+    the noise are accounted for. Where the noise is estimated, the ratio follows F;
+    where it comes from replicates of the same data, their scatter is taken out of
+    the residuals first (Draper & Smith 1998, Sec. 2.1). Priors of a fit are data
+    like any other: a row each of r, :math:`\sigma` and J. So a prior that the data
+    overrule adds to chi-square, one that decides what the data leave open adds
+    nothing, and one that a fit heeds leaves more freedom to the data.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The measurement.
+    vector : array_like or Calibration, optional
+        Fitted parameters, by default the current ones. A calibration made from this
+        very measurement brings its weights along; with another one
+        the data count as not fitted.
+    noise : NoiseEstimate, optional
+        By default `noise_from_errors`.
+    weights : array_like, optional
+        Weights of the fit (one over sigma), by default equal; shape (n_data,).
+    fitted : bool
+        Whether the parameters come from these data.
+
+    Returns
+    -------
+    LackOfFit
+        For all data and for each wavelength; NaN where the noise is unknown or no
+        degree of freedom is left. With estimated noise the total is Fisher's
+        combination of the probabilities of the wavelengths.
+
+    Raises
+    ------
+    FitError
+        If the noise belongs to another measurement.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> bool(lack_of_fit(cal.measurement, cal).p_value > 0.01)
+    True
+    """
+    noise = noise_from_errors(measurement) if noise is None else noise
+    if noise.sigma_of_data.shape != (measurement.n_data,):
+        raise FitError(
+            f"the noise is that of {noise.sigma_of_data.size} data, the measurement has "
+            f"{measurement.n_data}; estimate it from this measurement"
+        )
+    if hasattr(vector, "measurement"):
+        vector, weights, fitted = _of_calibration(measurement, vector)
+    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
+    left, right = _low_rank(measurement, vector, noise.sigma_of_data, weights, fitted)
+    table, whole = _test_by_wavelength(measurement, vector, noise, left, right)
+    priors = _test_of_priors(measurement, vector, left, right)
+    chi2, expected, p_value = _together(table, whole, noise.dof, priors)
+    words = _verdict(chi2, expected, p_value, noise, priors)
+    return LackOfFit(table, chi2, expected, p_value, words, priors)
+
+
+def _of_calibration(measurement, calibration):
+    fitted = calibration.measurement is measurement
+    return measurement.vector(), weighting_of(calibration).weight if fitted else None, fitted
+
+
+def _test_of_priors(measurement, vector, left, right):
+    """Return chi-square of the priors that were rows of the fit, its mean and probability."""
+    n = measurement.n_data
+    if len(left) == n:
+        return None
+    chi2 = np.sum(measurement.free.prior_residuals(vector) ** 2)
+    mean, dof = _moments(left[n:], right[n:], 0.0)
+    p = _chi2_above(chi2 / mean * dof, dof) if np.isfinite(dof) else np.nan
+    return {"chi2": float(chi2), "expected": float(mean), "p_value": float(p)}
+
+
+def _test_by_wavelength(measurement, vector, noise, left, right):
+    """Return the table of the test, and mean and freedom of the whole chi-square."""
+    numbers, wavelength, rows = data_by_wavelength(measurement)
+    residuals, sigma = measurement.residuals(vector), noise.sigma_of_data
+    usable = np.isfinite(np.append(sigma, np.ones(len(left) - sigma.size)))
+    replicates = noise.method == "replicates"
+    chi2, mean, dof = np.full((3, len(rows)), np.nan)
+    for i, row in enumerate(rows):
+        if row.size and usable[row].all():
+            # scatter among replicates is noise by definition
+            own = noise.dof[i] if replicates else 0.0
+            chi2[i] = np.sum((residuals[row] / sigma[row]) ** 2) - own
+            mean[i], dof[i] = _moments(left[row], right[row], own)
+    from scipy.special import fdtrc
+
+    with np.errstate(invalid="ignore"):
+        reduced = chi2 / np.where(mean > _LEAST_FREEDOM, mean, np.nan)
+        known = np.isinf(noise.dof)
+        p = np.where(known, _chi2_above(reduced * dof, dof), fdtrc(dof, noise.dof, reduced))
+    table = QTable(
+        {
+            "dataset": numbers,
+            "wavelength": wavelength,
+            "n": np.array([row.size for row in rows]),
+            "chi2": chi2,
+            "expected": mean,
+            "dof": dof,
+            "chi2_reduced": reduced,
+            "dof_noise": noise.dof.astype(float),
+            "p_value": p,
+        }
+    )
+    return table, _moments(left[usable], right[usable], 0.0)
+
+
+def _low_rank(measurement, vector, sigma, weights, fitted):
+    """
+    Return P and Q of C = 1 + P Q^T, the covariance of residuals over the noise.
+
+    One row a datum, and behind them one a prior of the fit.
+    """
+    nothing = np.zeros((measurement.n_data, 0))
+    if not fitted:
+        return nothing, nothing
+    free = measurement.free
+    level = prior_noise(measurement, weights)
+    weights = np.ones(measurement.n_data) if weights is None else np.asarray(weights, float)
+    weights = np.append(weights, np.full(measurement.n_priors, level))
+    slope = np.hstack([measurement.jacobian(vector), free.prior_jacobian(vector)])
+    slope = slope[~free.at_bounds(vector)].T
+    # columns of unit length, lest the rank depend on units
+    scale = np.sqrt(np.sum((slope * weights[:, None]) ** 2, axis=0))
+    slope = slope[:, scale > 0] / scale[scale > 0]
+    slope *= weights[:, None]
+    # the triangular factor has the same right vectors, and there are far more data than columns
+    triangle = np.linalg.qr(slope, mode="r") if len(slope) > slope.shape[1] else slope
+    _, values, right = np.linalg.svd(triangle, full_matrices=False)
+    some = values > _RANK * values.max(initial=0.0)
+    basis = slope @ (right[some] / values[some, None]).T
+    # in units of the noise the hat matrix is a b^T
+    known = np.append(np.where(np.isfinite(sigma), sigma, 1.0), np.ones(measurement.n_priors))
+    by_noise = (weights * known)[:, None]
+    a, b = basis / by_noise, basis * by_noise
+    return np.hstack([a, b]), np.hstack([a @ (b.T @ b) - b, -a])
+
+
+def _chi2_above(chi2, dof):
+    """Return the probability of a larger chi-square; `scipy.stats` takes long to import."""
+    from scipy.special import gammaincc
+
+    return gammaincc(dof / 2, np.maximum(chi2, 0) / 2)
+
+
+def _moments(left, right, own):
+    """Return mean and effective freedom of chi-square without the replicates' own."""
+    # tr(C) and tr(C^2) of C = 1 + P Q^T from the small matrix Q^T P, not the n x n one
+    inner = right.T @ left
+    n = len(left)
+    mean = n + np.trace(inner) - own
+    square = n + 2 * np.trace(inner) + np.sum(inner * inner.T) - own
+    if mean <= _LEAST_FREEDOM or square <= 0:
+        return max(mean, 0.0), np.nan
+    # mean and variance of chi-square match those of a scaled chi-square of this freedom
+    return mean, mean**2 / square
+
+
+def _together(table, whole, dof_noise, priors):
+    """Return chi-square, freedom and probability of all wavelengths and priors together."""
+    p = np.asarray(table["p_value"])
+    chi2, mean = float(np.nansum(table["chi2"])), float(np.nansum(table["expected"]))
+    if priors is not None:
+        p = np.append(p, priors["p_value"])
+        chi2, mean = chi2 + priors["chi2"], mean + priors["expected"]
+    p = p[np.isfinite(p)]
+    if not p.size:
+        return chi2, mean, np.nan
+    if np.isinf(dof_noise).all():
+        mean, dof = whole
+        return chi2, float(mean), float(_chi2_above(chi2 / mean * dof, dof))
+    with np.errstate(divide="ignore"):
+        # p of the wavelengths are uniform and independent if the model is true: -2 sum ln p is then
+        # chi-square of twice their number
+        fisher = -2 * np.sum(np.log(p))
+    return chi2, mean, float(_chi2_above(fisher, 2 * p.size))
+
+
+def _verdict(chi2, expected, p_value, noise, priors):
+    if not np.isfinite(p_value):
+        return f"no test: no degree of freedom is left; noise from {noise.method}"
+    ratio = np.sqrt(chi2 / expected) if chi2 > 0 else 0.0
+    if p_value < _UNLIKELY:
+        says = f"the residuals are {ratio:.3g} times the noise: the model misses something"
+    elif p_value > 1 - _UNLIKELY:
+        says = f"the residuals are {ratio:.3g} times the noise: the noise is overestimated"
+    else:
+        says = "the residuals agree with the noise"
+    says += f" (p = {p_value:.3g})"
+    if priors is not None and priors["p_value"] < _UNLIKELY:
+        says += f"; the data disagree with the priors (p = {priors['p_value']:.3g})"
+    return f"{says}; noise: {noise.words}"

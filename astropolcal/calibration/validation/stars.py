@@ -1,0 +1,523 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Polarization of stars as a calibrated instrument sees it, cycle by cycle.
+
+Check of a calibration with a star of known polarization that no fit has seen.
+"""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal import standards, stokes
+from astropolcal.calibration.validation.held_out import predicted_chain, refuse_fitted, rows_on_grid
+from astropolcal.calibration.validation.targets import target_accuracies
+from astropolcal.chain import join, leaves
+from astropolcal.exceptions import (
+    AstropolcalError,
+    ChainError,
+    ObservationError,
+    WavelengthRangeError,
+)
+from astropolcal.measurement import Measurement
+from astropolcal.observations import cycle_numbers
+from astropolcal.optics import PolarizedSource, StarSource
+from astropolcal.stokes import polarization_angle
+
+__all__ = ["fitted_stars", "star_accuracy", "star_check", "star_stokes"]
+
+
+def star_stokes(calibration, chain, observations, positions=None):
+    """
+    Return q and u of a star on sky from every cycle of the half-wave plate.
+
+    The data are linear in q and u to first order of the instrumental polarization; the
+    normalized double differences of each cycle are inverted by least squares, with all that the
+    calibration knows of the instrument. The star's own q and u in the chain do not count.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    chain : `~astropy.modeling.CompoundModel`
+        Chain of the star, with a `~astropolcal.optics.PolarizedSource` first.
+    observations : Observations
+        The star.
+    positions : dict of str to `~numpy.ndarray`, optional
+        See `~astropolcal.measurement.Measurement`.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        One row a wavelength: ``wavelength``; ``q``, ``u`` (means over the cycles) and their
+        standard errors ``q_err``, ``u_err``, from the scatter of the cycles; ``dolp`` (debiased)
+        and ``aolp`` with errors; ``n_cycles``; ``q_cycles`` and ``u_cycles``, one a cycle, NaN
+        where a cycle does not determine them.
+
+    Raises
+    ------
+    ChainError
+        If the chain has no polarized source.
+    ObservationError
+        If no cycle determines q and u.
+
+    Examples
+    --------
+    Frames of a star behind a telescope that does nothing, seen as they are:
+
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments, optics
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> lam = [1.2, 1.6, 2.2] * u.um
+    >>> chain = charis.chain(derotator="linear", wavelength=lam)
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, lam, frames, seed=2))
+    >>> star = optics.PolarizedSource(q=0.02, u=0.01, name="star")
+    >>> sky = star | chain["hwp"] | chain["derotator"] | chain["wollaston"]
+    >>> table = star_stokes(cal, sky, simulate(sky, lam, frames, seed=3))
+    >>> table["q"].round(1)
+    <Quantity [2., 2., 2.] %>
+    """
+    chain = _with_free_star(chain)
+    predicted = predicted_chain(calibration, chain, observations)
+    measurement = Measurement(
+        predicted,
+        observations,
+        observable=calibration.settings["observable"],
+        positions=None if positions is None else [positions],
+    )
+    vector, (part,) = measurement.vector(), measurement.datasets
+    # around an unpolarized star (q = u = 0): what is left is the star's, to first order linear
+    residuals, slopes = measurement.residuals(vector), _star_slopes(measurement, vector)
+    cycle = cycle_numbers(observations)[part.frames[:, 0]][part.group_of_datum]
+    labels = np.unique(cycle)
+    found = np.full((2, len(part.bins), len(labels)), np.nan)
+    for i, b in enumerate(part.bins):
+        for j, label in enumerate(labels):
+            rows = (part.bin_of_datum == b) & (cycle == label)
+            found[:, i, j] = _solved(slopes[:, rows], residuals[rows])
+    if np.isnan(found).all():
+        raise ObservationError(f"{observations.name}: no cycle determines q and u")
+    return _table(observations.wavelength, found)
+
+
+def _with_free_star(chain):
+    first, *rest = leaves(chain)
+    if not isinstance(first, PolarizedSource):
+        raise ChainError("the chain of a star begins with a PolarizedSource")
+    return join([PolarizedSource(q=0.0, u=0.0, name=first.name), *rest])
+
+
+def _star_slopes(measurement, vector):
+    """Return the derivatives of the data to q and u, (2, n_data)."""
+    name = leaves(measurement.chains[0])[0].name
+    jacobian = measurement.jacobian(vector)
+    return np.stack([jacobian[measurement.free.by_name[f"{name}.{key}"].start] for key in "qu"])
+
+
+def _solved(slopes, residuals):
+    # the smaller singular value is the efficiency in the direction that is measured worst
+    if slopes.shape[1] < 2 or np.linalg.svd(slopes, compute_uv=False)[1] < 1e-3:
+        return np.nan
+    return np.linalg.lstsq(slopes.T, residuals, rcond=None)[0]
+
+
+def _table(wavelength, found):
+    count = np.isfinite(found[0]).sum(axis=1)
+    mean = np.nanmean(found, axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # standard error of the mean: s / sqrt(n - 1) with the standard deviation s over n
+        error = np.nanstd(found, axis=2) / np.sqrt(np.maximum(count - 1, 0))
+    percent = 100 * u.percent
+    table = QTable({"wavelength": wavelength})
+    for key, value in zip(("q", "u", "q_err", "u_err"), (*mean, *error), strict=True):
+        table[key] = value * percent
+    # rms of both components: the degree has the error of one of them
+    spread = np.hypot(*error) / np.sqrt(2)
+    dolp = np.hypot(*mean)
+    table["dolp"] = stokes.debias_dolp(dolp, spread) * percent
+    table["dolp_err"] = spread * percent
+    table["aolp"] = stokes.polarization_angle(*mean) * u.deg
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # chi = atan2(u, q) / 2, so that an error s across the polarization turns it by s / (2 p)
+        table["aolp_err"] = np.rad2deg(0.5 * spread / dolp) * u.deg
+    table["n_cycles"] = count
+    for key, value in zip(("q_cycles", "u_cycles"), found, strict=True):
+        table[key] = value * percent
+    return table
+
+
+def star_accuracy(table, q=0.0, u_=0.0):
+    """
+    Return how well a star of known polarization came out, per wavelength.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        As from `star_stokes`.
+    q, u_ : float or array_like
+        What is known of the star, one a wavelength.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        ``wavelength``; ``dolp_error`` and ``aolp_error``, of the mean, observed less known;
+        ``s_dolp``, the rms error of single cycles along the known polarization, or of both
+        components where it is zero; ``s_q`` and ``s_u``, the rms errors of single cycles.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.table import QTable
+
+    >>> table = QTable({"wavelength": [1.6] * u.um, "q": [1] * u.percent, "u": [0] * u.percent,
+    ...                 "q_cycles": [[0.9, 1.1]] * u.percent,
+    ...                 "u_cycles": [[0.1, -0.1]] * u.percent})
+    >>> star_accuracy(table, q=0.01)["s_dolp"].round(3)
+    <Quantity [0.1] %>
+    """
+    known = np.stack(np.broadcast_arrays(q, u_, np.zeros(len(table)))[:2])
+    mean = np.stack([table[key].to_value(u.one) for key in ("q", "u")])
+    off = np.stack([table[f"{k}_cycles"].to_value(u.one) for k in "qu"]) - known[..., None]
+    length, percent = np.hypot(*known), 100 * u.percent
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = np.einsum("kw,kwc->wc", known / length, off)
+    # an unpolarized star has no direction: the mean square of q and u
+    squares = np.where(length[:, None] > 0, along**2, 0.5 * (off**2).sum(axis=0))
+    angle = 0.5 * (np.arctan2(mean[1], mean[0]) - np.arctan2(known[1], known[0]))
+    # angles of polarization repeat after 180 deg: the shortest way, -90 to 90 deg
+    turn = np.mod(angle + np.pi / 2, np.pi) - np.pi / 2
+    result = QTable({"wavelength": table["wavelength"]})
+    result["dolp_error"] = (np.hypot(*mean) - length) * percent
+    result["aolp_error"] = np.rad2deg(np.where(length > 0, turn, np.nan)) * u.deg
+    result["s_dolp"] = np.sqrt(np.nanmean(squares, axis=1)) * percent
+    for key, value in zip(("s_q", "s_u"), np.sqrt(np.nanmean(off**2, axis=2)), strict=True):
+        result[key] = value * percent
+    return result
+
+
+# ---- what a calibration has found of its standards -----------------------------------------
+
+
+def fitted_stars(calibration):
+    """
+    Return the polarization that a calibration has found of its standard stars.
+
+    The field turns a star against the telescope, so that a calibration can tell the two apart as
+    far as it has turned. What it cannot tell rests on the catalogue.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+
+    Returns
+    -------
+    list of `~astropy.table.QTable`
+        One per star whose polarization had a prior: ``wavelength``, ``q``, ``q_err``, ``q_prior``,
+        ``q_prior_err`` and the same of u, in percent and in the frame of the sky. Meta ``name`` of
+        the optic, ``from_data``, the share of the prior variance that the data have taken away, 0
+        to 1, and ``words``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.observations import Observations
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> lam = [1.2, 1.6, 2.2] * u.um
+    >>> chain = charis.chain("unpolarized standard star", derotator="linear", wavelength=lam)
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> frames["parallactic"] = np.linspace(-40, 40, len(frames)) * u.deg
+    >>> frames["altitude"] = np.linspace(60, 70, len(frames)) * u.deg
+    >>> cal = calibrate(chain, simulate(chain, lam, frames, seed=2), cross_validate=False)
+    >>> fitted_stars(cal)[0].colnames[:4]
+    ['wavelength', 'q', 'q_err', 'q_prior']
+    """
+    found = {}
+    for chain in calibration.chains:
+        star = leaves(chain)[0]
+        free = [key for key in star.param_names if not getattr(star, key).fixed]
+        if isinstance(star, StarSource) and any(getattr(star, key).prior for key in free):
+            found.setdefault(star.name, _fitted_star(calibration, star, free))
+    return list(found.values())
+
+
+def _fitted_star(calibration, star, free):
+    """Return q and u of a fitted star with their errors, and those of its priors."""
+    wavelength, covariance = calibration.wavelength, calibration.covariance
+    slopes = star.mueller_derivatives(wavelength)
+    means = {key: getattr(star, key).prior for key in free}
+    units = {key: getattr(star, key).unit or u.one for key in free}
+    before = star.with_parameters(**{key: p.mean() * units[key] for key, p in means.items()})
+    table = QTable({"wavelength": wavelength})
+    share = []
+    for row, key in ((1, "q"), (2, "u")):
+        matrix = np.zeros((wavelength.size, len(covariance)))
+        prior = np.zeros(wavelength.size)
+        for name in free:
+            slope = (slopes[name] * units[name]).to_value(u.one)[..., row, 0]
+            matrix[:, covariance.names.index(f"{star.name}.{name}")] = slope
+            prior += (slope * means[name].std()) ** 2
+        error = np.sqrt(np.diag(covariance.propagate(matrix)))
+        values = star.mueller(wavelength)[..., row, 0], error
+        known = before.mueller(wavelength)[..., row, 0], np.sqrt(prior)
+        for stem, (value, std) in ((key, values), (f"{key}_prior", known)):
+            table[stem], table[f"{stem}_err"] = 100 * value * u.percent, 100 * std * u.percent
+        share.append(1 - np.clip(error**2 / prior, 0, 1))
+    table.meta |= {"name": star.name, "from_data": float(np.median(share))}
+    table.meta["words"] = _fitted_words(table)
+    return table
+
+
+def _fitted_words(table):
+    """Say q and u in the middle of the wavelengths, before and after the fit."""
+    i = len(table) // 2
+    parts = [
+        f"{key} {table[key][i].value:+.2f} +- {table[f'{key}_err'][i].value:.2f}" for key in "qu"
+    ]
+    prior = max(table[f"{key}_prior_err"][i].value for key in "qu")
+    nm = table["wavelength"][i].to_value(u.nm)
+    return (
+        f"{table.meta['name']:<27} {', '.join(parts)} % ({nm:.0f} nm; +- {prior:.2f} before; "
+        f"{100 * table.meta['from_data']:.0f} % by the data)"
+    )
+
+
+# ---- check of a calibration with a star of known polarization that no fit has seen ----
+
+
+# what is kept with a calibration, and in which unit
+_KEPT = {
+    "dolp": u.percent,
+    "dolp_err": u.percent,
+    "dolp_sys_err": u.percent,
+    "dolp_known": u.percent,
+    "dolp_known_err": u.percent,
+    "aolp": u.deg,
+    "aolp_err": u.deg,
+    "aolp_sys_err": u.deg,
+    "aolp_known": u.deg,
+    "aolp_known_err": u.deg,
+    "dolp_error": u.percent,
+    "aolp_error": u.deg,
+    "s_dolp": u.percent,
+    "s_q": u.percent,
+    "s_u": u.percent,
+}
+
+
+def star_check(calibration, chain, observations, positions=None, star=None):
+    """
+    Compare the polarization of a standard star with that of the catalogue, per wavelength.
+
+    Every half-wave-plate cycle is inverted with the calibration, see
+    `star_stokes`; the means are compared with the Serkowski law of the
+    star, or with zero. This is the check with HD 30675 of McIntosh et al. (2026, appendix).
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    chain : `~astropy.modeling.CompoundModel`
+        Chain of the star, with a `~astropolcal.optics.PolarizedSource` first.
+    observations : Observations
+        The star; it must not have taken part in the fit.
+    positions : dict of str to `~numpy.ndarray`, optional
+        See `~astropolcal.measurement.Measurement`.
+    star : str or `~astropolcal.standards.StandardStar`, optional
+        The standard, by default the ``object`` of the table.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        The columns of `~astropolcal.calibration.validation.star_stokes` and
+        `star_accuracy`; ``dolp_sys_err`` and ``aolp_sys_err``, what the
+        calibration claims of such light, see `~astropolcal.calibration.target_accuracies`; and
+        ``q_known``, ``u_known``, ``dolp_known``,
+        ``aolp_known`` of the catalogue with ``dolp_known_err`` and ``aolp_known_err``, NaN
+        where no errors are published. Meta ``star``, ``name`` and ``words``.
+
+    Raises
+    ------
+    FitError
+        If the observations took part in the fit.
+    ObservationError
+        If the table does not name its star, or the catalogue has no polarization for it.
+    ChainError
+        If the chain has no polarized source.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments, optics, standards
+    >>> from astropolcal.calibration import star_check
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> lam = [1.2, 1.6, 2.2] * u.um
+    >>> chain = charis.chain(derotator="linear", wavelength=lam)
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, lam, frames, seed=2))
+    >>> known = standards.get("HD 30675").stokes(lam)
+    >>> star = optics.PolarizedSource(q=known.q, u=known.u, name="star")
+    >>> sky = star | chain["hwp"] | chain["derotator"] | chain["wollaston"]
+    >>> night = simulate(sky, lam, frames, seed=3, meta={"object": "HD 30675"})
+    >>> table = star_check(cal, sky, night)
+    >>> print(table["dolp"].round(1), table["dolp_known"].round(1))
+    [2.  1.1 0.5] % [2.  1.1 0.5] %
+    """
+    refuse_fitted(calibration, observations)
+    known = _known(observations, star)
+    table = star_stokes(calibration, chain, observations, positions)
+    table.meta |= {"name": observations.name, "star": known.name}
+    q, stokes_u, covariance = known.stokes(table["wavelength"])
+    accuracy = star_accuracy(table, q, stokes_u)
+    for key in accuracy.colnames[1:]:
+        table[key] = accuracy[key]
+    _add_known(table, np.asarray(q), np.asarray(stokes_u), covariance)
+    _add_claims(table, calibration, rows_on_grid(calibration, observations))
+    table.meta["words"] = _words(table)
+    return table
+
+
+def _known(observations, star):
+    """Return the standard star, if the catalogue knows its polarization."""
+    if star is None:
+        star = observations.meta.get("object")
+        if not star:
+            raise ObservationError(
+                f"{observations.name}: no entry 'object' in the table's meta names the star"
+            )
+    found = star if isinstance(star, standards.StandardStar) else standards.get(str(star))
+    try:
+        found.stokes(observations.wavelength)
+    except WavelengthRangeError:
+        raise
+    except AstropolcalError as error:
+        raise ObservationError(f"{observations.name}: {error}") from error
+    return found
+
+
+def _add_known(table, q, stokes_u, covariance):
+    percent = 100 * u.percent
+    length = np.hypot(q, stokes_u)
+    table["q_known"], table["u_known"] = q * percent, stokes_u * percent
+    table["dolp_known"] = length * percent
+    table["aolp_known"] = np.where(length > 0, polarization_angle(q, stokes_u), np.nan) * u.deg
+    along, across = np.full((2, length.size), np.nan)
+    if covariance is not None:
+        # the direction of the polarization in the (q, u) plane; of a star without any that of q,
+        # as good as another one, and its error of the angle ends in the division by zero below
+        c = np.divide(q, length, out=np.ones_like(length), where=length > 0)
+        s = np.divide(stokes_u, length, out=np.zeros_like(length), where=length > 0)
+        matrix = np.broadcast_to(np.asarray(covariance), (length.size, 2, 2))
+        along = _error_along(np.stack([c, s], -1), matrix)
+        across = _error_along(np.stack([-s, c], -1), matrix)
+    table["dolp_known_err"] = along * percent
+    with np.errstate(divide="ignore", invalid="ignore"):
+        table["aolp_known_err"] = np.rad2deg(0.5 * across / length) * u.deg
+
+
+def _add_claims(table, calibration, rows):
+    """Add the errors that the calibration claims for light of the catalogue's polarization."""
+    degrees = np.clip(table["dolp_known"], 0 * u.percent, 100 * u.percent)
+    angles = np.nan_to_num(table["aolp_known"])
+    claimed = target_accuracies(calibration, list(zip(degrees, angles, strict=True)))
+    for key, name, unit in (("dolp", "s_p", u.percent), ("aolp", "s_chi", u.deg)):
+        values = [one[name][row].value for one, row in zip(claimed, rows, strict=bool(claimed))]
+        table[f"{key}_sys_err"] = (values or np.full(len(table), np.nan)) * unit
+
+
+def _pull(table, key):
+    """Return by how many of all errors together the star is off, median over the wavelengths."""
+    return np.nanmedian(np.abs(table[f"{key}_error"].value) / _stated(table, key))
+
+
+def _stated(table, key):
+    """Return the errors of the star, the calibration and the catalogue together."""
+    parts = (table[f"{key}{suffix}"].value for suffix in ("_err", "_sys_err", "_known_err"))
+    return np.sqrt(sum(np.nan_to_num(part, posinf=np.inf) ** 2 for part in parts))
+
+
+def _error_along(direction, matrix):
+    """Return the standard error along unit vectors, shape (n_wavelengths, 2)."""
+    variance = np.einsum("wi,wij,wj->w", direction, matrix, direction)
+    # where it is zero rounding may leave less
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+def _words(table):
+    off = np.abs(table["dolp_error"].to_value(u.percent))
+    words = (
+        f"DoLP off by {np.nanmedian(off):.2g} % (median over the wavelengths; worst "
+        f"{np.nanmax(off):.2g} %; {_pull(table, 'dolp'):.1f} times all errors), single cycles by "
+        f"{np.nanmedian(table['s_dolp'].to_value(u.percent)):.2g} %"
+    )
+    turned = table["aolp_error"].to_value(u.deg)
+    if np.isfinite(turned).any():
+        words += (
+            f"; AoLP by {np.nanmedian(turned):+.2g} deg (median), {_pull(table, 'aolp'):.1f} times "
+            "the errors of calibration, star and catalogue together"
+        )
+    return words
+
+
+def add_star_check(calibration, chain, observations, positions=None):
+    """
+    Check a calibration with a star and keep the result with the calibration.
+
+    It goes into ``calibration.fit["stars"]``, and so into summary, JSON and file.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; it is changed.
+    chain, observations, positions
+        As for `star_check`.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        As `star_check` gives it.
+
+    Raises
+    ------
+    FitError, ObservationError, ChainError
+        As `star_check`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments, optics
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> lam = [1.2, 1.6, 2.2] * u.um
+    >>> chain = charis.chain(derotator="linear", wavelength=lam)
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, lam, frames, seed=2))
+    >>> sky = optics.PolarizedSource(name="star") | chain["hwp"] | chain["derotator"]
+    >>> sky = sky | chain["wollaston"]
+    >>> night = simulate(sky, lam, frames, seed=3, meta={"object": "HD 293396"})
+    >>> table = add_star_check(cal, sky, night)
+    >>> cal.fit["stars"][0]["star"]
+    'HD 293396'
+    """
+    table = star_check(calibration, chain, observations, positions)
+    entry = {key: table.meta[key] for key in ("name", "star", "words")}
+    entry["content_hash"] = observations.content_hash
+    entry["wavelength_nm"] = table["wavelength"].to_value(u.nm).tolist()
+    entry["n_cycles"] = np.asarray(table["n_cycles"]).tolist()
+    for key, unit in _KEPT.items():
+        suffix = "percent" if unit == u.percent else "deg"
+        entry[f"{key}_{suffix}"] = table[key].to_value(unit).tolist()
+    others = calibration.fit.get("stars", [])
+    # checked again, a star replaces its entry
+    others = [other for other in others if other["content_hash"] != entry["content_hash"]]
+    calibration.fit["stars"] = [*others, entry]
+    return table

@@ -1,0 +1,694 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Errors of q, u, degree and angle of polarization of a target, from the covariance of a fit.
+
+What an accuracy means for a target, and four accuracies side by side.
+
+`target_accuracies` is what a calibration claims. The equations of McIntosh et al. (2026, Sec. 2.3),
+after van Holstein et al. 2020, A&A 633, A64 (doi:10.1051/0004-6361/201834996), stand beside it as
+`paper_accuracies`.
+"""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal.calibration.identifiability.sky import light_of, settings_of, view_of_calibration
+from astropolcal.calibration.noise.scatter import groups_by
+from astropolcal.calibration.system import model_error
+from astropolcal.calibration.uncertainty.covariance import full_covariance
+from astropolcal.calibration.validation.cross_validation import (
+    accuracy_table,
+    cross_validated_residuals,
+)
+from astropolcal.calibration.validation.held_out import refuse_fitted
+from astropolcal.chain import leaves
+from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.optics import LinearPolarizer
+from astropolcal.units import angle_to_rad
+
+__all__ = ["four_accuracies", "paper_accuracies", "target_accuracies", "target_accuracy"]
+
+# what changes by less than this share of all its changes along an open direction stands still
+_STILL = 1e-5
+KEYS = ("s_Q", "s_U", "s_p", "s_chi")
+
+
+class SkyErrors:
+    """Covariance of the nine changes of I, Q and U that a calibration's errors make on sky."""
+
+    def __init__(self, calibration, view, ignore=False):
+        self._good, self._ignore = view.good, ignore
+        axes = full_covariance(calibration)._axes()
+        # the nine in one axis, in degree, micrometre or percent
+        slopes = view.changes.reshape(*view.good.shape, 9, -1) * axes.steps
+        known, is_open, is_blind = (slopes @ part.T for part in (axes.known, axes.open, axes.blind))
+        self._known, self._open, self._blind = map(_products, (known, is_open, is_blind))
+        self._partial = axes.partial
+        extra = model_error(calibration.fit, view.lam)
+        extra = np.moveaxis(extra.reshape(len(extra), len(view.lam), 9), 0, -1)
+        self._covariance = _products(known * axes.sigmas) + _products(extra)[:, None]
+
+    def of_target(self, dolp, double):
+        """
+        Return the rms over the settings of the errors of q, u, degree and angle, as fractions.
+
+        Shape (4, n_wavelengths, n_angles) for angles of which the double is given in radian;
+        infinite where an open direction changes a quantity.
+        """
+        weights = _weights(dolp, double).reshape(-1, 9)
+        variance, known, is_open, blind = (
+            _quadratic(matrix, weights)
+            for matrix in (self._covariance, self._known, self._open, self._blind)
+        )
+        # as for any quantity derived from the parameters, see `Covariance.propagate`
+        limit = _STILL**2 * (known + is_open + blind)
+        lost = blind > limit
+        if not self._partial:
+            lost &= known <= limit
+        if not self._ignore:
+            variance[lost | (is_open > limit)] = np.inf
+        variance[~self._good] = np.nan
+        with np.errstate(invalid="ignore", divide="ignore"):
+            count = self._good.sum(axis=1)[:, None]
+            rms = np.sqrt(np.nansum(variance, axis=1) / np.where(count, count, np.nan))
+        return np.moveaxis(rms.reshape(len(rms), len(KEYS), -1), 0, 1)
+
+
+def _products(rows):
+    return rows @ np.swapaxes(rows, -1, -2)
+
+
+def _quadratic(matrices, weights):
+    """Return w M w for each of the weights, (n_wavelengths, n_settings, n_weights)."""
+    return np.sum((matrices @ weights.T) * weights.T, axis=-2)
+
+
+def _weights(dolp, double):
+    """Return how q, u, degree and angle follow from the nine changes, (4, n_angles, 9)."""
+    light = light_of(dolp, double).T
+    # dQ = sum of M_Qc S_c, and of q = Q / I also what is found of I changes
+    change = np.eye(3)[:, None, :, None] * light[None, :, None, :]
+    dq, du = (change[i] - light[:, i, None, None] * change[0] for i in (1, 2))
+    cosine, sine = np.cos(double)[:, None, None], np.sin(double)[:, None, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = np.where(dolp > 0, (cosine * du - sine * dq) / np.float64(2 * dolp), np.nan)
+    return np.stack([dq, du, cosine * dq + sine * du, turn]).reshape(4, len(light), 9)
+
+
+# ---- what an accuracy means for a target, and four accuracies side by side ----
+
+
+#: Degrees and angles of polarization that are reported; an angle of None is any.
+TARGETS = ((30 * u.percent, None), (1 * u.percent, None), (0.1 * u.percent, None))
+#: Those of the paper.
+PAPER_TARGETS = ((1 * u.percent, None), (30 * u.percent, None))
+
+_COLUMNS = ("s_mean", "s_res", "s_cv")
+_CALIBRATIONS = {"polarized": "s_rel", "unpolarized": "s_unpol", "on_sky": "s_sky"}
+# where s_Q, s_U, s_p and s_chi are largest: between these angles each rises or falls steadily
+_EXTREMES = (0.0, 22.5, 45.0) * u.deg
+_OPEN = ("infinite", "ignore")
+# angles among which those of a calibration are sought
+_ANY = np.arange(0.0, 180.0, 7.5) * u.deg
+
+
+# ---- what a calibration claims --------------------------------------------------------------
+
+
+def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite"):
+    """
+    Return the accuracy of a calibration for several targets, per wavelength.
+
+    What the errors of all calibrated parameters, with their correlations, and the error of the
+    model do to the polarization of a target on sky: the systematic error that
+    `~astropolcal.correction.correct` states, for one cycle of the half-wave plate, rms over a few
+    settings of telescope and derotator.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    targets : sequence of (dolp, aolp)
+        Degree and angle of linear polarization of each. An angle of None stands for any: each
+        error is then that at its worst angle.
+    open_directions : {"infinite", "ignore"}
+        As for `~astropolcal.correction.correct`: errors along directions that the data leave open
+        are infinite, or zero as if the choice that the calibration made were true.
+
+    Returns
+    -------
+    list of `~astropy.table.QTable`
+        One a target, with columns ``wavelength``, ``s_Q``, ``s_U``, ``s_p`` (percent) and
+        ``s_chi`` (degree), infinite where the data leave a direction open that changes it; in
+        the meta ``dolp``, ``aolp`` and, in ``words``, what the numbers are made of. None where
+        the chain has no half-wave plate.
+
+    Raises
+    ------
+    ParameterError
+        If a target is impossible, or the choice is unknown.
+
+    Notes
+    -----
+    It is linear error propagation: above some 30 deg the angle is simply unknown.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import target_accuracies
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> (table,) = target_accuracies(cal, [(30 * u.percent, 50 * u.deg)])
+    >>> bool((table["s_chi"] < 0.05 * u.deg).all())
+    True
+    """
+    if open_directions not in _OPEN:
+        raise ParameterError(
+            f"open_directions = {open_directions!r}; allowed are {', '.join(_OPEN)}"
+        )
+    wanted = [_target(dolp, aolp) for dolp, aolp in targets]
+    view, ignore = view_of_calibration(calibration), open_directions == "ignore"
+    return _accuracies(calibration, targets, wanted, view, ignore)
+
+
+def _accuracies(calibration, targets, wanted, view, ignore=False):
+    if view is None:
+        return []
+    errors, words, tables = SkyErrors(calibration, view, ignore), _made_of(calibration, view), []
+    words += "; as if what the data leave open were known" if ignore else ""
+    for (dolp, aolp), (p, double) in zip(targets, wanted, strict=True):
+        found = np.max(errors.of_target(p, double), axis=-1)
+        if p == 0:
+            # no angle at all
+            found[-1] = np.inf
+        table = QTable({"wavelength": calibration.wavelength})
+        for key, values in zip(KEYS, found, strict=True):
+            table[key] = np.rad2deg(values) * u.deg if key == "s_chi" else 100 * values * u.percent
+        table.meta |= {"dolp": dolp, "aolp": aolp, "words": words}
+        tables.append(table)
+    return tables
+
+
+def _target(dolp, aolp):
+    """Return a degree of polarization as a fraction, and the double angles, radian."""
+    if np.ndim(dolp) or np.ndim(aolp):
+        raise ParameterError(f"target {dolp}, {aolp}: one degree and one angle are needed")
+    double = 2 * np.atleast_1d(angle_to_rad(_ANY if aolp is None else aolp, "aolp"))
+    return float(_fraction("dolp", dolp, 1.0)), double
+
+
+def _made_of(calibration, view):
+    model = calibration.fit.get("model_error")
+    count = view.good.shape[1]
+    return (
+        f"from the covariance of the fit {'and' if model else 'without'} an error of the model; "
+        f"{view.telescope}; one cycle of the half-wave plate"
+        + (f", rms over {count} settings" if count > 1 else "")
+    )
+
+
+def keep_sky_accuracy(calibration, view=None):
+    """
+    Keep what a calibration claims on sky in its ``fit``, and with it in its file.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; its ``fit`` gets ``sky_accuracy``, a list with ``dolp_percent``,
+        ``aolp_deg`` (None for any), ``wavelength_nm``, ``s_q_percent``, ``s_u_percent``,
+        ``s_p_percent``, ``s_chi_deg`` and ``words`` of each of the usual targets, and
+        ``sky_settings``, the angles of the stages for which it holds, in radian.
+    view : SkyView, optional
+        What it sees of the sky, if that is known already.
+
+    Returns
+    -------
+    Calibration
+        Itself.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> [entry["dolp_percent"] for entry in cal.fit["sky_accuracy"]]
+    [30.0, 1.0, 0.1]
+    """
+    if calibration.measurement is not None:
+        calibration.fit["sky_settings"] = settings_of(calibration.measurement)
+    view = view_of_calibration(calibration) if view is None else view
+    tables = _accuracies(calibration, TARGETS, [_target(*one) for one in TARGETS], view)
+    calibration.fit["sky_accuracy"] = [_kept(table) for table in tables]
+    return calibration
+
+
+def _kept(table):
+    aolp = table.meta["aolp"]
+    columns = {f"{key.lower()}_percent": table[key].to_value(u.percent) for key in KEYS[:3]}
+    return {
+        "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
+        "aolp_deg": None if aolp is None else float(aolp.to_value(u.deg)),
+        "wavelength_nm": table["wavelength"].to_value(u.nm).tolist(),
+        **{key: values.tolist() for key, values in columns.items()},
+        "s_chi_deg": table["s_chi"].to_value(u.deg).tolist(),
+        "words": table.meta["words"],
+    }
+
+
+# ---- the equations of the paper ------------------------------------------------------------
+
+
+def absolute_accuracy(s_unpol, s_sky):
+    r"""
+    Return the error that scales with the intensity.
+
+    :math:`s_\mathrm{abs} = \sqrt{s_\mathrm{unpol}^2 + s_\mathrm{sky}^2}`
+    (paper, Sec. 2.3).
+
+    Parameters
+    ----------
+    s_unpol, s_sky : `~astropy.units.Quantity`
+        Accuracies of the unpolarized internal and of the on-sky calibration.
+
+    Returns
+    -------
+    `~astropy.units.Quantity`
+
+    Examples
+    --------
+    >>> import astropy.units as u
+
+    >>> absolute_accuracy(0.03 * u.percent, 0.04 * u.percent)
+    <Quantity 0.05 %>
+    """
+    return np.hypot(s_unpol, s_sky)
+
+
+def propagate_accuracy(dolp, aolp, s_rel, s_abs):
+    r"""
+    Return the accuracy of q, u, degree and angle of polarization of a target.
+
+    With :math:`q = p\cos 2\chi`, :math:`u = p\sin 2\chi` (paper, Sec. 2.3)
+
+    .. math::
+
+        s_Q = s_\mathrm{abs} + s_\mathrm{rel}|q|, \quad
+        s_U = s_\mathrm{abs} + s_\mathrm{rel}|u|, \quad
+        s_p = \sqrt{\frac{q^2 s_Q^2 + u^2 s_U^2}{q^2 + u^2}}, \quad
+        s_\chi = \frac{\sqrt{q^2 s_U^2 + u^2 s_Q^2}}{2 (q^2 + u^2)}.
+
+    Parameters
+    ----------
+    dolp : `~astropy.units.Quantity` or float
+        Degree of linear polarization, 0 to 1 (0 to 100 %).
+    aolp : `~astropy.units.Quantity`
+        Angle of linear polarization.
+    s_rel, s_abs : `~astropy.units.Quantity` or float
+        Relative and absolute accuracy. All four broadcast.
+
+    Returns
+    -------
+    dict of str to `~astropy.units.Quantity`
+        ``s_Q``, ``s_U``, ``s_p`` in percent; ``s_chi`` in degree, infinite for an
+        unpolarized target. It is linear error propagation: above some 30 deg
+        the angle is simply unknown.
+
+    Raises
+    ------
+    ParameterError
+        If a degree of polarization or an accuracy is not a possible one.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+
+    >>> s = propagate_accuracy(1 * u.percent, 0 * u.deg, 0.1 * u.percent, 0.03 * u.percent)
+    >>> s["s_p"].round(6), s["s_chi"].round(2)
+    (<Quantity 0.031 %>, <Quantity 0.86 deg>)
+    """
+    p = _fraction("dolp", dolp, 1.0)
+    rel, absolute = (_fraction(n, v) for n, v in (("s_rel", s_rel), ("s_abs", s_abs)))
+    chi = 2 * angle_to_rad(aolp, "aolp")
+    # q and u over p stay defined for an unpolarized target
+    along, across = np.abs(np.cos(chi)), np.abs(np.sin(chi))
+    s_q, s_u = absolute + rel * p * along, absolute + rel * p * across
+    s_p = np.hypot(along * s_q, across * s_u)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s_chi = np.where(p > 0, np.hypot(along * s_u, across * s_q) / (2 * p), np.inf)
+    percent = {"s_Q": s_q, "s_U": s_u, "s_p": s_p}
+    result = {key: 100 * value * u.percent for key, value in percent.items()}
+    return result | {"s_chi": np.rad2deg(s_chi) * u.deg}
+
+
+def _fraction(name, value, limit=np.inf):
+    number = np.asarray(u.Quantity(value).to_value(u.one), dtype=float)
+    # an accuracy may be unknown, a target may not
+    unknown = np.isnan(number).any() and np.isfinite(limit)
+    if unknown or np.any(number < 0) or np.any(number > limit) or np.any(np.isinf(number)):
+        allowed = "0 to 1 (0 to 100 %)" if np.isfinite(limit) else "numbers from 0"
+        raise ParameterError(f"{name} = {value}; allowed are {allowed}")
+    return number
+
+
+def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None, column="s_mean"):
+    """
+    Return the accuracy of a calibrated instrument for a target, per wavelength.
+
+    Parameters
+    ----------
+    dolp : `~astropy.units.Quantity` or float
+        The target's degree of linear polarization; scalar or one a wavelength.
+    aolp : `~astropy.units.Quantity`
+        Its angle of linear polarization; scalar or one a wavelength.
+    polarized, unpolarized, on_sky : `~astropy.table.QTable`, optional
+        Accuracies of the calibrations with the internal source polarized
+        (s_rel) and unpolarized (s_unpol) and on an unpolarized standard star
+        (s_sky), such as ``Calibration.accuracy``. What is missing counts as
+        zero; its column is NaN and ``meta["words"]`` says so.
+    column : {"s_mean", "s_res", "s_cv"}
+        Which accuracy to take: the paper's is ``s_mean``, the error of a
+        prediction at one setting is ``s_cv``.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Columns ``wavelength``, ``s_rel``, ``s_unpol``, ``s_sky``, ``s_abs``, ``s_Q``,
+        ``s_U``, ``s_p`` (percent) and ``s_chi`` (degree), see `propagate_accuracy`;
+        meta ``column``, ``missing`` and ``words``.
+
+    Raises
+    ------
+    ParameterError
+        If there is no table at all, they have no such column, their wavelengths
+        differ, or the target is impossible.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+
+    >>> lam = [1.2, 1.6] * u.um
+    >>> lamp = QTable({"wavelength": lam, "s_mean": [0.10, 0.05] * u.percent})
+    >>> star = QTable({"wavelength": lam, "s_mean": [0.03, 0.02] * u.percent})
+    >>> table = target_accuracy(1 * u.percent, 0 * u.deg, polarized=lamp, on_sky=star)
+    >>> table["s_p"].round(4)
+    <Quantity [0.031 , 0.0205] %>
+    >>> table.meta["missing"]
+    ['unpolarized']
+    """
+    given = {"polarized": polarized, "unpolarized": unpolarized, "on_sky": on_sky}
+    present = {name: table for name, table in given.items() if table is not None}
+    if not present:
+        raise ParameterError(f"no accuracy is given; at least one of {', '.join(given)} is needed")
+    wavelength = next(iter(present.values()))["wavelength"]
+    found = {name: _values(name, table, column, wavelength) for name, table in present.items()}
+    zero = np.zeros(len(wavelength)) * u.percent
+    s_rel, s_unpol, s_sky = (found.get(name, zero) for name in given)
+    s_abs = absolute_accuracy(s_unpol, s_sky)
+    result = QTable({"wavelength": wavelength})
+    for name, key in _CALIBRATIONS.items():
+        result[key] = found.get(name, zero * np.nan)
+    result["s_abs"] = s_abs if "unpolarized" in found or "on_sky" in found else zero * np.nan
+    for key, value in _for_target(dolp, aolp, s_rel, s_abs).items():
+        result[key] = value
+    missing = [name for name in given if name not in found]
+    result.meta |= {"column": column, "missing": missing, "words": _words(column, missing)}
+    return result
+
+
+def _for_target(dolp, aolp, s_rel, s_abs):
+    shape = s_rel.shape
+    for name, value in (("dolp", dolp), ("aolp", aolp)):
+        if np.shape(value) not in ((), shape):
+            raise ParameterError(
+                f"{name} has shape {np.shape(value)}; allowed are () and {shape}, one a wavelength"
+            )
+    return propagate_accuracy(dolp, aolp, s_rel, s_abs)
+
+
+def _values(name, table, column, wavelength):
+    if column not in _COLUMNS or column not in table.colnames:
+        raise ParameterError(
+            f"{name}: no column {column!r}; allowed are {', '.join(_COLUMNS)}, if present"
+        )
+    own = table["wavelength"]
+    if own.shape != wavelength.shape or not u.allclose(own, wavelength, rtol=SAME_WAVELENGTH):
+        raise ParameterError(
+            f"{name}: {len(own)} wavelengths from {own.min():.6g} to {own.max():.6g} are not the "
+            f"{len(wavelength)} from {wavelength.min():.6g} to {wavelength.max():.6g} of the others"
+        )
+    return u.Quantity(table[column]).to(u.percent)
+
+
+def _words(column, missing):
+    if not missing:
+        return f"all three calibrations count, by their {column}"
+    lacking = ", ".join(f"{name} ({_CALIBRATIONS[name]})" for name in missing)
+    return f"by {column}; without the calibration {lacking}: the accuracies are lower limits"
+
+
+def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
+    """
+    Return the paper's accuracy of a calibration for several targets, per wavelength.
+
+    It follows from residuals alone, and knows neither telescope nor correlations: what a
+    calibration claims is `target_accuracies`. Which datasets give s_rel, s_unpol and s_sky
+    follows from their sources: s_sky is that of unpolarized standard stars. Several of one kind
+    count by the rms of their accuracies. Where no dataset of a kind was fitted, a standard of
+    that kind counts that was predicted, see `~astropolcal.calibration.add_standard`.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one read from a file will do.
+    targets : sequence of (dolp, aolp)
+        Degree and angle of linear polarization of each, as for `target_accuracy`. An
+        angle of None stands for any: the accuracies are then the largest over all
+        angles.
+    column : {"s_mean", "s_res", "s_cv"}
+        Which accuracy of the calibration to take.
+
+    Returns
+    -------
+    list of `~astropy.table.QTable`
+        As `target_accuracy` gives them, one a target, with ``dolp`` and ``aolp`` in the
+        meta; none if no dataset is of a known kind.
+
+    Raises
+    ------
+    ParameterError
+        If a target is impossible or there is no such column.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> (table,) = paper_accuracies(cal, [(30 * u.percent, 50 * u.deg)])
+    >>> table.meta["missing"]
+    ['unpolarized', 'on_sky']
+    """
+    tables = _tables_of_kinds(calibration, column)
+    found = []
+    for dolp, aolp in targets:
+        propagate_accuracy(dolp, 0 * u.deg if aolp is None else aolp, 0.0, 0.0)
+        if not tables:
+            continue
+        angles = _EXTREMES if aolp is None else [aolp]
+        each = [target_accuracy(dolp, angle, **tables, column=column) for angle in angles]
+        for key in ("s_Q", "s_U", "s_p", "s_chi"):
+            each[0][key] = np.max([table[key].value for table in each], axis=0) * each[0][key].unit
+        each[0].meta |= {"dolp": dolp, "aolp": aolp}
+        found.append(each[0])
+    return found
+
+
+def _kind(source, chain):
+    """Return which of the three calibrations a dataset belongs to, or None."""
+    words = (source or "").lower()
+    if "star" in words or "sky" in words:
+        # a polarized star does not tell s_sky, as its own
+        # polarization is fitted or from a catalogue
+        return "on_sky" if "unpolarized" in words else None
+    if "polarized" in words:
+        return "unpolarized" if "unpolarized" in words else "polarized"
+    if chain is None:
+        return None
+    # a table that does not say it; a polarizer in front does
+    return "polarized" if isinstance(leaves(chain)[0], LinearPolarizer) else None
+
+
+def _tables_of_kinds(calibration, column):
+    """Return the accuracies of each kind of dataset on the calibration's wavelengths."""
+    grid = calibration.wavelength
+    squares = {}
+    for record, chain in zip(calibration.datasets, calibration.chains, strict=True):
+        kind = _kind(record.source, chain)
+        if kind is None or record.accuracy is None:
+            continue
+        own = record.accuracy["wavelength"]
+        value = _values(kind, record.accuracy, column, own).value
+        row = np.full(grid.size, np.nan)
+        # a dataset may cover a part of the grid; the rest stays unknown
+        row[np.abs(own[:, None] - grid).argmin(axis=1)] = value**2
+        squares.setdefault(kind, []).append(row)
+    for kind, row in _standards_of_kinds(calibration, column):
+        if kind not in {_kind(r.source, c) for r, c in _fitted(calibration)}:
+            squares.setdefault(kind, []).append(row)
+    return {
+        kind: QTable({"wavelength": grid, column: np.sqrt(_mean(rows)) * u.percent})
+        for kind, rows in squares.items()
+    }
+
+
+def _fitted(calibration):
+    return zip(calibration.datasets, calibration.chains, strict=True)
+
+
+def _standards_of_kinds(calibration, column):
+    """Yield kind and squared accuracy at each wavelength of the standards that were predicted."""
+    grid = calibration.wavelength.to_value(u.nm)
+    # a diagnosis asks with what has no fit
+    for entry in getattr(calibration, "fit", {}).get("standards", []):
+        kind = _kind(entry["source"], None)
+        if kind is None:
+            continue
+        own, n = np.array(entry["wavelength_nm"]), np.array(entry["n"], dtype=float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # nothing was fitted: its rms over sqrt(n) is what s_mean is for a fit
+            share = 1 / n if column == "s_mean" else 1.0
+        row = np.full(grid.size, np.nan)
+        at = np.abs(own[:, None] - grid).argmin(axis=1)
+        row[at] = np.array(entry["s_standard_percent"], dtype=float) ** 2 * share
+        yield kind, row
+
+
+def _mean(rows):
+    """Return the mean of the known values of each column, NaN where there are none."""
+    known = np.isfinite(rows)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(known, rows, 0.0).sum(axis=0) / known.sum(axis=0)
+
+
+# ---- four accuracies ------------------------------------------------------------------------
+
+
+def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
+    """
+    Return s_res, s_mean, s_cv and s_standard at each wavelength, side by side.
+
+    They answer four questions: how well the model follows the data it was fitted
+    to; how well the mean residual would be known, were residuals independent
+    (the paper's s_rel); how well settings left out of the fit are predicted; and
+    how well a dataset is predicted that no fit has seen.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; one that was read from a file has its data no more, so
+        ``groups`` cannot be chosen.
+    standard : Observations or Measurement, optional
+        The dataset the fit never saw: observations with the set-up of
+        ``dataset``, or a measurement with a chain of its own, at its current
+        parameters. By default those that the calibration remembers, see
+        `~astropolcal.calibration.add_standard`.
+    dataset : int
+        Which dataset of the calibration.
+    groups : {"derotator", "cycle", "dataset"} or `~numpy.ndarray`, optional
+        Cross-validate anew by `groups_by`, or by the group of each datum; by
+        default ``s_cv`` is what the calibration remembers (derotator angles).
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Columns ``wavelength``, ``s_res``, ``s_mean``, ``s_cv``, ``s_standard``, in
+        percent; NaN where there is none. meta ``groups`` and ``standard``.
+
+    Raises
+    ------
+    FitError
+        If the standard was part of the fit, or groups are too few or have a
+        single member.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+    >>> from astropolcal.calibration import four_accuracies
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> four_accuracies(cal, simulate(chain, charis.wavelength, frames, seed=3)).colnames
+    ['wavelength', 's_res', 's_mean', 's_cv', 's_standard']
+    """
+    table = calibration.datasets[dataset].accuracy
+    if groups is not None:
+        table = _cross_validated(calibration, dataset, groups)
+    result = table["wavelength", "s_res", "s_mean", "s_cv"].copy()
+    record = calibration.datasets[dataset]
+    result["s_standard"] = _remembered(record)
+    known = [s for s in calibration.fit.get("standards", []) if s["source"] == record.source]
+    name = ", ".join(entry["name"] for entry in known) or None
+    if standard is not None:
+        measurement = _independent(calibration, standard, dataset)
+        name = ", ".join(part.observations.name for part in measurement.datasets)
+        result["s_standard"] = _rms_at(measurement, result["wavelength"])
+    chosen = groups if isinstance(groups, str) else "as given" if groups is not None else None
+    result.meta |= {"groups": chosen or "as in the calibration", "standard": name}
+    return result
+
+
+def _remembered(record):
+    # files that were written before the column existed do not have it
+    table = record.accuracy
+    unknown = np.full(len(table), np.nan) * u.percent
+    return table["s_standard"] if "s_standard" in table.colnames else unknown
+
+
+def _cross_validated(calibration, dataset, groups):
+    # residuals refuses a calibration without data in words of its own
+    residuals, live = calibration.residuals, calibration.measurement
+    if isinstance(groups, str):
+        groups = groups_by(live, groups)
+    held_out = cross_validated_residuals(live, live.vector(), calibration._weights(), groups)
+    if np.isnan(held_out).all():
+        raise FitError(f"{np.unique(groups).size} groups are too few for cross-validation")
+    return accuracy_table(live, dataset, residuals, held_out)
+
+
+def _independent(calibration, standard, dataset):
+    """Return the standard as a measurement, unless the fit has seen it."""
+    measurement = standard
+    if not hasattr(standard, "datasets"):
+        measurement = calibration.measurement_of(standard, dataset)
+    for part in measurement.datasets:
+        refuse_fitted(calibration, part.observations)
+    return measurement
+
+
+def _rms_at(measurement, wavelength):
+    """Return the rms of the residuals at each wavelength, NaN where there are none."""
+    residuals = measurement.residuals()
+    own = measurement.wavelength[measurement.bins]
+    found = [
+        residuals[np.abs(own - value) <= SAME_WAVELENGTH * value]
+        for value in wavelength.to_value(u.um)
+    ]
+    rms = [np.sqrt(np.mean(r**2)) if r.size else np.nan for r in found]
+    return 100 * np.array(rms) * u.percent

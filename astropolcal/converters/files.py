@@ -1,0 +1,302 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Calibration files: ASDF, with schemas of our own, validated on reading.
+
+By default ASDF neither validates what it reads nor stops at what it cannot
+convert, and it follows links out of the file. Here all of that is refused: a
+file gives back exactly what was written, or one line that says why not.
+"""
+
+import io
+import math
+import re
+import struct
+import warnings
+from contextlib import contextmanager
+from pathlib import Path
+
+import asdf
+import asdf.util
+from asdf.constants import YAML_END_MARKER_REGEX
+from asdf.exceptions import AsdfConversionWarning, AsdfWarning, ValidationError
+
+from astropolcal.converters.extension import (
+    CALIBRATION_TAG,
+    CALIBRATION_TAGS,
+    MANIFEST_URI,
+    get_extensions,
+    get_resource_mappings,
+)
+from astropolcal.exceptions import CalibrationFileError
+from astropolcal.files import atomic_path, check_new, check_yaml, one_line, understood
+from astropolcal.version import version as our_version
+
+__all__ = []
+
+_KEY = "calibration"
+_ALLOWED_TAGS = re.compile(
+    r"tag:stsci\.edu:asdf/(core/(asdf|software|extension_metadata|history_entry|ndarray)"
+    r"|unit/(quantity|unit))-[0-9.]+"
+    r"|tag:astropy\.org:astropy/units/unit-[0-9.]+"
+    rf"|{'|'.join(map(re.escape, CALIBRATION_TAGS))}"
+    r"|tag:astropolcal\.org:astropolcal/optics/[a-z_0-9]+-1\.0\.0"
+    r"|tag:yaml\.org,2002:[a-z]+"
+)
+# arrays of more numbers go into binary blocks, the others are readable
+_INLINE = 64
+_BEGIN, _END = b"#ASDF", b"\n...\n"
+_NUMBERS = re.compile(r"bool8|u?int(8|16|32|64)|float(16|32|64)")
+# bytes that a compressed block may always have
+_MOST_UNPACKED = 2**26
+_BLOCK, _BLOCK_HEAD = b"\xd3BLK", struct.Struct(">4sHI4sQQQ")
+
+
+def write_calibration(calibration, path, overwrite=False):
+    """
+    Write a calibration to an ASDF file, which appears complete or not at all.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    path : path-like
+        The file.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    CalibrationFileError
+        If the file exists, its folder is missing or cannot be written, or the
+        calibration holds what a file cannot hold, such as an optic of a class
+        outside `astropolcal.optics`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> write_calibration(cal, "charis.asdf")
+    >>> read_calibration("charis.asdf").covariance == cal.covariance
+    True
+    """
+    path = check_new(path, overwrite, CalibrationFileError)
+    with _speaking_of(path, "cannot be written", "cannot be written: ", reads=False):
+        content = _to_bytes(calibration)
+    with atomic_path(path, error=CalibrationFileError) as temporary:
+        temporary.write_bytes(content)
+
+
+def read_calibration(path):
+    """
+    Read a calibration from an ASDF file, validated; nothing in it is executed.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    Calibration
+        Equal to what was written, to the last bit; without ``measurement``.
+
+    Raises
+    ------
+    CalibrationFileError
+        If the file is missing, truncated, changed, of another version, not a
+        calibration, or inconsistent.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> write_calibration(cal, "charis.asdf")
+    >>> len(read_calibration("charis.asdf").parameters)
+    49
+    """
+    path = Path(path)
+    with _speaking_of(path, "damaged"):
+        content = path.read_bytes()
+        # cheap checks first: most broken files are truncated or something else
+        _check_ends(content)
+        _check_tree(content)
+        return _from_bytes(content)
+
+
+# ---- to and from bytes -------------------------------------------------------------
+
+
+def _to_bytes(calibration):
+    buffer = io.BytesIO()
+    with _strict_asdf(), asdf.AsdfFile({_KEY: calibration}) as file:
+        file.write_to(buffer)
+    return buffer.getvalue()
+
+
+def _from_bytes(content):
+    with (
+        _strict_asdf(),
+        asdf.open(
+            io.BytesIO(content), lazy_load=False, memmap=False, validate_checksums=True
+        ) as file,
+    ):
+        return file[_KEY]
+
+
+@contextmanager
+def _strict_asdf():
+    """Switch on what ASDF leaves off: validation, and errors for what cannot be converted."""
+    # loaded once and kept by every context, which would load them anew
+    asdf.get_config().extensions  # noqa: B018
+    with asdf.config_context() as config, warnings.catch_warnings():
+        # other versions of asdf and its plugins do not matter, what is in the file does
+        warnings.simplefilter("ignore", AsdfWarning)
+        warnings.simplefilter("error", AsdfConversionWarning)
+        # without its schema a node would pass unseen
+        warnings.filterwarnings("error", "Unable to locate schema", AsdfWarning)
+        config.validate_on_read = True
+        config.warn_on_failed_conversion = False
+        config.lazy_tree = False
+        config.array_inline_threshold = _INLINE
+        config.all_array_storage = None
+        config.all_array_compression = "input"
+        _register(config)
+        yield
+
+
+def _register(config):
+    """Tell ASDF of our schemas where the package was not installed, only imported."""
+    if MANIFEST_URI in config.resource_manager:
+        return
+    for mapping in get_resource_mappings():
+        config.add_resource_mapping(mapping)
+    for extension in get_extensions():
+        config.add_extension(extension)
+
+
+# ---- what is refused before ASDF opens the file ------------------------------------
+
+
+def _check_ends(content):
+    if not content.startswith(_BEGIN):
+        raise CalibrationFileError("not an ASDF file")
+    if not content.endswith(_END):
+        raise CalibrationFileError("truncated: the end of the file is missing")
+
+
+def _check_tree(content):
+    """Check text and tags before any object is made, so that nothing unknown is."""
+    end = re.search(YAML_END_MARKER_REGEX, content)
+    with _speaking_of("damaged", "its YAML", reads=False):
+        check_yaml(content[: end.end()], CalibrationFileError)
+    _check_blocks(content, end.end())
+    tree = asdf.util.load_yaml(io.BytesIO(content), tagged=True)
+    if not isinstance(tree, dict) or _KEY not in tree:
+        raise CalibrationFileError(f"not an astropolcal calibration: it has no {_KEY!r}")
+    _check_version(getattr(tree[_KEY], "_tag", None) or "no tag")
+    _check_nodes(tree, len(content))
+
+
+def _check_blocks(content, start):
+    """Refuse blocks that are not all there, or claim to hold much more than the file."""
+    while content[start : start + 4] == _BLOCK:
+        head = content[start : start + 6 + 48]
+        if len(head) < 6 + 48:
+            raise CalibrationFileError("truncated: a binary block has no end")
+        _, size, _, packing, room, used, data = _BLOCK_HEAD.unpack_from(head)
+        start += 6 + size
+        if data > (used if packing == b"\0\0\0\0" else max(_MOST_UNPACKED, 20 * used)):
+            raise CalibrationFileError(f"a binary block claims to hold {data} bytes")
+        if not used <= room <= len(content) - start:
+            raise CalibrationFileError("a binary block claims more than the file holds")
+        start += room
+
+
+def _check_version(tag):
+    if tag in CALIBRATION_TAGS:
+        return
+    ours = CALIBRATION_TAG.rpartition("-")[0]
+    kind, _, version = tag.rpartition("-")
+    if kind != ours:
+        raise CalibrationFileError(f"not an astropolcal calibration: {_KEY!r} has {tag}")
+    known = [tag.rpartition("-")[2] for tag in CALIBRATION_TAGS]
+    advice = f": update {our_version}, the file is newer" if _newer(version, known[-1]) else ""
+    raise CalibrationFileError(
+        f"calibration of version {version}; this astropolcal reads version "
+        f"{', '.join(known)}{advice}"
+    )
+
+
+def _newer(version, known):
+    numbers = [re.fullmatch(r"(\d+)\.(\d+)\.(\d+)", text) for text in (version, known)]
+    if not all(numbers):
+        return False
+    first, second = (tuple(map(int, match.groups())) for match in numbers)
+    return first > second
+
+
+def _check_nodes(tree, size):
+    """Refuse unknown tags, links out of the file, and arrays that cannot be in it."""
+    waiting, seen = [tree], set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen:
+            continue
+        seen.add(id(node))
+        tag = getattr(node, "_tag", None)
+        if tag is not None and not _ALLOWED_TAGS.fullmatch(tag):
+            raise CalibrationFileError(f"holds an object of unknown kind or version, {tag}")
+        if isinstance(node, dict):
+            if "$ref" in node or ("ndarray" in (tag or "") and isinstance(node.get("source"), str)):
+                # a file stands for itself, and reading it must not open others
+                raise CalibrationFileError("refers to another file")
+            if "ndarray" in (tag or ""):
+                _check_array(node, size)
+            waiting.extend(node.values())
+        elif isinstance(node, list):
+            waiting.extend(node)
+
+
+def _check_array(node, size):
+    """Refuse arrays that are no plain numbers, or more than the bytes of the file."""
+    kind, shape = node.get("datatype"), node.get("shape", [])
+    if not (isinstance(kind, str) and _NUMBERS.fullmatch(kind)):
+        raise CalibrationFileError(f"an array of {one_line(kind)}, plain numbers are allowed")
+    plain = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
+    if not plain or math.prod(shape) > size:
+        raise CalibrationFileError(f"an array of shape {one_line(shape)}, which cannot be in it")
+    for key in ("strides", "mask"):
+        if key in node:
+            raise CalibrationFileError(f"an array with {key}, plain ones are allowed")
+
+
+# ---- errors ------------------------------------------------------------------------
+
+
+@contextmanager
+def _speaking_of(path, words, prefix="", reads=True):
+    """Turn whatever goes wrong into one line that names the file."""
+    with understood(path, CalibrationFileError, words, reads=reads):
+        try:
+            yield
+        except CalibrationFileError as error:
+            raise CalibrationFileError(f"{path}: {prefix}{one_line(error, 500)}") from error
+        except ValidationError as error:
+            raise CalibrationFileError(f"{path}: {prefix}{_where(error)}") from error
+
+
+def _where(error):
+    """Return what a schema objects to, and at which place of the file."""
+    place = ".".join(str(part) for part in error.absolute_path)
+    return f"invalid at {one_line(place)}: {one_line(error.message)}"

@@ -1,0 +1,394 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Polarimetric efficiency: how much of the linear polarization of the sky an observation measures.
+
+What a retarder turns into circular polarization is lost for an instrument that measures linear
+polarization only. The efficiency is the degree of linear polarization that a cycle of the
+half-wave plate measures of a source that is completely polarized (McIntosh et al. 2026, Sec. 7.1):
+of the normalized double differences at 0 and 22.5 deg, behind an ideal beam splitter. The
+modulation efficiency of the real one does not enter.
+"""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from astropolcal import instruments
+from astropolcal.chain import join, leaves, stages, system_mueller
+from astropolcal.exceptions import ChainError, ParameterError
+from astropolcal.instruments import SkyLaw
+from astropolcal.observations.pointings import horizontal, tracked
+from astropolcal.optics import COORDINATES, Rotator
+from astropolcal.units import angle_to_rad
+
+__all__ = ["BestDerotator", "best_derotator", "polarimetric_efficiency"]
+
+#: Derotator angle = offset + f * parallactic angle + g * altitude, as (f, g), where no instrument
+#: is given.
+DEROTATOR_LAWS = SkyLaw().derotator
+
+# plus and minus angles of the half-wave plate, and where a modulator has exchanged the beams
+_CYCLE = [0, 45, 22.5, 67.5] * u.deg
+_EXCHANGED = [45, 0, 67.5, 22.5] * u.deg
+_SKY = {"parallactic", "altitude"}
+_MOST_CELLS = 2_000_000
+
+
+def sky_path(chain):
+    """
+    Return the optics from the sky to the beam splitter, without either.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        A chain; of an internal source what stands before the first optic on a stage
+        belongs to the source.
+
+    Returns
+    -------
+    Optic or `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    ChainError
+        If nothing is left.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+
+    >>> [optic.name for optic in sky_path(instruments.get("charis").published())]
+    ['hwp', 'derotator', 'dichroic', 'nbs']
+    """
+    found = leaves(chain)
+    # the first optic that treats the two beams differently is the beam splitter
+    end = next((i for i, leaf in enumerate(found) if leaf.depends_on_beam), len(found))
+    moving = (i for i, leaf in enumerate(found) if leaf.stage not in (None, *COORDINATES))
+    train = list(found[next(moving, end) : end])
+    if not train:
+        raise ChainError("the chain has no optic on a stage in front of a beam splitter")
+    if end < len(found) and found[end].theta.value:
+        # the frame of a beam splitter that does not stand straight
+        train.append(Rotator(theta=found[end].theta.quantity, name="analyser"))
+    return join(train)
+
+
+def has_derotator(chain):
+    """
+    Return whether a chain has a derotator: an optic on a stage that is not the plate's.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        A chain, from the sky or of an internal source.
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+
+    >>> has_derotator(instruments.get("irdis").published())
+    True
+    """
+    angles = set(stages(sky_path(chain))) - {*COORDINATES, *_SKY, "hwp"}
+    return bool(angles)
+
+
+def polarimetric_efficiency(
+    chain,
+    wavelength,
+    *,
+    derotator=None,
+    altitude=None,
+    parallactic=None,
+    aolp=90 * u.deg,
+    instrument=None,
+    mode=None,
+    law=None,
+):
+    r"""
+    Return the degree of linear polarization measured of a completely polarized source.
+
+    For a linear retarder :math:`\Delta` at the angle D behind an ideal half-wave plate it is
+    :math:`\sqrt{\cos^2 2D + \sin^2 2D \cos^2\Delta}`, at all angles of polarization: least at
+    45 and 135 deg. Telescope and half-wave plate change that by a few percent.
+
+    Parameters
+    ----------
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        A calibrated chain, from the sky or of an internal source, see ``sky_path``.
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_wavelengths,); that of the chain's parameters where these are given per
+        wavelength.
+    derotator : `~astropy.units.Quantity`, optional
+        Angle of the derotator, whatever its stage is called; needed if there is one. The angles
+        broadcast against each other.
+    altitude, parallactic : `~astropy.units.Quantity`, optional
+        Where the telescope points; needed for a chain from the sky, the altitude only if it
+        turns an optic. The half-wave plate then follows the tracking law.
+    aolp : `~astropy.units.Quantity` or None
+        Angle of the source's polarization, on sky or behind an internal source; 90 deg, the
+        paper's choice, is -Q. With None the angle that is measured worst.
+    instrument : str or Instrument, optional
+        Whose half-wave plate it is: its ``sky_law`` is the tracking law. Without it that of
+        `~astropolcal.instruments.SkyLaw`.
+    mode : str, optional
+        What the derotator keeps still, such as ``"field"``; needed where the law of the plate
+        depends on it.
+    law : (float, float), optional
+        Another tracking law of the half-wave plate, see `~astropolcal.observations.tracked`.
+
+    Returns
+    -------
+    `~numpy.ndarray`
+        Of the broadcast shape of the angles and (n_wavelengths,); between 0 and 1, up to the
+        polarization that the optics make themselves.
+
+    Raises
+    ------
+    ChainError
+        If the chain has a stage that has no position here.
+    ParameterError
+        If an angle is missing or not finite, or too many values are asked for.
+    ObservationError
+        If the altitude is not above 0 to 90 deg.
+    InstrumentError
+        If the instrument or the mode is unknown.
+
+    Notes
+    -----
+    A modulator on the stage ``flc_state`` is averaged over both of its states.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.on_sky(charis.published())
+    >>> efficiency = polarimetric_efficiency(chain, charis.wavelength, derotator=[45, 90] * u.deg,
+    ...                                      altitude=60 * u.deg, parallactic=94 * u.deg,
+    ...                                      instrument=charis)
+    >>> efficiency.shape, efficiency[:, 9].round(2).tolist()
+    ((2, 22), [0.28, 0.99])
+    """
+    path = sky_path(chain)
+    law = _plate_law(path, instrument, mode) if law is None else law
+    positions = _positions(path, derotator, altitude, parallactic, law)
+    lam = np.atleast_1d(u.Quantity(wavelength))
+    shape = np.broadcast_shapes(*(np.shape(angle) for angle in positions.values()))
+    if np.prod(shape, dtype=float) * lam.size > _MOST_CELLS:
+        raise ParameterError(
+            f"{shape} angles at {lam.size} wavelengths are too many; allowed are {_MOST_CELLS}"
+        )
+    flat = {stage: np.broadcast_to(a, shape).ravel() * u.rad for stage, a in positions.items()}
+    return _measured(_cycle(path, lam, flat), aolp).reshape(*shape, lam.size)
+
+
+def _cycle(path, lam, positions):
+    """Return the first two rows of the matrices at the four angles of the plate."""
+    if "flc_state" not in stages(path):
+        return np.stack([_at(path, lam, positions, hwp) for hwp in _CYCLE])
+    n = len(next(iter(positions.values())))
+    a, b = (positions | {"flc_state": np.full(n, state)} for state in (0.0, 1.0))
+    pairs = zip(_CYCLE, _EXCHANGED, strict=True)
+    return np.stack([(_at(path, lam, a, one) + _at(path, lam, b, two)) / 2 for one, two in pairs])
+
+
+def _at(path, lam, positions, hwp):
+    """Return the first two rows of the matrices with the plate turned further."""
+    if "hwp" in positions:
+        positions = positions | {"hwp": positions["hwp"] + hwp}
+    return np.asarray(system_mueller(path, lam, positions))[..., :2, :]
+
+
+def _law_of(instrument):
+    if instrument is None:
+        return SkyLaw()
+    return (instruments.get(instrument) if isinstance(instrument, str) else instrument).sky_law
+
+
+def _plate_law(path, instrument, mode):
+    """Return the law of the plate, which only counts on sky."""
+    if not _SKY & set(stages(path)):
+        return 0.0, 0.0
+    return _law_of(instrument).plate_law(mode)
+
+
+def _derotator_stage(path):
+    """Return the stage that turns with the derotator, None where there is none."""
+    angles = set(stages(path)) - {*COORDINATES, *_SKY, "hwp"}
+    if "derotator" in angles or not angles:
+        return "derotator" if angles else None
+    return angles.pop() if len(angles) == 1 else None
+
+
+def _positions(path, derotator, altitude, parallactic, law):
+    """Return the position of every stage in radian."""
+    wanted, turning = set(stages(path)) - set(COORDINATES), _derotator_stage(path)
+    found = {"hwp": 0.0}
+    if derotator is not None:
+        found[turning or "derotator"] = angle_to_rad(derotator, "derotator")
+    elif turning is not None:
+        raise ParameterError(f"the chain has an optic on the stage {turning}: derotator= is needed")
+    found |= _pointing(wanted, altitude, parallactic, law)
+    unknown = wanted - set(found)
+    if unknown:
+        raise ChainError(f"no position of the stages {', '.join(sorted(unknown))}")
+    for name, angle in found.items():
+        if not np.all(np.isfinite(angle)):
+            raise ParameterError(f"{name} = {angle} must be finite")
+    keep = {"derotator", *wanted} & set(found)
+    return {stage: found[stage] for stage in keep} or {"hwp": 0.0}
+
+
+def _pointing(wanted, altitude, parallactic, law):
+    """Return the positions of what follows the sky."""
+    if not _SKY & wanted:
+        return {}
+    needs_altitude = "altitude" in wanted or (law[1] and "hwp" in wanted)
+    if parallactic is None or (altitude is None and needs_altitude):
+        lacking = "altitude= and parallactic=" if needs_altitude else "parallactic="
+        raise ParameterError(f"a chain from the sky needs {lacking}")
+    a, p = horizontal(90 * u.deg if altitude is None else altitude, parallactic)
+    return {"altitude": a, "parallactic": p, "hwp": tracked(0.0, p, a, law)}
+
+
+def _measured(rows, aolp):
+    """Return the degree of polarization of a cycle, from rows I and Q at its four angles."""
+    if aolp is not None:
+        angle = 2 * float(angle_to_rad(aolp, "aolp"))
+        total, difference = np.moveaxis(
+            rows @ np.array([1.0, np.cos(angle), np.sin(angle), 0.0]), -1, 0
+        )
+        # (2, ...): q from 0 and 45 deg, u from 22.5 and 67.5 deg
+        double = (difference[0::2] - difference[1::2]) / (total[0::2] + total[1::2])
+        return np.hypot(*double)
+    # to first order of what the optics polarize themselves
+    total = rows[0::2, ..., 0, 0] + rows[1::2, ..., 0, 0]
+    difference = rows[0::2, ..., 1, 1:3] - rows[1::2, ..., 1, 1:3]
+    response = np.moveaxis(difference / total[..., None], 0, -2)
+    # the worst angle of polarization is the direction of the least singular value
+    return np.linalg.svd(response, compute_uv=False)[..., -1]
+
+
+# ---- planning --------------------------------------------------------------------------------
+
+
+@dataclass
+class BestDerotator:
+    """
+    Offsets of the derotator for an observation, and the efficiency each gives.
+
+    Parameters
+    ----------
+    offset : `~astropy.units.Quantity`
+        The best offset.
+    table : `~astropy.table.QTable`
+        One row an offset: ``offset``; ``mean`` and ``least``, efficiency over the observation and
+        the wavelengths, at the worst angle of polarization; and ``now``, the same at the first
+        moment.
+    law : str
+        What the derotator keeps still.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+
+    >>> BestDerotator(65 * u.deg, QTable(), "pupil").offset
+    <Quantity 65. deg>
+    """
+
+    offset: u.Quantity
+    table: QTable
+    law: str
+
+
+def best_derotator(
+    chain,
+    wavelength,
+    altitude,
+    parallactic,
+    *,
+    law="pupil",
+    offsets=None,
+    by="least",
+    instrument=None,
+):
+    """
+    Find the offset of the derotator that loses least polarization in an observation.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        A calibrated chain from the sky.
+    wavelength : `~astropy.units.Quantity`
+        The wavelengths that count, on the grid of the chain's parameters.
+    altitude, parallactic : `~astropy.units.Quantity`
+        Over the observation, shape (n_times,); `~astropolcal.observations.pointing` gives them for
+        target, time and site.
+    law : str
+        What the derotator keeps still, usually ``"pupil"`` or ``"field"``: one of the modes of the
+        instrument's law.
+    offsets : `~astropy.units.Quantity`, optional
+        Offsets to try, by default 0 to 179 deg in steps of 1 deg.
+    by : {"least", "mean"}
+        Whether the worst or the mean moment and wavelength decides.
+    instrument : str or Instrument, optional
+        Whose plate and derotator they are: its ``sky_law`` counts, without it
+        `DEROTATOR_LAWS`.
+
+    Returns
+    -------
+    BestDerotator
+
+    Raises
+    ------
+    ParameterError
+        If a choice is unknown.
+    ChainError
+        If the chain, or the instrument, has no derotator.
+    ObservationError
+        If the target is below the horizon.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+
+    >>> charis = instruments.get("charis")
+    >>> best = best_derotator(charis.on_sky(charis.published()), charis.wavelength,
+    ...                       [60, 65] * u.deg, [-30, -20] * u.deg,
+    ...                       offsets=range(0, 180, 5) * u.deg)
+    >>> bool(best.table["least"].max() > 0.9)
+    True
+    """
+    sky_law = _law_of(instrument)
+    if not sky_law.derotator or _derotator_stage(sky_path(chain)) is None:
+        raise ChainError("there is no derotator whose offset could be chosen")
+    if law not in sky_law.derotator or by not in ("least", "mean"):
+        allowed = ", ".join(sky_law.derotator)
+        raise ParameterError(f"law = {law!r}, by = {by!r}; allowed are {allowed}, and least, mean")
+    offsets = np.arange(180) * u.deg if offsets is None else np.atleast_1d(u.Quantity(offsets))
+    a, p = (np.atleast_1d(angle) * u.rad for angle in horizontal(altitude, parallactic))
+    f, g = sky_law.derotator_law(law)
+    efficiency = polarimetric_efficiency(
+        chain,
+        wavelength,
+        # (n_offsets, n_times)
+        derotator=offsets[:, None] + f * p + g * a,
+        altitude=a,
+        parallactic=p,
+        aolp=None,
+        law=sky_law.plate_law(law),
+    )
+    table = QTable({"offset": offsets.to(u.deg)})
+    table["mean"] = efficiency.mean(axis=(1, 2))
+    table["least"] = efficiency.min(axis=(1, 2))
+    table["now"] = efficiency[:, 0].min(axis=1)
+    return BestDerotator(table["offset"][np.argmax(table[by])], table, law)

@@ -1,0 +1,21 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Calibrations at work: library, headers, system Mueller matrices, export, history."""
+
+from astropolcal.pipeline.export import mueller_table, write_mueller
+from astropolcal.pipeline.history import Change, changes, parameter_history, restart
+from astropolcal.pipeline.library import Entry, Library
+from astropolcal.pipeline.loading import LoadedCalibration, SystemMueller, load
+
+__all__ = [
+    "Change",
+    "Entry",
+    "Library",
+    "LoadedCalibration",
+    "SystemMueller",
+    "changes",
+    "load",
+    "mueller_table",
+    "parameter_history",
+    "restart",
+    "write_mueller",
+]

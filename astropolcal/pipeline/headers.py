@@ -1,0 +1,468 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What the headers of frames tell: instrument, mode, date, and the angles of the stages.
+
+Which of a calibration's chains the light of a frame went through.
+"""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+from astropy.time import Time
+
+from astropolcal import instruments
+from astropolcal.calibration.result.validity import (
+    _dates,
+    _moment,
+    beam_words,
+    instrument_of,
+    optics_words,
+    validity_of,
+)
+from astropolcal.calibration.system import split_chain
+from astropolcal.chain import leaves
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    CalibrationFileError,
+    ChainError,
+    InstrumentError,
+    ObservationError,
+    ParameterError,
+)
+from astropolcal.instruments import Instrument
+from astropolcal.instruments.base import without_nuisance
+from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
+from astropolcal.observations.pointings import offline
+from astropolcal.observations.reading import numeric_column
+from astropolcal.units import plain_number
+
+__all__ = []
+
+_SKY = ("right_ascension", "declination")
+# columns that are no angles of a stage, though their values may be numbers
+_OTHERS = {"exposure_time", "mjd", *TEXTS} - set(_SKY)
+
+
+def describe(header, instrument=None, stated=()):
+    """
+    Return what a header tells of a frame.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header` or mapping
+        Primary header.
+    instrument : str or Instrument, optional
+        The instrument, by default that whose identity stands in the header.
+    stated : set of str
+        What is not to be looked for.
+
+    Returns
+    -------
+    dict
+        ``instrument`` (name), ``stated`` (what the header calls it), ``mode`` and ``date`` (ISO,
+        UTC); what is not told is None.
+    """
+    if instrument is None:
+        found = _recognized(header)
+    else:
+        found = instruments.get(instrument) if isinstance(instrument, str) else instrument
+    layout = found.files
+    if layout is None:
+        return {"instrument": found.name}
+    # what is stated by the user, or is the identity itself, is no contradiction
+    own = _look_up(header, "instrument", layout)
+    if "instrument" in stated or own in layout.identities:
+        own = None
+    time = None if "date" in stated else _time(header, layout)
+    return {
+        "instrument": found.name,
+        "stated": own,
+        "mode": None if "mode" in stated else _text(_look_up(header, "filter", layout)),
+        "date": None if time is None else time.utc.isot,
+    }
+
+
+def _text(value):
+    return None if value is None else str(value).strip()
+
+
+def _recognized(header):
+    """Return the instrument whose identity a header bears."""
+    seen = []
+    # each instrument looks under its own keyword, so that all of them are asked
+    for name in instruments.names():
+        instrument = instruments.get(name)
+        layout = instrument.files
+        told = None if layout is None else _text(_look_up(header, "instrument", layout))
+        if told is None:
+            continue
+        if told in layout.identities or instrument.answers_to(told):
+            return instrument
+        seen.append(told)
+    words = f"says {seen[0]!r}, which is not known" if seen else "does not say it"
+    raise InstrumentError(
+        f"which instrument? the header {words}; give instrument=, one of "
+        f"{', '.join(instruments.names())}"
+    )
+
+
+def _look_up(header, column, layout):
+    return look_up([header], column, layout)[1]
+
+
+def _time(header, layout):
+    """Return when a frame was taken, or None."""
+    try:
+        return frame_time(header, layout)
+    except (TypeError, ValueError):
+        told = (_look_up(header, key, layout) for key in ("mjd", "date", "time"))
+        mjd, date, clock = (_text(value) for value in told)
+        shown = mjd or f"{date} {clock or ''}".strip()
+        raise CalibrationFileError(f"the header's date {shown!r} cannot be understood") from None
+
+
+class FrameAngles:
+    """
+    The angles of frames from their headers, as `~astropolcal.instruments.Instrument` reads them.
+
+    Parameters
+    ----------
+    headers : list of mappings
+        One a frame.
+    instrument : Instrument
+        With a layout of its files.
+
+    Raises
+    ------
+    InstrumentError
+        If the instrument has no map of keywords.
+    ObservationError
+        If an angle is no number, cannot be right, or is missing in some of the frames.
+    """
+
+    def __init__(self, headers, instrument):
+        if instrument.files is None:
+            raise InstrumentError(f"{instrument.name}: no map of header keywords; give positions")
+        if not headers:
+            raise ObservationError("no header: at least one frame is needed")
+        self.name, self.path, self.meta = "header", None, {"instrument": instrument.name}
+        self.instrument, self.source, self.mask = instrument.name, "star", np.zeros((1, 1), bool)
+        self._layout = layout = instrument.files
+        self.n_frames = len(headers)
+        table = QTable({"frame": np.arange(self.n_frames)})
+        for column in (c for c in layout.keywords if c not in _OTHERS):
+            values = [_look_up(header, column, layout) for header in headers]
+            if self._complete(column, values):
+                table[column] = self._column(column, values)
+        times = [_time(header, layout) for header in headers]
+        if all(time is not None for time in times):
+            table["time"] = Time(times)
+        self._table = table
+
+    @property
+    def frames(self):
+        """One row a frame."""
+        return self._table.copy()
+
+    def _complete(self, column, values):
+        missing = [i for i, value in enumerate(values) if value is None]
+        if not missing:
+            return True
+        # some with and some without is a mixture of modes, or a
+        # broken header; none has it: not there
+        if len(missing) < len(values):
+            keyword = self._layout.keywords[column]
+            raise ObservationError(
+                f"frame {missing[0]}: no {keyword} in the header, others have it"
+            )
+        return False
+
+    def _column(self, column, values):
+        """Return angles as a Quantity, anything else as text."""
+        if column in _SKY:
+            return _sky(column, values)
+        keyword, layout = self._layout.keywords[column], self._layout
+        # states of a modulator, cameras and such
+        if not u.Unit(layout.units.get(column, "deg")).is_equivalent(u.deg):
+            return np.array([str(value).strip() for value in values])
+        # two turns: encoders count on past 360 deg, but what is further out is no angle
+        low, high = RANGES.get(column, (-720.0, 720.0))
+        angles = []
+        for i, value in enumerate(values):
+            try:
+                angle = convert(column, value, layout, u.deg)
+            except (TypeError, ValueError):
+                if column not in ANGLES:
+                    return np.array([str(value).strip() for value in values])
+                raise ObservationError(
+                    f"frame {i}: {keyword} = {value!r}, a number is needed"
+                ) from None
+            if not low <= angle <= high:
+                raise ObservationError(
+                    f"frame {i}: {keyword} = {value}, allowed are {low:g} to {high:g} deg"
+                )
+            angles.append(angle)
+        return angles * u.deg
+
+    def position(self, column):
+        """Return an angle of every frame in radian."""
+        if column not in self._table.colnames:
+            keyword = self._layout.keywords.get(column)
+            lacking = f"no {keyword}" if keyword else "no keyword is known for it"
+            raise ObservationError(f"position of {column!r}: {lacking} in the header")
+        return numeric_column(self._table, column, self.name, u.rad)
+
+
+def _sky(column, values):
+    from astropy.coordinates import Angle
+
+    try:
+        numbers = [plain_number(value) for value in values]
+        # plain numbers are degrees, also for the right ascension; sexagesimal ones are hours there
+        return numbers * u.deg
+    except (TypeError, ValueError):
+        pass
+    unit = u.hourangle if column == "right_ascension" else u.deg
+    try:
+        return u.Quantity([Angle(str(value), unit=unit).to(u.deg) for value in values])
+    except ValueError as error:
+        raise ObservationError(f"{column}: {' '.join(str(error).split())}") from None
+
+
+# ---- which of a calibration's chains the light of a frame went through ----
+
+
+def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"):
+    """
+    Return the optics from the first on a stage of the instrument on.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        It may have chains for several sets of optional optics.
+    optics_in : sequence of str, optional
+        All optional optics in the beam.
+    beam : dict of str to bool, optional
+        Single ones that are known to be in the beam or not; not used with ``optics_in``.
+    label : str
+        What messages call the calibration.
+
+    Raises
+    ------
+    ChainError
+        If no chain has these optics, or several have.
+    """
+    instrument, kinds = instrument_of(calibration), {}
+    known = None if optics_in is None else set(optics_in)
+    for record, chain in zip(calibration.datasets, calibration.chains, strict=True):
+        inner = split_chain(without_nuisance(chain))[1]
+        if _matches(_optional(instrument, record), inner, known, beam or {}):
+            # chains of the same optics share them by name, so any one stands for all
+            kinds.setdefault(tuple(leaf.name for leaf in inner), inner)
+    if not kinds:
+        wanted = beam_words(beam) if known is None else optics_words([tuple(sorted(known))])
+        raise ChainError(f"{label}: no chain {wanted}; it holds for {validity_of(calibration)}")
+    if len(kinds) > 1:
+        # only what differs helps to choose
+        common = set.intersection(*map(set, kinds))
+        shown = [",".join(n for n in names if n not in common) or "none" for names in kinds]
+        raise ChainError(
+            f"{label}: which optics are in the beam? optics_in tells its chains apart: "
+            f"{' or '.join(shown)}"
+        )
+    return next(iter(kinds.values()))
+
+
+def _optional(instrument, record):
+    """Return the optional optics of a dataset, or None if no instrument knows them."""
+    try:
+        return set(instrument.setup(record)[1])
+    except (AttributeError, AstropolcalError):
+        return None
+
+
+def _matches(optional, inner, wanted, beam):
+    # an instrument knows which of its optics are optional; without one all of the chain's may be
+    present = {leaf.name for leaf in inner} if optional is None else optional
+    if wanted is None:
+        return all((name in present) == is_in for name, is_in in beam.items())
+    return wanted <= present if optional is None else wanted == present
+
+
+def telescope_optics(calibration):
+    """Return the optics of a calibrated telescope, from the sky on; None if there are none."""
+    for chain in calibration.chains:
+        outer, _ = split_chain(chain)
+        # in front of the parallactic angle stands the star itself, which is no telescope
+        start = next((i for i, leaf in enumerate(outer) if leaf.stage == "parallactic"), None)
+        if start is not None:
+            return outer[start:]
+    return None
+
+
+def told_beam(headers, instrument, labels=None):
+    """
+    Return what headers tell of optional optics, name to whether they are in the beam.
+
+    Raises
+    ------
+    ChainError
+        If the frames differ.
+    """
+    found = {}
+    for i, header in enumerate(headers):
+        label = f"frame {i}" if labels is None else labels[i]
+        for name, is_in in instrument.optics_of(header).items():
+            first, before = found.setdefault(name, (label, is_in))
+            if before != is_in:
+                words = ("in the beam", "not") if before else ("not in the beam", "in it")
+                raise ChainError(f"{name} was {words[0]} in {first}, and {words[1]} in {label}")
+    return {name: is_in for name, (_, is_in) in found.items()}
+
+
+# how a caller states what headers lack, where a command has no option for it
+_WAYS = {"date": "date= states it", "mode": "mode={}"}
+
+
+def check_frames(calibration, frames, name, *, max_age=None, light="sky", ways=None, dates=True):
+    """
+    Refuse frames for which a calibration does not hold, and warn if it is old for some.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    frames : sequence of (str, str or `~astropy.time.Time`, str)
+        What to call each frame, when it was taken (UTC) and its mode; None where not known.
+    name : str
+        What to call the calibration.
+    max_age : `~astropy.units.Quantity`, optional
+        Age from which on there is a warning; by default that of the instrument, and none where
+        the end of the validity was stated.
+    light : {"sky", "internal"}
+        Whether the light passed the telescope, whose mirrors may have changed.
+    ways : dict of str to str, optional
+        What the caller can do about a missing ``date`` or ``mode``, and an ``other date``, in
+        words.
+    dates : bool
+        Whether the dates matter, or only the mode.
+
+    Raises
+    ------
+    CalibrationFileError
+        If the calibration holds for other dates or another mode, a frame lacks what would tell,
+        or the instrument has changed in between.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If the calibration is too old; once, for the frame that is furthest from its data.
+    """
+    held, ways = validity_of(calibration), _WAYS if ways is None else ways
+    dated = dates and (held.valid_from is not None or held.valid_until is not None)
+    moments = {}
+    for label, date, mode in frames:
+        _check_mode(held, label, mode, name, ways["mode"].format(repr(held.mode)))
+        if dated and date is None:
+            raise CalibrationFileError(
+                f"{label}: its date is not known, and {name} holds for {held}; {ways['date']}"
+            )
+        if dated:
+            moment = _moment(date, "date")
+            if not held._spans(moment):
+                raise CalibrationFileError(
+                    f"{label} was taken {moment}, but {name} holds for {held}"
+                    f"{ways.get('other date', '')}"
+                )
+            moments.setdefault(moment, label)
+    days = _dates(calibration) or ([held.valid_from] if held.valid_from else [])
+    if not (moments and days):
+        return
+    changes = _changes(calibration, light)
+    if held.valid_from and held.valid_from > days[-1]:
+        # who states that it holds from a later day on vouches for what changed until then
+        changes = [change for change in changes if held.valid_from[:10] < change[1]]
+    for moment, label in moments.items():
+        _check_changes(changes, days, moment[:10], f"{label}, {name}", ways["date"])
+    # (n_moments, n_days), in days
+    apart = np.abs((_moments(list(moments))[:, None] - _moments(days)).to_value(u.day)).min(axis=1)
+    limit, worst = _max_age(max_age, held, instrument_of(calibration)), apart.argmax()
+    if apart[worst] > limit:
+        moment = list(moments)[worst]
+        warnings.warn(
+            f"{moments[moment]} was taken {moment}, {apart[worst] / 365.25:.1f} yr from the data "
+            f"of {name} ({' to '.join(dict.fromkeys((days[0], days[-1])))}); a calibration counts "
+            f"as old after {limit:g} d (max_age), and what has changed since is not in its errors",
+            AstropolcalWarning,
+            stacklevel=3,
+        )
+
+
+def _check_mode(held, label, mode, name, way):
+    if held.mode is None:
+        return
+    if mode is None:
+        raise CalibrationFileError(
+            f"{label}: its mode is not known, and {name} holds for {held}; {way} states it"
+        )
+    if _folded(mode) != _folded(held.mode):
+        raise CalibrationFileError(
+            f"{label} is in mode {mode!r}, but {name} holds for {held}; if it is the same by "
+            f"another name, {way} says so"
+        )
+
+
+def _folded(text):
+    return " ".join(str(text).split()).casefold()
+
+
+def _changes(calibration, light):
+    """Return the dated changes of the instrument that matter to light on its way."""
+    instrument = instrument_of(calibration)
+    if instrument is None:
+        return []
+    own = {leaf.name for chain in calibration.chains for leaf in leaves(chain)}
+    # a published telescope of the right epoch stands in where none was calibrated
+    renewed = "date" in instrument.sky_options
+    return [
+        change
+        for change in instrument.changes
+        if change[0] is None or (light == "sky" and (change[0] in own or not renewed))
+    ]
+
+
+def _check_changes(changes, days, day, label, way):
+    """Refuse a day between which and all days of the data the instrument has changed."""
+    for _, first, last, words in changes:
+        spans = [sorted([old[:10], day]) for old in days]
+        # on an unknown day from first on and before last; ISO dates compare as text
+        if all(lo < last and hi >= first and not (first <= lo and hi < last) for lo, hi in spans):
+            raise CalibrationFileError(
+                f"{label}: {words} between the data of the calibration "
+                f"({' to '.join(dict.fromkeys((days[0][:10], days[-1][:10])))}) and {day}; "
+                f"calibrate anew, or {way}"
+            )
+
+
+def _max_age(max_age, held, instrument):
+    """Return the age in days from which on a calibration is old."""
+    if max_age is None:
+        # who states an end has thought of it
+        if held.valid_until is not None:
+            return np.inf
+        max_age = Instrument.max_age if instrument is None else instrument.max_age
+    try:
+        days = float(u.Quantity(max_age).to_value(u.day))
+    except (TypeError, u.UnitConversionError):
+        days = np.nan
+    if not days >= 0:
+        raise ParameterError(f"max_age = {max_age!r}; a time is needed, such as 1 yr")
+    return days
+
+
+def _moments(moments):
+    """Return ISO texts as `~astropy.time.Time`, without a word on leap seconds to come."""
+    with offline():
+        return Time(moments, format="isot", scale="utc")

@@ -1,0 +1,569 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Calibrations over the years: parameters against date, what changed, and how surely.
+
+A difference between calibrations is judged in the directions that the data of
+all of them determine, with the full covariance of each. Calibrations that share
+data are refused, because their errors are not independent.
+
+Refit what changed since a calibration, and hold the rest.
+"""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable, Table
+from astropy.time import Time
+
+from astropolcal.calibration.fit.calibrate import calibrate
+from astropolcal.calibration.result.validity import instrument_of, validity_of
+from astropolcal.calibration.uncertainty.covariance import full_covariance
+from astropolcal.chain import join, leaves
+from astropolcal.converters.calibration import content_hash
+from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.measurement import parameter_table
+from astropolcal.observations import Observations
+from astropolcal.pipeline.library import Entry, Library
+
+__all__ = ["Change", "changes", "parameter_history", "restart"]
+
+# a direction less certain than this share of the most certain one tells nothing
+_RANK = 1e-12
+
+
+def _named(calibrations):
+    """Return (name, calibration) by start of validity."""
+    if isinstance(calibrations, Library):
+        if calibrations.problems:
+            path, reason = next(iter(calibrations.problems.items()))
+            raise ParameterError(f"{path}: {reason}")
+        calibrations = calibrations.entries
+    named = []
+    for i, item in enumerate(calibrations):
+        inside = getattr(item, "calibration", item)
+        name = item.name if isinstance(item, Entry) else _label(item, inside, i)
+        named.append((name, inside))
+    return sorted(named, key=lambda pair: validity_of(pair[1]).valid_from or "")
+
+
+def _label(item, calibration, number):
+    path = getattr(item, "path", None)
+    if path is not None:
+        return path.name
+    return ", ".join(r.name for r in calibration.datasets) or f"calibration {number}"
+
+
+def parameter_history(calibrations, parameters=None):
+    """
+    Return the calibrated parameters of several calibrations against their date.
+
+    Parameters
+    ----------
+    calibrations : Library, or sequence of Entry, LoadedCalibration or Calibration
+        In any order.
+    parameters : sequence of str, optional
+        ``"optic.parameter"`` or ``"optic"``; by default all that are free in one of them.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        One row a calibration, parameter and wavelength: ``date`` (start of validity, masked if
+        it is not known), ``calibration``, ``parameter``, ``wavelength`` (nm; NaN for one value
+        for all), ``value``, ``std`` (NaN where not determined or held), ``unit``, ``fixed``.
+
+    Raises
+    ------
+    ParameterError
+        If no calibration has a parameter of the name.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> years = [calibrate(chain, simulate(chain, charis.wavelength, frames, seed=i,
+    ...                                    meta={"date": f"202{i}-03-01"})) for i in (5, 6)]
+    >>> table = parameter_history(years, ["hwp.w_sio2"])
+    >>> table["date"].iso[0][:10], len(table)
+    ('2025-03-01', 2)
+    """
+    named = _named(calibrations)
+    rows = []
+    for name, calibration in named:
+        for key, entry in calibration.parameter_values().items():
+            if _wanted(key, entry, parameters):
+                rows += _rows(name, calibration, key, entry)
+    found = {row["parameter"] for row in rows}
+    for key in parameters or ():
+        if not any(_belongs(name, [key]) for name in found):
+            raise ParameterError(f"no calibration has a parameter {key!r}")
+    if parameters is None:
+        free = {row["parameter"] for row in rows if not row["fixed"]}
+        rows = [row for row in rows if row["parameter"] in free]
+    return _as_table(rows)
+
+
+def _wanted(key, entry, parameters):
+    if parameters is None:
+        return entry["tied"] is None
+    return _belongs(key, parameters)
+
+
+def _rows(name, calibration, key, entry):
+    several = entry["value"].ndim > 0
+    grid = calibration.wavelength.to_value("nm") if several else [np.nan]
+    common = {
+        "date": validity_of(calibration).valid_from,
+        "calibration": name,
+        "parameter": key,
+        "unit": str(entry["unit"] or ""),
+        "fixed": entry["fixed"] or entry["tied"] is not None,
+    }
+    columns = zip(grid, *(np.ravel(entry[k]) for k in ("value", "std")), strict=True)
+    return [common | {"wavelength": w, "value": v, "std": s} for w, v, s in columns]
+
+
+def _as_table(rows):
+    columns = {key: [row[key] for row in rows] for key in rows[0]} if rows else {}
+    table = QTable()
+    dates = columns.pop("date", [])
+    time = Time([text or "2000-01-01" for text in dates], scale="utc") if dates else []
+    unknown = np.array([text is None for text in dates], dtype=bool)
+    if unknown.any():
+        time[unknown] = np.ma.masked
+    table["date"] = time
+    for key in ("calibration", "parameter", "wavelength", "value", "std", "unit", "fixed"):
+        table[key] = columns.get(key, [])
+    table["wavelength"] = np.asarray(table["wavelength"], dtype=float) * u.nm
+    return table
+
+
+# ---- has something changed? --------------------------------------------------------------
+
+
+@dataclass
+class Change:
+    """
+    How surely parameters differ between calibrations.
+
+    Parameters
+    ----------
+    calibrations : list of str
+        Their names, by date.
+    parameters : list of str
+        Elements that were compared, such as ``derotator.horizontal[3]``.
+    chi2 : float
+        Of the hypothesis that they are the same in all calibrations.
+    dof : int
+        Directions that all of them determine, times calibrations less one.
+    p_value : float
+        Probability of a larger chi-square if nothing changed.
+    left_out : list of str
+        Elements at a bound, which have no error.
+    n_open : int
+        Directions that are open in one of the calibrations, which do not count.
+
+    Examples
+    --------
+    >>> print(Change(["a", "b"], ["m3.diattenuation"], 30.0, 1, 4e-8))
+    m3.diattenuation: changed from a to b at 5.5 sigma (chi-square 30.0 of 1, p = 4e-08)
+    """
+
+    calibrations: list
+    parameters: list
+    chi2: float
+    dof: int
+    p_value: float
+    left_out: list = field(default_factory=list)
+    n_open: int = 0
+
+    @property
+    def sigma(self):
+        """The probability as that of a normal deviate of two sides; 0 where nothing is known."""
+        from scipy.special import ndtri_exp
+
+        if not self.dof or self.p_value >= 1:
+            return 0.0
+        # half of the probability on each side of a normal deviate
+        return float(-ndtri_exp(_log_p(self.chi2, self.dof) - np.log(2)))
+
+    def __str__(self):
+        names = list(dict.fromkeys(name.partition("[")[0] for name in self.parameters))
+        between = f"from {self.calibrations[0]} to {self.calibrations[-1]}"
+        what = ", ".join(names) or "nothing"
+        if not self.dof:
+            return f"{what}: nothing that is determined in all of them to compare, {between}"
+        verdict = "changed" if self.p_value < 0.00135 else "no change seen"
+        return (
+            f"{what}: {verdict} {between} at {self.sigma:.1f} sigma (chi-square {self.chi2:.1f} "
+            f"of {self.dof}, p = {self.p_value:.1g})"
+        )
+
+
+def _log_p(chi2, dof):
+    """Return the logarithm of the probability of a larger chi-square, however small."""
+    from scipy.special import gammaincc, gammaln
+
+    p = gammaincc(dof / 2, chi2 / 2)
+    # below that exp underflows, and sigma would be infinite
+    if p > 1e-290:
+        return np.log(p)
+    half, x = dof / 2, chi2 / 2
+    # the first terms of the asymptotic series, far in the tail
+    return (half - 1) * np.log(x) - x - gammaln(half) + np.log1p((half - 1) / x)
+
+
+def significance(calibrations, parameters=None):
+    """
+    Return how surely parameters differ between calibrations.
+
+    Parameters
+    ----------
+    calibrations : Library or sequence
+        Two or more, see `parameter_history`.
+    parameters : sequence of str, optional
+        ``"optic.parameter"`` or ``"optic"``; by default all that are free in all of them.
+
+    Returns
+    -------
+    Change
+        The chi-square of one set of values for all of them, each with its full covariance, in
+        the directions that all determine. Angles are compared as they are: a
+        fit in another mirror branch counts as a change, so start the later fit from the
+        earlier one, see `~astropolcal.pipeline.restart`.
+
+    Raises
+    ------
+    FitError
+        If there are fewer than two, or two share a dataset.
+    ParameterError
+        If a parameter is not free in one of them, or they are on different wavelengths.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> years = [calibrate(chain, simulate(chain, charis.wavelength, frames, seed=i))
+    ...          for i in (5, 6)]
+    >>> found = significance(years, ["hwp.w_sio2", "hwp.w_mgf2"])
+    >>> found.dof, found.sigma < 4
+    (2, True)
+    """
+    named = _named(calibrations)
+    if len(named) < 2:
+        raise FitError(f"{len(named)} calibration: at least two are needed to compare")
+    _check_independent(named)
+    spaces = [full_covariance(calibration) for _, calibration in named]
+    names = _common(named, spaces, parameters)
+    axes = [space._axes() for space in spaces]
+    names, left_out = _with_errors(named, spaces, axes, names)
+    places = [[space.names.index(name) for name in names] for space in spaces]
+    # compared is only what every calibration knows: rows of `basis` are orthogonal to all that is
+    # open in any of them
+    basis = _determined([a.open[:, p] for a, p in zip(axes, places, strict=True)], len(names))
+    values = [
+        basis @ (_values(calibration, names) / a.steps[p])
+        for (_, calibration), a, p in zip(named, axes, places, strict=True)
+    ]
+    known = [
+        (a.known * a.sigmas[:, None])[:, p] @ basis.T for a, p in zip(axes, places, strict=True)
+    ]
+    chi2, rank = _chi_square(values, [k.T @ k for k in known])
+    dof = rank * (len(named) - 1)
+    p = float(np.exp(_log_p(chi2, dof))) if dof else 1.0
+    return Change(
+        [name for name, _ in named], names, chi2, dof, p, left_out, len(names) - len(basis)
+    )
+
+
+def _check_independent(named):
+    seen = {}
+    for i, (name, calibration) in enumerate(named):
+        for record in calibration.datasets:
+            other = seen.setdefault(record.content_hash, i)
+            if other != i:
+                raise FitError(
+                    f"{named[other][0]} and {name} were both made from {record.name}: their "
+                    "errors are not independent, so that a change cannot be judged"
+                )
+
+
+def _common(named, spaces, parameters):
+    """Return the elements to compare, in the order of the first calibration."""
+    grids = [calibration.wavelength.to_value("nm") for _, calibration in named]
+    same = all(g.shape == grids[0].shape and np.allclose(g, grids[0], rtol=1e-6) for g in grids)
+    names = [n for n in spaces[0].names if all(n in space.names for space in spaces)]
+    if parameters is not None:
+        for key in parameters:
+            for (name, _), space in zip(named, spaces, strict=True):
+                if not any(_belongs(n, [key]) for n in space.names):
+                    raise ParameterError(f"{name}: no free parameter {key!r}")
+        names = [n for n in names if _belongs(n, parameters)]
+    if not same and any("[" in n for n in names):
+        raise ParameterError(
+            f"{named[0][0]} and the others are on different wavelengths; compare parameters "
+            "common to all wavelengths"
+        )
+    return names
+
+
+def _belongs(element, parameters):
+    stem = element.partition("[")[0]
+    return stem in parameters or stem.partition(".")[0] in parameters
+
+
+def _with_errors(named, spaces, axes, names):
+    """Return the elements that have an error in all calibrations, and the others."""
+    stuck = {name for _, calibration in named for name in calibration.at_bound}
+    for space, own in zip(spaces, axes, strict=True):
+        stuck |= {space.names[i] for i in np.flatnonzero(np.abs(own.blind).any(axis=0))}
+    return [n for n in names if n not in stuck], [n for n in names if n in stuck]
+
+
+def _values(calibration, names):
+    elements = {}
+    for key, entry in calibration.parameter_values().items():
+        flat = np.ravel(entry["value"])
+        one = entry["value"].ndim == 0
+        elements |= {key: flat[0]} if one else {f"{key}[{i}]": v for i, v in enumerate(flat)}
+    # a parameter given per wavelength on a grid of one goes by its plain name
+    return np.array([elements.get(n, elements.get(f"{n}[0]")) for n in names], dtype=float)
+
+
+def _determined(opens, size):
+    """Return an orthonormal basis of the directions that none of the open ones moves."""
+    rows = np.concatenate(opens) if opens else np.zeros((0, size))
+    if not size or not len(rows):
+        return np.eye(size)
+    _, singular, vectors = np.linalg.svd(rows, full_matrices=True)
+    rank = int(np.sum(singular > 1e-5 * max(singular.max(initial=0.0), 1.0)))
+    return vectors[rank:]
+
+
+def _chi_square(values, covariances):
+    """Return chi-square of one common value, and the number of directions compared."""
+    total = sum(covariances)
+    variance, vectors = np.linalg.eigh(total) if total.size else (np.zeros(0), total)
+    kept = variance > _RANK * variance.max(initial=0.0)
+    vectors = vectors[:, kept]
+    if not kept.any():
+        return 0.0, 0
+    # each calibration's own covariance, in the directions that are kept
+    weights = [np.linalg.inv(vectors.T @ c @ vectors) for c in covariances]
+    points = [vectors.T @ v for v in values]
+    # the common value that fits all of them best; chi-square is what is left about it
+    mean = np.linalg.solve(sum(weights), sum(w @ x for w, x in zip(weights, points, strict=True)))
+    chi2 = sum((x - mean) @ w @ (x - mean) for w, x in zip(weights, points, strict=True))
+    return float(chi2), int(kept.sum())
+
+
+def changes(calibrations, parameters=None):
+    """
+    Return what changed from each calibration to the next, optic by optic.
+
+    Parameters
+    ----------
+    calibrations : Library or sequence
+        See `parameter_history`.
+    parameters : sequence of str, optional
+        Optics or parameters that are judged one by one; by default all optics with
+        free parameters in both.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        One row a pair and optic: ``before``, ``after``, ``what``, ``chi2``, ``dof``, ``p_value``,
+        ``sigma``, ``n_open``, ``left_out``.
+
+    Raises
+    ------
+    FitError, ParameterError
+        As `significance`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> years = [calibrate(chain, simulate(chain, charis.wavelength, frames, seed=i))
+    ...          for i in (5, 6)]
+    >>> changes(years)["what"].tolist()
+    ['calibration_polarizer', 'hwp', 'derotator', 'wollaston']
+    """
+    named = _named(calibrations)
+    rows = []
+    for first, second in pairwise(named):
+        pair = [_Named(*first), _Named(*second)]
+        for what in parameters or _optics(pair):
+            found = significance(pair, [what])
+            rows.append(
+                {
+                    "before": first[0],
+                    "after": second[0],
+                    "what": what,
+                    **{k: getattr(found, k) for k in ("chi2", "dof", "p_value", "sigma", "n_open")},
+                    "left_out": len(found.left_out),
+                }
+            )
+    if not rows:
+        raise FitError(f"{len(named)} calibration: at least two are needed to compare")
+    return Table(rows=rows)
+
+
+@dataclass
+class _Named:
+    """A calibration under the name that it has already."""
+
+    label: str
+    calibration: object
+
+    @property
+    def path(self):
+        from types import SimpleNamespace
+
+        return SimpleNamespace(name=self.label)
+
+
+def _optics(pair):
+    names = [set(item.calibration.covariance.names) for item in pair]
+    first = pair[0].calibration.covariance.names
+    common = [name for name in first if name in names[1]]
+    return list(dict.fromkeys(name.partition(".")[0] for name in common))
+
+
+# ---- refit what changed since a calibration, and hold the rest ----
+
+
+def restart(calibration, observations, free, *, chain=None, positions=None, **options):
+    """
+    Refit only what changed: everything else keeps the values of a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration or LoadedCalibration
+        The old one, which is not changed.
+    observations : Observations or sequence of Observations
+        The new data.
+    free : sequence of str
+        What may have changed, ``"optic.parameter"`` or ``"optic"`` (then what is free in the old
+        calibration, or all if nothing is). Optics that the old one lacks, such as a new star,
+        are free as the instrument has them.
+    chain : sequence of chains, optional
+        One a dataset, whose optics take the values of those of the same name; by default as the
+        instrument makes them, or the first of the calibration.
+    positions : sequence of dict, optional
+        As for ``calibrate``; by default as the instrument reads them.
+    **options
+        Passed to ``calibrate``; by default the old observable, and no search of
+        other mirror branches.
+
+    Returns
+    -------
+    Calibration
+        With the errors of what was refitted; those of what was held are not in it.
+        ``settings["restarted"]`` holds the hash of the old one and what was free.
+
+    Raises
+    ------
+    ParameterError
+        If nothing of a name in ``free`` exists, or the wavelengths differ.
+    FitError
+        As ``calibrate``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> old = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
+    >>> new = restart(old, simulate(chain, charis.wavelength, frames, seed=3), ["wollaston"])
+    >>> {name.partition(".")[0] for name in new.covariance.names}
+    {'wollaston'}
+    """
+    old = getattr(calibration, "calibration", calibration)
+    datasets = [observations] if isinstance(observations, Observations) else list(observations)
+    free = [free] if isinstance(free, str) else list(free)
+    instrument = instrument_of(old)
+    chains = _new_chains(old, datasets, instrument, chain)
+    _hold(old, chains, free)
+    if positions is None and instrument is not None:
+        positions = [instrument.positions(*pair) for pair in zip(datasets, chains, strict=True)]
+    # another mirror branch would look like a change of the instrument
+    start = {"observable": old.settings["observable"], "search": False}
+    options = start | {"wavelength": old.wavelength} | options
+    fixed = {"ties": _ties(old, chains), "instrument": old.instrument}
+    new = calibrate(chains, datasets, positions=positions, **(fixed | options))
+    new.settings["restarted"] = {"from": content_hash(old), "free": free}
+    return new
+
+
+def _new_chains(old, datasets, instrument, chain):
+    """Return a chain a dataset with copies of the old optics in the place of those it has."""
+    if chain is not None:
+        chains = list(chain) if isinstance(chain, (list, tuple)) else [chain]
+    elif instrument is not None:
+        chains = [_made(instrument, table, old.wavelength) for table in datasets]
+    else:
+        chains = [old.chains[0]] * len(datasets)
+    if len(chains) != len(datasets):
+        raise ParameterError(f"{len(chains)} chains for {len(datasets)} datasets")
+    # reversed, so that of optics in several chains the first dataset's is taken
+    known = {leaf.name: leaf for chain in reversed(old.chains) for leaf in leaves(chain)}
+    return [join(known.get(leaf.name, leaf).copy() for leaf in leaves(c)) for c in chains]
+
+
+def _made(instrument, table, wavelength):
+    instrument.check(table)
+    source, optics_in = instrument.setup(table)
+    own = instrument.particulars(table)
+    return instrument.chain(source, optics_in, wavelength=wavelength, **own)
+
+
+def _hold(old, chains, free):
+    """Fix all that the old calibration knows but what is to be free."""
+    known = {leaf.name for chain in old.chains for leaf in leaves(chain)}
+    found = {}
+    for leaf in (leaf for chain in chains for leaf in leaves(chain)):
+        for key in leaf.param_names:
+            parameter, names = getattr(leaf, key), (leaf.name.lower(), f"{leaf.name}.{key}".lower())
+            for text in (t for t in free if t.lower() in names):
+                # as it was before it is held below
+                found.setdefault(text, []).append((parameter, parameter.fixed))
+            if leaf.name in known:
+                parameter.fixed = True
+    for text in free:
+        if text not in found:
+            names = sorted({leaf.name for chain in chains for leaf in leaves(chain)})
+            raise ParameterError(f"free: no {text!r} in the chains; optics are {', '.join(names)}")
+        were_free = [parameter for parameter, fixed in found[text] if not fixed]
+        whole = "." in text or not were_free
+        for parameter, _ in found[text]:
+            parameter.fixed = not (whole or any(parameter is p for p in were_free))
+
+
+def _ties(old, chains):
+    """Return the ties of which the leading parameter is free."""
+    table = parameter_table(chains)
+    return {
+        name: tie
+        for name, tie in old.ties.items()
+        if name in table and tie.source in table and not table[tie.source][0].fixed
+    }

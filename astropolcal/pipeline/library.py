@@ -1,0 +1,668 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""Libraries of calibrations: which one holds for a frame.
+
+A library is a folder of calibration files, or some files. Each says for which
+instrument, mode, optics in the beam and dates it holds, and of those that hold
+the newest is taken. What is ambiguous is an error, never a choice.
+
+An index beside the files of a folder tells what each holds for, so that a look-up
+reads one file of many. It only proposes: what is chosen is read, and has to be what
+the index says.
+"""
+
+import errno
+import fnmatch
+import hashlib
+import json
+import os
+import re
+import stat
+import time
+from contextlib import contextmanager, suppress
+from functools import lru_cache
+from importlib.metadata import entry_points
+from itertools import islice
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+from astropy.table import Table
+
+from astropolcal import instruments
+from astropolcal.calibration.result.validity import (
+    Validity,
+    _moment,
+    beam_words,
+    optics_sets,
+    optics_words,
+    validity_of,
+    with_validity,
+)
+from astropolcal.converters.calibration import content_hash
+from astropolcal.converters.files import read_calibration, write_calibration
+from astropolcal.exceptions import CalibrationFileError, InstrumentError
+from astropolcal.files import atomic_path, check_kind, one_line
+from astropolcal.version import version as our_version
+
+__all__ = ["Entry", "Library"]
+
+_LOCK, _INDEX, _INDEX_VERSION = ".lock", ".astropolcal-index.json", 1
+# of the index for each file of the folder; 500 are usual
+_MOST_BYTES = 16_384
+# nanoseconds; a younger file may change once more within the same tick of its file system's clock
+_SETTLED = 2_000_000_000
+_LONGEST_NAME, _LONGEST_SLUG, _MOST_SHOWN = 255, 60, 4
+# what the index keeps of how good a calibration is
+_QUALITY = {"datasets": str, "s_res": float | None, "s_cv": float | None, "converged": bool}
+
+
+class Entry:
+    """
+    A file of a library.
+
+    Parameters
+    ----------
+    path : `~pathlib.Path`
+        The file.
+    calibration : Calibration or None
+        What it holds; None to read it when it is asked for.
+    validity : Validity
+        For what it holds.
+    content_hash : str
+        See `content_hash`.
+
+    Examples
+    --------
+    >>> from astropolcal.calibration.result.validity import Validity
+    >>> Entry("cal.asdf", None, Validity("lab"), "00").validity.instrument
+    'lab'
+    """
+
+    def __init__(self, path, calibration, validity, content_hash):
+        self.path, self.validity, self.content_hash = path, validity, content_hash
+        self._calibration, self._quality = calibration, None
+
+    def __repr__(self):
+        return f"<Entry {self.name}: {self.validity}>"
+
+    @property
+    def name(self):
+        """Name of the file."""
+        return Path(self.path).name
+
+    @property
+    def calibration(self):
+        """What the file holds; an error if that is not what the entry says."""
+        if self._calibration is None:
+            self._calibration = self._read()
+        return self._calibration
+
+    def _read(self):
+        path = Path(self.path)
+        try:
+            calibration, record = _read(path, _state(path))
+        except OSError as error:
+            raise CalibrationFileError(f"{path}: {error.strerror}") from error
+        told = {"validity": self.validity.to_dict(), "content_hash": self.content_hash}
+        if told != {key: record[key] for key in told}:
+            raise CalibrationFileError(
+                f"{path}: holds something else than when the library was read; read the library "
+                f"again, and delete {_INDEX} in it if that does not help"
+            )
+        return calibration
+
+
+class Library:
+    """
+    Calibration files, looked up by what they hold for.
+
+    Parameters
+    ----------
+    source : path-like or sequence of path-like
+        A folder, whose ``*.asdf`` count, or files.
+
+    Attributes
+    ----------
+    entries : list of Entry
+        The readable files, by instrument and start of validity.
+    problems : dict of `~pathlib.Path` to str
+        The others, and why.
+
+    Notes
+    -----
+    What the files of a folder hold for is kept in ``.astropolcal-index.json`` beside them, and only
+    files that have changed are read again. A folder that cannot be written to does without.
+
+    Raises
+    ------
+    CalibrationFileError
+        If there is no such folder or file.
+
+    Examples
+    --------
+    >>> import tempfile
+
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     len(Library(folder))
+    0
+    """
+
+    def __init__(self, source):
+        one = isinstance(source, (str, Path)) or hasattr(source, "__fspath__")
+        self.source = Path(source) if one else None
+        self._files = [self.source] if one else [Path(path) for path in source]
+        for path in self._files:
+            # os.path answers where pathlib raises: the name may be one that no system takes
+            if not os.path.exists(path):
+                raise CalibrationFileError(f"{one_line(path)}: no such file or folder")
+            check_kind(path, CalibrationFileError)
+        self._scan()
+
+    @property
+    def _folder(self):
+        return self.source if self.source is not None and self.source.is_dir() else None
+
+    def _scan(self, believe=True):
+        """Look through the files; those that the index knows are not read."""
+        folder = self._folder
+        files = [(p, p.resolve()) for p in self._files] if folder is None else _files_of(folder)
+        index = _read_index(folder, len(files)) if folder is not None and believe else {}
+        self.entries, self.problems, known = [], {}, {}
+        for path, target in files:
+            try:
+                entry, record = _looked_at(target, index.get(path.name))
+            except (OSError, CalibrationFileError) as error:
+                reason = " ".join(str(error).split())
+                self.problems[path] = reason.removeprefix(f"{target}: ")
+                continue
+            self.entries.append(entry)
+            if record is not None:
+                known[path.name] = record
+        self.entries.sort(key=_order)
+        if folder is not None and known != index:
+            _write_index(folder, known)
+
+    def _confirmed(self, choose):
+        """Return the entry that is chosen when its file is what the entry says, or None."""
+        # the file may have changed since, and after that the index may be wrong
+        for believe in (True, False, None):
+            entry = choose()
+            try:
+                if entry is not None:
+                    entry.calibration  # noqa: B018
+                return entry
+            except CalibrationFileError:
+                if believe is None:
+                    raise
+                self._scan(believe)
+
+    def __len__(self):
+        return len(self.entries)
+
+    def __repr__(self):
+        bad = f", {len(self.problems)} unreadable" if self.problems else ""
+        return f"<Library {self._label!r}: {len(self)} calibrations{bad}>"
+
+    @property
+    def _label(self):
+        return "of files" if self.source is None else str(self.source)
+
+    def find(self, instrument=None, *, mode=None, date=None, optics_in=None, beam=None):
+        """
+        Return the newest calibration that holds.
+
+        Parameters
+        ----------
+        instrument : str, optional
+            Name or alias.
+        mode : str, optional
+            Mode; case does not matter.
+        date : str, `~astropy.time.Time` or date, optional
+            When, UTC.
+        optics_in : sequence of str, optional
+            All optional optics in the beam.
+        beam : dict of str to bool, optional
+            Single optics that are known to be in the beam or not, such as ``{"nbs": True}``.
+
+        Returns
+        -------
+        Entry
+
+        Raises
+        ------
+        CalibrationFileError
+            If a file is unreadable, no calibration holds, or several do and the
+            choice between them is open: their ranges overlap, or what is left out
+            here would decide. The message names the files.
+        """
+        wanted = {"mode": mode, "optics_in": optics_in, "beam": beam or None, "date": date}
+        return self._confirmed(lambda: self._choice(instrument, wanted))
+
+    def _choice(self, instrument, wanted):
+        if self.problems:
+            path, reason = next(iter(self.problems.items()))
+            raise CalibrationFileError(
+                f"{path}: {reason}; as it might be the one that is needed, remove or repair it"
+            )
+        found, date = _of_instrument(self.entries, instrument), wanted["date"]
+        # once, as it takes longer than to compare
+        moment = _moment(date, "date")
+        words = f"no calibration of {instrument}" if instrument else "no calibration"
+        for key, value in wanted.items():
+            if value is None or not found:
+                continue
+            fitting = moment if key == "date" else value
+            kept = [e for e in found if _fits(e.validity, key, fitting)]
+            if not kept:
+                # of several reasons the date says most: there is a
+                # calibration, but not of that time
+                if date is not None and not any(e.validity.holds(moment) for e in found):
+                    key, value = "date", date
+                raise CalibrationFileError(self._lacking(words, key, value, found))
+            before, found = found, kept
+        if not found:
+            raise CalibrationFileError(f"{self._label}: {words}{self._known(self.entries)}")
+        newest = self._newest(found, wanted | {"instrument": instrument})
+        if date is not None:
+            _check_replaced(newest, before, moment)
+        return newest
+
+    def _lacking(self, words, key, value, found):
+        if key == "beam":
+            told = f"a beam {beam_words(value)}"
+        else:
+            told = f"{key} {'+'.join(value) or 'none' if key == 'optics_in' else value}"
+        return f"{self._label}: {words} for {told}{self._known(found)}"
+
+    def _known(self, entries):
+        if not entries:
+            return "; it holds none"
+        shown = "; ".join(f"{entry.name} ({entry.validity})" for entry in entries[-_MOST_SHOWN:])
+        return f"; there {'is' if len(entries) == 1 else 'are'} {shown}"
+
+    def _newest(self, found, wanted):
+        # a copy of a file is no second opinion
+        found = sorted({e.content_hash: e for e in reversed(found)}.values(), key=_start)
+        for key in ("instrument", "mode", "optics_in"):
+            kinds = {getattr(e.validity, key): e for e in reversed(found)}
+            if len(kinds) > 1 and wanted[key] is None:
+                # one of each kind is enough to choose by
+                names = _shown(
+                    [f"{e.name} ({e.validity})" for e in sorted(kinds.values(), key=_order)]
+                )
+                raise CalibrationFileError(
+                    f"{self._label}: {names}: say which {key} is meant", argument=key
+                )
+        if len(found) > 1 and wanted["date"] is None:
+            names = _shown([e.name for e in found])
+            raise CalibrationFileError(f"{self._label}: {names}: a date is needed to choose")
+        *others, newest = found
+        for other in others:
+            if _meet(other, newest):
+                raise CalibrationFileError(_overlap(other, newest))
+        return newest
+
+    def add(self, calibration, name=None, **stated):
+        """
+        Write a calibration into the folder, under a name of its own.
+
+        Parameters
+        ----------
+        calibration : Calibration
+            The calibration.
+        name : str, optional
+            Name of the file, with suffix ``.asdf``; by default it is made of instrument, mode,
+            start and hash.
+        **stated
+            As for `with_validity`.
+
+        Returns
+        -------
+        `~pathlib.Path`
+            The file. A calibration that is there already is not written again.
+
+        Raises
+        ------
+        CalibrationFileError
+            If the library is no folder, the name is not that of a file in it, a file of the name
+            exists, or the range overlaps with that of a calibration in it.
+        """
+        if self._folder is None:
+            raise CalibrationFileError(f"{self._label}: only a folder can be added to")
+        calibration = with_validity(calibration, **stated)
+        held, digest = validity_of(calibration), content_hash(calibration)
+        path = self.source / (_name(held, digest) if name is None else _checked_name(name))
+        new = Entry(path, calibration, held, digest)
+        with _locked(self.source):
+            self._scan()
+            same = self._confirmed(lambda: self._of_hash(digest))
+            if same is not None:
+                return self.source / same.name
+            for entry in self.entries:
+                _check_pair(entry, new)
+            # within the lock, or two writers at once could both find nothing that overlaps
+            write_calibration(calibration, path)
+            self._scan()
+        return path
+
+    def _of_hash(self, digest):
+        return next((entry for entry in self.entries if entry.content_hash == digest), None)
+
+    def overlaps(self):
+        """Return a sentence for each pair of different files that claim the same moment."""
+        found, entries = [], sorted(self.entries, key=_order)
+        for i, first in enumerate(entries):
+            name = first.validity.instrument
+            for second in islice(entries, i + 1, None):
+                # in the order of instruments and starts: none that follows meets it either
+                if second.validity.instrument != name or not _meet(first, second):
+                    break
+                if _differ(first, second):
+                    found.append(_overlap(first, second))
+        return found
+
+    def table(self):
+        """
+        Return one row a readable file: what it holds for, and how good it is.
+
+        Returns
+        -------
+        `~astropy.table.Table`
+            ``name``, ``instrument``, ``mode``, ``valid_from``, ``valid_until``, ``optics_in``,
+            ``datasets``, ``s_res`` and ``s_cv`` (median over wavelengths of the worst dataset,
+            percent), ``converged``, ``content_hash``.
+        """
+        rows = []
+        for entry in self.entries:
+            held, good = entry.validity, entry._quality or _quality(entry.calibration)
+            rows.append(
+                {
+                    "name": entry.name,
+                    "instrument": held.instrument or "",
+                    "mode": held.mode or "",
+                    "valid_from": held.valid_from or "",
+                    "valid_until": held.valid_until or "",
+                    "optics_in": optics_words(held.optics_in).removeprefix("with "),
+                    "datasets": good["datasets"],
+                    "s_res": np.nan if good["s_res"] is None else good["s_res"],
+                    "s_cv": np.nan if good["s_cv"] is None else good["s_cv"],
+                    "converged": good["converged"],
+                    "content_hash": entry.content_hash,
+                }
+            )
+        return Table(rows=rows)
+
+
+def _order(entry):
+    return (entry.validity.instrument or "", *_start(entry))
+
+
+def _start(entry):
+    return (entry.validity.valid_from or "", str(entry.path))
+
+
+def _of_instrument(entries, instrument):
+    if instrument is None:
+        return entries
+    names = {entry.validity.instrument for entry in entries} - {None}
+    try:
+        same = {name for name in names if instruments.get(instrument).answers_to(name)}
+    except InstrumentError:
+        same = {name for name in names if name.lower() == str(instrument).lower()}
+    return [entry for entry in entries if entry.validity.instrument in same]
+
+
+def _fits(validity, key, value):
+    if key == "date":
+        return validity.holds(value)
+    if key == "mode":
+        return validity.mode is None or _folded(validity.mode) == _folded(value)
+    if key == "beam":
+        sets = validity.optics_in
+        return sets is None or any(_in_beam(names, value) for names in sets)
+    return validity.optics_in is not None and optics_sets(value)[0] in validity.optics_in
+
+
+def _in_beam(names, beam):
+    return all((name in names) == is_in for name, is_in in beam.items())
+
+
+def _folded(text):
+    return " ".join(str(text).split()).casefold()
+
+
+def _alike(one, other):
+    """Return whether two calibrations may hold for the same frame but for its date."""
+    modes = None in (one.mode, other.mode) or _folded(one.mode) == _folded(other.mode)
+    sets = None in (one.optics_in, other.optics_in) or set(one.optics_in) & set(other.optics_in)
+    return one.instrument == other.instrument and modes and bool(sets)
+
+
+def _differ(one, other):
+    """Return whether two are different ones, of which some frame could choose either."""
+    # a copy under another name chooses the same
+    return one.content_hash != other.content_hash and _alike(one.validity, other.validity)
+
+
+def _check_pair(one, other):
+    """Refuse two different files of which some frame could choose neither."""
+    first, second = sorted([one, other], key=_order)
+    if _differ(first, second) and _meet(first, second):
+        raise CalibrationFileError(_overlap(first, second))
+
+
+def _meet(first, second):
+    """Return whether two claim a moment both; one without an end makes way for a newer one."""
+    older, newer = first.validity, second.validity
+    if older.valid_until is None:
+        return older.valid_from == newer.valid_from
+    # ISO texts in UTC compare as the moments do
+    return older.valid_until > (newer.valid_from or "")
+
+
+def _overlap(older, newer):
+    return (
+        f"{older.name} ({older.validity}) and {newer.name} ({newer.validity}) overlap: state "
+        "until when the first holds, or remove one of them"
+    )
+
+
+def _check_replaced(entry, others, moment):
+    """Refuse one without an end that another had replaced which has ended since."""
+    held = entry.validity
+    if held.valid_until is not None:
+        return
+    for other in others:
+        if (held.valid_from or "") < (other.validity.valid_from or "") <= moment:
+            raise CalibrationFileError(
+                f"no calibration for {moment}: {other.name} ({other.validity}) had replaced "
+                f"{entry.name} ({held}) and has ended; state until when that one holds"
+            )
+
+
+def _shown(words):
+    """Return the first few in a line."""
+    more = f" and {len(words) - _MOST_SHOWN} more" if len(words) > _MOST_SHOWN else ""
+    return ", ".join(words[:_MOST_SHOWN]) + more
+
+
+def _name(held, digest):
+    parts = [held.instrument, held.mode, (held.valid_from or "")[:10], digest[:8]]
+    slugs = [re.sub(r"[^A-Za-z0-9.-]+", "-", part)[:_LONGEST_SLUG] for part in parts if part]
+    return "_".join(slug.strip("-.") for slug in slugs) + ".asdf"
+
+
+def _checked_name(name):
+    """Return the name of a file to add, refused where it leads out of the folder or is hidden."""
+    good = (
+        isinstance(name, str)
+        # of another system too: a library may be copied there
+        and PureWindowsPath(name).name == name
+        and name.isprintable()
+        and len(os.fsencode(name)) <= _LONGEST_NAME
+        and name.endswith(".asdf")
+        and not name.startswith(".")
+    )
+    if not good:
+        raise CalibrationFileError(
+            f"name = {one_line(repr(name))} cannot be added: allowed are names of files without "
+            f"folder or leading dot, of at most {_LONGEST_NAME} bytes, with suffix .asdf",
+            argument="name",
+        )
+    return name
+
+
+# ---- the index ---------------------------------------------------------------------------
+
+
+def _files_of(folder):
+    """Return the calibration files of a folder, each with where it really is."""
+    try:
+        with os.scandir(folder) as found:
+            links = {file.name: file.is_symlink() for file in found if file.name[0] != "."}
+    except OSError as error:
+        raise CalibrationFileError(f"{folder}: cannot be read: {error.strerror}") from error
+    root = folder.resolve()
+    # to resolve each of them would take longer than all the rest
+    return [
+        (folder / name, (root / name).resolve() if links[name] else root / name)
+        for name in sorted(fnmatch.filter(links, "*.asdf"))
+    ]
+
+
+def _state(path):
+    """Return by what a change of a file is noticed, and whether any change from now on is."""
+    told = os.stat(path)
+    settled = time.time_ns() - max(told.st_mtime_ns, told.st_ctime_ns) > _SETTLED
+    # size and time of change stay where a copy with old times is put in its place
+    return (told.st_size, told.st_mtime_ns, told.st_ctime_ns, told.st_ino, settled)
+
+
+@lru_cache(maxsize=256)
+def _read(path, state):
+    """Return a calibration, and what the index keeps of a file in this state."""
+    calibration = read_calibration(path)
+    return calibration, {
+        "state": list(state),
+        "validity": validity_of(calibration).to_dict(),
+        "content_hash": content_hash(calibration),
+        "quality": _quality(calibration),
+    }
+
+
+def _quality(calibration):
+    return {
+        "datasets": ", ".join(record.name for record in calibration.datasets),
+        "s_res": _worst_median(calibration, "s_res"),
+        "s_cv": _worst_median(calibration, "s_cv"),
+        "converged": bool(calibration.converged),
+    }
+
+
+def _worst_median(calibration, key):
+    tables = [r.accuracy for r in calibration.datasets if r.accuracy is not None]
+    known = [t[key].value[np.isfinite(t[key].value)] for t in tables if key in t.colnames]
+    # None of a column that no dataset fills: there is no accuracy, not a perfect one
+    return max((float(np.median(values)) for values in known if values.size), default=None)
+
+
+def _looked_at(path, told):
+    """Return the entry of a file, read unless the index tells it, and what the index keeps."""
+    state = _state(path)
+    entry = _entry(path, told, state)
+    if entry is not None:
+        return entry, told
+    record = _read(path, state)[1]
+    keeps = state[-1] and len(json.dumps(record)) <= _MOST_BYTES
+    return _entry(path, record, state), record if keeps else None
+
+
+def _entry(path, record, state):
+    """Return the entry that a record tells of; None if it is of another state, or nonsense."""
+    try:
+        quality, held = record["quality"], Validity(**record["validity"])
+        sound = [isinstance(quality[key], kind) for key, kind in _QUALITY.items()]
+        sound += [isinstance(held.instrument, str | None), isinstance(record["content_hash"], str)]
+        if record["state"] != list(state) or not all(sound):
+            return None
+    except (LookupError, TypeError, CalibrationFileError):
+        return None
+    entry = Entry(path, None, held, record["content_hash"])
+    entry._quality = quality
+    return entry
+
+
+def _read_index(folder, n_files):
+    """Return what the index tells of each file; nothing if it is damaged or of other software."""
+    most = _MOST_BYTES * (n_files + 1)
+    try:
+        with os.fdopen(_open_plain(folder / _INDEX, os.O_RDONLY), "rb") as stream:
+            content = stream.read(most + 1)
+        index = json.loads(content) if len(content) <= most else {}
+        files = index["files"]
+        return files if isinstance(files, dict) and index == _index(files) else {}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return {}
+
+
+def _write_index(folder, files):
+    """Write the index where that is possible; without one, all files are read each time."""
+    path = folder / _INDEX
+    with suppress(OSError, CalibrationFileError):
+        # what somebody put there is left alone
+        if not os.path.lexists(path) or stat.S_ISREG(os.lstat(path).st_mode):
+            with atomic_path(path, error=CalibrationFileError) as temporary:
+                temporary.write_text(json.dumps(_index(files)), encoding="ascii")
+
+
+def _index(files):
+    content = json.dumps(files, sort_keys=True).encode("ascii")
+    return {
+        "version": _INDEX_VERSION,
+        "software": _software(),
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "files": files,
+    }
+
+
+def _software():
+    """Return what decides, besides the files, for what they hold."""
+    known = {*instruments._REGISTRY, *(name for name, *_ in _plugins())}
+    return [our_version, sorted(known), [list(plugin) for plugin in _plugins()]]
+
+
+@lru_cache(maxsize=1)
+def _plugins():
+    points = entry_points(group="astropolcal.instruments")
+    return sorted((p.name, p.value, p.dist.version if p.dist else "") for p in points)
+
+
+def _open_plain(path, flags):
+    """Open a regular file, never what a link leads to, and wait for nothing."""
+    for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"):
+        flags |= getattr(os, name, 0)
+    number = os.open(path, flags, 0o666)
+    if not stat.S_ISREG(os.fstat(number).st_mode):
+        os.close(number)
+        raise OSError(errno.EINVAL, "it is not a regular file")
+    return number
+
+
+@contextmanager
+def _locked(folder):
+    """Let one writer at a time look for overlaps; without locks names alone keep files apart."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    path = folder / _LOCK
+    try:
+        with os.fdopen(_open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND), "ab") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX)
+            yield
+    except OSError as error:
+        if os.path.lexists(path) and not stat.S_ISREG(os.lstat(path).st_mode):
+            raise CalibrationFileError(
+                f"{path}: is a link or not a regular file; remove it to add to the library"
+            ) from error
+        raise CalibrationFileError(f"{folder}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,432 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""What a pipeline loads: the system Mueller matrix of a frame, from its header.
+
+Loading needs numpy, astropy and asdf, nothing that fits, measures or draws.
+"""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal import instruments
+from astropolcal.calibration.result.calibration import Calibration
+from astropolcal.calibration.result.validity import instrument_of, validity_of
+from astropolcal.calibration.system import at_bins, errors, match_wavelengths
+from astropolcal.calibration.uncertainty.covariance import full_covariance
+from astropolcal.chain import (
+    join,
+    leaves,
+    system_mueller,
+    system_mueller_derivatives,
+    with_beam,
+)
+from astropolcal.converters.calibration import content_hash
+from astropolcal.exceptions import (
+    AstropolcalWarning,
+    CalibrationFileError,
+    ChainError,
+    InstrumentError,
+    ParameterError,
+)
+from astropolcal.pipeline.headers import (
+    FrameAngles,
+    check_frames,
+    describe,
+    inner_optics,
+    telescope_optics,
+    told_beam,
+)
+from astropolcal.pipeline.library import Entry, Library
+
+__all__ = ["LoadedCalibration", "SystemMueller", "load"]
+
+
+@dataclass
+class SystemMueller:
+    """
+    System Mueller matrices of frames and wavelengths, with what is known of their errors.
+
+    Parameters
+    ----------
+    value : `~numpy.ndarray`
+        Shape (n_frames, n_wavelengths, 4, 4); no first axis for a single frame. The first row
+        gives the flux of the beam for incident I, Q, U and V.
+    wavelength : `~astropy.units.Quantity`
+        Shape (n_wavelengths,).
+    beam : str
+        ``"right"`` or ``"left"``.
+    positions : dict of str to `~astropy.units.Quantity`
+        Of every stage, in degree.
+    factor : `~numpy.ndarray`
+        Changes of ``value`` for one standard error along each direction that the data of the
+        calibration determine, shape (..., 4, 4, rank). The covariance of any two elements,
+        also of different frames, wavelengths or beams, is the sum of the products of theirs.
+    is_open, is_blind : `~numpy.ndarray`
+        Elements that move along an open direction, or depend on parameters at a bound alone.
+    assumed : tuple of str
+        Optics that are not calibrated: they have published values and add nothing to the errors.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+
+    >>> one = SystemMueller(np.eye(4)[None], [1.6] * u.um, "right", {}, np.full((1, 4, 4, 1), 0.1))
+    >>> one.covariance.shape, float(one.std[0, 0, 0])
+    ((1, 16, 16), 0.1)
+    """
+
+    value: np.ndarray
+    wavelength: u.Quantity
+    beam: str
+    positions: dict
+    factor: np.ndarray
+    is_open: np.ndarray | None = None
+    is_blind: np.ndarray | None = None
+    assumed: tuple = ()
+
+    @property
+    def covariance(self):
+        """
+        Covariance of the 16 elements of each matrix, row by row, shape (..., 16, 16).
+
+        Infinite for what the data leave open and NaN for what they tell nothing of, as
+        `~astropolcal.calibration.Covariance.propagate` has it.
+        """
+        matrix = self.covariance_in_gauge
+        is_open, is_blind = (self._flat(flags) for flags in (self.is_open, self.is_blind))
+        unknown = is_open | is_blind
+        # no covariance with what has no error, whichever of the two it is
+        matrix[unknown[..., :, None] | unknown[..., None, :]] = np.nan
+        matrix[is_open[..., :, None] & np.eye(16, dtype=bool)] = np.inf
+        return matrix
+
+    @property
+    def covariance_in_gauge(self):
+        """
+        The covariance with open directions held where the calibration has put them.
+
+        Finite everywhere. It is too small for what moves along them, such as the angle of
+        polarization where the data know misalignments up to a common turn; a prior on one
+        of the angles in the calibration gives an error that is right.
+        """
+        # rows: the elements of a matrix; columns: the determined directions of the parameters
+        moved = self.factor.reshape(*self.value.shape[:-2], 16, -1)
+        return moved @ np.swapaxes(moved, -1, -2)
+
+    @property
+    def std(self):
+        """Standard error of each element, of the shape of ``value``."""
+        std = np.sqrt(np.sum(self.factor**2, axis=-1))
+        is_open, is_blind = (
+            self._flat(flags).reshape(std.shape) for flags in (self.is_open, self.is_blind)
+        )
+        return np.where(is_open, np.inf, np.where(is_blind, np.nan, std))
+
+    def _flat(self, flags):
+        shape = (*self.value.shape[:-2], 16)
+        return np.zeros(shape, dtype=bool) if flags is None else flags.reshape(shape)
+
+
+# what a caller can do about a header that does not say enough
+_WAYS = {"date": "load(..., date=) states it", "mode": "load(..., mode={})"}
+
+
+def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=None, max_age=None):
+    """
+    Load the calibration that holds for a frame.
+
+    Parameters
+    ----------
+    path : path-like, Library or Calibration
+        A folder of calibrations, a file, or a calibration that is in memory.
+    header : `~astropy.io.fits.Header` or mapping, optional
+        Primary header of the frame (or of one of several), which tells instrument, mode,
+        date and, as far as the instrument knows, optics in the beam; what is given below comes
+        before it.
+    instrument, mode, date, optics_in
+        As for `~astropolcal.pipeline.Library.find`.
+    max_age : `~astropy.units.Quantity`, optional
+        Time between the data of the calibration and a frame from which on there is a warning; by
+        default that of the instrument (`~astropolcal.instruments.Instrument`), a year for most.
+        A calibration whose end of validity was stated is never too old.
+
+    Returns
+    -------
+    LoadedCalibration
+
+    Raises
+    ------
+    CalibrationFileError
+        If no calibration holds, several do, a file is damaged, the header lacks a date or a mode
+        that the calibration needs and none is stated here, or the instrument has changed between
+        the data of the calibration and the frame.
+    ParameterError
+        If the header is none, or ``max_age`` no time.
+
+    Warns
+    -----
+    AstropolcalWarning
+        If the calibration is older than ``max_age``.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear", optics_in=["nbs"])
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> table = simulate(chain, charis.wavelength, frames, seed=2, meta={"date": "2025-10-05"})
+    >>> calibrate(chain, table, instrument="charis").write("to_load.asdf")
+    >>> header = {"MJD": 60960.5, "RET-ANG1": 22.5, "D_IMRANG": 60.0, "INSTRUME": "CHARIS"}
+
+    The three lines of a pipeline, here for a frame of the internal source:
+
+    >>> calibration = load("to_load.asdf", header)
+    >>> mueller = calibration.system_mueller(header, light="internal")
+    >>> mueller.value.shape, mueller.covariance.shape
+    ((22, 4, 4), (22, 16, 16))
+    """
+    library = _library(path)
+    if header is not None and not hasattr(header, "get"):
+        raise ParameterError(
+            f"header = {header!r} is of type {type(header).__name__}; a FITS header or a mapping "
+            "is needed, such as astropy.io.fits.getheader(file)"
+        )
+    told = {} if header is None else describe(header, instrument)
+    chosen = {"instrument": instrument, "mode": mode, "date": date}
+    wanted = {key: told.get(key) if value is None else value for key, value in chosen.items()}
+    beam = None
+    if header is not None and optics_in is None:
+        beam = instruments.get(wanted["instrument"]).optics_of(header)
+    entry = library.find(**wanted, optics_in=optics_in, beam=beam)
+    stated = {key: value for key, value in chosen.items() if value is not None}
+    loaded = LoadedCalibration(entry, optics_in=optics_in, stated=stated, max_age=max_age)
+    if header is not None:
+        # whether the light comes from the sky, whose mirrors may have changed, is known later
+        loaded._check([("the frame", wanted["date"], wanted["mode"])], light="internal")
+    elif date is not None:
+        loaded._check(loaded._stated_frame(), light="internal")
+    return loaded
+
+
+def _library(source):
+    if isinstance(source, Library):
+        return source
+    if not isinstance(source, Calibration):
+        return Library(source)
+    library = Library([])
+    held, digest = validity_of(source), content_hash(source)
+    library.entries.append(Entry(Path("calibration in memory"), source, held, digest))
+    return library
+
+
+class LoadedCalibration:
+    """
+    A calibration that gives the system Mueller matrix of frames; `load` makes it.
+
+    Parameters
+    ----------
+    entry : Entry
+        File and validity.
+    optics_in : sequence of str, optional
+        Optional optics in the beam; needed if the calibration has several sets of them, and
+        the headers do not tell which.
+    stated : dict of str to str
+        What the user states of ``instrument``, ``mode`` and ``date``, whatever headers say.
+    max_age : `~astropy.units.Quantity`, optional
+        As for `load`.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        All that the file holds.
+    path : `~pathlib.Path`
+    validity : Validity
+    content_hash : str
+        Of the file's content, for the provenance of products.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import calibrate, instruments
+
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> chain = charis.chain(derotator="linear")
+    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
+    >>> calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2)).write("lab.asdf")
+    >>> load("lab.asdf")
+    <LoadedCalibration lab.asdf: an instrument, any mode, from any date on, optics in the beam not known>
+    """  # noqa: E501
+
+    def __init__(self, entry, optics_in=None, stated=None, max_age=None):
+        self.calibration = entry.calibration
+        self.path, self.validity = entry.path, entry.validity
+        self.content_hash = entry.content_hash
+        self.optics_in = optics_in
+        self._stated, self._max_age = dict(stated or {}), max_age
+        self._covariance = full_covariance(self.calibration)._axes()
+
+    def __repr__(self):
+        return f"<LoadedCalibration {self.path.name}: {self.validity}>"
+
+    @property
+    def instrument(self):
+        """The `~astropolcal.instruments.Instrument`, or None if it is not a known one."""
+        return instrument_of(self.calibration)
+
+    @property
+    def wavelength(self):
+        """Wavelengths of the calibration, a `~astropy.units.Quantity`."""
+        return self.calibration.wavelength
+
+    def system_mueller(
+        self, header=None, *, positions=None, wavelength=None, beam="right", light="sky"
+    ):
+        """
+        Return the system Mueller matrix of frames, with its covariance.
+
+        The covariance is that of the calibrated parameters to first order.
+
+        Parameters
+        ----------
+        header : `~astropy.io.fits.Header`, mapping, or sequence of those
+            Primary header of a frame, or those of several.
+        positions : dict of str to `~astropy.units.Quantity`
+            In its place the positions of all stages (on sky with the true angle of the
+            half-wave plate), scalar or shape (n_frames,).
+        wavelength : `~astropy.units.Quantity`, optional
+            By default the calibration's grid. Others than those of the grid are possible where
+            no parameter is given per wavelength, and within the range of the grid.
+        beam : {"right", "left"}
+            The beam.
+        light : {"sky", "internal"}
+            Where the light enters: above the telescope, in the frame of the sky; or in front of
+            the half-wave plate, as from the internal source.
+
+        Returns
+        -------
+        SystemMueller
+
+        Raises
+        ------
+        CalibrationFileError
+            If the calibration does not hold for the header, the header lacks a date or a mode that
+            was not stated to `load` either, or the instrument has changed in between. Positions
+            are taken for what they are, unless a date was stated.
+        ObservationError
+            If the header lacks an angle.
+        ChainError, ParameterError
+            If a position is missing, the optics in the beam are ambiguous or lacking.
+        WavelengthRangeError
+            If the wavelengths do not match.
+
+        Warns
+        -----
+        AstropolcalWarning
+            If an optic is not calibrated and has published values, or the calibration is old.
+        """
+        if (header is None) == (positions is None):
+            raise ParameterError("give either header or positions")
+        # a Header of astropy is no Mapping
+        single = isinstance(header, Mapping) or hasattr(header, "cards")
+        headers = [header] if single else list(() if header is None else header)
+        if header is not None:
+            self._check(self._frames(headers), light)
+        elif "date" in self._stated:
+            self._check(self._stated_frame(), light)
+        chain, assumed = self._chain(light, headers)
+        if header is not None:
+            found = self.instrument.positions(FrameAngles(headers, self.instrument), chain)
+            # the same reader as for tables of observations, so that tracking laws and offsets agree
+            positions = {name: angle * u.rad for name, angle in found.items()}
+        lam, bins = match_wavelengths(self.wavelength, chain, wavelength)
+        chain = with_beam(at_bins(chain, bins, len(self.wavelength)), beam)
+        value = system_mueller(chain, lam, positions)
+        slopes = system_mueller_derivatives(chain, lam, positions)
+        parts = errors(self.calibration, self._covariance, value, slopes, bins)
+        shown = {name: _degrees(position) for name, position in positions.items()}
+        if single:
+            value, *parts = (part[0] for part in (value, *parts))
+            shown = {name: angle[0] for name, angle in shown.items()}
+        return SystemMueller(value, lam, beam, shown, *parts, assumed)
+
+    def _check(self, frames, light):
+        """Refuse frames for which the calibration does not hold."""
+        options = {"max_age": self._max_age, "light": light, "ways": _WAYS}
+        check_frames(self.calibration, frames, self.path.name, **options)
+
+    def _stated_frame(self):
+        """Return a frame without a header, of the date that was stated."""
+        mode = self._stated.get("mode", self.validity.mode)
+        return [("the frame", self._stated["date"], mode)]
+
+    def _frames(self, headers):
+        """Return what to call each frame, its date and its mode; refuse other instruments."""
+        instrument = self.instrument
+        if instrument is None:
+            raise InstrumentError(
+                f"{self.path.name}: instrument {self.calibration.instrument!r} has no map of "
+                "header keywords; give positions"
+            )
+        frames = []
+        for i, header in enumerate(headers):
+            told = describe(header, instrument.name, self._stated)
+            if told.get("stated") is not None and not instrument.answers_to(told["stated"]):
+                raise CalibrationFileError(
+                    f"frame {i} is of {told['stated']}, but {self.path.name} holds for "
+                    f"{self.validity}"
+                )
+            date, mode = (self._stated.get(key, told.get(key)) for key in ("date", "mode"))
+            frames.append((f"frame {i}", date, mode))
+        return frames
+
+    # ---- the chain ---------------------------------------------------------------------
+
+    def _chain(self, light, headers):
+        """Return the chain from where the light enters, and the optics that are assumed."""
+        if light not in ("sky", "internal"):
+            raise ParameterError(f"light = {light!r}; allowed are 'sky', 'internal'")
+        beam = None
+        if self.optics_in is None and self.instrument is not None:
+            beam = told_beam(headers, self.instrument)
+        inner = inner_optics(self.calibration, self.optics_in, beam, self.path.name)
+        if light == "internal":
+            return join(inner), ()
+        outer = telescope_optics(self.calibration)
+        return self._published(inner) if outer is None else (join([*outer, *inner]), ())
+
+    def _published(self, inner):
+        """Return a chain with the telescope as the instrument publishes it."""
+        try:
+            chain = self.instrument.on_sky(join(inner)) if self.instrument else None
+        except InstrumentError:
+            chain = None
+        if chain is None:
+            raise ChainError(
+                f"{self.path.name} calibrates no telescope, and no published one is known; "
+                "light='internal' leaves it out"
+            )
+        known = {leaf.name for leaf in inner}
+        # axes of the telescope are optics, too, but there is nothing to calibrate in them
+        assumed = tuple(o.name for o in leaves(chain) if o.name not in known and not o.stage)
+        if assumed:
+            warnings.warn(
+                f"{self.path.name}: {', '.join(assumed)} not calibrated, published values are "
+                "taken without errors",
+                AstropolcalWarning,
+                stacklevel=4,
+            )
+        return chain, assumed
+
+
+def _degrees(position):
+    angle = u.Quantity(position)
+    return angle.to(u.deg) if angle.unit.is_equivalent(u.deg) else angle
