@@ -11,12 +11,40 @@ from astropy.modeling import FittableModel, Parameter
 _SHARED = (str, bool, int, float, type(None), u.UnitBase)
 
 
+class Setting:
+    """
+    A keyword of an optic other than its parameters, with a default, checked whenever it is set.
+
+    ``check(value, name)`` returns what is kept, of a setting ``beam`` in ``_beam``, or raises.
+    """
+
+    def __init__(self, default, check, doc):
+        self.default, self.check, self.__doc__ = default, check, doc
+
+    def __set_name__(self, owner, name):
+        self.name = name
+
+    def __get__(self, optic, owner=None):
+        return self if optic is None else optic.__dict__[f"_{self.name}"]
+
+    def __set__(self, optic, value):
+        checked = self.check(value, f"{type(optic).__name__}.{self.name}")
+        optic.__dict__[f"_{self.name}"] = checked
+
+
 class KeywordOnly(type(FittableModel)):
     """Keeps astropy from giving each optic an ``__init__`` with positional parameters."""
 
     def __init__(cls, name, bases, members, **kwargs):
         # astropy's metaclass writes an __init__ for every class whose members have none
         super().__init__(name, bases, {"__init__": cls.__init__} | members, **kwargs)
+        # those of the bases first
+        cls._declared_settings = {
+            key: setting
+            for base in reversed(cls.__mro__)
+            for key, setting in vars(base).items()
+            if isinstance(setting, Setting)
+        }
         cls.__signature__ = inspect.Signature(
             [
                 inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default)
@@ -32,6 +60,7 @@ class KeywordOnly(type(FittableModel)):
             parameter = inspect.getattr_static(cls, key)
             unit = parameter.unit
             found[key] = parameter.default if unit is None else parameter.default * unit
+        found |= {key: setting.default for key, setting in cls._declared_settings.items()}
         for base in cls.__mro__:
             if isinstance(base, KeywordOnly):
                 found |= getattr(base.__init__, "__kwdefaults__", None) or {}

@@ -141,6 +141,10 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             )
         values = {key: kwargs.pop(key) for key in self.param_names if key in kwargs}
         values = {key: self._at_the_door(key, value) for key, value in values.items()}
+        settings = {
+            key: kwargs.pop(key, setting.default)
+            for key, setting in self._declared_settings.items()
+        }
         try:
             super().__init__(name=name, **values, **kwargs)
         except (TypeError, InputParameterError) as error:
@@ -150,6 +154,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         self._inputs = self._outputs = LIGHT
         self._mount, self._position = None, 0.0
         self.mount = mount
+        for key, value in settings.items():
+            setattr(self, key, value)
 
     def _check_names(self, kwargs):
         known = [*inspect.signature(type(self)).parameters, "bounds", "fixed", "tied", "meta"]
@@ -481,4 +487,5 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     def _settings(self):
         """Return the keyword arguments, other than parameters, that rebuild the optic."""
-        return {"name": self.name, "mount": self.mount}
+        own = {key: getattr(self, key) for key in self._declared_settings}
+        return {"name": self.name, "mount": self.mount} | own

@@ -23,6 +23,7 @@ from astropolcal.mueller import (
     fill_phase_block,
     transverse_share,
 )
+from astropolcal.optics._modelling import Setting
 from astropolcal.optics.core import Optic
 from astropolcal.optics.polarizers import DiattenuatorRetarder
 from astropolcal.thinfilm import _Stack, _wrapped
@@ -145,13 +146,13 @@ class _Mirror(Optic):
 
     def loosened(self, wavelength):
         """Return the diattenuator-retarder of the same values, free at each wavelength."""
-        # name and mount only: the free optic has neither metal nor film
-        settings = Optic._settings(self)
+        # the free optic has neither metal nor film
         free = DiattenuatorRetarder(
             diattenuation=self.diattenuation(wavelength),
             retardance=self.retardance(wavelength),
             theta=self.theta.value * u.deg,
-            **settings,
+            name=self.name,
+            mount=self.mount,
         )
         free.theta.fixed, free.theta.bounds = self.theta.fixed, self.theta.bounds
         return free
@@ -241,34 +242,30 @@ class PowerLawMirror(_Mirror):
         return np.sqrt(sum(self._parts(log, *values[:4])))
 
 
+def _material_name(value, label):
+    """Return the name by which a material is found again, in a file too."""
+    if isinstance(value, str):
+        get_material(value)
+        return value
+    name = getattr(value, "name", None)
+    try:
+        if name and get_material(name) is value:
+            return name
+    except ParameterError:
+        pass
+    raise ParameterError(
+        f"{label} = {value!r}; allowed is the name of a material, which register_material "
+        "gives to one of your own"
+    )
+
+
 class _Metallic(_Mirror):
     """What is coated with a metal and a film: one or several reflections in one plane."""
 
-    def __init__(self, *args, material="silver", film="fused silica", **kwargs):
-        super().__init__(*args, **kwargs)
-        self.material = material
-        self.film = film
-
-    @property
-    def material(self):
-        """Name of the metal, see `~astropolcal.materials.get_material`."""
-        return self._material
-
-    @material.setter
-    def material(self, value):
-        self._material = _material_name(value, f"{type(self).__name__}.material")
-
-    @property
-    def film(self):
-        """Name of the material of the film."""
-        return self._film
-
-    @film.setter
-    def film(self, value):
-        self._film = _material_name(value, f"{type(self).__name__}.film")
-
-    def _settings(self):
-        return super()._settings() | {"material": self.material, "film": self.film}
+    material = Setting(
+        "silver", _material_name, "Name of the metal, see `~astropolcal.materials.get_material`."
+    )
+    film = Setting("fused silica", _material_name, "Name of the material of the film.")
 
     def _dispersion(self, wavelength):
         wavelength = np.asarray(wavelength)
@@ -374,23 +371,6 @@ class MetalMirror(_Metallic):
 
     def _reflections(self, incidence):
         return ((incidence, 1.0, 1),)
-
-
-def _material_name(value, label):
-    """Return the name by which a material is found again, in a file too."""
-    if isinstance(value, str):
-        get_material(value)
-        return value
-    name = getattr(value, "name", None)
-    try:
-        if name and get_material(name) is value:
-            return name
-    except ParameterError:
-        pass
-    raise ParameterError(
-        f"{label} = {value!r}; allowed is the name of a material, which register_material "
-        "gives to one of your own"
-    )
 
 
 class KMirror(_Metallic):

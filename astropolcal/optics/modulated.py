@@ -23,6 +23,7 @@ from astropolcal.mueller import (
     retardance_slope,
     rotation_generator,
 )
+from astropolcal.optics._modelling import Setting
 from astropolcal.optics.core import Optic
 from astropolcal.optics.polarizers import BEAMS, _BeamOptic
 from astropolcal.optics.retarders import EllipticalRetarder
@@ -78,11 +79,28 @@ class FrameOptic(Optic):
         return coordinate + shift, angle + shift if self.turns else angle
 
 
-def one_of(allowed, value, name):
-    """Return a whole number of those allowed, or raise."""
-    if isinstance(value, bool | np.bool_) or not np.isscalar(value) or value not in allowed:
-        raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(map(str, allowed))}")
-    return int(value)
+def _one_of(*allowed):
+    """Return the check of a setting that is one of some whole numbers."""
+
+    def check(value, name):
+        if isinstance(value, bool | np.bool_) or not np.isscalar(value) or value not in allowed:
+            raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(map(str, allowed))}")
+        return int(value)
+
+    return check
+
+
+def _positive(value, name):
+    number = to_unit(value, None, name)
+    if number.ndim or not (np.isfinite(number) and number > 0):
+        raise ParameterError(f"{name} = {value!r} must be one positive number")
+    return float(number)
+
+
+def _true_or_false(value, name):
+    if not isinstance(value, bool | np.bool_):
+        raise ParameterError(f"{name} = {value!r}; allowed are True and False")
+    return bool(value)
 
 
 class _Harmonic(FrameOptic):
@@ -90,21 +108,7 @@ class _Harmonic(FrameOptic):
 
     takes_numbers = False
 
-    def __init__(self, *args, harmonic=1, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.harmonic = harmonic
-
-    @property
-    def harmonic(self):
-        """Number of periods in a turn of the mount: 1, 2 or 4."""
-        return self._harmonic
-
-    @harmonic.setter
-    def harmonic(self, value):
-        self._harmonic = one_of((1, 2, 4), value, f"{type(self).__name__}.harmonic")
-
-    def _settings(self):
-        return super()._settings() | {"harmonic": self.harmonic}
+    harmonic = Setting(1, _one_of(1, 2, 4), "Number of periods in a turn of the mount: 1, 2 or 4.")
 
     def _waves(self, coordinate):
         phase = self._harmonic * np.asarray(coordinate)
@@ -315,30 +319,14 @@ class HarmonicGain(_BeamOptic, _Harmonic):
     cosine = Parameter(default=0.0, bounds=(-0.4, 0.4), description="cosine amplitude")
     sine = Parameter(default=0.0, bounds=(-0.4, 0.4), description="sine amplitude")
 
-    def __init__(self, *args, differential=False, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.differential = differential
-
-    @property
-    def differential(self):
-        """Whether the left beam changes with the opposite sign."""
-        return self._differential
-
-    @differential.setter
-    def differential(self, value):
-        if not isinstance(value, bool | np.bool_):
-            raise ParameterError(
-                f"HarmonicGain.differential = {value!r}; allowed are True and False"
-            )
-        self._differential = bool(value)
+    differential = Setting(
+        False, _true_or_false, "Whether the left beam changes with the opposite sign."
+    )
 
     @property
     def depends_on_beam(self):
         """True where the left beam changes with the opposite sign."""
         return self._differential
-
-    def _settings(self):
-        return super()._settings() | {"differential": self.differential}
 
     @property
     def _sign(self):
@@ -437,21 +425,9 @@ class FerroelectricLiquidCrystal(FrameOptic):
 class _Referenced(FrameOptic):
     """What is given for a reference flux, so that its parameters are numbers near one."""
 
-    def __init__(self, *args, reference=1.0, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.reference = reference
-
-    @property
-    def reference(self):
-        """Flux of which the coefficients are shares, in the unit of the tables."""
-        return self._reference
-
-    @reference.setter
-    def reference(self, value):
-        self._reference = _positive(value, f"{type(self).__name__}.reference")
-
-    def _settings(self):
-        return super()._settings() | {"reference": self.reference}
+    reference = Setting(
+        1.0, _positive, "Flux of which the coefficients are shares, in the unit of the tables."
+    )
 
 
 class FluxGain(_BeamOptic, _Referenced):
@@ -487,21 +463,7 @@ class FluxGain(_BeamOptic, _Referenced):
     right = Parameter(default=0.0, bounds=(-0.5, 0.5), description="coefficient of the right beam")
     left = Parameter(default=0.0, bounds=(-0.5, 0.5), description="coefficient of the left beam")
 
-    def __init__(self, *args, power=1, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.power = power
-
-    @property
-    def power(self):
-        """Exponent of the flux, 1 or -1."""
-        return self._power
-
-    @power.setter
-    def power(self, value):
-        self._power = one_of((1, -1), value, "FluxGain.power")
-
-    def _settings(self):
-        return super()._settings() | {"power": self.power}
+    power = Setting(1, _one_of(1, -1), "Exponent of the flux, 1 or -1.")
 
     def _level(self, coordinate):
         # on the stage previous_flux the coordinate is F now over F before, so that its inverse
@@ -620,10 +582,3 @@ class PolarizedBackground(StrayLight):
             out[..., row, 0] = self._share(coordinate)
             slopes.append(out)
         return tuple(slopes)
-
-
-def _positive(value, name):
-    number = to_unit(value, None, name)
-    if number.ndim or not (np.isfinite(number) and number > 0):
-        raise ParameterError(f"{name} = {value!r} must be one positive number")
-    return float(number)

@@ -14,6 +14,7 @@ from astropolcal.mueller import (
     fill_phase_block,
     transverse_share,
 )
+from astropolcal.optics._modelling import Setting
 from astropolcal.optics.core import Optic
 
 __all__ = [
@@ -253,28 +254,17 @@ class Depolarizer(Optic):
 BEAMS = {"right": 1.0, "left": -1.0}
 
 
+def _beam(value, name):
+    if value not in BEAMS:
+        raise ParameterError(f"beam = {value!r}; allowed are {sorted(BEAMS)}")
+    return value
+
+
 class _BeamOptic(Optic):
     """What acts differently on the two beams, and follows one of them in a chain."""
 
     depends_on_beam = True
-
-    def __init__(self, *args, beam="right", **kwargs):
-        super().__init__(*args, **kwargs)
-        self.beam = beam
-
-    @property
-    def beam(self):
-        """The beam that goes on in a chain, ``"right"`` or ``"left"``."""
-        return self._beam
-
-    @beam.setter
-    def beam(self, value):
-        if value not in BEAMS:
-            raise ParameterError(f"beam = {value!r}; allowed are {sorted(BEAMS)}")
-        self._beam = value
-
-    def _settings(self):
-        return super()._settings() | {"beam": self.beam}
+    beam = Setting("right", _beam, 'The beam that goes on in a chain, ``"right"`` or ``"left"``.')
 
 
 class WollastonPrism(_BeamOptic):
