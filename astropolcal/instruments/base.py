@@ -21,7 +21,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments.telescope import as_exact, behind_telescope, star_options
+from astropolcal.instruments.telescope import _normal, as_exact, behind_telescope, star_options
 from astropolcal.observations import (
     common_wavelengths,
     is_star,
@@ -241,7 +241,7 @@ def _lamps(chains, chosen, text):
 
 
 def _added(chain, observations, kind, name, size):
-    found, prior, zero = leaves(chain), _normal(NUISANCES[kind]), np.zeros(size)
+    found, prior, zero = leaves(chain), _normal(0.0, NUISANCES[kind]), np.zeros(size)
     split = next(i for i, leaf in enumerate(found) if leaf.splits_light)
     if kind == "lamp":
         source = optics.PolarizedSource(name=name)
@@ -260,12 +260,6 @@ def _added(chain, observations, kind, name, size):
     )
     light.amount.prior = prior
     return join([*found[:split], light, *found[split:]])
-
-
-def _normal(std):
-    from scipy.stats import norm
-
-    return norm(0.0, std)
 
 
 class Instrument(ABC):

@@ -30,6 +30,7 @@ from astropolcal.instruments.telescope import (
     M3_MODELS,
     SITE,
     STARS,
+    _normal,
     fold_mirror,
     k_mirror,
     misaligned,
@@ -200,12 +201,6 @@ def _mirror(model, grid):
         mirror.diattenuation = _silver("m3").diattenuation(grid)
         mirror.retardance = _silver("m3").retardance(grid)
     return mirror
-
-
-def _normal(mean, std):
-    from scipy.stats import norm
-
-    return norm(mean, std)
 
 
 def _starts(grid, values):

@@ -17,6 +17,7 @@ from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement.datasets import Dataset, as_pairs
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import common_wavelengths, get_observable
+from astropolcal.optics._modelling import with_own_scalars
 
 __all__ = ["Measurement"]
 
@@ -186,18 +187,8 @@ class Measurement(FittableModel):
     def __deepcopy__(self, memo):
         # every fitter copies the model: what does not change is shared, and the chains are
         # copied when somebody looks at them
-        new = self.__class__.__new__(self.__class__)
-        memo[id(self)] = new
-        new.__dict__.update(self.__dict__, _chains_are_shared=True)
-        new.__dict__["_parameters"] = self._parameters.copy()
-        for key in ("_mconstraints", "_constraints_cache", "_user_inverse", "_meta"):
-            if key in self.__dict__:
-                new.__dict__[key] = copy_module.copy(self.__dict__[key])
-        for label in self._param_names:
-            parameter = copy_module.copy(self.__dict__[label])
-            parameter.model = new
-            new.__dict__[label] = parameter
-            parameter.value = float(self.__dict__[label].value)
+        memo[id(self)] = new = with_own_scalars(self, self._param_names)
+        new._chains_are_shared = True
         self._chains_are_shared = True
         return new
 

@@ -151,7 +151,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             self._check_names(kwargs)
             raise ParameterError(f"{type(self).__name__}: {error}") from None
         # astropy would call the five channels x0 to x4
-        self._inputs = self._outputs = LIGHT
+        self.inputs = self.outputs = LIGHT
         self._mount, self._position = None, 0.0
         self.mount = mount
         for key, value in settings.items():
