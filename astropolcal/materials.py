@@ -222,24 +222,8 @@ class UniaxialMaterial(_Ranged):
     <Quantity 0.03534>
     """
 
-    def __init__(
-        self,
-        name,
-        ordinary_law,
-        extraordinary_law,
-        *,
-        measured_range,
-        valid_range=None,
-        doi="",
-        aliases=(),
-    ):
-        super().__init__(
-            name,
-            measured_range=measured_range,
-            valid_range=valid_range,
-            doi=doi,
-            aliases=aliases,
-        )
+    def __init__(self, name, ordinary_law, extraordinary_law, **kwargs):
+        super().__init__(name, **kwargs)
         self.ordinary_law = ordinary_law
         self.extraordinary_law = extraordinary_law
 
@@ -370,7 +354,7 @@ class TabulatedLaw:
         if self._wavelength.ndim != 1 or self._wavelength.shape != self._index.shape:
             raise ParameterError(
                 f"a table of {self._wavelength.shape} wavelengths has {self._index.shape} "
-                "indices; allowed is one a wavelength"
+                "indices; allowed is one per wavelength"
             )
         if self._wavelength.size < 2 or not np.all(np.diff(self._wavelength) > 0):
             raise ParameterError("the wavelengths of a table must be two or more and increase")

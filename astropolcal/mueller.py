@@ -554,7 +554,7 @@ def is_physical(matrix, tolerance=1e-9):
 def phase_of(stage, theta):
     """Return what Q + iU is multiplied by at the entrance of an optic, or None for 1."""
     if np.ndim(theta):
-        # one value a wavelength goes along the first axis, positions along the second
+        # one value per wavelength goes along the first axis, positions along the second
         turn = np.exp(-2j * theta)[:, None]
     elif theta:
         turn = cmath.exp(-2j * theta)

@@ -150,7 +150,7 @@ class Propagator:
         common, frame = _at(self._common, values, 0.0)
         arms = [_inward(_at(arm, values, frame)[0]) for arm in self._arms]
         (right, phase), (left, _) = arms
-        # what stands still meets the light of all frames as two rows a wavelength
+        # what stands still meets the light of all frames as two rows per wavelength
         rows, phase = _inward(common[self._meeting :], np.concatenate([right, left], axis=1), phase)
         light, fresh = _behind(common[: self._meeting], self.source, keep=False)
         fluxes = turned(light, phase, fresh) @ np.ascontiguousarray(rows.swapaxes(1, 2))

@@ -39,7 +39,7 @@ def half_wave_plate_cycles(hwp=_CYCLE * u.deg, derotator=45 * u.deg):
     Returns
     -------
     `~astropy.table.QTable`
-        Columns ``hwp`` and ``derotator``, one row a frame.
+        Columns ``hwp`` and ``derotator``, one row per frame.
 
     Examples
     --------
@@ -79,10 +79,10 @@ def simulate(
     wavelength : `~astropy.units.Quantity`
         Shape (n_wavelengths,).
     frames : `~astropy.table.QTable`
-        One row a frame: the position of every stage (``hwp``, ``derotator``,
+        One row per frame: the position of every stage (``hwp``, ``derotator``,
         ...) and whatever else is to stand in the table.
     flux : float or array_like
-        Flux that enters the chain, in adu; scalar or one value a wavelength.
+        Flux that enters the chain, in adu; scalar or one value per wavelength.
     lamp : array_like, optional
         Relative brightness of the source in each frame.
     gain : float

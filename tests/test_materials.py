@@ -416,8 +416,8 @@ def test_what_is_no_material_is_not_registered(registry):
 
 def test_a_table_that_is_not_one_is_refused():
     for wavelength, index, message in [
-        ([1.0, 2.0], [1.5], "one a wavelength"),
-        ([[1.0, 2.0]], [[1.5, 1.5]], "one a wavelength"),
+        ([1.0, 2.0], [1.5], "one per wavelength"),
+        ([[1.0, 2.0]], [[1.5, 1.5]], "one per wavelength"),
         ([1.0], [1.5], "two or more and increase"),
         ([2.0, 1.0], [1.5, 1.6], "two or more and increase"),
         ([1.0, np.nan], [1.5, 1.6], "two or more and increase"),

@@ -162,8 +162,8 @@ def add_nuisance(chains, datasets, nuisance):
     Return the chains with nuisance optics, one of each kind for each dataset.
 
     ``"background"``, light that is added at a constant flux: the share of it in a frame of median
-    flux, one value a wavelength. ``"beam_gain"``, half the relative difference of the gains
-    of the two beams, one value a wavelength; normalized double differences see it in second
+    flux, one value per wavelength. ``"beam_gain"``, half the relative difference of the gains
+    of the two beams, one value per wavelength; normalized double differences see it in second
     order only, single differences in first. ``"lamp"``, q and u of an internal source without
     polarizer, for all wavelengths; q cannot be told from the diattenuation of a mirror that
     stands straight, except by the prior.

@@ -183,7 +183,7 @@ class CHARIS(Instrument):
             thicknesses are within 0.6 to 1.4 of 't Hart's, misalignments
             within 5 deg, efficiencies between 0 and 1.
         m3 : {"free", "power law", "metal"}
-            Tertiary mirror of a star's chain: a diattenuation a wavelength, the paper's
+            Tertiary mirror of a star's chain: a diattenuation per wavelength, the paper's
             permittivity, or silver with a film.
         star : str
             Name of the source optic in a star's chain.

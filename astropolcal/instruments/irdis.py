@@ -190,7 +190,7 @@ def _warn_of_starts(frames, motions, tracking, law):
         )
 
 
-# van Holstein et al. 2020, as distributed with their pipeline; one row a filter
+# van Holstein et al. 2020, as distributed with their pipeline; one row per filter
 _DATA = QTable.read(Path(__file__).parents[1] / "data" / "irdis.ecsv", format="ascii.ecsv")
 
 #: Filters with coefficients, and the wavelengths that stand for them.
@@ -224,8 +224,8 @@ def check_all_filters(found):
     sizes = {getattr(leaf, key).size for leaf in found for key in leaf.param_names}
     if max(sizes) != len(FILTERS):
         raise ChainError(
-            f"irdis: the chain has {max(sizes)} values a parameter, and it is not known for which "
-            f"of the filters {', '.join(FILTERS)}; give on_sky(chain, wavelength=...)"
+            f"irdis: the chain has {max(sizes)} values per parameter, and it is not known for "
+            f"which of the filters {', '.join(FILTERS)}; give on_sky(chain, wavelength=...)"
         )
 
 
@@ -406,7 +406,7 @@ class IRDIS(Instrument):
         Return the chain of an internal source or a star, with the published values.
 
         Free are the retardances of half-wave plate and derotator and the diattenuations of plate
-        and polarizers, one a filter, and the angles of plate and derotator; of stars also the
+        and polarizers, one per filter, and the angles of plate and derotator; of stars also the
         diattenuations of telescope and M4, whose retardances are held. The diattenuation of the
         derotator, to which double differences are blind, is held.
 
@@ -415,7 +415,7 @@ class IRDIS(Instrument):
         source : str
             ``"polarized"``: internal source with its polarizer, whose angle is free.
             ``"unpolarized"``: without it; q and u of the light that reaches the half-wave plate
-            are free, one a filter. ``"unpolarized standard star"``,
+            are free, one per filter. ``"unpolarized standard star"``,
             ``"polarized standard star"`` or ``"star"``: behind telescope and M4.
         optics_in : sequence of str
             Nothing is optional here.
@@ -542,7 +542,7 @@ class IRDIS(Instrument):
         Returns
         -------
         `~astropy.table.QTable`
-            One row a frame: ``frame``, ``hwp`` (commanded), ``hwp_true``, ``derotator``,
+            One row per frame: ``frame``, ``hwp`` (commanded), ``hwp_true``, ``derotator``,
             ``wavelength``, ``exposure_time``, ``time``, and of stars ``parallactic`` and
             ``altitude``, all in the middle of the exposure. With the fluxes of both beams it is
             a table of observations. The meta have instrument, filter, date and tracking.

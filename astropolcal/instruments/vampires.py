@@ -355,7 +355,7 @@ class VAMPIRES(Instrument):
         bounds : {"physical"}
             Half-wave plate from -180 to -90 deg, derotator within the turn from 0 deg on.
         m3 : {"free", "power law", "metal"}
-            Tertiary mirror of a star's chain: a diattenuation a wavelength with the retardance of
+            Tertiary mirror of a star's chain: a diattenuation per wavelength with the retardance of
             silver, a law of the permittivity, or silver with a film.
         plate : {"free", "two-layer"}
             Half-wave plate with a retardance of its own in each band, or with the law of its two

@@ -154,7 +154,7 @@ class Dataset:
                 if slot is not None:
                     where = slot.start + self.bins if slot.per_wavelength else slot.start
                     self._live.append(((i, j), where, factor, offset))
-                # a fixed value a wavelength is cut down to this dataset's wavelengths
+                # a fixed value per wavelength is cut down to this dataset's wavelengths
                 elif np.size(self._constants[i][j]) > 1:
                     self._constants[i][j] = self._constants[i][j][self.bins]
 
@@ -195,7 +195,7 @@ class Dataset:
         each = np.arange(n_bins)
         for key, where, factor, _ in self._live:
             slope = factor * self._grouped(self._over_nodes(slopes[key])).sum(axis=0)
-            # a value a wavelength moves the data of its own wavelength
+            # a value per wavelength moves the data of its own wavelength
             # only, one for all moves all of them
             if np.ndim(where):
                 out[where, each] += slope

@@ -3,8 +3,8 @@
 Free parameters of one or several chains as one flat vector.
 
 Chains name their parameters ``optic.parameter``; equal names in several
-chains are the same parameter. A parameter with one value a wavelength
-becomes one number a wavelength of the common grid. Ties are linear and are
+chains are the same parameter. A parameter with one value per wavelength
+becomes one number per wavelength of the common grid. Ties are linear and are
 applied here, so that the Jacobian stays exact.
 """
 
@@ -80,7 +80,7 @@ class Slot:
 
     @property
     def per_wavelength(self):
-        """Whether there is one value a wavelength."""
+        """Whether there is one value per wavelength."""
         return self.size > 1
 
     @property
@@ -110,7 +110,7 @@ def parameter_table(chains):
     Returns
     -------
     dict of str to list of `~astropy.modeling.Parameter`
-        ``"optic.parameter"`` to its parameter objects, one a chain that has it.
+        ``"optic.parameter"`` to its parameter objects, one per chain that has it.
 
     Raises
     ------
@@ -216,7 +216,7 @@ class FreeParameters:
         size = np.size(first.value)
         if size not in (1, n_wavelengths):
             raise ParameterError(
-                f"{name} has {size} values; allowed are 1 or {n_wavelengths}, one a wavelength"
+                f"{name} has {size} values; allowed are 1 or {n_wavelengths}, one per wavelength"
             )
         if any(np.size(p.value) != size or p.fixed != first.fixed for p in parameters[1:]):
             raise ParameterError(f"{name} differs between datasets in shape or in being fixed")

@@ -32,7 +32,7 @@ class Normal:
     Parameters
     ----------
     mean, std : `~astropy.units.Quantity` or float
-        In any unit that converts to the parameter's; one value a wavelength for a
+        In any unit that converts to the parameter's; one value per wavelength for a
         parameter that has one.
 
     Examples
@@ -201,7 +201,7 @@ def normal_per_wavelength(prior, unit):
 
 
 def _plain(value):
-    """Return a float, or an array where there is one value a wavelength."""
+    """Return a float, or an array where there is one value per wavelength."""
     value = np.asarray(value, dtype=float)
     return value if value.ndim else float(value)
 

@@ -82,7 +82,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     name : str, optional
         Name of the optic in its chain.
     **parameters : `~astropy.units.Quantity` or float
-        Values of the optic's parameters: a scalar, or one value a wavelength.
+        Values of the optic's parameters: a scalar, or one value per wavelength.
 
     Raises
     ------
@@ -115,7 +115,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     n_inputs = 5
     n_outputs = 5
-    # one value a wavelength is not to be broadcast by astropy against light of another shape
+    # one value per wavelength is not to be broadcast by astropy against light of another shape
     standard_broadcasting = False
     #: True for an optic that turns the frame of all that follows.
     rotates_frame = False
@@ -177,7 +177,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         if number.ndim > 1 or number.size == 0:
             raise ParameterError(
                 f"{cls.__name__}.{key} has shape {number.shape}; allowed are a "
-                "scalar or one value a wavelength"
+                "scalar or one value per wavelength"
             )
         return number if unit is None else number * unit
 

@@ -132,7 +132,7 @@ class HarmonicRotator(_Harmonic):
     Parameters
     ----------
     cosine, sine : `~astropy.units.Quantity`
-        Amplitudes a and b, angles; scalars, or one value a wavelength.
+        Amplitudes a and b, angles; scalars, or one value per wavelength.
     harmonic : {1, 2, 4}
         Periods n in a turn of the mount.
     theta : `~astropy.units.Quantity`
@@ -203,7 +203,7 @@ class DriftRetarder(FrameOptic):
     Parameters
     ----------
     horizontal, diagonal : `~astropy.units.Quantity`
-        Retardances h and d in the first frame; scalars, or one value a wavelength.
+        Retardances h and d in the first frame; scalars, or one value per wavelength.
     horizontal_rate, diagonal_rate : `~astropy.units.Quantity`
         Their changes over the run.
     theta : `~astropy.units.Quantity`
@@ -257,7 +257,7 @@ class HarmonicRetarder(_Harmonic):
     Parameters
     ----------
     cosine, sine : `~astropy.units.Quantity`
-        Amplitudes a and b; scalars, or one value a wavelength.
+        Amplitudes a and b; scalars, or one value per wavelength.
     harmonic : {1, 2, 4}
         Periods n in a turn of the mount.
     theta : `~astropy.units.Quantity`
@@ -297,7 +297,7 @@ class HarmonicGain(_BeamOptic, _Harmonic):
     Parameters
     ----------
     cosine, sine : float or array_like
-        Amplitudes a and b; scalars, or one value a wavelength.
+        Amplitudes a and b; scalars, or one value per wavelength.
     harmonic : {1, 2, 4}
         Periods n in a turn of the mount.
     differential : bool
@@ -376,10 +376,10 @@ class FerroelectricLiquidCrystal(FrameOptic):
     Parameters
     ----------
     retardance : `~astropy.units.Quantity`
-        Retardance :math:`\delta`; scalar, or one value a wavelength.
+        Retardance :math:`\delta`; scalar, or one value per wavelength.
     switching_angle : `~astropy.units.Quantity`
         Angle :math:`\alpha` from the fast axis in state A to that in state B; scalar, or one
-        value a wavelength.
+        value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the fast axis in state A.
 
@@ -442,7 +442,7 @@ class FluxGain(_BeamOptic, _Referenced):
     Parameters
     ----------
     right, left : float or array_like
-        Coefficient k of each beam; scalars, or one value a wavelength.
+        Coefficient k of each beam; scalars, or one value per wavelength.
     power : {1, -1}
         Exponent m.
     reference : float
@@ -499,7 +499,7 @@ class StrayLight(_Referenced):
     Parameters
     ----------
     amount : float or array_like
-        Added flux b over :math:`F_0`; scalar, or one value a wavelength.
+        Added flux b over :math:`F_0`; scalar, or one value per wavelength.
     reference : float
         :math:`F_0`, in the unit of the tables.
     theta : `~astropy.units.Quantity`
@@ -550,7 +550,7 @@ class PolarizedBackground(StrayLight):
         subtracted, but not its polarization.
     q, u : float or array_like
         Added polarized flux over :math:`F_0`, in the frame of what follows;
-        scalars, or one value a wavelength.
+        scalars, or one value per wavelength.
     reference : float
         :math:`F_0`, in the unit of the tables.
     theta : `~astropy.units.Quantity`

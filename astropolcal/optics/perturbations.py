@@ -278,7 +278,7 @@ class MuellerElement(Optic):
     Parameters
     ----------
     m00, m01, ..., m33 : float or array_like
-        The elements, fixed by default; scalars, or one value a wavelength.
+        The elements, fixed by default; scalars, or one value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the axes.
 

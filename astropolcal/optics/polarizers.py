@@ -156,7 +156,7 @@ class VectorDiattenuator(Optic):
     Parameters
     ----------
     horizontal, diagonal : float or array_like
-        The components; scalars, or one value a wavelength.
+        The components; scalars, or one value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the axes.
 
@@ -217,7 +217,7 @@ class Depolarizer(Optic):
     ----------
     retained_q, retained_u, retained_v : float or array_like
         Share of Q, U and V (in the optic's frame) that survives, between 0
-        and 1; scalars, or one value a wavelength. Physical as long as the
+        and 1; scalars, or one value per wavelength. Physical as long as the
         coherency matrix stays positive, for instance ``a + b <= 1 + c``.
     theta : `~astropy.units.Quantity`
         Orientation of the axes.

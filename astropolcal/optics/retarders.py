@@ -30,7 +30,7 @@ class LinearRetarder(Optic):
     Parameters
     ----------
     retardance : `~astropy.units.Quantity`
-        :math:`\Delta`: scalar, or one value a wavelength.
+        :math:`\Delta`: scalar, or one value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the axis.
 
@@ -150,7 +150,7 @@ class EllipticalRetarder(Optic):
     ----------
     horizontal, diagonal, circular : `~astropy.units.Quantity`
         :math:`\Delta_H`, :math:`\Delta_{45}`, :math:`\Delta_R`; scalars, or
-        one value a wavelength.
+        one value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the axes.
 

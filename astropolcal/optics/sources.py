@@ -27,7 +27,7 @@ class PolarizedSource(Optic):
     ----------
     q, u : float or array_like
         Normalized Stokes parameters, between -0.7 and 0.7 so that every pair is a
-        possible one; scalars, or one value a wavelength.
+        possible one; scalars, or one value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the axes of q and u.
 

@@ -274,9 +274,9 @@ def catalogue():
     Returns
     -------
     stars : `~astropy.table.QTable`
-        One row a star; missing numbers are nan.
+        One row per star; missing numbers are nan.
     polarization : `~astropy.table.QTable`
-        One row a star, band and source.
+        One row per star, band and source.
 
     Examples
     --------

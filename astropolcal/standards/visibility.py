@@ -191,7 +191,7 @@ def telescope_information(
     Parameters
     ----------
     parallactic : `~astropy.units.Quantity`
-        One angle a frame, shape (n,).
+        One angle per frame, shape (n,).
     altitude : `~astropy.units.Quantity`, optional
         One a frame; needed with ``offset``.
     frame_error : float
@@ -280,7 +280,7 @@ def _covariance(columns):
 def _angles(value, name):
     angles = np.atleast_1d(angle_to_rad(value, name))
     if angles.ndim != 1 or not angles.size or not np.all(np.isfinite(angles)):
-        raise ParameterError(f"{name} must be finite angles, one a frame")
+        raise ParameterError(f"{name} must be finite angles, one per frame")
     return angles
 
 
@@ -307,7 +307,7 @@ class Observability:
     min_altitude : `~astropy.units.Quantity`
         Altitude below which the star is not observed.
     table : `~astropy.table.QTable`
-        One row a time of the dark hours: ``time, altitude, parallactic,
+        One row per time of the dark hours: ``time, altitude, parallactic,
         observable``. ``parallactic`` has no jumps, so it may pass +180 deg.
 
     Examples
@@ -371,7 +371,7 @@ class Observability:
         Parameters
         ----------
         frames : int, optional
-            How many pairs of q and u; by default one a row of the table.
+            How many pairs of q and u; by default one per row of the table.
         **options
             As for `telescope_information`.
 

@@ -873,7 +873,7 @@ def test_value_that_is_not_finite_is_refused(label):
 def test_value_of_other_shape_is_refused(label):
     cls = CASES[label].optic
     for key, shape in product(cls().param_names, [(0,), (2, 2), (1, 3)]):
-        with pytest.raises(ParameterError, match="scalar or one value a wavelength"):
+        with pytest.raises(ParameterError, match="scalar or one value per wavelength"):
             cls(**{key: np.zeros(shape) * unit_of(cls(), key)})
 
 
@@ -882,7 +882,7 @@ def test_value_of_other_number_of_wavelengths_is_refused(label):
     cls = CASES[label].optic
     for key in cls().param_names:
         optic = cls(**{key: np.full(2, 0.5) * unit_of(cls(), key)}, name="it")
-        message = rf"it.{key} has 2 values, one a wavelength, but {{}} wavelengths"
+        message = rf"it.{key} has 2 values, one per wavelength, but {{}} wavelengths"
         for wavelength in (WAVELENGTH, 1.6 * u.um, None):
             count = 0 if wavelength is None else np.size(wavelength)
             with pytest.raises(ParameterError, match=message.format(count)):

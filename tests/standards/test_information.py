@@ -111,7 +111,7 @@ def test_bad_angles_are_refused():
     for arguments, words in [
         (([1, 2],), "needs a unit"),
         (([] * u.deg,), "finite angles"),
-        (([[1, 2]] * u.deg,), "one a frame"),
+        (([[1, 2]] * u.deg,), "one per frame"),
         (([1, np.nan] * u.deg,), "finite angles"),
         (([1, 2] * u.deg, [1] * u.deg), "2 parallactic angles and 1 altitudes"),
     ]:
