@@ -36,30 +36,9 @@ _MOST_CELLS = 2_000_000
 
 
 def sky_path(chain):
-    """
-    Return the optics from the sky to the beam splitter, without either.
+    """Return the optics from the sky to the beam splitter, without either.
 
-    Parameters
-    ----------
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        A chain; of an internal source what stands before the first optic on a stage
-        belongs to the source.
-
-    Returns
-    -------
-    Optic or `~astropy.modeling.CompoundModel`
-
-    Raises
-    ------
-    ChainError
-        If nothing is left.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-
-    >>> [optic.name for optic in sky_path(instruments.get("charis").published())]
-    ['hwp', 'derotator', 'dichroic', 'nbs']
+    Of an internal source what stands before the first optic on a stage belongs to the source.
     """
     found = leaves(chain)
     # the first optic that treats the two beams differently is the beam splitter
@@ -75,25 +54,7 @@ def sky_path(chain):
 
 
 def has_derotator(chain):
-    """
-    Return whether a chain has a derotator: an optic on a stage that is not the plate's.
-
-    Parameters
-    ----------
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        A chain, from the sky or of an internal source.
-
-    Returns
-    -------
-    bool
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-
-    >>> has_derotator(instruments.get("irdis").published())
-    True
-    """
+    """Return whether a chain has a derotator: an optic on a stage that is not the plate's."""
     angles = set(stages(sky_path(chain))) - {*COORDINATES, *_SKY, "hwp"}
     return bool(angles)
 
@@ -140,7 +101,7 @@ def polarimetric_efficiency(
         What the derotator keeps still, such as ``"field"``; needed where the law of the plate
         depends on it.
     law : (float, float), optional
-        Another tracking law of the half-wave plate, see `~astropolcal.observations.tracked`.
+        Another tracking law of the half-wave plate: factors of parallactic angle and altitude.
 
     Returns
     -------
@@ -166,8 +127,8 @@ def polarimetric_efficiency(
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.efficiency import polarimetric_efficiency
     >>> from astropolcal import instruments
-
     >>> charis = instruments.get("charis")
     >>> chain = charis.on_sky(charis.published())
     >>> efficiency = polarimetric_efficiency(chain, charis.wavelength, derotator=[45, 90] * u.deg,
@@ -297,9 +258,9 @@ class BestDerotator:
 
     Examples
     --------
+    >>> from astropolcal.efficiency import BestDerotator
     >>> import astropy.units as u
     >>> from astropy.table import QTable
-
     >>> BestDerotator(65 * u.deg, QTable(), "pupil").offset
     <Quantity 65. deg>
     """
@@ -359,8 +320,8 @@ def best_derotator(
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.efficiency import best_derotator
     >>> from astropolcal import instruments
-
     >>> charis = instruments.get("charis")
     >>> best = best_derotator(charis.on_sky(charis.published()), charis.wavelength,
     ...                       [60, 65] * u.deg, [-30, -20] * u.deg,

@@ -19,7 +19,7 @@ from astropolcal.chain import find_optic, leaves, stages, system_mueller, with_b
 from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.instruments import Instrument
 from astropolcal.mueller import is_physical
-from astropolcal.observations import is_star
+from astropolcal.observations.quality import is_star
 from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource
 from astropolcal.simulation import simulate
 

@@ -60,41 +60,33 @@ def pyplot():
 # --- words of the pages -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("bounds", "words"),
-    [
+def test_bounds_in_words(pages):
+    for bounds, words in [
         ((None, None), "none"),
         ((0, None), "from 0"),
         ((None, 2.5), "up to 2.5"),
         ((-5, 5), "-5 to 5"),
-    ],
-)
-def test_bounds_in_words(pages, bounds, words):
-    assert pages._bounds(Parameter(default=1, bounds=bounds)) == words
+    ]:
+        assert pages._bounds(Parameter(default=1, bounds=bounds)) == words, (bounds, words)
 
 
-@pytest.mark.parametrize(
-    ("value", "words"), [(0.004, "0.4 %"), (2 * u.deg, "2 deg"), (30 * u.nm, "30 nm")]
-)
-def test_sizes_in_words(pages, value, words):
-    assert pages._quantity(value) == words
+def test_sizes_in_words(pages):
+    for value, words in [(0.004, "0.4 %"), (2 * u.deg, "2 deg"), (30 * u.nm, "30 nm")]:
+        assert pages._quantity(value) == words, (value, words)
 
 
-@pytest.mark.parametrize(
-    ("columns", "words"),
-    [
+def test_laws_in_words(pages):
+    for columns, words in [
         (1, "one number"),
         (2, "polynomial of degree 1 in wavelength"),
         (4, "polynomial of degree 3 in wavelength"),
         (22, "one value a wavelength"),
-    ],
-)
-def test_laws_in_words(pages, columns, words):
-    from astropolcal.gap.problem import law_basis
+    ]:
+        from astropolcal.gap.problem import law_basis
 
-    grid = np.linspace(1.2, 2.4, 22)
-    basis = law_basis(grid, columns - 1) if columns < 22 else np.eye(22)
-    assert pages._law(basis, True, grid) == words
+        grid = np.linspace(1.2, 2.4, 22)
+        basis = law_basis(grid, columns - 1) if columns < 22 else np.eye(22)
+        assert pages._law(basis, True, grid) == words, (columns, words)
 
 
 def test_laws_that_are_no_polynomials(pages):
@@ -107,30 +99,27 @@ def test_laws_that_are_no_polynomials(pages):
     assert pages._law(None, False, grid) == "one number"
 
 
-@pytest.mark.parametrize(
-    ("text", "linked"),
-    [
+def test_names_of_a_docstring_work_on_any_page(pages):
+    for text, linked in [
         ("as a `LinearRetarder` is", "as a `~astropolcal.optics.LinearRetarder` is"),
         ("see `evaluate`", "see ``evaluate``"),
         (":math:`x` and ``y``", ":math:`x` and ``y``"),
         ("`Title`_", "`Title`_"),
-    ],
-)
-def test_names_of_a_docstring_work_on_any_page(pages, text, linked):
-    assert pages._linked(text) == linked
+    ]:
+        assert pages._linked(text) == linked, (text, linked)
 
 
 INDICES = [(OPTICS, "optics_index"), (EFFECTS, "effects_index")]
 
 
-@pytest.mark.parametrize(("registry", "make"), INDICES)
-def test_index_lists_every_member_once(pages, registry, make):
-    page = getattr(pages, make)()
-    folder = make.removesuffix("_index")
-    listed = re.findall(rf":doc:`(\w+) <{folder}/\1>`", page)
-    assert sorted(listed) == sorted(registry)
-    hidden = re.findall(rf"^   {folder}/(\w+)$", page, re.M)
-    assert hidden == listed
+def test_index_lists_every_member_once(pages):
+    for registry, make in INDICES:
+        page = getattr(pages, make)()
+        folder = make.removesuffix("_index")
+        listed = re.findall(rf":doc:`(\w+) <{folder}/\1>`", page)
+        assert sorted(listed) == sorted(registry), (registry, make)
+        hidden = re.findall(rf"^   {folder}/(\w+)$", page, re.M)
+        assert hidden == listed, (registry, make)
 
 
 def test_every_kind_of_effect_has_a_title(pages):
@@ -150,9 +139,8 @@ C, S = r"\cos(\mathrm{retardance})", r"\sin(\mathrm{retardance})"
 D, ROOT = r"\mathrm{diattenuation}", r"\sqrt{1 - \mathrm{diattenuation}^2}"
 
 
-@pytest.mark.parametrize(
-    ("name", "rows"),
-    [
+def test_matrices_are_those_of_the_paper(on_path):
+    for name, rows in [
         # McIntosh et al. 2026, Eqs. of a linear retarder, a diattenuator, a rotation and the
         # beam switcher
         ("LinearRetarder", ["1 0 0 0", "0 1 0 0", f"0 0 {C} {S}", f"0 0 -{S} {C}"]),
@@ -167,17 +155,18 @@ D, ROOT = r"\mathrm{diattenuation}", r"\sqrt{1 - \mathrm{diattenuation}^2}"
                 "0 0 0 1",
             ],
         ),
-    ],
-)
-def test_matrices_are_those_of_the_paper(on_path, name, rows):
-    from gallery.examples import example_of
-    from gallery.form import form_of
+    ]:
+        from gallery.examples import example_of
+        from gallery.form import form_of
 
-    matrix, _ = form_of(example_of(OPTICS[name]))
-    inside = re.search(r"\\begin\{pmatrix\}(.*)\\end\{pmatrix\}", matrix).group(1)
-    found = [[cell.strip() for cell in row.split(" & ")] for row in inside.split(r"\\ ")]
-    without_spaces = [[cell.replace(" ", "") for cell in row] for row in found]
-    assert without_spaces == [row.replace("1 - ", "1-").split(" ") for row in rows]
+        matrix, _ = form_of(example_of(OPTICS[name]))
+        inside = re.search(r"\\begin\{pmatrix\}(.*)\\end\{pmatrix\}", matrix).group(1)
+        found = [[cell.strip() for cell in row.split(" & ")] for row in inside.split(r"\\ ")]
+        without_spaces = [[cell.replace(" ", "") for cell in row] for row in found]
+        assert without_spaces == [row.replace("1 - ", "1-").split(" ") for row in rows], (
+            name,
+            rows,
+        )
 
 
 EXAMPLE = """

@@ -6,7 +6,6 @@ import sys
 from importlib.metadata import entry_points
 from importlib.resources import files
 
-import pytest
 import yaml
 
 from astropolcal.converters.extension import (
@@ -58,11 +57,13 @@ def test_types_are_those_that_are_there():
             assert found.__name__ == cls
 
 
-@pytest.mark.parametrize("group", ["asdf.resource_mappings", "asdf.extensions"])
-def test_asdf_finds_both_functions(group):
-    named = [point for point in entry_points(group=group) if point.value.startswith("astropolcal.")]
-    assert {point.load() for point in named} <= {get_extensions, get_resource_mappings}
-    assert len(named) == 1
+def test_asdf_finds_both_functions():
+    for group in ["asdf.resource_mappings", "asdf.extensions"]:
+        named = [
+            point for point in entry_points(group=group) if point.value.startswith("astropolcal.")
+        ]
+        assert {point.load() for point in named} <= {get_extensions, get_resource_mappings}, group
+        assert len(named) == 1, group
 
 
 def test_no_physics_is_imported_for_files_of_others():

@@ -34,7 +34,7 @@ from astropolcal.files import atomic_path
 from astropolcal.gap.challenge import _append, _journal
 from astropolcal.pipeline import Library, load, mueller_table, write_mueller
 from astropolcal.reduction.frames import Frame
-from astropolcal.reduction.journal import Journal
+from astropolcal.reduction.run import Journal
 from astropolcal.scripts._common import write_json
 from tests.fuzz.readers import READERS, Checkpoint, calibration, lab
 
@@ -242,10 +242,10 @@ def test_folder_without_permission(writer, tmp_path):
     tmp_path.chmod(0o700)
 
 
-@pytest.mark.parametrize("name", ["", ".", "a\0b"])
-def test_what_is_no_name_of_a_file(name):
-    with pytest.raises(AstropolcalError, match="no name of a file"), atomic_path(name):
-        pass
+def test_what_is_no_name_of_a_file():
+    for name in ["", ".", "a\0b"]:
+        with pytest.raises(AstropolcalError, match="no name of a file"), atomic_path(name):
+            pass
 
 
 def test_long_names_can_be_written(tmp_path):

@@ -18,7 +18,8 @@ from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError
 from astropolcal.instruments import CHARIS, Instrument, SkyLaw
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.observations import Observations, is_star
+from astropolcal.observations import Observations
+from astropolcal.observations.quality import is_star
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 N_BINS = 22

@@ -16,7 +16,8 @@ from astropy.time import Time
 from astropolcal import optics
 from astropolcal.calibration import calibrate
 from astropolcal.chain import insert_optic, leaves, remove_optic, system_mueller, with_beam
-from astropolcal.correction import ScienceFrames, correct, frame_positions, measurement_rows
+from astropolcal.correction import ScienceFrames, correct, measurement_rows
+from astropolcal.correction.frames import frame_positions
 from astropolcal.exceptions import (
     AstropolcalWarning,
     ChainError,

@@ -107,10 +107,10 @@ def test_everything_that_is_imported_is_a_dependency(project):
             assert names.get(name, name).lower() in known, f"{path.name} imports {name}"
 
 
-@pytest.mark.parametrize("extra", ["mcmc", "materials", "dask", "all", "test", "docs"])
-def test_installation_page_lists_every_extra(extra, project):
-    assert extra in project["optional-dependencies"]
-    assert re.search(rf"^``{extra}`` +\w", _text("docs", "installation.rst"), re.M)
+def test_installation_page_lists_every_extra(project):
+    for extra in ["mcmc", "materials", "dask", "all", "test", "docs"]:
+        assert extra in project["optional-dependencies"], extra
+        assert re.search(rf"^``{extra}`` +\w", _text("docs", "installation.rst"), re.M), extra
 
 
 def test_installation_page_lists_the_dependencies(project):
@@ -145,9 +145,9 @@ def test_package_data_names_every_file_that_is_no_module(tool):
     assert others == named
 
 
-@pytest.mark.parametrize("pattern", ["resources/**/*.yaml", "data/*.ecsv", "gap/templates/*.html"])
-def test_installed_package_has_its_data(pattern):
-    assert list(Path(astropolcal.__file__).parent.glob(pattern))
+def test_installed_package_has_its_data():
+    for pattern in ["resources/**/*.yaml", "data/*.ecsv", "gap/templates/*.html"]:
+        assert list(Path(astropolcal.__file__).parent.glob(pattern)), pattern
 
 
 def test_every_folder_of_modules_is_a_package():
@@ -222,9 +222,9 @@ def _environments_of(job):
     return named | set(re.findall(r"tox -e ([\w-]+)", commands))
 
 
-@pytest.mark.parametrize("name", ["tests", "docs", "release", "audit"])
-def test_workflow_is_there(name):
-    assert REPOSITORY / ".github" / "workflows" / f"{name}.yml" in WORKFLOWS
+def test_workflow_is_there():
+    for name in ["tests", "docs", "release", "audit"]:
+        assert REPOSITORY / ".github" / "workflows" / f"{name}.yml" in WORKFLOWS, name
 
 
 def test_workflows_run_environments_that_tox_has(environments):
@@ -240,16 +240,16 @@ def test_every_environment_is_run_by_a_workflow(environments):
     assert environments - run == {"fast", "benchmarks"}
 
 
-@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
-def test_workflow_has_few_rights_and_pinned_actions(path):
-    text = yaml.safe_load(path.read_text(encoding="utf-8"))
-    assert text["permissions"] == {"contents": "read"}
-    for name, step in _steps(path):
-        if "uses" in step:
-            assert re.fullmatch(r"[\w.-]+/[\w.-]+@(v\d+|release/v\d+)", step["uses"]), name
-        if step.get("uses", "").startswith("actions/checkout@"):
-            # setuptools-scm reads the version off the tags
-            assert step["with"] == {"fetch-depth": 0, "persist-credentials": False}
+def test_workflow_has_few_rights_and_pinned_actions():
+    for path in WORKFLOWS:
+        text = yaml.safe_load(path.read_text(encoding="utf-8"))
+        assert text["permissions"] == {"contents": "read"}, path
+        for name, step in _steps(path):
+            if "uses" in step:
+                assert re.fullmatch(r"[\w.-]+/[\w.-]+@(v\d+|release/v\d+)", step["uses"]), name
+            if step.get("uses", "").startswith("actions/checkout@"):
+                # setuptools-scm reads the version off the tags
+                assert step["with"] == {"fetch-depth": 0, "persist-credentials": False}, path
 
 
 def test_workflows_use_one_version_of_each_action():
@@ -307,14 +307,14 @@ def test_kinds_of_fragments_are_explained(kinds):
     assert set(explained) == kinds
 
 
-@pytest.mark.parametrize("path", FRAGMENTS, ids=lambda path: path.name)
-def test_fragment_is_named_and_written_as_it_should_be(path, kinds):
-    found = re.fullmatch(r"(\+\w+|\d+)\.(\w+)\.rst", path.name)
-    assert found, f"docs/changes/{path.name}: NUMBER.TYPE.rst, or +word.TYPE.rst"
-    assert found.group(2) in kinds, f"docs/changes/{path.name}: TYPE is one of {sorted(kinds)}"
-    text = path.read_text(encoding="utf-8")
-    assert text.strip().endswith("."), f"docs/changes/{path.name}: one or two sentences"
-    assert len(text.split()) < 120, f"docs/changes/{path.name}: one or two sentences"
+def test_fragment_is_named_and_written_as_it_should_be(kinds):
+    for path in FRAGMENTS:
+        found = re.fullmatch(r"(\+\w+|\d+)\.(\w+)\.rst", path.name)
+        assert found, f"docs/changes/{path.name}: NUMBER.TYPE.rst, or +word.TYPE.rst"
+        assert found.group(2) in kinds, f"docs/changes/{path.name}: TYPE is one of {sorted(kinds)}"
+        text = path.read_text(encoding="utf-8")
+        assert text.strip().endswith("."), f"docs/changes/{path.name}: one or two sentences"
+        assert len(text.split()) < 120, f"docs/changes/{path.name}: one or two sentences"
 
 
 def test_citation_is_complete(project):

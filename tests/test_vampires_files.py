@@ -17,10 +17,10 @@ from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.instruments.vampires import layout_of, mode_header, slices_of
 from astropolcal.observations import Observations
 from astropolcal.reduction import reduce_run
-from astropolcal.reduction._images import Detector as SimulatedDetector
 from astropolcal.reduction.cubes import both_states, simulate_cubes
-from astropolcal.reduction.errors import Detector, detector_of
 from astropolcal.reduction.headers import read_header
+from astropolcal.reduction.images import Detector as SimulatedDetector
+from astropolcal.reduction.photometry import Detector, detector_of
 from astropolcal.scripts.main import main
 from astropolcal.simulation import half_wave_plate_cycles
 
@@ -108,10 +108,10 @@ def test_keywords_of_the_detectors_before():
     assert (conventional.read_noise, conventional.excess_noise) == (9.6, 1.0)
 
 
-@pytest.mark.parametrize(("value", "state"), [("NA", None), (2, "B"), (2.0, "B"), (" A ", "A")])
-def test_states_in_headers(value, state):
-    values, errors = header_values(U_FLC=value)
-    assert (values.get("flc_state"), errors) == (state, [])
+def test_states_in_headers():
+    for value, state in [("NA", None), (2, "B"), (2.0, "B"), (" A ", "A")]:
+        values, errors = header_values(U_FLC=value)
+        assert (values.get("flc_state"), errors) == (state, []), (value, state)
 
 
 def test_a_state_that_there_is_not():

@@ -3,7 +3,6 @@
 
 import difflib
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,22 +12,19 @@ NAMES = ["hwp", "derotator", "wollaston", "dichroic"]
 texts = st.text("abcdehiloprtw_", min_size=1, max_size=12)
 
 
-@pytest.mark.parametrize(
-    ("name", "hint"),
-    [
+def test_nearest_name_or_nothing():
+    for name, hint in [
         ("wolaston", "; did you mean 'wollaston'?"),
         ("hpw", "; did you mean 'hwp'?"),
         ("derotators", "; did you mean 'derotator'?"),
         ("quartz", ""),
         ("", ""),
         (None, ""),
-    ],
-)
-def test_nearest_name_or_nothing(name, hint):
-    assert did_you_mean(name, NAMES) == hint
-    # a registry is a dictionary, and an iterator has its names once only
-    assert did_you_mean(name, dict.fromkeys(NAMES)) == hint
-    assert did_you_mean(name, iter(NAMES)) == hint
+    ]:
+        assert did_you_mean(name, NAMES) == hint, (name, hint)
+        # a registry is a dictionary, and an iterator has its names once only
+        assert did_you_mean(name, dict.fromkeys(NAMES)) == hint, (name, hint)
+        assert did_you_mean(name, iter(NAMES)) == hint, (name, hint)
 
 
 def test_several_are_joined_the_nearest_first():
@@ -58,12 +54,15 @@ def test_what_is_suggested_is_known_and_similar(name, known):
         assert hint.removeprefix("; did you mean '").removesuffix("'?") in near
 
 
-@pytest.mark.parametrize(
-    ("number", "words"),
-    [(0, "0 frames"), (1, "1 frame"), (2, "2 frames"), (-1, "-1 frames"), (1000, "1000 frames")],
-)
-def test_one_is_singular(number, words):
-    assert counted(number, "frame") == words
+def test_one_is_singular():
+    for number, words in [
+        (0, "0 frames"),
+        (1, "1 frame"),
+        (2, "2 frames"),
+        (-1, "-1 frames"),
+        (1000, "1000 frames"),
+    ]:
+        assert counted(number, "frame") == words, (number, words)
 
 
 def test_irregular_plural():

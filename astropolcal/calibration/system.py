@@ -1,14 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Rows of the measurement matrix of a chain, and how the Stokes parameters found with it change.
-
-Pieces of a system Mueller matrix: where a chain begins, its wavelengths, its errors.
-"""
+"""Rows of the system Mueller matrix of a chain: values, derivatives and errors."""
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import ParameterError, WavelengthRangeError
+from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
@@ -33,40 +30,15 @@ class Rows:
         self._shape = len(lam), self._light[0].shape[1] // len(self._nodes)
 
     def rows(self, vector=None, n=4):
-        """
-        Return the rows of both beams.
-
-        Parameters
-        ----------
-        vector : `~numpy.ndarray`, optional
-            Free parameters of the calibration in canonical units; by default its own values.
-        n : int
-            For how many of I, Q, U, V.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Shape (2, n_wavelengths, n_frames, n), the right beam first.
-        """
+        """Return the rows of both beams, right first, (2, n_wavelengths, n_frames, n)."""
         values = self._values(vector)
         fluxes = [np.stack(light.fluxes(values)) for light in self._light[:n]]
         return np.stack([self._over_nodes(flux) for flux in fluxes], axis=-1)
 
     def derivatives(self, n=4):
-        """
-        Return how the rows change with each free parameter of the chain.
+        """Return derivatives of the rows, ``"optic.parameter"`` to array, per canonical unit.
 
-        Parameters
-        ----------
-        n : int
-            For how many of I, Q, U, V.
-
-        Returns
-        -------
-        dict of str to `~numpy.ndarray`
-            ``"optic.parameter"`` to derivative per canonical unit (radian, micrometre or 1), of
-            the shape of `rows`; for a parameter given per wavelength, to the value at that
-            wavelength.
+        Of a parameter given per wavelength it is that to the value at the wavelength of the row.
         """
         wanted = self._wanted()
         if not wanted:
@@ -86,18 +58,9 @@ class Rows:
         return result
 
     def spread(self, slopes):
-        """
-        Lay derivatives by name out over the calibration's free parameters.
+        """Lay derivatives by name, per canonical unit, out over the free parameters on a last axis.
 
-        Parameters
-        ----------
-        slopes : dict of str to `~numpy.ndarray`
-            Derivatives per canonical unit, the first axis that of the wavelengths.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Derivatives per declared unit, with a last axis for the free parameters.
+        The first axis is that of the wavelengths; the result is per declared unit.
         """
         shape = next(iter(slopes.values())).shape if slopes else self._shape
         result = np.zeros((*shape, self.free.size))
@@ -113,24 +76,11 @@ class Rows:
         return result
 
     def changes(self, gain, n=3, scale=1.0):
-        r"""
-        Return how the Stokes parameters that a solution finds change with the free parameters.
+        r"""Return how the Stokes parameters that a solution finds change with the free parameters.
 
-        :math:`\delta\hat{\mathbf S} = -G\,\delta A\,\mathbf S`
-
-        Parameters
-        ----------
-        gain : `~numpy.ndarray`
-            What turns fluxes into Stokes parameters, (n_wavelengths, n_found, 2, n_frames).
-        n : int
-            How many of I, Q, U, V the light has.
-        scale : `~numpy.ndarray` or float
-            What multiplies the rows.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Per declared unit, (n_wavelengths, n_found, n, n_free).
+        :math:`\delta\hat S = -G\,\delta A\,S`, per declared unit, (n_wavelengths, n_found, n,
+        n_free); ``gain`` G turns fluxes into Stokes parameters, (n_wavelengths, n_found, 2,
+        n_frames).
         """
         slopes = {
             # dS = -G dA S; b: beams, f: frames, s: components of the light
@@ -184,13 +134,10 @@ class Rows:
 
 
 def model_error(fit, lam, n=3):
-    """
-    Return what the model lacks, as further directions of the Stokes parameters.
+    """Return what the model lacks, as directions (n_directions, n_wavelengths, n, n) of Stokes.
 
-    Shape (n_directions, n_wavelengths, n, n), from ``model_error`` of what a calibration knows of
-    its fit: each of q and u errs in proportion to q and to u, and by a share of the intensity.
-    At all wavelengths together, as what the model lacks is smooth; between those that are known
-    the errors are interpolated.
+    From ``model_error`` of `Calibration.fit`: each of q and u errs in proportion to q and u, and by
+    a share of the intensity, at all wavelengths together, as what the model lacks is smooth.
     """
     known = (fit or {}).get("model_error")
     if not known:
@@ -252,17 +199,14 @@ def match_wavelengths(grid, chain, wavelength):
 
 def errors(calibration, axes, value, slopes, bins):
     """Return the factor of the covariance, and which elements are open or blind."""
-    grid = calibration.wavelength
-    free = FreeParameters(calibration.chains, len(grid), calibration.ties)
-    shape = value.shape
+    free, shape = free_of(calibration), value.shape
     factor = np.empty((*shape, len(axes.sigmas)))
     is_open, is_blind = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for w in range(shape[-3]):
         at = (..., w, slice(None), slice(None))
         place = None if bins is None else bins[w]
-        # derivatives per degree, micrometre or percent, (n_elements of the matrices, n_free)
-        scaled = _along(free, slopes, at, place, value[at].shape) * axes.steps
-        spread = axes.spread(scaled @ axes.known.T, scaled @ axes.open.T, scaled @ axes.blind.T)
+        slopes_here = _along(free, slopes, at, place, value[at].shape)
+        spread = axes.spread(*axes.along(slopes_here))
         here = value[at].shape
         factor[(*at, slice(None))] = spread.moved.reshape(*here, -1)
         is_open[at] = spread.is_open.reshape(here)
@@ -285,6 +229,23 @@ def _along(free, slopes, at, place, shape):
     return result
 
 
+def free_of(calibration):
+    """Return the free parameters of a calibration's chains."""
+    return FreeParameters(calibration.chains, len(calibration.wavelength), calibration.ties)
+
+
+def from_first_stage(chain, wanted=None):
+    """Return the optics from the first on a stage, or on one of those that are wanted."""
+    found = leaves(chain)
+    for i, leaf in enumerate(found):
+        on_stage = (
+            leaf.stage not in (None, *COORDINATES) if wanted is None else leaf.stage in wanted
+        )
+        if on_stage:
+            return join(found[i:])
+    raise ChainError("the chain has no optic on a stage; give the chain from the sky")
+
+
 def split_chain(chain):
     """Return the optics in front of the first stage of the instrument, and the others."""
     found = leaves(chain)
@@ -301,13 +262,10 @@ def at_bins(chain, bins, size):
     chain = chain.copy()
     if bins is None or np.array_equal(bins, np.arange(size)):
         return chain
-    return join(_sliced(leaf, bins, size) for leaf in leaves(chain))
-
-
-def _sliced(leaf, bins, size):
-    """Return an optic at some bins of its parameters given per wavelength."""
-    several = [key for key in leaf.param_names if np.size(getattr(leaf, key).value) == size > 1]
-    values = {key: getattr(leaf, key) for key in several}
-    return leaf.with_parameters(
-        **{key: own.value[bins] * (own.unit or 1) for key, own in values.items()}
-    )
+    sliced = []
+    for leaf in leaves(chain):
+        several = [k for k in leaf.param_names if np.size(getattr(leaf, k).value) == size > 1]
+        own = {key: getattr(leaf, key) for key in several}
+        values = {key: p.value[bins] * (p.unit or 1) for key, p in own.items()}
+        sliced.append(leaf.with_parameters(**values))
+    return join(sliced)

@@ -1,15 +1,12 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""The converter of calibrations.
+"""
+Nodes of calibrations, and whether their parts belong together.
 
-The node holds everything of a `~astropolcal.calibration.Calibration` but the
-measurement, so the observations themselves stay outside. Its checksum covers
-all numbers and words, so that a file either gives back what was written or is
-refused.
-
-A file of an older version of the schema is checked against that version and its
-checksum, and then carried to the newest one step by step, see ``MIGRATIONS``.
-
-Whether the parts of a calibration belong together.
+The node holds everything of a `~astropolcal.calibration.Calibration` but the measurement, so the
+observations themselves stay outside. Its checksum covers all numbers and words, so that a file
+either gives back what was written or is refused. A file of an older version of the schema is
+checked against that version and its checksum, and then carried to the newest one step by step, see
+``MIGRATIONS``.
 """
 
 from importlib.metadata import version as installed
@@ -58,37 +55,7 @@ _DERIVED = ("checksum", "validity", "written_with")
 
 
 def node_from_calibration(calibration):
-    """
-    Return the node that stores a calibration.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-
-    Returns
-    -------
-    dict
-        As the schema ``calibration-1.1.0`` describes it.
-
-    Raises
-    ------
-    CalibrationFileError
-        If it is inconsistent, or holds what files cannot hold.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> node_from_calibration(cal)["covariance"]["names"][:2]
-    ['calibration_polarizer.theta', 'hwp.theta']
-    """
+    """Return the node of a calibration, as the newest schema describes it."""
     check_calibration(calibration)
     node = {
         **_chains_and_priors(calibration.chains),
@@ -232,40 +199,7 @@ def _stage_node(stage):
 
 
 def calibration_from_node(node, tag=CALIBRATION_TAG):
-    """
-    Return the calibration that a node stores.
-
-    Parameters
-    ----------
-    node : dict
-        Its node, which obeys the schema, with its optics restored.
-    tag : str
-        Version of the schema that it obeys, one of ``CALIBRATION_TAGS``.
-
-    Returns
-    -------
-    Calibration
-        Without ``measurement``.
-
-    Raises
-    ------
-    CalibrationFileError
-        If the content does not match its checksum or is inconsistent.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> again = calibration_from_node(node_from_calibration(cal))
-    >>> again.to_dict() == cal.to_dict()
-    True
-    """
+    """Return the calibration of a node with its optics restored, which obeys the schema ``tag``."""
     if _checksum(node) != node["checksum"]:
         raise CalibrationFileError(
             "the content does not match its checksum: it was changed after it was written"
@@ -394,38 +328,7 @@ _ACCURACY = ("wavelength", "n", "k", "s_res", "s_mean", "s_cv")
 
 
 def check_calibration(calibration):
-    """
-    Check shapes, names and units of a calibration against each other.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-
-    Raises
-    ------
-    CalibrationFileError
-        If the sizes of the parameters do not fit the wavelengths, covariance
-        or identifiability are not those of the free parameters, a value is
-        outside of its bounds, datasets of one optic disagree, or the numbers of
-        chains and datasets differ.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> cal.at_bound = ["hwp.thickness"]
-    >>> check_calibration(cal)
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.CalibrationFileError: at_bound names 'hwp.thickness', which ...
-    """
+    """Check shapes, names, units, bounds and shared values of a calibration against each other."""
     wavelength = calibration.wavelength
     if np.ndim(wavelength) != 1 or not np.all(wavelength.value > 0):
         raise CalibrationFileError(f"wavelength = {wavelength} must be a list of positive lengths")
@@ -638,30 +541,5 @@ def _check_accuracy(record):
 
 
 def content_hash(calibration):
-    """
-    Return the SHA-256 of all that a calibration file keeps, the ``checksum`` of the file.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits; the same after writing and reading.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.converters.calibration import content_hash
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> len(content_hash(cal))
-    64
-    """
+    """Return the SHA-256 of all that a calibration file keeps, the ``checksum`` of the file."""
     return node_from_calibration(calibration)["checksum"]

@@ -1,15 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What all nodes are made of: plain values, quantities, tables, and a checksum.
+"""
+What nodes are made of: plain values, quantities, tables, priors, posteriors; a checksum.
 
-Priors in a calibration file.
-
-A prior belongs to a parameter, in whatever chain its optic stands; so the file
-lists priors by the parameter's name, beside the chains.
-
-Samples of a posterior in a calibration file.
-
-A file keeps a part of the samples, and what the whole run says of its
-convergence, its quantiles among it.
+A prior belongs to a parameter, in whatever chain its optic stands; so the file lists priors by the
+parameter's name, beside the chains. Of a posterior it keeps a part of the samples, and what the
+whole run says of its convergence, its quantiles among it.
 """
 
 import datetime
@@ -30,33 +25,12 @@ __all__ = []
 
 
 def unit_text(unit):
-    """
-    Return a unit as text that `unit_from_text` understands; None stays None.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-
-    >>> unit_text(u.deg)
-    'deg'
-    """
+    """Return a unit as text that `unit_from_text` understands; None stays None."""
     return None if unit is None else u.Unit(unit).to_string()
 
 
 def unit_from_text(text):
-    """
-    Return the unit that `unit_text` wrote.
-
-    Raises
-    ------
-    CalibrationFileError
-        If it is a number times a unit, such as ``"1e-3 deg"``, which nothing is written in.
-
-    Examples
-    --------
-    >>> unit_from_text("mm")
-    Unit("mm")
-    """
+    """Return the unit of `unit_text`; nothing is written in a number times a unit."""
     if text is None:
         return None
     unit = u.Unit(text)
@@ -69,26 +43,7 @@ def unit_from_text(text):
 
 
 def node_from_value(value):
-    """
-    Return the node of a number, an array or a Quantity.
-
-    Parameters
-    ----------
-    value : float, `~numpy.ndarray` or `~astropy.units.Quantity`
-        Of any shape.
-
-    Returns
-    -------
-    dict
-        ``value``, and ``unit`` where it has one.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-
-    >>> node_from_value(1.5 * u.deg)
-    {'value': 1.5, 'unit': 'deg'}
-    """
+    """Return ``value``, and ``unit`` where it has one, of a number, an array or a Quantity."""
     unit = getattr(value, "unit", None)
     # a copy, as views of one array would share a block of the file
     number = np.array(value.value if isinstance(value, u.Quantity) else value)
@@ -97,14 +52,7 @@ def node_from_value(value):
 
 
 def value_from_node(node):
-    """
-    Return the array or the Quantity of a node that `node_from_value` made.
-
-    Examples
-    --------
-    >>> value_from_node({"value": 1.5, "unit": "deg"})
-    <Quantity 1.5 deg>
-    """
+    """Return the array or the Quantity of a node that `node_from_value` made."""
     unknown = sorted(set(node) - {"name", "unit", "value"})
     if unknown:
         raise CalibrationFileError(f"a value with {unknown[0]!r}, which means nothing here")
@@ -113,31 +61,14 @@ def value_from_node(node):
 
 
 def node_from_table(table):
-    """
-    Return the node of a table, a list of its columns in their order; None stays None.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropy.table import QTable
-
-    >>> [column["name"] for column in node_from_table(QTable({"s_res": [0.2] * u.percent}))]
-    ['s_res']
-    """
+    """Return the node of a table, a list of its columns in their order; None stays None."""
     if table is None:
         return None
     return [{"name": name} | node_from_value(table[name]) for name in table.colnames]
 
 
 def table_from_node(node):
-    """
-    Return the `~astropy.table.QTable` of a node that `node_from_table` made.
-
-    Examples
-    --------
-    >>> table_from_node([{"name": "s_res", "value": [0.2], "unit": "%"}])["s_res"]
-    <Quantity [0.2] %>
-    """
+    """Return the `~astropy.table.QTable` of a node that `node_from_table` made."""
     if node is None:
         return None
     columns = {column["name"]: value_from_node(column) for column in node}
@@ -147,33 +78,10 @@ def table_from_node(node):
 
 
 def plain(value, where="value"):
-    """
-    Return a value as ASDF stores it: numbers, text, lists, mappings, quantities.
+    """Return a value as ASDF stores it: numbers, text, lists, mappings, quantities.
 
-    Dates and times become ISO text, tuples lists, numpy's numbers Python's.
-
-    Parameters
-    ----------
-    value : object
-        The value, such as the meta of a table.
-    where : str
-        What it is called in the error message.
-
-    Returns
-    -------
-    object
-
-    Raises
-    ------
-    CalibrationFileError
-        If it, or something in it, is of another kind.
-
-    Examples
-    --------
-    >>> import datetime
-
-    >>> plain({"date": datetime.date(2025, 10, 2), "lamps": ("halogen", 2)})
-    {'date': '2025-10-02', 'lamps': ['halogen', 2]}
+    Dates and times become ISO text, tuples lists, numpy's numbers Python's; ``where`` is for the
+    message.
     """
     if isinstance(value, dict):
         return {str(key): plain(item, f"{where}.{key}") for key, item in value.items()}
@@ -203,28 +111,10 @@ def _plain_scalar(value, where):
 
 
 def checksum(node, expand=None):
-    """
-    Return the SHA-256 of the content of a node, however a file spells it.
+    """Return the SHA-256 of the content of a node, however a file spells it.
 
-    Parameters
-    ----------
-    node : object
-        Mappings, lists, numbers, text, arrays and quantities.
-    expand : callable, optional
-        What turns any other object into such a node.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits. Equal for equal bits, whatever the order of the
-        keys and whether arrays are inline or in blocks.
-
-    Examples
-    --------
-    >>> checksum({"a": 1.0, "b": None}) == checksum({"b": None, "a": 1.0})
-    True
-    >>> checksum(1.0) == checksum(1.0000000000000002)
-    False
+    Equal for equal bits, whatever the order of the keys and whether arrays are inline or in blocks.
+    ``expand`` turns any other object into such a node.
     """
     # the order of keys in YAML means nothing
     text = json.dumps(_spelled(node, expand), sort_keys=True)
@@ -264,36 +154,9 @@ _OURS = {"normal": ("mean", "std"), "uniform": ("low", "high")}
 
 
 def node_from_priors(chains):
-    """
-    Return the priors of the chains' parameters.
+    """Return the priors of the chains' parameters: ``parameter``, ``kind`` and their numbers.
 
-    Parameters
-    ----------
-    chains : sequence
-        The chains.
-
-    Returns
-    -------
-    list of dict
-        ``parameter`` and ``kind``, with ``mean`` and ``std``, ``low`` and
-        ``high``, or ``distribution``, ``args`` and ``kwds`` of `scipy.stats`.
-
-    Raises
-    ------
-    CalibrationFileError
-        If a prior is no `~astropolcal.measurement.Normal`,
-        ``Uniform`` or frozen continuous distribution.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import optics
-
-    >>> from astropolcal.measurement import Normal
-    >>> hwp = optics.TwoLayerWaveplate(name="hwp")
-    >>> hwp.theta.prior = Normal(0 * u.deg, 6 * u.arcmin)
-    >>> node_from_priors([hwp])[0]["std"]
-    {'value': 6.0, 'unit': 'arcmin'}
+    Normal, Uniform and frozen continuous distributions of `scipy.stats` are allowed.
     """
     # one entry a parameter: chains share the optics that stand in several of them
     table = parameter_table(chains).items()
@@ -348,25 +211,7 @@ def _frozen(node):
 
 
 def without_priors(chain):
-    """
-    Return a copy of a chain whose parameters have no priors.
-
-    Parameters
-    ----------
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        The chain; it is not changed.
-
-    Returns
-    -------
-    Optic or `~astropy.modeling.CompoundModel`
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-
-    >>> without_priors(optics.Rotator(name="r")).theta.prior is None
-    True
-    """
+    """Return a copy of a chain whose parameters have no priors."""
     copy = chain.copy()
     for parameters in parameter_table([copy]).values():
         for parameter in parameters:
@@ -375,32 +220,7 @@ def without_priors(chain):
 
 
 def restore_priors(chains, nodes):
-    """
-    Give the parameters of chains the priors that `node_from_priors` wrote.
-
-    Parameters
-    ----------
-    chains : sequence
-        The chains, which are changed.
-    nodes : list of dict
-        The priors.
-
-    Raises
-    ------
-    CalibrationFileError
-        If no chain has such a parameter, or there is no such distribution.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-
-    >>> rotator = optics.Rotator(name="r")
-    >>> bound = {"value": 1.0, "unit": "deg"}
-    >>> restore_priors([rotator], [{"parameter": "r.theta", "kind": "normal", "mean": bound,
-    ...                             "std": bound}])
-    >>> rotator.theta.prior.std
-    <Quantity 1. deg>
-    """
+    """Give the parameters of chains the priors that `node_from_priors` wrote."""
     table, seen = parameter_table(chains), set()
     for node in nodes:
         if node["parameter"] in seen:
@@ -440,30 +260,7 @@ _DERIVED = ("converged", "words", "kept")
 
 
 def node_from_posterior(posterior):
-    """
-    Return the node that stores a posterior.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        If it is not thinned yet, it is thinned as
-        `~astropolcal.calibration.posterior.Posterior.thinned` does by default.
-
-    Returns
-    -------
-    dict
-        As the schema ``calibration-1.0.0`` describes it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.calibration.posterior.samples import Posterior
-
-    >>> chain = np.random.default_rng(1).normal(size=(4000, 8, 1))
-    >>> node = node_from_posterior(Posterior(["hwp.theta"], ["deg"], chain, chain[..., 0]))
-    >>> node["chain"].size <= 4000, node["converged"]
-    (True, True)
-    """
+    """Return the node of a posterior, thinned if it is not yet."""
     kept = posterior if posterior.is_thinned else posterior.thinned()
     parts = kept.to_dict()
     # what was thinned has no burn-in any more
@@ -478,34 +275,7 @@ def node_from_posterior(posterior):
 
 
 def posterior_from_node(node):
-    """
-    Return the posterior that a node stores.
-
-    Parameters
-    ----------
-    node : dict
-        Its node, which obeys the schema.
-
-    Returns
-    -------
-    Posterior
-        Thinned.
-
-    Raises
-    ------
-    CalibrationFileError
-        If its parts do not belong together.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.calibration.posterior.samples import Posterior
-
-    >>> chain = np.random.default_rng(1).normal(size=(100, 8, 1))
-    >>> posterior = Posterior(["hwp.theta"], ["deg"], chain, chain[..., 0]).thinned()
-    >>> posterior_from_node(node_from_posterior(posterior)) == posterior
-    True
-    """
+    """Return the thinned posterior that a node, which obeys the schema, stores."""
     parts = {key: value for key, value in node.items() if key not in _DERIVED}
     # copies of our own: what ASDF gives may be tied to the file
     for key in ("chain", "log_prob", "acceptance", "fitted"):
@@ -525,34 +295,7 @@ def posterior_from_node(node):
 
 
 def check_posterior(posterior, covariance):
-    """
-    Check a posterior against the free parameters of its calibration.
-
-    Parameters
-    ----------
-    posterior : Posterior or None
-        The posterior.
-    covariance : Covariance
-        Of all free parameters.
-
-    Raises
-    ------
-    CalibrationFileError
-        If it has samples of something else, in other units, or no finite ones.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.calibration.posterior.samples import Posterior
-    >>> from astropolcal.calibration.uncertainty.covariance import Covariance
-
-    >>> chain = np.random.default_rng(1).normal(size=(100, 8, 1))
-    >>> posterior = Posterior(["hwp.theta"], ["deg"], chain, chain[..., 0])
-    >>> check_posterior(posterior, Covariance(["hwp.w_sio2"], ["mm"], [[1.0]]))
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.CalibrationFileError: posterior of 'hwp.theta', which is ...
-    """
+    """Check a posterior against the free parameters of its calibration."""
     if posterior is None:
         return
     units = dict(zip(covariance.names, covariance.units, strict=True))

@@ -1,11 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-One converter for all optics.
+Nodes of optics.
 
-An optic is stored as its parameters, each with value, unit, fixed flag and
-both bounds written out, and the settings that rebuild it (name, mount, beam and
-what else its class has).
-The position of its stage belongs to a frame and is not stored.
+An optic is stored as its parameters, each with value, unit, fixed flag and both bounds written out,
+and the settings that rebuild it (name, mount, beam and what else its class has). The position of
+its stage belongs to a frame and is not stored.
 """
 
 import numpy as np
@@ -21,35 +20,7 @@ __all__ = []
 
 
 def node_from_optic(optic):
-    """
-    Return the node that stores an optic.
-
-    Parameters
-    ----------
-    optic : Optic
-        Of a class in `astropolcal.optics.OPTICS`.
-
-    Returns
-    -------
-    dict
-        ``parameters``, ``name`` and ``mount`` where they are not None, and the
-        settings of the class, such as ``beam`` or ``harmonic``.
-
-    Raises
-    ------
-    CalibrationFileError
-        If a file cannot hold the optic: its class is not registered, or a
-        parameter has a callable tie, a prior that is no distribution, or a value that is not
-        finite.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.converters.optics import node_from_optic
-    >>> node = node_from_optic(optics.WollastonPrism(name="wollaston"))
-    >>> node["beam"], node["parameters"]["efficiency"]
-    ('right', {'value': 1.0, 'fixed': False, 'bounds': [0.0, 1.0]})
-    """
+    """Return the node of an optic, of a class in `astropolcal.optics.OPTICS`."""
     _check_class(optic)
     settings = {key: value for key, value in optic._settings().items() if value is not None}
     return settings | {
@@ -104,33 +75,7 @@ def _bounds(parameter):
 
 
 def optic_from_node(name, node):
-    """
-    Return the optic that a node stores.
-
-    Parameters
-    ----------
-    name : str
-        Name of its class.
-    node : dict
-        Its node, which obeys the schema.
-
-    Returns
-    -------
-    Optic
-
-    Raises
-    ------
-    CalibrationFileError
-        If the class refuses a value or a setting.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.converters.optics import node_from_optic, optic_from_node
-    >>> node = node_from_optic(optics.WollastonPrism(efficiency=0.98, name="wollaston"))
-    >>> optic_from_node("WollastonPrism", node)
-    <WollastonPrism(theta=0. deg, efficiency=0.98, name='wollaston')>
-    """
+    """Return the optic of the class ``name`` that a node, which obeys the schema, stores."""
     # an optic that is on no stage says so: the default of some is another
     settings = {"mount": None} | {key: value for key, value in node.items() if key != "parameters"}
     values = {key: _value(entry) for key, entry in node["parameters"].items()}

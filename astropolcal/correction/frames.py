@@ -8,15 +8,16 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.chain import stages
-from astropolcal.correction.brightness import frame_brightness
+from astropolcal.correction.solve import frame_brightness
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.fitscheck import primary_header
-from astropolcal.observations import Observations, pair_frames
+from astropolcal.observations import Observations
+from astropolcal.observations.pairing import pair_frames
 from astropolcal.optics import COORDINATES
 from astropolcal.pipeline.headers import describe
 
-__all__ = ["ScienceFrames", "frame_positions"]
+__all__ = ["ScienceFrames"]
 
 
 @dataclass
@@ -26,12 +27,13 @@ class ScienceFrames:
 
     Attributes
     ----------
-    source : ArraySource, TurnedSource or CubeFiles
-        The fluxes.
+    source : object
+        The fluxes of both beams, in memory or in files.
     wavelength : `~astropy.units.Quantity`
         Shape (n_wavelengths,).
     positions : dict
-        Position of every stage of the chain, (n_frames,), see `RowModel`.
+        Position of every stage of the chain, (n_frames,), or (nodes, n_frames) at the
+        Gauss-Legendre nodes of the exposures; without a unit in radian.
     pairs : `~numpy.ndarray` or None
         Frames of the pairs of double differences.
     scale : `~numpy.ndarray` or None
@@ -123,9 +125,10 @@ class ScienceFrames:
         Parameters
         ----------
         rows : `~numpy.ndarray`
-            As `measurement_rows` gives them.
+            As `~astropolcal.correction.measurement_rows` gives them.
         **settings
-            As for `frame_brightness`.
+            ``components``, ``observable``, ``pairs`` and ``weights``, as for
+            `~astropolcal.correction.correct`.
 
         Returns
         -------
@@ -183,16 +186,25 @@ class ScienceFrames:
 
         Parameters
         ----------
-        right, left, variance_right, variance_left, names, batch
-            As for ``ArraySource``; images or spectra.
+        right, left, variance_right, variance_left : array_like
+            Images or spectra in memory, mapped from disk, or of dask, and their variances, shape
+            (n_frames, n_wavelengths, ...); NaN where there is none.
+        names : sequence of str, optional
+            What to call the frames.
+        batch : int, optional
+            Frames that are read at a time.
         wavelength, positions
             As the attributes.
         hwp : `~astropy.units.Quantity`, optional
             Commanded angles of the half-wave plate, by which frames are paired.
         position_angle : `~astropy.units.Quantity`, optional
             Of the +y axis of every frame; the images are then turned north up.
-        centre, mirrored, order
-            As for `derotate`.
+        centre : (float, float), optional
+            0-based x and y of the star; by default the middle.
+        mirrored : bool
+            Whether east is to the right of north.
+        order : int
+            Of the spline, 0 to 5.
         **settings
             More attributes: ``pairs``, ``scale``, ``unit``, ``pixel_scale``, ``date``, ``mode``,
             ``meta``.
@@ -273,16 +285,20 @@ class ScienceFrames:
             star ``parallactic`` and ``altitude``, and ``hwp_true`` if it is known; ``flc_state`` if
             the chain has a modulator.
         chain : `~astropy.modeling.CompoundModel`
-            From the sky to the detector, see `sky_chain`.
+            From the sky to the detector.
         wavelength : `~astropy.units.Quantity`, optional
             Of the slices; by default the instrument's.
         centres : array_like, optional
-            As for ``CubeFiles``, in both images side by side where each beam has files of its own,
-            shape (2, 2) or (n_frames, 2, 2); or of the left beam only, shape
-            (2,) or (n_frames, 2), with the right beam where the layout says; by default in the
-            middle of the field.
-        size, position_angle, mirrored, order, left_scale
-            As for ``CubeFiles``.
+            Place of the star in the right and the left beam, 0-based x and y, side by side also
+            where each beam has files of its own, shape (2, 2) or (n_frames, 2, 2); or of the left
+            beam only, shape (2,) or (n_frames, 2), with the right beam where the layout says; by
+            default in the middle of the field.
+        size : int
+            Rows and columns that are cut out about it.
+        position_angle, mirrored, order
+            As for `from_arrays`.
+        left_scale : array_like
+            By what the left beam is multiplied, one number or one a frame.
         **settings
             More attributes. Without ``date`` and ``mode`` the headers of the files tell.
 
@@ -388,43 +404,10 @@ def _in_files(centres, layout):
 
 def frame_positions(instrument, table, chain, names=None):
     """
-    Return the position of every stage in each frame, from what the headers give.
+    Return the position of every stage of a chain in each frame, radian, (n_frames,), by name.
 
-    Parameters
-    ----------
-    instrument : Instrument
-        That knows how stages follow the sky.
-    table : `~astropy.table.QTable`
-        One row a frame with the angles of the headers, and the state of a modulator, A or B, as
-        ``flc_state`` if the chain has one.
-    chain : `~astropy.modeling.CompoundModel`
-        From the sky to the detector.
-    names : sequence of str, optional
-        What to call the frames.
-
-    Returns
-    -------
-    dict of str to `~numpy.ndarray`
-        Radian, shape (n_frames,).
-
-    Raises
-    ------
-    ObservationError
-        If an angle or a state is missing; the message names the frame.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropy.table import QTable
-    >>> from astropolcal import instruments
-    >>> from astropolcal.correction import frame_positions
-    >>> charis = instruments.get("charis")
-    >>> table = QTable({"hwp": [45] * u.deg, "derotator": [60] * u.deg,
-    ...                 "parallactic": [20] * u.deg, "altitude": [67] * u.deg})
-    >>> positions = frame_positions(charis, table, charis.on_sky(charis.published()))
-    >>> np.rad2deg(positions["hwp"])
-    array([122.])
+    ``table`` has one row a frame with the angles of the headers, and ``flc_state``, A or B, if the
+    chain has a modulator; ``names`` are those of the frames in messages.
     """
     table = QTable(table, copy=True)
     names = [f"frame {i}" for i in range(len(table))] if names is None else list(map(str, names))

@@ -9,15 +9,16 @@ of the sky already.
 """
 
 from functools import lru_cache
+from itertools import pairwise
 
 import astropy.units as u
 import numpy as np
+from scipy.sparse import csr_array
 
-from astropolcal.correction._spline import resample, suits
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import angle_to_rad
 
-__all__ = ["azimuthal", "derotate", "derotate_variance", "position_angles"]
+__all__ = []
 
 _QUARTER = np.pi / 2
 # also the share of a pixel without a value from which on the result has none
@@ -30,52 +31,15 @@ def derotate(
     image, position_angle, *, centre=None, size=None, mirrored=False, order=3, centre_out=None
 ):
     """
-    Resample images so that north is up and east is left.
+    Resample images (..., Y, X) so that north is up and east is left.
 
-    Parameters
-    ----------
-    image : `~numpy.ndarray`
-        Shape (..., Y, X).
-    position_angle : `~astropy.units.Quantity`
-        Of the +y axis of the image, from north through east.
-    centre : (float, float), optional
-        0-based x and y of the point that stays; by default the middle.
-    size : int or (int, int), optional
-        Rows and columns of the result; by default those of the image.
-    mirrored : bool
-        Whether east is to the right of north in the image.
-    order : int
-        Of the spline, 0 to 5.
-    centre_out : (float, float), optional
-        Where the point lies in the result; by default in the middle, or where it was if
-        ``size`` is not given.
+    NaN outside and where a pixel without a value has a share.
 
-    Returns
-    -------
-    `~numpy.ndarray`
-        NaN outside the image, and where a pixel without a value has a share.
-
-    Raises
-    ------
-    ParameterError
-        If the angle has no unit or is not finite, or a choice is not possible.
-
-    Notes
-    -----
-    Surface brightness is interpolated. A pixel keeps its area in a rotation, so this
-    conserves flux up to what leaves the image.
-
-    Examples
-    --------
-    A star up in an image whose y axis points east is east of the middle, so left:
-
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal.correction import derotate
-    >>> image = np.zeros((5, 5))
-    >>> image[3, 2] = 1
-    >>> np.argwhere(derotate(image, 90 * u.deg).round(9)).tolist()
-    [[2, 1]]
+    ``position_angle`` is that of the +y axis, from north through east; ``centre`` the 0-based x and
+    y that stays (by default the middle), ``centre_out`` where it lies in the result of ``size``
+    rows and columns; ``mirrored`` images have east to the right of north; ``order`` is the
+    spline's, 0 to 5. Surface brightness is interpolated: a rotation keeps the area of a pixel, so
+    flux is conserved.
     """
     image = np.asarray(image, dtype=float)
     grid = _grid(image, position_angle, centre, size, mirrored, centre_out)
@@ -88,32 +52,10 @@ def derotate_variance(
     variance, position_angle, *, centre=None, size=None, mirrored=False, order=3, centre_out=None
 ):
     """
-    Return the variances of images resampled by `derotate`.
+    Return the variances of images turned by `derotate`.
 
-    Parameters
-    ----------
-    variance : `~numpy.ndarray`
-        Of the pixels, which are independent; shape (..., Y, X).
-    position_angle, centre, size, mirrored, order, centre_out
-        As for `derotate`.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Correlations between neighbours, which resampling makes, are not in it.
-
-    Notes
-    -----
-    The sum of the squared weights of the spline, times the variance interpolated linearly,
-    which is exact where the variance is the same within a few pixels.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal.correction import derotate_variance
-    >>> derotate_variance(np.ones((9, 9)), 45 * u.deg)[4, 4:7].round(2).tolist()
-    [1.0, 0.7, 0.6]
+    Sums of squared spline weights times the variances. The covariance of neighbouring pixels that
+    resampling makes is not kept.
     """
     variance = np.asarray(variance, dtype=float)
     matrix, offset, shape = _grid(variance, position_angle, centre, size, mirrored, centre_out)
@@ -246,25 +188,10 @@ def _gain(place, order):
 
 def position_angles(shape, centre=None):
     """
-    Return the position angle of every pixel about a point, of an image with north up.
+    Return the position angle of every pixel about a point of an image with north up.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    centre : (float, float), optional
-        0-based x and y; by default the middle.
-
-    Returns
-    -------
-    `~astropy.units.Quantity`
-        Degree, from north through east, shape (Y, X), between -180 and 180.
-
-    Examples
-    --------
-    >>> from astropolcal.correction import position_angles
-    >>> position_angles((3, 3))[1, 0]
-    <Quantity 90. deg>
+    Degree, from north through east, -180 to 180; the point is 0-based x and y, by default the
+    middle.
     """
     height, width = shape
     x, y = _point("centre", ((width - 1) / 2, (height - 1) / 2) if centre is None else centre)
@@ -274,34 +201,12 @@ def position_angles(shape, centre=None):
 
 
 def azimuthal(q, u_, centre=None):
-    r"""
-    Return the Stokes parameters with respect to the direction to a star.
+    """
+    Return Q_phi and U_phi about a star; positive Q_phi is polarization across the direction to it.
 
-    Parameters
-    ----------
-    q, u_ : `~numpy.ndarray`
-        Stokes Q and U, north up, shape (..., Y, X).
-    centre : (float, float), optional
-        0-based x and y of the star; by default the middle.
-
-    Returns
-    -------
-    q_phi, u_phi : `~numpy.ndarray`
-        Positive ``q_phi`` is polarization across the direction to the star.
-
-    Notes
-    -----
-    :math:`Q_\phi = -Q\cos 2\phi - U\sin 2\phi`, :math:`U_\phi = Q\sin 2\phi - U\cos 2\phi`
-    with the position angle :math:`\phi` (de Boer et al. 2020, A&A 633, A63,
-    doi:10.1051/0004-6361/201834989).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.correction import azimuthal
-    >>> q_phi, u_phi = azimuthal(np.full((3, 3), -1.0), np.zeros((3, 3)))
-    >>> q_phi[2, 1], q_phi[1, 2]
-    (np.float64(1.0), np.float64(-1.0))
+    Q_phi = -Q cos 2 phi - U sin 2 phi, U_phi = Q sin 2 phi - U cos 2 phi with the position angle
+    phi (de Boer et al. 2020, A&A 633, A63, doi:10.1051/0004-6361/201834989); maps (..., Y, X),
+    north up.
     """
     cosine, sine = _double(np.shape(q)[-2:], centre)
     return -q * cosine - u_ * sine, q * sine - u_ * cosine
@@ -322,3 +227,94 @@ def azimuthal_variances(variance_q, variance_u, covariance, centre=None):
             cosine**2 * variance_q + sine**2 * variance_u + cross,
             sine**2 * variance_q + cosine**2 * variance_u - cross,
         )
+
+
+# ---- splines of many slices ----------------------------------------------------------------------
+# The same as `scipy.ndimage.affine_transform` with ``mode="mirror"`` makes of each slice. All
+# slices of a cube turn by the same angle, so the weights of the pixels are worked out once, and
+# applied to all of them as a sparse matrix.
+
+# below, the weights cost more than they save, or the ends of the recursion meet
+_FEWEST_PLANES, _SHORTEST = 5, 30
+# the pole of the cubic spline filter and the terms after which its powers are below 1e-14
+# (Unser, Aldroubi and Eden 1993, IEEE Trans. Signal Process. 41, 821)
+_POLE = np.sqrt(3.0) - 2.0
+_RECURSION = 25
+# pixels of the result whose weights are in memory at a time: 16 each, 12 bytes a weight
+_BLOCK = 2**17
+
+
+def suits(shape, order):
+    """Return whether `resample` takes images of this shape, (planes, rows, columns)."""
+    return order in (1, 3) and shape[0] >= _FEWEST_PLANES and min(shape[1:]) >= _SHORTEST
+
+
+def resample(planes, matrix, offset, shape, order):
+    """Return finite images at ``matrix @ pixel + offset``, (planes, *shape)."""
+    count, height, width = planes.shape
+    # the slices are the last axis: the filter and the matrix then run over contiguous numbers
+    values = np.ascontiguousarray(planes.transpose(1, 2, 0), dtype=float)
+    if order == 3:
+        _filter(values.reshape(height, -1))
+    # now (column, row, slice), so that the pixel of a weight is row + height * column
+    values = np.ascontiguousarray(values.swapaxes(0, 1))
+    if order == 3:
+        _filter(values.reshape(width, -1))
+    values = values.reshape(-1, count)
+    out = np.empty((count, *shape))
+    rows = max(_BLOCK // shape[1], 1)
+    for first in range(0, shape[0], rows):
+        block = (first, min(first + rows, shape[0]), shape[1])
+        weights = _weights(block, tuple(map(tuple, matrix)), tuple(offset), (height, width), order)
+        out[:, first : block[1]] = (weights @ values).T.reshape(count, -1, shape[1])
+    return out
+
+
+def _filter(lines):
+    """Replace values by the coefficients of a cubic spline, along the first axis, in place."""
+    # the gain of the two passes, (1 - z)(1 - 1/z) = 6 for z = sqrt(3) - 2
+    lines *= 6.0
+    powers = _POLE ** np.arange(_RECURSION)
+    # start of the causal pass as if the signal went on mirrored at its first sample
+    lines[0] = powers @ lines[:_RECURSION]
+    for before, line in pairwise(lines):
+        line += _POLE * before
+    # start of the anticausal pass, mirrored at the last sample
+    lines[-1] = _POLE / (_POLE**2 - 1) * (lines[-1] + _POLE * lines[-2])
+    for line, behind in zip(lines[-2::-1], lines[:0:-1], strict=True):
+        np.subtract(behind, line, out=line)
+        line *= _POLE
+
+
+# both beams, fluxes and then variances, are turned alike
+@lru_cache(maxsize=2)
+def _weights(block, matrix, offset, size, order):
+    """Return the weight of each pixel, column by column of the image, in those of the result."""
+    i, j = np.arange(*block[:2])[:, None], np.arange(block[2])
+    lines = zip(matrix, offset, strict=True)
+    places = ((by_row * i + by_column * j + o).ravel() for (by_row, by_column), o in lines)
+    (y, by_y), (x, by_x) = (_taps(p, n, order) for p, n in zip(places, size, strict=True))
+    index = (y[:, :, None] + size[0] * x[:, None, :]).reshape(len(y), -1)
+    weights = (by_y[:, :, None] * by_x[:, None, :]).reshape(index.shape)
+    # every row of the matrix has the same number of weights, 4 or 16
+    ends = np.arange(0, weights.size + 1, weights.shape[1], dtype=np.int32)
+    shape = (len(index), size[0] * size[1])
+    return csr_array((weights.ravel(), index.ravel(), ends), shape=shape)
+
+
+def _taps(place, n, order):
+    """Return the pixels that have a share at each place along an axis of n pixels, and shares."""
+    # what lies outside has no value in the end; it must only not lie outside of the array
+    place = np.clip(place, 0.0, n - 1.0)
+    # the last pixel itself lies at the end of the last interval, not at the begin of another
+    first = np.minimum(place.astype(np.int32), n - 2)
+    f = (place - first)[:, None]
+    g = 1.0 - f
+    if order == 1:
+        return first[:, None] + np.arange(2, dtype=np.int32), np.concatenate([g, f], axis=1)
+    # the cubic B-spline at distances 1 + f, f, 1 - f and 2 - f, times six
+    shares = [g**3, 4 - 6 * f**2 + 3 * f**3, 4 - 6 * g**2 + 3 * g**3, f**3]
+    pixels = first[:, None] + np.arange(-1, 3, dtype=np.int32)
+    # taps beyond an end fall on the pixels mirrored about it
+    pixels = n - 1 - np.abs(n - 1 - np.abs(pixels))
+    return pixels, np.concatenate(shares, axis=1) / 6

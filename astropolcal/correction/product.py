@@ -15,13 +15,13 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyUserWarning
 
-from astropolcal.correction.engine import covariance_index
+from astropolcal.correction.solve import covariance_index
 from astropolcal.correction.systematic import Systematic
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import atomic_path, check_new, understood
 from astropolcal.fitscheck import open_fits
 
-__all__ = ["PRODUCT", "read_product", "write_product"]
+__all__ = []
 
 #: What the keyword ``CONTENT`` of a product says.
 PRODUCT = "astropolcal Stokes product"
@@ -40,40 +40,14 @@ _KEYWORDS = {
 
 
 def write_product(corrected, path, *, overwrite=False, maps=True):
-    """
-    Write corrected Stokes parameters to a FITS file, which appears complete or not at all.
-
-    Parameters
-    ----------
-    corrected : Corrected
-        What to write.
-    path : path-like
-        The file.
-    overwrite : bool
-        Whether an existing file may be replaced.
-    maps : bool
-        See ``Corrected.write``.
-
-    Raises
-    ------
-    ObservationError
-        If the file exists or cannot be written, or is one of the frames.
-
-    Examples
-    --------
-    >>> from astropolcal.correction.product import write_product
-    >>> write_product(None, ".")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: .: is a folder; name a file in it
-    """
-    made_from = [] if corrected is None else corrected.provenance.get("frames", [])
-    path = check_new(path, overwrite, ObservationError, made_from)
+    """Write a `Corrected` to a FITS file, which appears complete or not at all."""
+    path = check_new(path, overwrite, ObservationError, corrected.provenance.get("frames", []))
     hdus = [fits.PrimaryHDU(corrected.stokes, _header(corrected)), _wavelengths(corrected)]
     hdus += _errors(corrected)
     if maps:
         hdus += _maps(corrected)
-    hdus.append(_frames(corrected))
+    names = [_printable(name) for name in corrected.provenance.get("frames", [])] or ["unknown"]
+    hdus.append(fits.BinTableHDU(Table({"frame": np.array(names, dtype=str)}), name="FRAMES"))
     with atomic_path(path, ObservationError) as temporary, open(temporary, "wb") as stream:
         fits.HDUList(hdus).writeto(stream, checksum=True)
 
@@ -194,37 +168,8 @@ def _maps(corrected):
     return hdus
 
 
-def _frames(corrected):
-    names = [_printable(name) for name in corrected.provenance.get("frames", [])] or ["unknown"]
-    return fits.BinTableHDU(Table({"frame": np.array(names, dtype=str)}), name="FRAMES")
-
-
 def read_product(path):
-    """
-    Read a product of `write_product`.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-
-    Returns
-    -------
-    Corrected
-
-    Raises
-    ------
-    ObservationError
-        If the file is missing, damaged or not ours.
-
-    Examples
-    --------
-    >>> from astropolcal.correction.product import read_product
-    >>> read_product("nowhere.fits")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: nowhere.fits: no such file
-    """
+    """Return the fields of a `Corrected` from a product of `write_product`."""
     with (
         understood(path, ObservationError, "not a readable product"),
         open_fits(path, whole=True) as stream,
@@ -236,8 +181,6 @@ def read_product(path):
 
 
 def _read(path, hdus):
-    from astropolcal.correction.result import Corrected
-
     header = hdus[0].header
     if header.get("CONTENT") != PRODUCT or header.get("CONTVERS") != _VERSION:
         raise ObservationError(
@@ -257,24 +200,26 @@ def _read(path, hdus):
     place = ("STARX", "STARY")
     provenance["frames"] = [str(name) for name in _table(path, hdus["FRAMES"])["frame"]]
     _check(path, hdus, stokes, codes, table)
-    return Corrected(
-        "".join(StokesCoord(codes).symbol),
-        np.asarray(table["wavelength"], dtype=float) * u.Unit(table["wavelength"].unit),
-        stokes,
-        _native(hdus["COVSTAT"].data) if "COVSTAT" in hdus else None,
-        _systematic(hdus),
-        _native(table["condition"]),
-        np.asarray(table["determined"], dtype=bool),
-        _native(table["leakage"]),
-        [str(words).strip() for words in table["weak"]],
-        _stated(path, header, "CORRMODE", str),
-        _stated(path, header, "OBSERVBL", str),
-        _unit(path, header["BUNIT"]),
-        _stated(path, header, "NORTHUP", bool),
-        tuple(_stated(path, header, key, float) for key in place) if "STARX" in header else None,
-        _stated(path, header, "PIXSCALE", float) if "PIXSCALE" in header else None,
-        provenance,
-    )
+    return {
+        "components": "".join(StokesCoord(codes).symbol),
+        "wavelength": np.asarray(table["wavelength"], dtype=float) * table["wavelength"].unit,
+        "stokes": stokes,
+        "covariance": _native(hdus["COVSTAT"].data) if "COVSTAT" in hdus else None,
+        "systematic": _systematic(hdus),
+        "condition": _native(table["condition"]),
+        "determined": np.asarray(table["determined"], dtype=bool),
+        "leakage": _native(table["leakage"]),
+        "weak": [str(words).strip() for words in table["weak"]],
+        "mode": _stated(path, header, "CORRMODE", str),
+        "observable": _stated(path, header, "OBSERVBL", str),
+        "unit": _unit(path, header["BUNIT"]),
+        "north_up": _stated(path, header, "NORTHUP", bool),
+        "centre": tuple(_stated(path, header, key, float) for key in place)
+        if "STARX" in header
+        else None,
+        "pixel_scale": _stated(path, header, "PIXSCALE", float) if "PIXSCALE" in header else None,
+        "provenance": provenance,
+    }
 
 
 def _table(path, hdu):

@@ -8,10 +8,17 @@ import numpy as np
 from astropy.coordinates import StokesCoord
 from astropy.table import QTable
 
-from astropolcal.correction.engine import covariance_index
 from astropolcal.correction.geometry import azimuthal, azimuthal_variances
-from astropolcal.correction.polarization import fractions, polarization
+from astropolcal.correction.product import read_product, write_product
+from astropolcal.correction.solve import covariance_index
 from astropolcal.exceptions import AstropolcalError, ParameterError
+from astropolcal.stokes import (
+    aolp_error,
+    debias_dolp,
+    dolp_error,
+    polarization_angle,
+    transverse_error,
+)
 
 __all__ = ["Corrected"]
 
@@ -32,11 +39,17 @@ class Corrected:
     stokes : `~numpy.ndarray`
         Shape (n_components, n_wavelengths, ...); NaN where not determined.
     covariance : `~numpy.ndarray` or None
-        Statistical, of the pairs of ``covariance_index``, (n_pairs, n_wavelengths, ...).
+        Statistical, of the pairs II, IQ, IU, QQ, ..., (n_pairs, n_wavelengths, ...).
     systematic : Systematic or None
         What the errors of the calibration do; None without a calibration.
-    condition, determined, leakage, weak
-        As in `Estimator`.
+    condition : `~numpy.ndarray`
+        Largest over smallest singular value of the frames' rows, for each wavelength.
+    determined : `~numpy.ndarray` of bool
+        Which components the frames determine, (n_wavelengths, n_components).
+    leakage : `~numpy.ndarray`
+        What each component takes from a V that is taken as zero, (n_wavelengths, n_components).
+    weak : list of str
+        The poorly determined combinations in words, one a wavelength; else "".
     mode, observable : str
         How it was corrected.
     unit : `~astropy.units.UnitBase`
@@ -326,8 +339,6 @@ class Corrected:
         ObservationError
             If the file exists or cannot be written.
         """
-        from astropolcal.correction.product import write_product
-
         write_product(self, path, overwrite=overwrite, maps=maps)
 
     @classmethod
@@ -349,10 +360,84 @@ class Corrected:
         ObservationError
             If the file is missing, damaged or not ours.
         """
-        from astropolcal.correction.product import read_product
-
-        return read_product(path)
+        return cls(**read_product(path))
 
     def __repr__(self):
         shape = " x ".join(map(str, self.stokes.shape[1:]))
         return f"<Corrected {self.components} of {shape}, mode {self.mode}>"
+
+
+# ---- fractions, degree and angle; NaN where there are none ---------------------------------------
+
+
+def fractions(stokes, covariances, components="IQU"):
+    """
+    Return standard deviations ``q``, ``u``, ``v`` of Q / I, ...
+
+    And ``covariance_qu``, from Stokes parameters (n, ...), I first, and covariances (n, n, ...);
+    infinite where a covariance is, NaN where it is not known or there is no light.
+    """
+    bright = stokes[0] > 0
+    light = np.where(bright, stokes[0], 1.0)
+    share = stokes / light
+    found = {}
+    with np.errstate(invalid="ignore"):
+        for i, name in enumerate(components[1:].lower(), start=1):
+            # dq = (dQ - q dI) / I to first order
+            variance = (
+                covariances[i, i]
+                - 2 * share[i] * covariances[0, i]
+                + share[i] ** 2 * covariances[0, 0]
+            ) / light**2
+            # what is open has no covariance, but an infinite error all the same
+            variance = np.where(np.isinf(covariances[i, i]), np.inf, variance)
+            found[name] = np.where(bright, np.sqrt(np.maximum(variance, 0)), np.nan)
+        # the same for the covariance of q and u
+        cross = (
+            covariances[1, 2]
+            - share[1] * covariances[0, 2]
+            - share[2] * covariances[0, 1]
+            + share[1] * share[2] * covariances[0, 0]
+        ) / light**2
+    found["covariance_qu"] = np.where(bright, cross, np.nan)
+    return found
+
+
+def polarization(q, u, errors, method="mas"):
+    """
+    Return degree and angle of linear polarization with their errors.
+
+    ``dolp``, ``dolp_debiased``, ``aolp`` (degree, 0 to 180), and ``s_p`` and ``s_chi`` (degree) of
+    each kind of error that `fractions` gave; the statistical one removes the bias of noise.
+    """
+    dolp = np.hypot(q, u)
+    result = {
+        "dolp": dolp,
+        "dolp_debiased": np.full(dolp.shape, np.nan),
+        "aolp": np.where(dolp > 0, polarization_angle(q, u), np.nan),
+    }
+    for kind, error in errors.items():
+        s_p, s_chi, across = _errors(q, u, dolp, error)
+        result[f"s_p_{kind}"], result[f"s_chi_{kind}"] = s_p, s_chi
+        if kind == "statistical":
+            known = np.isfinite(across) & np.isfinite(dolp)
+            result["dolp_debiased"][known] = debias_dolp(dolp[known], across[known], method)
+    return result
+
+
+def _errors(q, u, dolp, error):
+    """Return error of the degree, of the angle, and across the direction of polarization."""
+    s_q, s_u = error["q"], error["u"]
+    is_open = np.isinf(s_q) | np.isinf(s_u)
+    found = np.full((3, *dolp.shape), np.nan)
+    found[:, is_open & (dolp > 0)] = np.inf
+    good = (dolp > 0) & np.isfinite(s_q) & np.isfinite(s_u)
+    if good.any():
+        # rounding may lift a perfect correlation above one
+        limit = s_q[good] * s_u[good]
+        cross = np.clip(error["covariance_qu"][good], -limit, limit)
+        arguments = q[good], u[good], s_q[good], s_u[good], cross
+        found[0, good] = dolp_error(*arguments)
+        found[1, good] = aolp_error(*arguments).value
+        found[2, good] = transverse_error(*arguments)
+    return found

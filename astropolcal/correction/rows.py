@@ -11,6 +11,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
+from astropolcal import optics
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
 from astropolcal.calibration.system import Rows
 from astropolcal.chain import join, leaves, stages
@@ -20,13 +21,13 @@ from astropolcal.exceptions import (
     WavelengthRangeError,
 )
 from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import finite_position
 from astropolcal.pipeline.headers import inner_optics, telescope_optics
 from astropolcal.units import length_to_um
 
-__all__ = ["RowModel", "check_optics", "measurement_rows", "sky_chain"]
+__all__ = ["ideal_chain", "measurement_rows"]
 
 
 def sky_chain(
@@ -35,43 +36,11 @@ def sky_chain(
     """
     Return the optics from the sky to the detector, with calibrated values.
 
-    The chain of a star that was calibrated, without the star itself; if there is none, the
-    instrument's chain from the sky, with the calibrated values of the optics inside. A chain
-    of an instrument without a telescope begins with the first optic on a stage.
-
-    Parameters
-    ----------
-    calibration : Calibration or `~astropy.modeling.CompoundModel`
-        The calibration, or a chain.
-    dataset : int, optional
-        Which of the calibration's chains; by default the one of the optics in the beam.
-    optics_in : sequence of str, optional
-        All optional optics in the beam; needed if the calibration has several sets of them.
-    beam : dict of str to bool, optional
-        Single ones that are known to be in the beam or not, as
-        `~astropolcal.instruments.Instrument.optics_of` tells them.
-    label : str
-        What messages call the calibration.
-    date : str, `~astropy.time.Time` or sequence of them, optional
-        Of the frames, for an instrument whose telescope changed.
-
-    Returns
-    -------
-    `~astropy.modeling.CompoundModel`
-
-    Raises
-    ------
-    ChainError
-        If no optic stands on a stage, or the calibration has no chain of the optics in the
-        beam, or several.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.correction.rows import sky_chain
-    >>> charis = instruments.get("charis")
-    >>> [optic.name for optic in sky_chain(charis.on_sky(charis.published()))][:4]
-    ['parallactic', 'm3', 'altitude', 'hwp']
+    The chain of a star that was calibrated, without the star; if there is none, the instrument's
+    chain from the sky with the calibrated optics inside. Without a telescope it begins with the
+    first optic on a stage. ``dataset`` picks one of the calibration's chains, by default that of
+    the optics in the beam: ``optics_in`` (all of them), ``beam`` (single ones, see
+    `Instrument.optics_of`). ``date`` is that of the frames, for a telescope that changed.
     """
     chains = getattr(calibration, "chains", [calibration])
     if dataset is not None:
@@ -84,79 +53,14 @@ def sky_chain(
     return chain_from_sky(chains, instrument, wavelength, date)[0]
 
 
-def check_optics(chain, optics_in):
-    """
-    Raise if an optic that is in the beam is absent from the chain.
-
-    Parameters
-    ----------
-    chain : `~astropy.modeling.CompoundModel`
-        The chain.
-    optics_in : sequence of str
-        Names of optics that were in the beam.
-
-    Raises
-    ------
-    ChainError
-        Naming the optic.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.correction.rows import check_optics
-    >>> check_optics(instruments.get("charis").published(), ["dichroic", "nbs"])
-    """
-    known = [leaf.name for leaf in leaves(chain)]
-    absent = [name for name in optics_in if name not in known]
-    if absent:
-        raise ChainError(
-            f"{', '.join(absent)} was in the beam, but is not in the calibrated chain "
-            f"({', '.join(filter(None, known))})"
-        )
-
-
 class RowModel(Rows):
     """
-    Measurement rows of a calibration at given positions and wavelengths, and how they move.
+    Measurement rows of a calibration, or a chain, at given positions, and how they move.
 
-    Parameters
-    ----------
-    calibration : Calibration or `~astropy.modeling.CompoundModel`
-        The calibration, or a chain with known values, which has no errors.
-    positions : dict of str to `~astropy.units.Quantity` or `~numpy.ndarray`
-        Position of every stage in each frame, shape (n_frames,), or (nodes, n_frames) at the
-        Gauss-Legendre nodes of the exposures. Angles without a unit are in radian.
-    wavelength : `~astropy.units.Quantity`
-        Of the science data.
-    chain : `~astropy.modeling.CompoundModel`, optional
-        From the sky to the detector, with optics named as the calibrated ones; by default
-        that of `sky_chain`.
-    interpolate : bool
-        Whether parameters known at the calibrated wavelengths only are interpolated linearly
-        between them. Else each wavelength must be one of the calibrated.
-
-    Raises
-    ------
-    WavelengthRangeError
-        If a wavelength is not one at which the calibration is known.
-    ChainError
-        If the position of a stage is missing, or the frames of the stages differ in number.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If parameters are interpolated; it names them.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.correction import RowModel
-    >>> charis = instruments.get("charis")
-    >>> positions = {"hwp": [0, 22.5, 45, 67.5] * u.deg, "derotator": [60] * 4 * u.deg,
-    ...              "parallactic": [10] * 4 * u.deg, "altitude": [70] * 4 * u.deg}
-    >>> RowModel(charis.on_sky(charis.published()), positions, charis.wavelength).rows().shape
-    (2, 22, 4, 4)
+    Positions are (n_frames,), or (nodes, n_frames) at the Gauss-Legendre nodes of the exposures;
+    without a unit in radian. Parameters known at the calibrated wavelengths only are interpolated
+    linearly between them, with a warning, if ``interpolate``; else a wavelength off them is
+    refused.
     """
 
     def __init__(self, calibration, positions, wavelength, *, chain=None, interpolate=False):
@@ -208,8 +112,18 @@ def measurement_rows(calibration, positions, wavelength, *, chain=None, interpol
 
     Parameters
     ----------
-    calibration, positions, wavelength, chain, interpolate
-        As for `RowModel`, which also has the derivatives.
+    calibration : Calibration or `~astropy.modeling.CompoundModel`
+        The calibration, or a chain with known values.
+    positions : dict of str to `~astropy.units.Quantity` or `~numpy.ndarray`
+        Position of every stage in each frame, shape (n_frames,), or (nodes, n_frames) at the
+        Gauss-Legendre nodes of the exposures. Angles without a unit are in radian.
+    wavelength : `~astropy.units.Quantity`
+        Of the science data.
+    chain : `~astropy.modeling.CompoundModel`, optional
+        From the sky to the detector, with optics named as the calibrated ones.
+    interpolate : bool
+        Whether parameters known at the calibrated wavelengths only are interpolated linearly
+        between them. Else each wavelength must be one of the calibrated.
 
     Returns
     -------
@@ -279,3 +193,74 @@ def _placed(positions, wanted):
     spread = {n: v.ravel() if v.ndim == 2 else np.tile(v, len(weights)) for n, v in placed.items()}
     # the weights of Gauss and Legendre add up to the length of [-1, 1], a mean needs one
     return spread, weights / 2
+
+
+# ---- the instrument without errors ---------------------------------------------------------------
+# With it a correction can be restricted to the instrumental polarization, as was done before there
+# were models of the crosstalk.
+
+_IDENTITY, _HALF_WAVE = np.eye(4), np.diag([1.0, 1.0, -1.0, -1.0])
+# a half-wave plate at 45 deg: Q and V change sign
+_FLIP = np.diag([1.0, -1.0, 1.0, -1.0])
+
+
+def ideal_chain(chain, wavelength):
+    """
+    Return a chain of perfect optics at the places and angles of those of a chain.
+
+    What turns with a stage is a half-wave plate (a derotator of an odd number of mirrors
+    included), a splitter is perfect, and whatever stands still is what it comes closest to: a
+    mirror, a flip of the image, or nothing. Rotations stay.
+
+    Parameters
+    ----------
+    chain : `~astropy.modeling.CompoundModel`
+        From the sky to the detector.
+    wavelength : `~astropy.units.Quantity`
+        Where fixed optics are looked at.
+
+    Returns
+    -------
+    `~astropy.modeling.CompoundModel`
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.correction import ideal_chain
+    >>> charis = instruments.get("charis")
+    >>> ideal = ideal_chain(charis.on_sky(charis.published()), charis.wavelength)
+    >>> float(ideal["wollaston"].efficiency.value), ideal["hwp"].retardance.quantity
+    (1.0, <Quantity 180. deg>)
+    """
+    found = (_ideal(leaf, np.atleast_1d(wavelength)) for leaf in leaves(chain))
+    return join(leaf for leaf in found if leaf is not None)
+
+
+def _ideal(leaf, wavelength):
+    name, theta = leaf.name, leaf.theta.quantity
+    if leaf.rotates_frame:
+        return leaf
+    if leaf.splits_light:
+        return optics.WollastonPrism(name=name, mount=leaf.mount, theta=theta)
+    # drifts, stray light and gains of the beams are faults
+    if leaf.stage in COORDINATES or leaf.depends_on_beam:
+        return None
+    if leaf.stage:
+        return _half_wave(name, leaf.mount, theta)
+    # the mean over wavelengths: which of the three is nearest must not change along a spectrum
+    matrix = np.mean(np.atleast_3d(_normalized(leaf, wavelength)), axis=0)
+    nearest = min((_IDENTITY, _HALF_WAVE, _FLIP), key=lambda m: np.abs(m - matrix).max())
+    if nearest is _IDENTITY:
+        return None
+    return _half_wave(name, None, theta + (0 if nearest is _HALF_WAVE else 45) * u.deg)
+
+
+def _normalized(leaf, wavelength):
+    """Return the matrices of an optic in its own axes, without its losses."""
+    matrix = leaf._matrix(leaf._dispersion(wavelength.to_value(u.um)), *leaf.canonical_values()[1:])
+    matrix = np.reshape(matrix, (-1, 4, 4))
+    return matrix / matrix[:, :1, :1]
+
+
+def _half_wave(name, mount, theta):
+    return optics.LinearRetarder(retardance=180 * u.deg, name=name, mount=mount, theta=theta)

@@ -8,17 +8,104 @@ what belongs to values that are too small is reported, never divided by.
 """
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 
 from astropolcal.calibration.identifiability.linearized import ranked
-from astropolcal.correction.channels import Channels
 from astropolcal.exceptions import ObservationError, ParameterError
 
-__all__ = ["COMPONENTS", "Estimator", "estimator"]
+__all__ = []
 
 #: What may be solved for; without V it is taken as zero.
 COMPONENTS = ("IQU", "IQUV")
+
+# ---- what is fitted: linear in the beams, so that a solution for channels is one for beams -------
+
+#: What a solution may be made of.
+CHANNELS = ("intensity", "single", "double")
+
+
+class Channels:
+    """
+    Linear combinations of the fluxes of both beams in all frames.
+
+    ``intensity``: the fluxes; ``single``: difference and sum of each frame; ``double``: half the
+    difference of differences and half the sum of sums of each pair, frames (n_pairs, 2).
+    """
+
+    def __init__(self, observable, n_frames, pairs=None):
+        if observable not in CHANNELS:
+            raise ParameterError(f"observable = {observable!r}; allowed are {', '.join(CHANNELS)}")
+        self.observable, self.n_frames = observable, n_frames
+        self.pairs = None
+        if observable == "double":
+            self.pairs = _checked(pairs, n_frames)
+
+    @property
+    def units(self):
+        """Frames of which each pair of channels is made, a list of tuples."""
+        if self.pairs is None:
+            return [(frame,) for frame in range(self.n_frames)]
+        return [tuple(pair) for pair in self.pairs.tolist()]
+
+    def combine(self, fluxes):
+        """Return channels of fluxes of shape (2, n_frames, ...): shape (2, n_units, ...)."""
+        if self.observable == "intensity":
+            return fluxes
+        both = np.stack([fluxes[0] - fluxes[1], fluxes[0] + fluxes[1]])
+        if self.pairs is None:
+            return both
+        plus, minus = both[:, self.pairs[:, 0]], both[:, self.pairs[:, 1]]
+        # (X+ - X-) / 2 and (I+ + I-) / 2, the half differences and sums of the paper
+        return np.stack([plus[0] - minus[0], plus[1] + minus[1]]) / 2
+
+    def one(self, fluxes, variance=False):
+        """Return the channels, or their variances, of one unit from its frames, (2, k, ...)."""
+        alone = Channels(self.observable, fluxes.shape[1], [(0, 1)])
+        return (alone.variances if variance else alone.combine)(fluxes)[:, 0]
+
+    def variances(self, variances):
+        """Return variances of channels, without their correlations; shapes as in `combine`."""
+        if self.observable == "intensity":
+            return variances
+        # var(r - l) = var(r + l) = var(r) + var(l); halving the pair divides it by four
+        total = variances.sum(axis=0)
+        if self.pairs is not None:
+            total = (total[self.pairs[:, 0]] + total[self.pairs[:, 1]]) / 4
+        return np.stack([total, total])
+
+    def to_beams(self, gain):
+        """
+        Return gains of the beams, (..., 2, n_frames), from those of channels, (..., 2, n_units).
+        """
+        if self.observable == "intensity":
+            return gain
+        difference, total = gain[..., 0, :], gain[..., 1, :]
+        if self.pairs is not None:
+            shape = (*difference.shape[:-1], self.n_frames)
+            spread = np.zeros((2, *shape))
+            for side, sign in ((0, 1.0), (1, -1.0)):
+                # a frame may belong to several pairs
+                np.add.at(spread[0], (..., self.pairs[:, side]), sign * difference / 2)
+                np.add.at(spread[1], (..., self.pairs[:, side]), total / 2)
+            difference, total = spread
+        # of right - left and right + left: both gains act on each beam, the first with its sign
+        return np.stack([total + difference, total - difference], axis=-2)
+
+
+def _checked(pairs, n_frames):
+    pairs = np.asarray([] if pairs is None else pairs, dtype=int).reshape(-1, 2)
+    if not len(pairs):
+        raise ObservationError("double differences need pairs of frames, and there is none")
+    if pairs.min() < 0 or pairs.max() >= n_frames:
+        raise ObservationError(
+            f"pairs name frames {pairs.min()} to {pairs.max()}; there are 0 to {n_frames - 1}"
+        )
+    return pairs
+
+
+# ---- the solution --------------------------------------------------------------------------------
 
 # a component whose share in a poorly determined direction is larger than this is not determined
 _SHARE = 1e-3
@@ -27,80 +114,41 @@ _MAX_CONDITION = 30.0
 _MAX_NAMED = 8
 
 
+def covariance_index(n_components):
+    """Return the pairs of components whose covariances are kept, in order: (0, 0), (0, 1), ..."""
+    return list(combinations_with_replacement(range(n_components), 2))
+
+
 @dataclass
 class Estimator:
-    """
-    What turns the fluxes of all frames into Stokes parameters.
-
-    Attributes
-    ----------
-    components : str
-        The Stokes parameters, such as ``"IQU"``.
-    gain : `~numpy.ndarray`
-        Shape (n_wavelengths, n_components, 2, n_frames); NaN where a component is not
-        determined.
-    rows : `~numpy.ndarray`
-        The rows solved, with the brightness of the frames, (2, n_wavelengths, n_frames, 4).
-    channels : Channels
-        Of what the solution was made.
-    channel_rows : `~numpy.ndarray`
-        The rows of the channels, (2, n_wavelengths, n_units, 4).
-    weights : `~numpy.ndarray`
-        Of the channels, (2, n_wavelengths, n_units).
-    condition : `~numpy.ndarray`
-        Largest over smallest singular value for each wavelength, of all components asked for.
-    determined : `~numpy.ndarray` of bool
-        Shape (n_wavelengths, n_components).
-    leakage : `~numpy.ndarray`
-        What each component takes from a V that is taken as zero, (n_wavelengths, n_components).
-    weak : list of str
-        The combinations that are poorly determined, in words, one a wavelength; else "".
-    max_condition : float
-        What was allowed.
-    scale : `~numpy.ndarray` or None
-        Relative brightness of the frames, (n_wavelengths, n_frames).
-    beam_weights : `~numpy.ndarray` or None
-        Of the fluxes, (2, n_wavelengths, n_frames).
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import optics
-    >>> from astropolcal.correction import estimator, measurement_rows
-    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
-    >>> chain = chain | optics.WollastonPrism(name="wollaston")
-    >>> rows = measurement_rows(chain, {"hwp": [0, 45, 22.5, 67.5] * u.deg}, [1.6] * u.um)
-    >>> estimator(rows).apply([[[1.0], [0.5], [1.0], [0.5]], [[0.5], [1.0], [0.5], [1.0]]]).tolist()
-    [[1.5], [0.5], [0.5]]
-    """
+    """What turns the fluxes of all frames into Stokes parameters."""
 
     components: str
+    # (n_wavelengths, n_components, 2, n_frames); NaN where a component is not determined
     gain: np.ndarray
+    # with the brightness of the frames, (2, n_wavelengths, n_frames, 4)
     rows: np.ndarray
     channels: Channels
+    # (2, n_wavelengths, n_units, 4) and (2, n_wavelengths, n_units)
     channel_rows: np.ndarray
     weights: np.ndarray
+    # largest over smallest singular value for each wavelength, of all components asked for
     condition: np.ndarray
+    # both (n_wavelengths, n_components); what each takes from a V that is taken as zero
     determined: np.ndarray
     leakage: np.ndarray
+    # the poorly determined combinations in words, one a wavelength; else ""
     weak: list
     max_condition: float = _MAX_CONDITION
+    # of the frames, (n_wavelengths, n_frames), and of the fluxes, (2, n_wavelengths, n_frames)
     scale: np.ndarray | None = None
     beam_weights: np.ndarray | None = None
 
     def apply(self, fluxes):
         """
-        Return the Stokes parameters of fluxes.
+        Return Stokes parameters, (n_components, n_wavelengths, ...), of fluxes.
 
-        Parameters
-        ----------
-        fluxes : array_like
-            Shape (2, n_frames, n_wavelengths, ...), the right beam first.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Shape (n_components, n_wavelengths, ...).
+        These have shape (2, n_frames, n_wavelengths, ...), the right beam first.
         """
         return np.einsum("wkbf,bfw...->kw...", self.gain, np.asarray(fluxes, dtype=float))
 
@@ -123,51 +171,12 @@ def estimator(
     """
     Solve for what turns fluxes into Stokes parameters, wavelength by wavelength.
 
-    Parameters
-    ----------
-    rows : `~numpy.ndarray`
-        As `measurement_rows` gives them, (2, n_wavelengths, n_frames, 4).
-    components : {"IQU", "IQUV"}
-        What to solve for. Without V it is taken as zero, see ``leakage``. Where V is asked for
-        and cannot be determined, it is taken as zero and flagged.
-    observable : {"intensity", "single", "double"}
-        What is fitted, see ``Channels``.
-    pairs : array_like of int, optional
-        Frames of the pairs of double differences, (n_pairs, 2).
-    weights : array_like, optional
-        Of the fluxes: (n_frames,), (n_wavelengths, n_frames) or (2, n_wavelengths, n_frames);
-        the inverse of their variance. By default all weigh the same.
-    scale : array_like, optional
-        Relative brightness of the frames, (n_frames,) or (n_wavelengths, n_frames).
-    max_condition : float
-        A combination is poorly determined if its singular value is smaller than the largest
-        by more than this.
-    labels : sequence, optional
-        What to call the frames in messages.
-
-    Returns
-    -------
-    Estimator
-
-    Raises
-    ------
-    ObservationError
-        If Q and U are not determined at any wavelength.
-    ParameterError
-        If a choice is unknown, or weights or brightness are of wrong shape or negative.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.correction import estimator, measurement_rows
-    >>> charis = instruments.get("charis")
-    >>> positions = {"hwp": [0, 22.5, 45, 67.5] * u.deg, "derotator": [60] * 4 * u.deg,
-    ...              "parallactic": [10] * 4 * u.deg, "altitude": [70] * 4 * u.deg}
-    >>> sky = charis.on_sky(charis.published())
-    >>> solution = estimator(measurement_rows(sky, positions, charis.wavelength))
-    >>> bool(solution.determined.all()), bool(solution.condition.max() < 3)
-    (True, True)
+    ``rows`` are those of `measurement_rows`, (2, n_wavelengths, n_frames, 4). Without V in
+    ``components`` it is taken as zero, and so where it cannot be determined. ``observable`` and
+    ``pairs`` as for `Channels`; ``weights`` are inverse variances of the fluxes, (n_frames,),
+    (n_wavelengths, n_frames) or (2, n_wavelengths, n_frames); ``scale`` the brightness of the
+    frames, (n_frames,) or (n_wavelengths, n_frames). A combination is poorly determined if its
+    singular value is smaller than the largest by more than ``max_condition``.
     """
     # rows are (2 beams, n_wavelengths, n_frames, 4)
     rows = np.asarray(rows, dtype=float)
@@ -177,7 +186,10 @@ def estimator(
         raise ParameterError(f"max_condition = {max_condition}; it must be above 1")
     shape = rows.shape[1:3]
     channels = Channels(observable, shape[1], pairs)
-    weights = _weights(weights, shape)
+    if weights is None:
+        weights = np.ones((2, *shape))
+    else:
+        weights = np.broadcast_to(_positive("weights", weights, shape, beams=True), (2, *shape))
     if scale is not None:
         scale = _positive("scale", scale, shape)
         rows = rows * scale[None, :, :, None]
@@ -277,12 +289,6 @@ def _leakage(gain, rows, components):
     return np.einsum("wkbf,bwf->wk", gain, rows[..., 3])
 
 
-def _weights(weights, shape):
-    if weights is None:
-        return np.ones((2, *shape))
-    return np.broadcast_to(_positive("weights", weights, shape, beams=True), (2, *shape))
-
-
 def _positive(name, value, shape, beams=False):
     value = np.asarray(value, dtype=float)
     allowed = [shape[1:], shape] + ([(2, *shape)] if beams else [])
@@ -320,3 +326,61 @@ def _refuse_undetermined(found, labels):
         f"{found.weak[0]}; frames at half-wave-plate angles such as 0, 22.5, 45 and 67.5 deg are "
         "needed"
     )
+
+
+# ---- brightness of the frames: clouds, seeing, exposure times ------------------------------------
+
+# a step shrinks the error by the instrumental polarization, some percent: ten suffice mostly
+_STEPS, _SETTLED = 50, 1e-13
+
+
+def frame_brightness(rows, fluxes, **settings):
+    """
+    Return the relative brightness of frames, (n_wavelengths, n_frames), of mean one.
+
+    ``fluxes`` are those of the whole image of each beam, (2, n_frames, n_wavelengths), NaN where
+    there is none, which gives one; the settings are those of `estimator`. The sum of both beams
+    follows the light that enters, but also, by a little, its polarization: brightness and Stokes
+    parameters are found in turn until they settle.
+    """
+    fluxes = np.asarray(fluxes, dtype=float)
+    # shape (n_wavelengths, n_frames), as the scale of an estimator
+    totals = fluxes.sum(axis=0).T
+    missing = np.isnan(totals)
+    dark = ~(totals > 0) & ~missing
+    if dark.any():
+        wavelength, frame = np.argwhere(dark)[0]
+        raise ObservationError(
+            f"frame {frame} has no light at wavelength {wavelength}: the sum of both beams is "
+            f"{totals[wavelength, frame]:.4g}"
+        )
+    if missing.any():
+        weights = settings.get("weights")
+        weights = 1.0 if weights is None else np.asarray(weights, dtype=float)
+        settings["weights"] = np.broadcast_to(weights, (2, *totals.shape)) * ~missing
+        fluxes = np.nan_to_num(fluxes)
+    # at a wavelength where not even I is determined, the sums have the last word
+    unknown = ~estimator(rows, **settings).determined[:, 0]
+    scale = _shared(totals, missing)
+    for _ in range(_STEPS):
+        stokes = estimator(rows, scale=scale, **settings).apply(fluxes)
+        # the light of an undetermined component is not known, and small
+        expected = np.einsum("bwfs,sw->wf", rows[..., : len(stokes)], np.nan_to_num(stokes))
+        expected[unknown] = 1.0
+        if not np.all(expected[~missing] > 0):
+            break
+        new = _shared(totals / expected, missing)
+        change, scale = np.abs(new - scale).max(), new
+        if change < _SETTLED:
+            return scale
+    raise ObservationError(
+        "the brightness of the frames does not settle: there is too little light, or it is not "
+        "that of one source in all frames"
+    )
+
+
+def _shared(brightness, missing):
+    """Return brightness over its mean: only ratios are measured, the mean is the source's."""
+    known = np.where(missing, 0.0, brightness)
+    mean = known.sum(axis=1, keepdims=True) / np.maximum((~missing).sum(axis=1, keepdims=True), 1)
+    return np.where(missing | (mean == 0), 1.0, known / np.where(mean == 0, 1.0, mean))

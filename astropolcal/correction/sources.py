@@ -14,7 +14,7 @@ from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import understood
 from astropolcal.fitscheck import open_fits, readable_fits
 
-__all__ = ["ArraySource", "CubeFiles", "TurnedSource"]
+__all__ = []
 
 # times the longer side of an image: any turn of the field fits, and nothing beyond has light
 _MOST_SIZE = 2
@@ -22,31 +22,10 @@ _MOST_SIZE = 2
 
 class ArraySource:
     """
-    Beams as arrays, in memory, mapped from disk, or of dask.
+    Beams as arrays, (n_frames, n_wavelengths, ...): in memory, mapped from disk, or of dask.
 
-    Parameters
-    ----------
-    right, left : array_like
-        Fluxes, shape (n_frames, n_wavelengths, ...); NaN where there is none.
-    variance_right, variance_left : array_like, optional
-        Their variances, of the same shape.
-    names : sequence of str, optional
-        What to call the frames.
-    batch : int, optional
-        Frames that are read at a time; by default all of arrays in memory, those of a chunk of
-        dask arrays, and one of arrays on disk.
-
-    Raises
-    ------
-    ObservationError
-        If the shapes differ, or only one beam has variances.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.correction.sources import ArraySource
-    >>> ArraySource(np.ones((4, 22)), np.ones((4, 22))).image_shape
-    ()
+    ``batch`` frames are read at a time; by default all of arrays in memory, those of a chunk of
+    dask arrays, and one of arrays on disk.
     """
 
     def __init__(
@@ -100,32 +79,9 @@ def _array(values):
 
 class TurnedSource:
     """
-    Beams turned north up, frame by frame, when they are read.
+    Beams of another source, turned north up frame by frame when they are read.
 
-    Parameters
-    ----------
-    source : ArraySource or CubeFiles
-        Images of both beams.
-    position_angle : `~astropy.units.Quantity`
-        Of the +y axis of every frame, from north through east, shape (n_frames,).
-    **options
-        Of ``derotate``: ``centre``, ``size``, ``mirrored``, ``order``.
-
-    Raises
-    ------
-    ParameterError
-        If the source has no images, or the angles are not one a frame.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal.correction.sources import ArraySource, TurnedSource
-    >>> image = np.zeros((1, 1, 3, 3))
-    >>> image[0, 0, 2, 1] = 1
-    >>> turned = TurnedSource(ArraySource(image, image), [90] * u.deg)
-    >>> turned.fluxes(0, slice(0, 1), slice(0, 1))[0, 0].tolist()
-    [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    ``position_angle`` is that of the +y axis, (n_frames,); the options are those of `derotate`.
     """
 
     def __init__(self, source, position_angle, **options):
@@ -169,45 +125,13 @@ class TurnedSource:
 
 class CubeFiles:
     """
-    Both beams of extracted cubes, cut out of files when they are needed.
+    Both beams of extracted cubes (n_wavelengths, Y, X), cut out of FITS files when they are needed.
 
-    Parameters
-    ----------
-    files : sequence of path-like
-        FITS cubes of shape (n_wavelengths, Y, X) with both beams side by side.
-    centres : array_like
-        Place of the same point of the sky in the right and in the left beam, 0-based x and y,
-        shape (2, 2), or (n_frames, 2, 2) for one in each frame.
-    size : int
-        Rows and columns that are cut out, with the point in the middle.
-    position_angle : `~astropy.units.Quantity`, optional
-        Of the +y axis of every frame; the images are then turned north up.
-    extension : int
-        That holds the cube; inverse variances may follow in ``extension + 1``.
-    mirrored, order
-        As for ``derotate``.
-    left_files : sequence of path-like, optional
-        Files of the left beam, where each beam has files of its own; centres are then those
-        in the image of each.
-    left_scale : array_like
-        By what the left beam is multiplied, one number or one a frame.
-    weights : {"inverse variance", "error"}
-        What follows the cube.
-
-    Raises
-    ------
-    ObservationError
-        If a file is missing, no FITS file, or of another shape than the first.
-    ParameterError
-        If ``size`` is less than 1, or more than twice the images.
-
-    Examples
-    --------
-    >>> from astropolcal.correction.sources import CubeFiles
-    >>> CubeFiles(["nowhere.fits"], [(100, 100), (36, 67)], 51)
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: nowhere.fits: no such file
+    ``centres`` are the place of one point of the sky in the right and left beam, 0-based x and y,
+    (2, 2) or (n_frames, 2, 2): side by side, or, with ``left_files``, in the image of each.
+    ``size`` rows and columns are cut out about it, turned north up if there are position angles.
+    Inverse variances or errors (``weights``) may follow the cube's ``extension``; ``left_scale``
+    multiplies the left beam.
     """
 
     def __init__(

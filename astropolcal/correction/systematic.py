@@ -20,7 +20,7 @@ from astropolcal.correction.solve import estimator
 from astropolcal.exceptions import ParameterError
 from astropolcal.simulation import check_seed
 
-__all__ = ["Systematic", "linear_systematic", "sampled_systematic"]
+__all__ = ["Systematic"]
 
 
 @dataclass
@@ -118,40 +118,7 @@ def linear_systematic(model, solution, *, mode="stokes", open_directions="infini
     """
     Return the systematic errors by the exact derivatives of the rows.
 
-    Parameters
-    ----------
-    model : RowModel
-        With a calibration.
-    solution : Estimator
-        What was solved.
-    mode : {"stokes", "ip"}
-        As for `correct`.
-    open_directions : {"infinite", "ignore"} or float
-        Errors along directions that the calibration leaves open: infinite; zero, as if the
-        choice that it made were true; or the standard deviation of the parameter that each
-        direction is named after (``calibration.identifiability.directions``), in degrees of an
-        angle, micrometres of a thickness, percent of anything else. All that cannot be told from
-        this parameter moves along.
-
-    Returns
-    -------
-    Systematic
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.correction import RowModel, estimator, linear_systematic
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> positions = {"hwp": [0, 22.5, 45, 67.5] * u.deg, "derotator": [60] * 4 * u.deg}
-    >>> model = RowModel(cal, positions, cal.wavelength)
-    >>> systematic = linear_systematic(model, estimator(model.rows()))
-    >>> bool(systematic.covariance([1, 0.01, 0], 5)[1, 1] ** 0.5 < 1e-4)
-    True
+    For ``open_directions`` see `correct`.
     """
     _choice(open_directions)
     n = len(solution.components)
@@ -184,44 +151,6 @@ def sampled_systematic(model, solution, *, n_samples=500, seed=None, mode="stoke
 
     The samples are those of the calibration's posterior, if it holds all free parameters, else
     drawn from its covariance; directions that the calibration leaves open stay where they are.
-
-    Parameters
-    ----------
-    model : RowModel
-        With a calibration.
-    solution : Estimator
-        What was solved.
-    n_samples : int
-        How many.
-    seed : int, optional
-        Of the samples.
-    mode : {"stokes", "ip"}
-        As for `correct`.
-
-    Returns
-    -------
-    Systematic
-        Nothing is open.
-
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two samples, or the seed is none.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.correction import RowModel, estimator, sampled_systematic
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> positions = {"hwp": [0, 22.5, 45, 67.5] * u.deg, "derotator": [60] * 4 * u.deg}
-    >>> model = RowModel(cal, positions, cal.wavelength)
-    >>> sampled_systematic(model, estimator(model.rows()), n_samples=10, seed=1).factor.shape
-    (16, 22, 3, 3)
     """
     if n_samples < 2:
         raise ParameterError(f"n_samples = {n_samples}; at least 2 are needed")

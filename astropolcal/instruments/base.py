@@ -22,18 +22,21 @@ from astropolcal import optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments.telescope import _normal, as_exact, behind_telescope, star_options
-from astropolcal.observations import (
-    common_wavelengths,
+from astropolcal.observations.pointings import (
+    TRACKING,
+    angle_change,
+    location_of,
+    sky_angles,
+    sky_positions,
+)
+from astropolcal.observations.quality import (
     is_star,
     mask_incomplete_cycles,
     mask_saturated,
     mask_unstable_lamp,
-    sky_angles,
-    sky_positions,
+    plain_source,
 )
-from astropolcal.observations.coordinates import angle_change
-from astropolcal.observations.pointings import TRACKING, location_of
-from astropolcal.observations.quality import plain_source
+from astropolcal.observations.reading import common_wavelengths
 
 __all__ = ["Instrument", "SkyLaw", "add_nuisance"]
 
@@ -658,8 +661,7 @@ class Instrument(ABC):
         Return the position of every stage of the chain in each frame, in radian.
 
         In a chain with stages "parallactic" or "altitude" the half-wave plate follows the sky, by
-        the instrument's law or as the column ``hwp_true`` tells, see
-        `~astropolcal.observations.sky_positions`; elsewhere the columns count.
+        the instrument's law or as the column ``hwp_true`` tells; elsewhere the columns count.
 
         Parameters
         ----------
@@ -668,8 +670,9 @@ class Instrument(ABC):
         chain : Optic or `~astropy.modeling.CompoundModel`
             The chain.
         **exposure
-            ``nodes``, ``when`` and ``duty`` of `~astropolcal.observations.sky_positions`, for
-            the motion during an exposure.
+            For the motion during an exposure: the number of Gauss-Legendre ``nodes``, ``when`` in
+            it the angles hold ("start", "middle", "end"), and ``duty``, the share of the time in
+            which light is collected.
 
         Returns
         -------

@@ -25,8 +25,8 @@ from astropolcal.chain import join
 from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
 from astropolcal.instruments.base import Instrument, SkyLaw, check_choice
 from astropolcal.instruments.telescope import INTERNAL, STARS, star_source
-from astropolcal.observations import is_star
 from astropolcal.observations.pointings import location_of, offline, pointing
+from astropolcal.observations.quality import is_star
 from astropolcal.observations.reading import stated_date
 from astropolcal.units import iso_date, plain_number
 from astropolcal.words import counted

@@ -40,8 +40,8 @@ from astropolcal.instruments.telescope import (
     tertiary_mirror,
     two_layer_plate,
 )
-from astropolcal.observations import is_star, mask_saturated
-from astropolcal.observations.wavelengths import SAME_WAVELENGTH, filter_wavelength
+from astropolcal.observations.quality import is_star, mask_saturated
+from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 
 __all__ = ["VAMPIRES"]
 

@@ -10,7 +10,7 @@ from astropy.modeling import Model
 from astropolcal import instruments
 from astropolcal.chain import leaves, stages
 from astropolcal.exceptions import InstrumentError, ObservationError, WavelengthRangeError
-from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 

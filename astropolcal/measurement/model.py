@@ -16,7 +16,8 @@ from astropy.modeling import FittableModel, Parameter
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement.datasets import Dataset, as_pairs
 from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.observations import common_wavelengths, get_observable
+from astropolcal.observations.observables import get_observable
+from astropolcal.observations.reading import common_wavelengths
 from astropolcal.optics._modelling import with_own_scalars
 
 __all__ = ["Measurement"]

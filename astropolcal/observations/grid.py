@@ -7,19 +7,24 @@ against each other, sorted into a grid of shape (F, W), and cells that cannot be
 used are masked with a reason.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.exceptions import ObservationError
-from astropolcal.observations.masking import mask_missing, mask_rows
+from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations.reading import check_table, first_bad_row, numeric_column
-from astropolcal.observations.variances import BEAM_ERRORS, SINGLE_ERRORS
 from astropolcal.words import counted
 
-__all__ = ["CELL_COLUMNS", "REQUIRED", "Grid", "build_grid"]
+__all__ = []
+
+BEAM_ERRORS = ("flux_right_err", "flux_left_err")
+"""Columns with the standard deviations of R and L."""
+
+SINGLE_ERRORS = ("single_difference_err", "single_sum_err")
+"""Columns with the standard deviations of R - L and R + L."""
 
 REQUIRED = ("frame", "bin", "wavelength", "hwp", "derotator", "flux_right", "flux_left")
 CELL_COLUMNS = (
@@ -44,83 +49,30 @@ _MAX_ANGLE = 1e6
 
 @dataclass(frozen=True)
 class Grid:
-    """
-    The arrays of a table of observations.
+    """The arrays of a table of observations: F frames, W wavelengths."""
 
-    Attributes
-    ----------
-    frames : `~astropy.table.QTable`
-        One row a frame, ordered by ``frame``.
-    rows : `~numpy.ndarray` of int
-        First data row (from 1) of every frame.
-    bin, wavelength : `~numpy.ndarray`, `~astropy.units.Quantity`
-        Shape (W,).
-    flux_unit : `~astropy.units.UnitBase`
-        Unit of the fluxes and their errors.
-    flux_right, flux_left : `~numpy.ndarray`
-        Shape (F, W), NaN where masked.
-    errors : dict of `~numpy.ndarray`
-        Error columns as given, each (F, W); empty if there are none.
-    reason : `~numpy.ndarray` of int
-        Shape (F, W): 0 usable, otherwise 1 + index in ``reasons``.
-    reasons : tuple of str
-        Why cells are masked.
-
-    Examples
-    --------
-    >>> from astropolcal.observations.grid import Grid
-    >>> sorted(Grid.__dataclass_fields__)[:3]
-    ['bin', 'errors', 'flux_left']
-    """
-
+    # one row a frame, ordered by ``frame``, and the first data row (from 1) of each
     frames: QTable
     rows: np.ndarray
+    # (W,)
     bin: np.ndarray
     wavelength: u.Quantity
     flux_unit: u.UnitBase
+    # (F, W), NaN where masked
     flux_right: np.ndarray
     flux_left: np.ndarray
+    # error columns as given, (F, W) each; empty if there are none
     errors: dict
+    # (F, W): 0 usable, else 1 + index in ``reasons``
     reason: np.ndarray
     reasons: tuple
 
 
 def build_grid(table, label):
     """
-    Check a table of observations and sort it into a `Grid`.
+    Check a table of observations (one row a frame and wavelength) and sort it into a `Grid`.
 
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        One row a frame and wavelength; see `~astropolcal.observations.Observations`.
-    label : str
-        What to call it in messages: the file or a name.
-
-    Returns
-    -------
-    Grid
-
-    Raises
-    ------
-    ObservationError
-        If the table is inconsistent; the message names the row or column.
-
-    Warns
-    -----
-    AstropolcalWarning
-        Once for every reason for which cells are masked.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropy.table import QTable
-    >>> from astropolcal.observations.grid import build_grid
-    >>> grid = build_grid(QTable({
-    ...     "frame": [1, 0], "bin": [0, 0], "wavelength": [1.2, 1.2] * u.um,
-    ...     "hwp": [45, 0] * u.deg, "derotator": [90, 90] * u.deg,
-    ...     "flux_right": [1, 2] * u.adu, "flux_left": [3, 4] * u.adu}), "night")
-    >>> grid.flux_right.tolist(), grid.rows.tolist()
-    ([[2.0], [1.0]], [2, 1])
+    ``label`` is the file or name for messages. Cells that are masked give one warning a reason.
     """
     table = check_table(table, label, REQUIRED)
     frame = _integers(table, "frame", label)
@@ -311,3 +263,115 @@ def _error_columns(table, label):
         if there and not found:
             found = pair
     return found
+
+
+# ---- cells that cannot be used -------------------------------------------------------------------
+# A bad cell is masked with a reason, never dropped in silence: when a table is read, one warning a
+# reason says how many cells and where the first is.
+
+# beyond this, and below its inverse, squares would overflow
+_HUGE = 1e100
+
+
+def mask_rows(table, values, label):
+    """
+    Judge the rows by fluxes and errors, each (N,).
+
+    Return codes (0 usable, else 1 + index of the reason) and reasons. What the column
+    ``mask_reason`` declares is respected, the rest is warned of.
+    """
+    # what the file declares was warned of when it was made
+    code, reasons = _declared_reasons(table, label)
+    for names, bad, reason in _complaints(values):
+        # the first reason stays
+        bad &= code == 0
+        if bad.any():
+            code[bad] = _number(reason, reasons)
+            row = int(np.argmax(bad))
+            shown = ", ".join(f"{name} = {values[name][row]:g}" for name in names)
+            first = f"row {row + 1}: {shown}; allowed are finite numbers above zero"
+            _warn(label, int(bad.sum()), reason, first)
+    return code, reasons
+
+
+def _complaints(values):
+    """Yield what may be wrong with single rows: columns, bad rows, reason."""
+    names = list(values)
+    for kind, pair in (("flux", names[:2]), ("error", names[2:])):
+        if pair:
+            both = np.array([values[name] for name in pair])
+            # NaN compares as false and is lost too
+            lost = ~(np.abs(both) < _HUGE).all(axis=0)
+            yield pair, lost.copy(), f"{kind} not finite"
+            yield pair, ~lost & (both < 1.0 / _HUGE).any(axis=0), f"{kind} not positive"
+
+
+def _declared_reasons(table, label):
+    """Read the column ``mask_reason``, which a written table has where cells were masked."""
+    code = np.zeros(len(table), dtype=int)
+    if "mask_reason" not in table.colnames:
+        return code, []
+    column = table["mask_reason"]
+    if column.dtype.kind not in "US":
+        raise ObservationError(
+            f"{label}: column mask_reason has type {column.dtype}, strings are needed"
+        )
+    # an empty string in ECSV may come back as a masked value
+    # code 0 means usable
+    text = np.where(getattr(column, "mask", False), "", np.ma.getdata(column).astype(str))
+    reasons = [str(reason) for reason in np.unique(text) if reason]
+    for number, reason in enumerate(reasons):
+        code[text == reason] = number + 1
+    return code, reasons
+
+
+def mask_missing(code, reasons, frame_numbers, bin_numbers, label):
+    """Give cells (F, W) without a row, code -1, the reason "missing", in place; warn of them."""
+    # a hole in the grid is masked like a bad value: a pair that needs it drops out
+    missing = code < 0
+    if missing.any():
+        code[missing] = _number("missing", reasons)
+        frame, column = np.argwhere(missing)[0]
+        first = f"frame {frame_numbers[frame]}, bin {bin_numbers[column]} has no row"
+        _warn(label, int(missing.sum()), "missing", first)
+
+
+def _number(reason, reasons):
+    """Return the code of a reason, adding it to the list where it is new."""
+    if reason not in reasons:
+        reasons.append(reason)
+    return reasons.index(reason) + 1
+
+
+def _warn(label, count, reason, first):
+    message = f"{label}: {counted(count, 'cell')} masked, {reason} (first: {first})"
+    warnings.warn(message, AstropolcalWarning, stacklevel=2)
+
+
+# ---- errors of the beams -------------------------------------------------------------------------
+
+
+def beam_variances(flux_right, flux_left, errors):
+    """
+    Return the variances of both beams and their covariance, (F, W) each.
+
+    ``errors`` are standard deviations under the names of `BEAM_ERRORS` or `SINGLE_ERRORS`; none
+    give NaN. With S = R + L and D = R - L, var(S) + var(D) = 2 (var(R) + var(L)) and var(S) -
+    var(D) = 4 cov(R, L). Errors of S and D leave open how the variance is shared between the beams:
+    it is shared in proportion to their fluxes, as photon noise would be, but never so unevenly that
+    the matrix ceases to be a covariance.
+    """
+    if not errors:
+        return tuple(np.full_like(flux_right, np.nan) for _ in range(3))
+    if BEAM_ERRORS[0] in errors:
+        right, left = (errors[name] ** 2 for name in BEAM_ERRORS)
+        return right, left, np.where(np.isnan(right), np.nan, 0.0)
+    difference, total = (errors[name] ** 2 for name in SINGLE_ERRORS)
+    # both at once: var(S) - var(D) = 4 cov
+    covariance = 0.25 * (total - difference)
+    # var(R) + var(L)
+    both = 0.5 * (total + difference)
+    # var(R) var(L) >= cov^2 bounds the share of the right beam around one half
+    reach = np.sqrt(np.maximum(0.25 - (covariance / both) ** 2, 0.0))
+    share = np.clip(flux_right / (flux_right + flux_left), 0.5 - reach, 0.5 + reach)
+    return both * share, both * (1.0 - share), covariance

@@ -17,16 +17,7 @@ import numpy as np
 from astropolcal.exceptions import ObservationError
 from astropolcal.words import did_you_mean
 
-__all__ = [
-    "OBSERVABLES",
-    "NormalizedDoubleDifference",
-    "NormalizedSingleDifference",
-    "NormalizedTripleDifference",
-    "Observable",
-    "PerFrameDoubleDifference",
-    "RatioMethod",
-    "get_observable",
-]
+__all__ = ["OBSERVABLES", "Observable"]
 
 
 class Observable(ABC):
@@ -39,7 +30,7 @@ class Observable(ABC):
     Attributes
     ----------
     name : str
-        The name by which `get_observable` finds it.
+        The name by which `OBSERVABLES` and ``observable=`` find it.
     description : str
         One line for reports.
     frames_per_datum : int
@@ -122,9 +113,9 @@ class Observable(ABC):
         Examples
         --------
         >>> import numpy as np
-        >>> from astropolcal.observations import get_observable
+        >>> from astropolcal.observations import OBSERVABLES
         >>> flux = np.full((2, 1, 1), 100.0)
-        >>> x = get_observable("normalized_double_difference")
+        >>> x = OBSERVABLES["normalized_double_difference"]
         >>> round(float(x.variance(flux, flux, flux, flux)[0, 0]), 6)
         0.0025
         """
@@ -159,9 +150,9 @@ class Observable(ABC):
         Two data that share their minus frame have half of their noise in common:
 
         >>> import numpy as np
-        >>> from astropolcal.observations import get_observable
+        >>> from astropolcal.observations import OBSERVABLES
         >>> flux = np.full((2, 1, 2), 100.0)
-        >>> x = get_observable("normalized_double_difference")
+        >>> x = OBSERVABLES["normalized_double_difference"]
         >>> c = x.frame_covariance(flux, flux, flux, flux, 0.0, np.array([[0, 1], [2, 1]]))
         >>> round(float(c[0, 0, 1] / c[0, 0, 0]), 6)
         0.5
@@ -191,21 +182,10 @@ class Observable(ABC):
 
 class NormalizedDoubleDifference(Observable):
     """
-    Normalized double difference, x = (X+ - X-) / (I+ + I-).
+    Normalized double difference, x = (X+ - X-) / (I+ + I-), of the CHARIS recalibration paper.
 
-    Notes
-    -----
-    Equation "normalized double difference" of the CHARIS recalibration paper.
-    It removes what the optics behind the half-wave plate polarize, as long as
-    the flux does not change between the two frames.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.observations import NormalizedDoubleDifference
-    >>> right, left = np.array([3.0, 1.0]), np.array([1.0, 3.0])
-    >>> float(NormalizedDoubleDifference().evaluate(right, left))
-    0.5
+    It removes what the optics downstream of the half-wave plate polarize, as long as the flux does
+    not change between the two frames.
     """
 
     name = "normalized_double_difference"
@@ -233,20 +213,7 @@ class PerFrameDoubleDifference(Observable):
     """
     Half the difference of the frames' normalized differences, x = (x+ - x-) / 2.
 
-    Notes
-    -----
-    Each frame is normalized by its own sum, x = (R - L) / (R + L), so a change
-    of flux between the frames (a warming lamp, a cloud) drops out.
-
-    Examples
-    --------
-    A source that doubles its brightness between the two frames:
-
-    >>> import numpy as np
-    >>> from astropolcal.observations import PerFrameDoubleDifference
-    >>> right, left = np.array([3.0, 2.0]), np.array([1.0, 6.0])
-    >>> float(PerFrameDoubleDifference().evaluate(right, left))
-    0.5
+    Each frame is normalized by its own sum, so a change of flux between the frames drops out.
     """
 
     name = "per_frame_double_difference"
@@ -270,20 +237,9 @@ class RatioMethod(Observable):
     """
     The ratio method, x = (rho - 1) / (rho + 1), rho^2 = (R+ / L+) / (R- / L-).
 
-    Notes
-    -----
-    Both the gains of the two beams and the flux of each frame drop out exactly,
-    at any degree of polarization; see Bagnulo et al. 2009, PASP 121, 993
-    (doi:10.1086/605654). Fluxes must be positive; the derivative diverges where
-    one of them vanishes.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.observations import RatioMethod
-    >>> right, left = np.array([3.0, 1.0]), np.array([1.0, 3.0])
-    >>> float(RatioMethod().evaluate(right, 7.0 * left).round(12))
-    0.5
+    The gains of the beams and the flux of each frame drop out exactly, at any degree of
+    polarization (Bagnulo et al. 2009, PASP 121, 993, doi:10.1086/605654). The derivative diverges
+    at zero flux.
     """
 
     name = "ratio"
@@ -309,17 +265,7 @@ class NormalizedSingleDifference(Observable):
     """
     Normalized single difference of every frame, x = (R - L) / (R + L).
 
-    Notes
-    -----
-    It keeps what a double difference cancels (the diattenuation behind the
-    half-wave plate, unequal gains of the beams), so the model must describe it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.observations import NormalizedSingleDifference
-    >>> float(NormalizedSingleDifference().evaluate(np.array([3.0]), np.array([1.0])))
-    0.5
+    It keeps what a double difference cancels, so the model must describe it.
     """
 
     name = "normalized_single_difference"
@@ -338,28 +284,14 @@ class NormalizedSingleDifference(Observable):
 
 
 class NormalizedTripleDifference(Observable):
-    r"""
-    Normalized triple difference: of beams, states of a modulator and half-wave-plate angles.
+    """
+    Normalized triple difference of the frames A+, B+, A-, B-.
 
-    .. math:: x = \frac{(X_A^+ - X_B^+) - (X_A^- - X_B^-)}{I_A^+ + I_B^+ + I_A^- + I_B^-}
+    Both states of a modulator, at half-wave plates 45 deg apart; x = ((XA+ - XB+) - (XA- - XB-)) /
+    (sum of all I).
 
-    The four frames of a datum are :math:`A^+, B^+, A^-, B^-`: states A and B of the modulator,
-    and half-wave plates 45 deg apart.
-
-    Notes
-    -----
-    Norris et al. 2015, MNRAS 447, 2894 (doi:10.1093/mnras/stu2529), where the states of the
-    liquid crystal, the cameras and the half-wave plate are differenced in turn. What
-    differs between the beams drops out by the modulator, and what the modulator or the optics
-    behind the half-wave plate polarize drops out by the plate, as long as the flux does not change.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.observations import NormalizedTripleDifference
-    >>> right, left = np.array([3.0, 1.0, 1.0, 3.0]), np.array([1.0, 3.0, 3.0, 1.0])
-    >>> float(NormalizedTripleDifference().evaluate(right, left))
-    0.5
+    Norris et al. 2015, MNRAS 447, 2894 (doi:10.1093/mnras/stu2529): beam differences drop out by
+    the modulator, polarization downstream of the plate drops out by the plate, at constant flux.
     """
 
     name = "normalized_triple_difference"
@@ -400,30 +332,7 @@ OBSERVABLES = {
 
 
 def get_observable(name):
-    """
-    Return the observable of that name.
-
-    Parameters
-    ----------
-    name : str or Observable
-        Case, blanks, hyphens and underscores do not matter. An `Observable` is
-        returned as it is.
-
-    Returns
-    -------
-    Observable
-
-    Raises
-    ------
-    ObservationError
-        If there is none of that name; the message suggests the nearest.
-
-    Examples
-    --------
-    >>> from astropolcal.observations import get_observable
-    >>> get_observable("Normalized-Double-Difference").frames_per_datum
-    2
-    """
+    """Return the observable of that name; case, blanks, hyphens and underscores do not matter."""
     if isinstance(name, Observable):
         return name
     # "Double-Difference" and "double difference" are one name

@@ -13,9 +13,11 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.observations.pointings import clock
 from astropolcal.units import angle_to_rad
+from astropolcal.words import counted
 
-__all__ = ["PAIRINGS", "pair_frames", "pair_states", "quadruples"]
+__all__ = []
 
 #: By what frames may be paired: the half-wave plate, or the state of a modulator.
 PAIRINGS = ("hwp", "flc_state")
@@ -42,51 +44,13 @@ def pair_frames(
     name="table",
 ):
     """
-    Pair the frames whose half-wave-plate angles differ by 45 degrees.
+    Pair the frames whose half-wave-plate angles differ by 45 deg; return indices (P, 2).
 
-    Parameters
-    ----------
-    hwp : `~astropy.units.Quantity`
-        Half-wave-plate angle of every frame, shape (F,).
-    derotator : `~astropy.units.Quantity`, optional
-        Derotator angle of every frame; the frames of a pair must agree in it.
-    flc_state : array_like, optional
-        State of a modulator of every frame; the frames of a pair must agree in it.
-    time : array_like of float, optional
-        Time of every frame in any unit; by default the index of the frame.
-    tolerance, derotator_tolerance : `~astropy.units.Quantity`
-        Largest difference that still counts as the same angle.
-    share : bool
-        Whether a frame left over may be paired with one that is already used.
-    labels : sequence, optional
-        What to call the frames in messages; by default their index.
-    rows : sequence of int, optional
-        The row of the file each frame starts in, for messages.
-    name : str
-        What to call the table in messages.
-
-    Returns
-    -------
-    `~numpy.ndarray` of int
-        Frame indices, shape (P, 2), ordered by plus frame: plus, then minus. The
-        plus frame is the one whose angle modulo 90 degrees lies in [0, 45).
-
-    Raises
-    ------
-    ObservationError
-        If no frame of the whole table stands 45 degrees from one of the angles.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If frames are left over because their partners are missing or used.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.observations import pair_frames
-    >>> pair_frames([0, 22.5, 45, 67.5] * u.deg).tolist()
-    [[0, 2], [1, 3]]
+    All arguments are one per frame, angles as quantities; frames of a pair agree in derotator and
+    state. The plus frame, whose angle modulo 90 deg lies in [0, 45), comes first; the nearest in
+    time (else in the table) wins. ``share`` lets a frame left over use one that is used already;
+    ``labels``, ``rows`` and ``name`` are for messages. An angle without any partner in the table is
+    an error, frames left over a warning.
     """
     hwp = np.atleast_1d(angle_to_rad(hwp, "hwp"))
     tolerance = float(angle_to_rad(tolerance, "tolerance"))
@@ -114,47 +78,10 @@ def pair_states(
     name="table",
 ):
     """
-    Pair the frames of two states of a modulator at the same angles.
+    Pair frames of both states (0, 1) of a modulator at the same angles, modulo 180 deg.
 
-    Parameters
-    ----------
-    state : array_like of float
-        State of every frame, 0 or 1, shape (F,).
-    hwp, derotator : `~astropy.units.Quantity`
-        Angles of every frame; the frames of a pair agree in them, modulo 180 deg.
-    time : array_like of float, optional
-        Time of every frame in any unit; by default the index of the frame.
-    tolerance, derotator_tolerance : `~astropy.units.Quantity`
-        Largest difference that still counts as the same angle.
-    share : bool
-        Whether a frame left over may be paired with one that is already used.
-    rows : sequence of int, optional
-        The row of the file each frame starts in, for messages.
-    name : str
-        What to call the table in messages.
-
-    Returns
-    -------
-    `~numpy.ndarray` of int
-        Frame indices, shape (P, 2), ordered by the first: state 0, then state 1. Among
-        several partners the nearest in time is taken.
-
-    Raises
-    ------
-    ObservationError
-        If a frame has no partner in the other state at its angles.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If frames are left over because their partners are used.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.observations.pairing import pair_states
-    >>> pair_states([0, 1, 1, 0], [0, 0, 22.5, 22.5] * u.deg, [90, 90, 90, 90] * u.deg).tolist()
-    [[0, 1], [3, 2]]
+    Returns indices (P, 2), state 0 first; the nearest in time wins. Arguments as for `pair_frames`.
+    A frame without any partner is an error, one whose partner is used a warning.
     """
     state = np.asarray(state)
     angles = [np.atleast_1d(angle_to_rad(x, "angle")) for x in (hwp, derotator)]
@@ -187,44 +114,10 @@ def quadruples(
     states, hwp, derotator, time=None, *, labels=None, rows=None, name="table", **limits
 ):
     """
-    Combine pairs of modulator states whose half-wave plates stand 45 degrees apart.
+    Combine pairs of states, (P, 2), whose half-wave plates stand 45 deg apart.
 
-    Parameters
-    ----------
-    states : `~numpy.ndarray` of int
-        Frame indices of each pair, first and second state, shape (P, 2), see `pair_states`.
-    hwp, derotator : `~astropy.units.Quantity`
-        Angles of every frame, shape (F,).
-    time : array_like of float, optional
-        Time of every frame in any unit; by default the index of the frame.
-    labels, rows, name
-        As for `pair_frames`, one a frame.
-    **limits
-        ``tolerance``, ``derotator_tolerance`` and ``share`` of `pair_frames`.
-
-    Returns
-    -------
-    `~numpy.ndarray` of int
-        Frame indices, shape (Q, 4): both states of the plus angle, both of the minus angle.
-
-    Raises
-    ------
-    ObservationError
-        If no pair stands 45 degrees from one of the angles.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If pairs are left over because their partners are missing or used.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal.observations.pairing import quadruples
-    >>> pairs = np.array([[0, 1], [2, 3]])
-    >>> quadruples(pairs, [0, 0, 45, 45] * u.deg, [90] * 4 * u.deg).tolist()
-    [[0, 1, 2, 3]]
+    Returns indices (Q, 4): both states of the plus angle, both of the minus angle. Arguments as for
+    `pair_frames`, one per frame.
     """
     # both frames of a pair stand at the same angles, so that one speaks for both
     first = np.asarray(states)[:, 0]
@@ -273,7 +166,7 @@ class _Setting:
         """
         Return plus and minus frame of all possible pairs, the best first.
 
-        Only frames that are at most ``width`` places apart in ``frames`` count.
+        Only frames at most ``width`` places apart in ``frames`` count.
         """
         first, second = _neighbours(frames, width)
         gap = self.hwp[second] - self.hwp[first]
@@ -383,3 +276,78 @@ def _warn_left_over(left, hwp, labels, name):
         AstropolcalWarning,
         stacklevel=3,
     )
+
+
+# ---- data of a table -----------------------------------------------------------------------------
+
+
+class FrameGroups:
+    """
+    The groups of frames of a table, found once for each choice of limits; the arrays are read only.
+    """
+
+    def __init__(self, observations, rows=None, label="table"):
+        self._observations = observations
+        self._names = {"rows": rows, "name": label}
+        self._found = {}
+
+    def pairs(self, tolerance=0.3 * u.deg, derotator_tolerance=0.5 * u.deg, share=False):
+        """Return frame indices of pairs, shape (P, 2)."""
+        states = self._observations.pairing == "flc_state"
+        find = self._find_states if states else self._find_pairs
+        return self._kept(find, tolerance, derotator_tolerance, share)
+
+    def quadruples(self, tolerance=0.3 * u.deg, derotator_tolerance=0.5 * u.deg, share=False):
+        """
+        Return frame indices of pairs in both states of a modulator, shape (Q, 4).
+
+        A and B at the plus angle, then at the minus angle.
+        """
+        return self._kept(self._find_quadruples, tolerance, derotator_tolerance, share)
+
+    def _kept(self, find, tolerance, derotator_tolerance, share):
+        angles = (tolerance, derotator_tolerance)
+        # in radian, so that 30 arcmin and 0.5 deg are one entry
+        key = (find.__name__, *(float(angle_to_rad(a, "tolerance")) for a in angles), bool(share))
+        if key not in self._found:
+            limits = dict(zip(("tolerance", "derotator_tolerance"), key[1:3] * u.rad, strict=True))
+            found = find(share=key[3], **limits)
+            # everybody gets the same array
+            found.flags.writeable = False
+            self._found[key] = found
+        return self._found[key]
+
+    @property
+    def _angles(self):
+        return tuple(self._observations.position(name) * u.rad for name in ("hwp", "derotator"))
+
+    def _labels(self):
+        return np.asarray(self._observations.frames["frame"]).tolist()
+
+    def _find_pairs(self, **limits):
+        frames = self._observations.frames
+        # the plate cancels what stands still: both frames must be in one state
+        state = np.asarray(frames["flc_state"]) if "flc_state" in frames.colnames else None
+        names = self._names | {"labels": self._labels()}
+        return self._some(pair_frames(*self._angles, state, clock(frames), **names, **limits))
+
+    def _find_states(self, **limits):
+        observations = self._observations
+        state, time = observations.position("flc_state"), clock(observations.frames)
+        return pair_states(state, *self._angles, time, **self._names, **limits)
+
+    def _find_quadruples(self, **limits):
+        time = clock(self._observations.frames)
+        names = self._names | {"labels": self._labels()}
+        # states first: they alternate within an exposure and so share its atmosphere
+        states = self._find_states(**limits)
+        return self._some(quadruples(states, *self._angles, time, **names, **limits))
+
+    def _some(self, groups):
+        if not len(groups):
+            n = self._observations.n_frames
+            raise ObservationError(
+                f"{self._names['name']}: none of its {counted(n, 'frame')} can be paired; two "
+                "frames 45 deg of half-wave plate apart at the same derotator angle are needed"
+            )
+        return groups

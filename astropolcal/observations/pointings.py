@@ -21,11 +21,12 @@ from erfa import ErfaWarning
 
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.files import one_line
-from astropolcal.observations.coordinates import clock
 from astropolcal.observations.reading import numeric_column
+from astropolcal.optics import COORDINATES
+from astropolcal.optics.core import MOVES
 from astropolcal.units import angle_to_rad
 
-__all__ = ["motion", "pointing", "sky_angles", "sky_positions", "smeared", "tracked"]
+__all__ = ["location_of", "pointing"]
 
 #: The tracking law of the half-wave plate (paper, Sec. 6.1): factors of parallactic angle
 #: and altitude.
@@ -152,28 +153,11 @@ def pointing(coord, time, location):
 
 
 def tracked(hwp, parallactic, altitude, law=TRACKING):
-    r"""
+    """
     Return the true angle of a half-wave plate that follows the sky.
 
-    :math:`\theta' = \theta + 0.5\,p + a` (paper, Sec. 6.1).
-
-    Parameters
-    ----------
-    hwp, parallactic, altitude : `~astropy.units.Quantity`
-        Commanded angle, parallactic angle and altitude.
-    law : (float, float)
-        Factors of parallactic angle and altitude.
-
-    Returns
-    -------
-    `~astropy.units.Quantity`
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.observations import tracked
-    >>> tracked(45 * u.deg, 30 * u.deg, 60 * u.deg)
-    <Quantity 120. deg>
+    The law are the factors of parallactic angle and altitude: theta' = theta + 0.5 p + a (paper,
+    Sec. 6.1).
     """
     return hwp + law[0] * parallactic + law[1] * altitude
 
@@ -183,38 +167,10 @@ def tracked(hwp, parallactic, altitude, law=TRACKING):
 
 def sky_angles(observations, location=None):
     """
-    Return altitude and parallactic angle of every frame.
+    Return altitude and parallactic angle of every frame, radian, (F,).
 
-    From the columns of that name; where they are absent from the columns ``time`` (a
-    `~astropy.time.Time`, or text that it understands, in UTC), ``right_ascension`` and
-    ``declination`` (columns, or meta, in degree).
-
-    Parameters
-    ----------
-    observations : Observations
-        The dataset.
-    location : `~astropy.coordinates.EarthLocation`, optional
-        Where; needed only where the angles must be computed.
-
-    Returns
-    -------
-    altitude, parallactic : `~numpy.ndarray`
-        Radian, shape (F,).
-
-    Raises
-    ------
-    ObservationError
-        If the table does not say where the telescope pointed, or the target is below
-        the horizon.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.observations import Observations, example_table, sky_angles
-    >>> table = example_table()
-    >>> table["altitude"], table["parallactic"] = 60 * u.deg, 30 * u.deg
-    >>> [angle[0].round(4) for angle in sky_angles(Observations.from_table(table))]
-    [np.float64(1.0472), np.float64(0.5236)]
+    From the columns of that name; else from ``time`` (UTC), ``right_ascension`` and ``declination``
+    (columns or meta, degree) and the `~astropy.coordinates.EarthLocation`.
     """
     there = observations.frames.colnames
     if "altitude" in there and "parallactic" in there:
@@ -281,33 +237,10 @@ def _target(observations):
 
 def motion(observations, angle, duty=None):
     """
-    Return by how much an angle changes while a frame is exposed.
+    Return by how much an angle (radian, (F,)) changes while a frame is exposed.
 
-    Parameters
-    ----------
-    observations : Observations
-        With columns ``exposure_time`` and ``time``, unless ``duty`` is given.
-    angle : array_like
-        The angle of every frame, radian, shape (F,).
-    duty : float, optional
-        Share of the time from one frame to the next in which light is collected, 0 to 1.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Radian, shape (F,).
-
-    Raises
-    ------
-    ObservationError
-        If neither times nor ``duty`` are known, or are not possible.
-
-    Examples
-    --------
-    >>> from astropolcal.observations import Observations, example_table
-    >>> from astropolcal.observations.pointings import motion
-    >>> motion(Observations.from_table(example_table()), [0.0, 0.1, 0.2, 0.3], duty=0.5).round(3)
-    array([0.05, 0.05, 0.05, 0.05])
+    By the columns ``time`` and ``exposure_time``, or by ``duty``, the share of the time in which
+    light is collected.
     """
     # the parallactic angle jumps by 360 deg north of the zenith
     steady = np.unwrap(np.asarray(angle, dtype=float))
@@ -341,38 +274,10 @@ def _seconds(observations):
 
 def smeared(angle, change, nodes=3, when="middle"):
     """
-    Return an angle at the Gauss-Legendre nodes of every exposure.
+    Return an angle (radian, (F,)) at the Gauss-Legendre nodes of every exposure, (nodes, F).
 
-    A measurement that is given such positions averages the fluxes of the nodes, see
-    `~astropolcal.measurement.Measurement`. Three nodes are exact for everything that is of
-    fifth degree in time.
-
-    Parameters
-    ----------
-    angle : array_like
-        The angle that the table gives, radian, shape (F,).
-    change : array_like
-        By how much it changes during the exposure, shape (F,), see `motion`.
-    nodes : int
-        Number of nodes.
-    when : {"start", "middle", "end"}
-        The moment of the exposure that the table's angle belongs to.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Radian, shape (nodes, F).
-
-    Raises
-    ------
-    ObservationError
-        If the number of nodes or the moment is not possible.
-
-    Examples
-    --------
-    >>> from astropolcal.observations.pointings import smeared
-    >>> smeared([1.0], [0.2], nodes=2).round(3).tolist()
-    [[0.942], [1.058]]
+    ``change`` is that of `motion`, ``when`` the moment that the angle belongs to: start, middle or
+    end. A measurement averages the fluxes of the nodes; three are exact to fifth degree in time.
     """
     if when not in _WHEN:
         raise ObservationError(f"when = {when!r}; allowed are {', '.join(_WHEN)}")
@@ -386,42 +291,10 @@ def smeared(angle, change, nodes=3, when="middle"):
 
 def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="middle", duty=None):
     """
-    Return the positions of all that moves with the sky, in radian.
+    Return altitude, parallactic, derotator and hwp, radian, (F,), or (nodes, F) for several nodes.
 
-    Parameters
-    ----------
-    observations : Observations
-        A star. Where the table has a column ``hwp_true``, it is the position of the
-        half-wave plate; else the plate follows the tracking law from the commanded ``hwp``.
-    location : `~astropy.coordinates.EarthLocation`, optional
-        See `sky_angles`.
-    law : (float, float)
-        See `tracked`.
-    nodes, when, duty
-        Nodes of an exposure, see `smeared` and `motion`; with one node a frame has one
-        angle, that of the table.
-
-    Returns
-    -------
-    dict of str to `~numpy.ndarray`
-        ``altitude``, ``parallactic``, ``hwp`` and ``derotator``, shape (F,), or
-        (nodes, F) with more than one node.
-
-    Raises
-    ------
-    ObservationError
-        As `sky_angles` and `motion`.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal.observations import Observations, example_table
-    >>> from astropolcal.observations.pointings import sky_positions
-    >>> table = example_table()
-    >>> table["altitude"], table["parallactic"] = 60 * u.deg, 30 * u.deg
-    >>> np.rad2deg(sky_positions(Observations.from_table(table))["hwp"]).round(1).tolist()
-    [75.0, 97.5, 120.0, 142.5]
+    The plate stands at ``hwp_true`` where the table has it, else where the tracking law puts it.
+    The other arguments are those of `sky_angles`, `tracked`, `smeared` and `motion`.
     """
     altitude, parallactic = sky_angles(observations, location)
     found = {"altitude": altitude, "parallactic": parallactic}
@@ -443,7 +316,24 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
 
 
 def location_of(site):
-    """Return the `~astropy.coordinates.EarthLocation` of (longitude, latitude, height), or None."""
+    """
+    Return the place of a telescope.
+
+    Parameters
+    ----------
+    site : tuple of float
+        Longitude and latitude in degree, height in metre; empty if it is not known.
+
+    Returns
+    -------
+    `~astropy.coordinates.EarthLocation` or None
+
+    Examples
+    --------
+    >>> from astropolcal.observations import location_of
+    >>> location_of((-155.4761, 19.8255, 4139.0)).lat.deg.round(4)
+    np.float64(19.8255)
+    """
     from astropy.coordinates import EarthLocation
 
     if not len(site):
@@ -464,3 +354,118 @@ def horizontal(altitude, parallactic):
         shown = np.rad2deg(np.ravel(altitude)[np.ravel(bad)][0])
         raise ObservationError(f"altitude = {shown:.4g} deg; allowed is above 0 to 90 deg")
     return altitude, parallactic
+
+
+# ---- other quantities of a frame -----------------------------------------------------------------
+
+# tables of others number the states, and a reader may have turned the numbers into floats
+_STATES = {"A": 0.0, "B": 1.0, "0": 0.0, "1": 1.0, "0.0": 0.0, "1.0": 1.0}
+
+
+def frame_coordinate(observations, name):
+    """
+    Return one of `~astropolcal.optics.COORDINATES` of every frame, (F,), or (2, B, F) for fluxes.
+
+    They are described in `Observations.position`. Persistence adds a share p of the frame before:
+    it multiplies the flux by 1 + p F_before / F_now, a `~astropolcal.optics.FluxGain` with
+    ``power=-1`` and ``mount="previous_flux"``.
+    """
+    if name not in COORDINATES:
+        raise ObservationError(
+            f"{observations.name}: no coordinate {name!r}; allowed are {', '.join(COORDINATES)}"
+        )
+    if name == "flc_state":
+        return _modulator_state(observations)
+    time = _time_or_order(observations)
+    if name == "sequence":
+        # affine in time, so that a drift has the same parameter whatever the unit of the clock
+        passed = time - time.min()
+        return passed / passed.max() if passed.max() > 0 else passed
+    if name == "frame":
+        return np.arange(observations.n_frames, dtype=float)
+    if name in MOVES:
+        return _last_move(time, observations.position(name.rpartition("_")[0]), name)
+    if name.endswith("_rate"):
+        return angle_change(observations, observations.position(name.removesuffix("_rate")))
+    # (2, B, F): beam, wavelength, frame, as the optics of a chain want them
+    fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
+    if name == "flux":
+        return np.where(observations.mask.T, 0.0, fluxes)
+    if name == "total_flux":
+        # both entries alike: what depends on all of the light acts on both beams alike
+        total = np.where(observations.mask.T, 0.0, fluxes.sum(axis=0))
+        return np.stack([total, total])
+    # stable: frames of one time stay in the order of the table
+    order = np.argsort(time, kind="stable")
+    # what the frame before leaves behind; the first one has none, and 1 changes nothing there
+    ratio = np.ones_like(fluxes)
+    ratio[..., order[1:]] = fluxes[..., order[1:]] / fluxes[..., order[:-1]]
+    return np.where(np.isnan(ratio), 1.0, ratio)
+
+
+def _last_move(time, angle, name):
+    """Return of every frame the last move of a stage: whether it was backwards, or how far."""
+    order = np.argsort(time, kind="stable")
+    steps = np.diff(angle[order], prepend=angle[order[:1]])
+    out = np.zeros_like(angle)
+    if name.endswith("_move"):
+        out[order] = steps
+        return out
+    # a stage that stays where it is was last moved as before
+    moved = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
+    out[order] = steps[moved] < 0
+    return out
+
+
+def angle_change(observations, angle):
+    """
+    Return how an angle (radian, (F,)) changes from frame to frame, in the order of the times.
+
+    That is half the change from the frame before to the one after.
+    """
+    order = np.argsort(_time_or_order(observations), kind="stable")
+    out = np.zeros_like(angle)
+    if len(angle) > 1:
+        # a turn through 180 deg is a small change; central differences, one-sided at both ends
+        out[order] = np.gradient(np.unwrap(angle[order]))
+    return out
+
+
+def clock(frames):
+    """
+    Return the times of frames as numbers, in days or in the unit of the column.
+
+    None without a column ``time`` of times or numbers, or if one is unknown.
+    """
+    column = frames["time"] if "time" in frames.colnames else None
+    # a double resolves a microsecond of a modified Julian date
+    column = column.mjd if isinstance(column, Time) else column
+    if getattr(getattr(column, "dtype", None), "kind", "") not in tuple("iuf"):
+        return None
+    # one unknown time makes the order of all frames doubtful, so none is used then
+    known = ~np.asarray(getattr(column, "mask", False))
+    plain = getattr(column, "unmasked", column)
+    times = np.asarray(getattr(plain, "value", plain), dtype=float)
+    return times if np.all(known & np.isfinite(times)) else None
+
+
+def _modulator_state(observations):
+    frames = observations.frames
+    if "flc_state" not in frames.colnames:
+        raise ObservationError(
+            f"{observations.name}: no column flc_state; it is needed, with A or B in each frame"
+        )
+    # strings, bytes and numbers alike become text here
+    found = [_STATES.get(str(value).strip().upper()) for value in frames["flc_state"]]
+    if None in found:
+        i = found.index(None)
+        raise ObservationError(
+            f"{observations.name}: flc_state = {str(frames['flc_state'][i])!r} in frame "
+            f"{frames['frame'][i]}; allowed are A and B, or 0 and 1"
+        )
+    return np.array(found)
+
+
+def _time_or_order(observations):
+    times = clock(observations.frames)
+    return np.arange(observations.n_frames, dtype=float) if times is None else times

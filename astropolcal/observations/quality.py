@@ -3,7 +3,7 @@
 Frames of a run that cannot be used, found from the table and masked with a reason.
 
 Nothing is dropped: a masked frame stays in the table with its reason, and one warning a
-reason says how many there are and which. See also `astropolcal.observations.masking`, which judges
+reason says how many there are and which. See also `astropolcal.observations.grid`, which judges
 single cells while a table is read.
 """
 
@@ -17,17 +17,7 @@ from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.units import angle_to_rad
 from astropolcal.words import counted
 
-__all__ = [
-    "MAD_TO_SIGMA",
-    "brightness",
-    "cycle_numbers",
-    "is_star",
-    "mask_incomplete_cycles",
-    "mask_saturated",
-    "mask_unstable_lamp",
-    "plain_source",
-    "robust_curve",
-]
+__all__ = []
 
 # derotator angles that differ by less belong to one run
 _SAME_ANGLE = np.deg2rad(0.5)
@@ -39,48 +29,16 @@ _MOST_NAMED = 8
 
 
 def is_star(source):
-    """
-    Return whether a table's source is a star.
-
-    Parameters
-    ----------
-    source : str or None
-        The entry ``source`` of its meta.
-
-    Returns
-    -------
-    bool
-
-    Examples
-    --------
-    >>> from astropolcal.observations import is_star
-    >>> is_star("unpolarized standard star"), is_star("unpolarized"), is_star(None)
-    (True, False, False)
-    """
+    """Return whether the source in the meta of a table is a star."""
     words = plain_source(source).split()
     return "star" in words or "sky" in words
 
 
 def plain_source(source):
     """
-    Return a table's source as instruments spell it.
+    Return a source in lower case with single spaces.
 
-    Parameters
-    ----------
-    source : str or None
-        The entry ``source`` of its meta.
-
-    Returns
-    -------
-    str
-        In lower case, with single spaces for hyphens and underscores; ``"star"`` for
-        ``"standard star"``, of which nobody says how polarized it is.
-
-    Examples
-    --------
-    >>> from astropolcal.observations.quality import plain_source
-    >>> plain_source("Unpolarized_standard-star"), plain_source("standard star")
-    ('unpolarized standard star', 'star')
+    "star" for "standard star", of which nobody says how polarized it is.
     """
     words = re.sub(r"[\s_-]+", " ", (source or "").lower()).strip()
     return "star" if words == "standard star" else words
@@ -91,29 +49,11 @@ def plain_source(source):
 
 def cycle_numbers(observations, start=None):
     """
-    Return the number of the half-wave-plate cycle of every frame.
+    Return the number of the half-wave-plate cycle of every frame, from 0, (F,).
 
-    That is the column ``cycle`` of the frames where there is one. Else a cycle ends where
-    a plate angle (of one state of a modulator) comes again or the derotator moves.
-
-    Parameters
-    ----------
-    observations : Observations
-        The dataset.
-    start : `~astropy.units.Quantity`, optional
-        Commanded angle with which a cycle begins, so that a run whose first frames are lost
-        is not cut at another place.
-
-    Returns
-    -------
-    `~numpy.ndarray` of int
-        Shape (F,), from 0.
-
-    Examples
-    --------
-    >>> from astropolcal.observations import Observations, cycle_numbers, example_table
-    >>> cycle_numbers(Observations.from_table(example_table())).tolist()
-    [0, 0, 0, 0]
+    That of the column ``cycle``; else a cycle ends where a plate angle (of one state of a
+    modulator) comes again, the derotator moves, or ``start`` comes, the angle with which a cycle
+    begins.
     """
     frames = observations.frames
     if "cycle" in frames.colnames:
@@ -144,35 +84,7 @@ def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
     """
     Mask the frames of cycles that lack an angle of the half-wave plate.
 
-    An incomplete cycle gives q without u, or neither. A frame that is masked at all
-    wavelengths counts as missing.
-
-    Parameters
-    ----------
-    observations : Observations
-        The dataset.
-    angles : `~astropy.units.Quantity`
-        Commanded angles that a cycle has, modulo 180 deg; it begins with the first.
-
-    Returns
-    -------
-    Observations
-
-    Raises
-    ------
-    ObservationError
-        If no cycle is complete.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If frames are masked.
-
-    Examples
-    --------
-    >>> from astropolcal.observations import Observations, example_table, mask_incomplete_cycles
-    >>> mask_incomplete_cycles(Observations.from_table(example_table())).mask_reasons
-    {}
+    They give q without u, or neither. A frame masked at all wavelengths counts as missing.
     """
     wanted = np.mod(np.atleast_1d(angle_to_rad(angles, "angles")), np.pi)
     plate, cycle = observations.position("hwp"), cycle_numbers(observations, wanted[0] * u.rad)
@@ -194,36 +106,7 @@ def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
 
 
 def mask_saturated(observations):
-    """
-    Mask the frames that the column ``saturated`` flags.
-
-    Parameters
-    ----------
-    observations : Observations
-        Its column ``saturated``, if there is one, holds booleans or numbers of pixels.
-
-    Returns
-    -------
-    Observations
-
-    Raises
-    ------
-    ObservationError
-        If the column holds neither booleans nor numbers.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If frames are masked.
-
-    Examples
-    --------
-    >>> from astropolcal.observations import Observations, example_table, mask_saturated
-    >>> table = example_table()
-    >>> table["saturated"] = 0
-    >>> mask_saturated(Observations.from_table(table)).mask_reasons
-    {}
-    """
+    """Mask the frames whose column ``saturated`` is true or above zero."""
     frames = observations.frames
     if "saturated" not in frames.colnames:
         return observations
@@ -238,24 +121,10 @@ def mask_saturated(observations):
 
 def brightness(observations):
     """
-    Return how bright each frame is, common to all wavelengths.
+    Return how bright each frame is, (F,).
 
-    Parameters
-    ----------
-    observations : Observations
-        The dataset.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Sum of the beams over its median frame, median over the wavelengths, shape (F,);
-        NaN where all are masked.
-
-    Examples
-    --------
-    >>> from astropolcal.observations import Observations, brightness, example_table
-    >>> brightness(Observations.from_table(example_table())).round(3).tolist()
-    [1.0, 1.0, 1.0, 1.0]
+    The sum of the beams over its median frame, median over the wavelengths; NaN where all are
+    masked.
     """
     total = np.where(observations.mask, np.nan, observations.flux_right + observations.flux_left)
     with warnings.catch_warnings():
@@ -269,52 +138,10 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
     """
     Mask the frames of an internal source whose brightness leaves its slow drift.
 
-    The brightness of the frames, see `brightness`, is compared with the parabola in
-    the order of the frames that has the least absolute deviations. A frame is unstable
-    if its logarithm is off by more than ``limit`` and by more than ``sigma`` robust
-    standard deviations. Where at least half of the frames at one derotator angle are, all
-    frames of that angle are masked, as pairs are formed within it.
-
-    Parameters
-    ----------
-    observations : Observations
-        An internal source; a star may fade behind clouds without harm to its
-        differences.
-    limit : float
-        Least change of brightness that counts, relative.
-    sigma : float
-        In robust standard deviations of all frames.
-
-    Returns
-    -------
-    Observations
-
-    Raises
-    ------
-    ObservationError
-        If every frame would be masked, or a limit is not positive.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If frames are masked.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> import warnings
-    >>> from astropolcal import instruments
-    >>> from astropolcal.observations import mask_unstable_lamp
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)
-    >>> lamp = np.where(np.arange(64) < 8, np.linspace(0.2, 3, 64), 1.0)
-    >>> data = simulate(charis.chain("unpolarized"), charis.wavelength, frames, lamp=lamp)
-    >>> with warnings.catch_warnings():
-    ...     warnings.simplefilter("ignore")
-    ...     mask_unstable_lamp(data).mask.all(axis=1).sum()
-    np.int64(8)
+    The drift is the parabola in the order of the frames with the least absolute deviations. A frame
+    is unstable if ln(brightness) is off by more than ``limit`` and by more than ``sigma`` robust
+    standard deviations. Where at least half of the frames at one derotator angle are, all frames of
+    that angle are masked, as pairs are formed within it.
     """
     if not (limit > 0 and sigma > 0):
         raise ObservationError(f"limit = {limit}, sigma = {sigma}; both must be above zero")
@@ -339,30 +166,9 @@ def _drift(values):
 
 def robust_curve(x, values, degree):
     """
-    Return a polynomial by least absolute deviations, which a bad run of values does not bend.
+    Return at all x the polynomial of least absolute deviations, which a bad run does not bend.
 
-    Parameters
-    ----------
-    x : `~numpy.ndarray`
-        Where the values are, from -1 to 1.
-    values : `~numpy.ndarray`
-        NaN where there is none.
-    degree : int
-        Degree of the polynomial.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        The polynomial at all x.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.observations.quality import robust_curve
-    >>> x = np.linspace(-1, 1, 9)
-    >>> bad = np.where(np.arange(9) == 4, 50.0, 2 + x)
-    >>> robust_curve(x, bad, 1).round(3).tolist()
-    [1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0]
+    x runs from -1 to 1; values are NaN where there is none.
     """
     known = np.isfinite(values)
     curve = np.polynomial.legendre.legvander(x, degree)

@@ -12,6 +12,7 @@ import io
 import re
 import textwrap
 import warnings
+from functools import lru_cache
 from pathlib import Path
 
 import astropy.units as u
@@ -21,17 +22,9 @@ from astropy.table import QTable, Table
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.files import check_yaml, one_line, understood
-from astropolcal.observations.wavelengths import stated_wavelength
 from astropolcal.units import iso_date, plain_number
 
-__all__ = [
-    "check_table",
-    "complete_table",
-    "first_bad_row",
-    "numeric_column",
-    "read_ecsv",
-    "stated_date",
-]
+__all__ = []
 
 # real headers have 1 to 3 kB; the YAML loader needs seconds for a quarter of a megabyte
 _MAX_HEADER = 2**18
@@ -41,31 +34,7 @@ _SINGLE = ("single_difference", "single_sum")
 
 
 def read_ecsv(path):
-    """
-    Read an ECSV file into a table without trusting it.
-
-    Parameters
-    ----------
-    path : str or `~pathlib.Path`
-        The file.
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-
-    Raises
-    ------
-    ObservationError
-        If there is no such file or it is not a readable ECSV table.
-
-    Examples
-    --------
-    >>> from astropolcal.observations.reading import read_ecsv
-    >>> read_ecsv("nowhere.ecsv")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: nowhere.ecsv: no such file
-    """
+    """Read an ECSV file into a table without trusting it."""
     # read once: what is checked is what is loaded, even if the file changes meanwhile
     text = _read_text(path)
     # astropy would guess another format, and make one column of it
@@ -133,35 +102,10 @@ def _check_numbers(path, text):
 
 def check_table(table, label, required):
     """
-    Refuse what is not a table with rows, the required columns and plain values.
+    Return a table as a QTable.
 
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        The table.
-    label : str
-        What to call it in messages: the file or a name.
-    required : sequence of str
-        Columns that must exist.
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-        The same columns.
-
-    Raises
-    ------
-    ObservationError
-        If something is wrong; all missing columns are named at once.
-
-    Examples
-    --------
-    >>> from astropy.table import Table
-    >>> from astropolcal.observations.reading import check_table
-    >>> check_table(Table({"frame": [1]}), "night.ecsv", ["frame", "bin"])
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: night.ecsv: missing column bin; it has frame
+    Refuse what is no table with rows, the required columns and plain values. All missing columns
+    are named at once.
     """
     if not isinstance(table, Table):
         raise ObservationError(f"{label}: a {type(table).__name__}, an astropy Table is needed")
@@ -193,33 +137,9 @@ def _check_plain(column, name, label):
 
 def stated_date(meta, label, error=ObservationError):
     """
-    Return the date in the meta of a table.
+    Return the date in the meta of a table in ISO form, perhaps a month alone; None without one.
 
-    Parameters
-    ----------
-    meta : dict
-        Of the table.
-    label : str
-        What to call the table in messages.
-    error : type
-        What to raise.
-
-    Returns
-    -------
-    str or None
-        As ``iso_date`` returns it, perhaps a month alone; None where the meta
-        have none.
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given, if there is a date that cannot be understood.
-
-    Examples
-    --------
-    >>> from astropolcal.observations.reading import stated_date
-    >>> stated_date({"date": 60953}, "night.ecsv")
-    '2025-10-05'
+    ``error`` is raised for a date that cannot be understood.
     """
     value = meta.get("date")
     if value is None or not str(value).strip():
@@ -231,39 +151,9 @@ def complete_table(table, label):
     """
     Return a table of single differences and sums as one of beam fluxes.
 
-    Where neither beam has a column, right and left are half the sum and difference of
-    ``single_sum`` and ``single_difference``. Where neither ``frame`` nor ``bin`` is there, each
-    row is a frame, of one wavelength. Where ``wavelength`` is not there, it is that of the
-    meta: ``wavelength``, such as "625 nm", or ``filter``, see
-    `~astropolcal.observations.wavelengths.filter_wavelength`. Frames of single differences
+    Where neither ``frame`` nor ``bin`` is there, each row is a frame of one wavelength; a missing
+    ``wavelength`` is that of the meta, ``wavelength`` or ``filter``. Frames of single differences
     with a column ``flc_state`` are paired by it, unless the meta say ``pairing: hwp``.
-
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        The table; it is not changed.
-    label : str
-        What to call it in messages.
-
-    Returns
-    -------
-    `~astropy.table.Table`
-        The same, or a completed copy.
-
-    Raises
-    ------
-    ObservationError
-        If a difference or sum is no number, the units do not fit, or the filter is unknown.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropy.table import QTable
-    >>> from astropolcal.observations.reading import complete_table
-    >>> table = QTable({"single_difference": [1.0] * u.adu, "single_sum": [3.0] * u.adu},
-    ...                meta={"wavelength": "625 nm"})
-    >>> complete_table(table, "night").colnames
-    ['frame', 'bin', 'wavelength', 'flux_right', 'flux_left']
     """
     if not isinstance(table, Table) or not len(table):
         return table
@@ -299,38 +189,7 @@ def _beams(table, label):
 
 
 def numeric_column(table, name, label, unit=None):
-    """
-    Return a column as floats in ``unit``, NaN where it is masked.
-
-    Parameters
-    ----------
-    table : `~astropy.table.QTable`
-        A table that passed `check_table`.
-    name : str
-        The column.
-    label : str
-        What to call the table in messages.
-    unit : `~astropy.units.UnitBase`, optional
-        The unit wanted; by default the column may have any unit or none.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (N,), a copy.
-
-    Raises
-    ------
-    ObservationError
-        If the column is not numeric or its unit is missing or of another kind.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropy.table import QTable
-    >>> from astropolcal.observations.reading import numeric_column
-    >>> numeric_column(QTable({"hwp": [0, 45] * u.deg}), "hwp", "night", u.arcmin).tolist()
-    [0.0, 2700.0]
-    """
+    """Return a column of a checked table as floats in ``unit`` (a copy), NaN where it is masked."""
     column = table[name]
     dtype = getattr(column, "dtype", None)
     if dtype is None or dtype.kind not in "iuf":
@@ -366,36 +225,83 @@ def _convert(values, own, unit, name, label):
 
 
 def first_bad_row(bad, name, values, label, allowed):
-    """
-    Raise for the first row that is bad, if there is one.
-
-    Parameters
-    ----------
-    bad : `~numpy.ndarray` of bool
-        Shape (N,).
-    name : str
-        The column.
-    values : sequence
-        What to show of the row.
-    label, allowed : str
-        What to call the table, and what would have been allowed.
-
-    Raises
-    ------
-    ObservationError
-        Naming the row, counted from 1.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.observations.reading import first_bad_row
-    >>> first_bad_row(np.array([False, True]), "hwp", [0, np.inf], "night", "finite angles")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: night, row 2: hwp = inf, allowed are finite angles
-    """
+    """Raise for the first row that is bad, if there is one, with its value and what is allowed."""
     if np.any(bad):
         row = int(np.argmax(bad))
         raise ObservationError(
             f"{label}, row {row + 1}: {name} = {values[row]}, allowed are {allowed}"
         )
+
+
+# ---- wavelengths ---------------------------------------------------------------------------------
+
+_FILTERS = Path(__file__).parents[1] / "data" / "filters.ecsv"
+
+#: Wavelengths of two tables are the same when they agree to this share.
+SAME_WAVELENGTH = 1e-5
+
+
+def common_wavelengths(observations, wavelength=None):
+    """Return the grid given, or the union of the wavelengths of datasets, ascending, micrometre."""
+    if wavelength is not None:
+        return np.atleast_1d(u.Quantity(wavelength).to_value(u.um))
+    # compared with the next lower one, so that a chain of near values keeps its first
+    merged = np.sort(np.concatenate([obs.wavelength.to_value(u.um) for obs in observations]))
+    return merged[np.diff(merged, prepend=-np.inf) > SAME_WAVELENGTH * merged]
+
+
+def filter_wavelength(instrument, name):
+    """
+    Return the central wavelength of a filter of "VAMPIRES", "SCExAO/VAMPIRES" or another.
+
+    Case, blanks and hyphens do not matter.
+    """
+    own = _filters().get(_plain(str(instrument).split("/")[-1]), {})
+    known = {_plain(label): wavelength for label, wavelength in own.items()}
+    # headers write 625-50, people 625 50
+    if _plain(name) not in known:
+        allowed = ", ".join(own) or "none; give the wavelength"
+        raise ObservationError(
+            f"{instrument}: no wavelength is known of filter {name!r}; known are {allowed}"
+        )
+    return known[_plain(name)]
+
+
+def stated_wavelength(meta, label):
+    """
+    Return the wavelength that the meta state for all rows; None if they state none.
+
+    By ``wavelength`` ("625 nm"), or by ``filter`` and ``instrument``.
+    """
+    value = meta.get("wavelength")
+    if value is None and meta.get("filter") is None:
+        return None
+    if value is None:
+        try:
+            return filter_wavelength(meta.get("instrument"), meta["filter"])
+        except ObservationError as error:
+            raise ObservationError(f"{label}: {error}") from None
+    try:
+        length = plain_number(value, u.Quantity)
+        good = length.isscalar and length.to_value(u.um) > 0
+    except (TypeError, ValueError, u.UnitsError):
+        good = False
+    if not good:
+        raise ObservationError(
+            f"{label}: wavelength = {value!r} in the meta; allowed is one length such as '625 nm'"
+        )
+    return length
+
+
+def _plain(name):
+    return "".join(c for c in str(name).lower() if c.isalnum())
+
+
+@lru_cache(maxsize=1)
+def _filters():
+    """Return instrument to name of filter to wavelength."""
+    found = {}
+    for row in QTable.read(_FILTERS, format="ascii.ecsv"):
+        # by the instrument first: a name such as H means another wavelength elsewhere
+        found.setdefault(_plain(row["instrument"]), {})[str(row["filter"])] = row["wavelength"]
+    return found

@@ -3,31 +3,31 @@
 `Observations`, the table of beam fluxes from which everything is calibrated.
 """
 
+import dataclasses
+import hashlib
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.table import Table
+from astropy.table import QTable, Table
+from astropy.time import Time
 
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import atomic_path, check_new, one_line
-from astropolcal.observations.coordinates import frame_coordinate
-from astropolcal.observations.grid import build_grid
-from astropolcal.observations.groups import FrameGroups
-from astropolcal.observations.hashing import hash_columns
-from astropolcal.observations.pairing import PAIRINGS
+from astropolcal.observations.grid import beam_variances, build_grid
+from astropolcal.observations.pairing import PAIRINGS, FrameGroups
+from astropolcal.observations.pointings import frame_coordinate
 from astropolcal.observations.reading import (
     complete_table,
     numeric_column,
     read_ecsv,
     stated_date,
 )
-from astropolcal.observations.selection import masked_grid, some_bins, some_frames
-from astropolcal.observations.variances import beam_variances
 from astropolcal.optics import COORDINATES
+from astropolcal.units import canonical_unit
 from astropolcal.words import counted
 
-__all__ = ["Observations"]
+__all__ = ["Observations", "example_table"]
 
 
 class Observations:
@@ -434,8 +434,10 @@ class Observations:
         Returns
         -------
         `~numpy.ndarray` of int
-            Frame indices (plus, minus), shape (P, 2); read only, found once and
-            kept. See `~astropolcal.observations.pair_frames` for the rules.
+            Frame indices (plus, minus), shape (P, 2); read only, found once and kept. The plus
+            frame is the one whose angle modulo 90 deg lies in [0, 45). The frames agree in the
+            derotator angle and in the state of a modulator; among several partners the nearest
+            in time is taken.
 
         Raises
         ------
@@ -667,3 +669,208 @@ def _span(angles):
 
 def _is_angle(column):
     return isinstance(column, u.Quantity) and column.unit.is_equivalent(u.rad)
+
+
+# ---- parts of a grid -----------------------------------------------------------------------------
+
+
+def masked_grid(grid, mask, reason, label):
+    """
+    Return a grid with more cells masked: a mask of shape (F, W), or (F,) for whole frames.
+
+    Cells masked before keep their reason.
+    """
+    mask, known = np.asarray(mask), grid.reason > 0
+    shapes = (known.shape, known.shape[:1])
+    if mask.dtype != bool or mask.shape not in shapes:
+        raise ObservationError(
+            f"{label}: mask of type {mask.dtype} and shape {mask.shape}; allowed are "
+            f"booleans of shape {shapes[0]} or {shapes[1]}"
+        )
+    if not isinstance(reason, str) or not reason.strip():
+        raise ObservationError(f"{label}: reason = {reason!r}, some words are needed")
+    reason = reason.strip()
+    new = (mask if mask.ndim == 2 else mask[:, None]) & ~known
+    if (new | known).all():
+        raise ObservationError(
+            f"{label}: masking {reason!r} would leave no usable cell of {new.size}"
+        )
+    reasons = grid.reasons if reason in grid.reasons else (*grid.reasons, reason)
+    # a masked flux is NaN as well, so that what forgets the mask cannot use it
+    return dataclasses.replace(
+        grid,
+        flux_right=np.where(new, np.nan, grid.flux_right),
+        flux_left=np.where(new, np.nan, grid.flux_left),
+        errors={name: np.where(new, np.nan, error) for name, error in grid.errors.items()},
+        reason=np.where(new, reasons.index(reason) + 1, grid.reason),
+        reasons=reasons,
+    )
+
+
+def some_frames(grid, frames, label):
+    """Return the grid of some frames, by booleans or indices, in the order of the table."""
+    index = _frame_index(np.asarray(frames), len(grid.frames), label)
+    if grid.reason[index].all():
+        raise ObservationError(
+            f"{label}: the {counted(len(index), 'frame')} selected have no usable cell"
+        )
+    return dataclasses.replace(
+        grid,
+        frames=grid.frames[index],
+        rows=grid.rows[index],
+        flux_right=grid.flux_right[index],
+        flux_left=grid.flux_left[index],
+        errors={name: error[index] for name, error in grid.errors.items()},
+        reason=grid.reason[index],
+    )
+
+
+def some_bins(grid, bins, label):
+    """Return the grid at some wavelengths, one boolean a bin."""
+    chosen, n_bins = np.asarray(bins), len(grid.bin)
+    if chosen.dtype != bool or chosen.shape != (n_bins,):
+        raise ObservationError(
+            f"{label}: bins of type {chosen.dtype} and shape {chosen.shape}; allowed "
+            f"are {n_bins} booleans"
+        )
+    if grid.reason[:, chosen].all():
+        raise ObservationError(f"{label}: the bins selected have no usable cell")
+    return dataclasses.replace(
+        grid,
+        bin=grid.bin[chosen],
+        wavelength=grid.wavelength[chosen],
+        flux_right=grid.flux_right[:, chosen],
+        flux_left=grid.flux_left[:, chosen],
+        errors={name: error[:, chosen] for name, error in grid.errors.items()},
+        reason=grid.reason[:, chosen],
+    )
+
+
+def _frame_index(frames, n_frames, label):
+    """Return the indices of frames, ascending; negative ones count from the end."""
+    if frames.dtype == bool and frames.shape == (n_frames,):
+        return np.flatnonzero(frames)
+    # an empty list has type float, and selects nothing that could be used
+    if frames.dtype.kind not in "iu" or frames.ndim != 1:
+        raise ObservationError(
+            f"{label}: frames of type {frames.dtype} and shape {frames.shape}; allowed "
+            f"are {n_frames} booleans or a list of indices"
+        )
+    outside = frames[(frames < -n_frames) | (frames >= n_frames)]
+    if outside.size:
+        raise ObservationError(
+            f"{label}: frame index {outside[0]}, allowed are 0 to {n_frames - 1}"
+        )
+    # -1 and the last index are the same frame
+    index, counts = np.unique(frames % n_frames, return_counts=True)
+    if (counts > 1).any():
+        raise ObservationError(
+            f"{label}: frame index {index[counts > 1][0]} is given twice, "
+            "each frame is allowed once"
+        )
+    return index
+
+
+# ---- fingerprint ---------------------------------------------------------------------------------
+
+
+def hash_columns(columns, header=""):
+    """
+    Return the SHA-256 of named columns in any order, and of a header.
+
+    Numbers count to 12 digits, angles and lengths in canonical units, so that the way they are
+    written does not matter.
+    """
+    digest = hashlib.sha256(header.encode())
+    # the order of columns in a file says nothing
+    for name in sorted(columns):
+        # the name separates columns, or moving a value to the next one would go unnoticed
+        unit, text = _canonical(columns[name])
+        digest.update(f"\n{name}|{unit}|{text}".encode())
+    return digest.hexdigest()
+
+
+def _canonical(column):
+    """Return the unit and the values of a column as text that formats cannot change."""
+    unit = getattr(column, "unit", None)
+    if isinstance(column, Time):
+        column = column.mjd
+    elif isinstance(column, u.Quantity):
+        try:
+            unit = canonical_unit(unit)
+            column = column.to_value(unit)
+        # units that are neither angles nor lengths, such as adu, stay as they are
+        except ParameterError:
+            column = column.value
+    if not isinstance(column, np.ndarray):
+        return unit, "\x1f".join(str(value) for value in column)  # coordinates and the like
+    mask = np.asarray(getattr(column, "mask", False))
+    values = np.ma.getdata(getattr(column, "unmasked", column))
+    if values.dtype.kind in "iuf":
+        # adding zero turns -0 into 0
+        # 12 digits: what conversions between units leave of a double
+        values = np.char.mod("%.11e", np.asarray(values, dtype=float) + 0.0)
+    elif values.dtype.kind in "US":
+        # a file of text has no blanks about a word, and a word that is empty is masked in it
+        values = np.char.strip(values.astype(str))
+        mask = mask | (values == "")
+    # what lies below a mask is not content
+    values = np.where(mask, "masked", np.asarray(values).astype(str))
+    return unit, "\x1f".join(values.ravel().tolist())
+
+
+# ---- example -------------------------------------------------------------------------------------
+
+
+def example_table(
+    hwp=(0.0, 22.5, 45.0, 67.5), derotator=(90.0,), wavelength=(1.2, 1.6, 2.2), polarization=0.5
+):
+    """
+    Return what an ideal dual-beam polarimeter measures of light with positive Q.
+
+    Fluxes follow R, L = I (1 +- p cos 4 (hwp - derotator)) / 2: half-wave plate,
+    derotator (half a wave as well) and Wollaston prism are all ideal.
+
+    Parameters
+    ----------
+    hwp, derotator : sequence of float
+        Angles in degree; there is a frame for every combination.
+    wavelength : sequence of float
+        Micrometre.
+    polarization : float
+        Degree of polarization, p.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        As `~astropolcal.observations.Observations.from_table` takes it, with the
+        errors of photon noise.
+
+    Examples
+    --------
+    >>> from astropolcal.observations import example_table
+    >>> example_table().colnames[:5]
+    ['frame', 'bin', 'wavelength', 'hwp', 'derotator']
+    """
+    # "ij": the wavelength runs fastest, then the plate, then the derotator
+    stages, plates, bins = np.meshgrid(derotator, hwp, np.arange(len(wavelength)), indexing="ij")
+    frame = np.repeat(np.arange(len(hwp) * len(derotator)), len(wavelength))
+    # each half-wave plate turns polarization by twice its angle, and both act in turn
+    signal = polarization * np.cos(4 * np.deg2rad(plates - stages)).ravel()
+    # photons, so that the errors of a few percent can be seen in a plot
+    intensity = 1000.0
+    right, left = intensity * (1 + signal) / 2, intensity * (1 - signal) / 2
+    return QTable(
+        {
+            "frame": frame,
+            "bin": bins.ravel(),
+            "wavelength": np.asarray(wavelength, dtype=float)[bins.ravel()] * u.um,
+            "hwp": plates.ravel() * u.deg,
+            "derotator": stages.ravel() * u.deg,
+            "flux_right": right * u.adu,
+            "flux_left": left * u.adu,
+            "flux_right_err": np.sqrt(right) * u.adu,
+            "flux_left_err": np.sqrt(left) * u.adu,
+        },
+        meta={"instrument": "example polarimeter", "source": "polarized"},
+    )

@@ -68,8 +68,7 @@ def mueller_table(calibration, header=None, *, positions=None, light="sky", wave
     --------
     >>> import astropy.units as u
     >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.pipeline.loading import load
+    >>> from astropolcal.pipeline import load, mueller_table
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -159,10 +158,10 @@ def write_mueller(table, path, overwrite=False):
 
     Examples
     --------
+    >>> from astropolcal.pipeline import write_mueller
     >>> import astropy.units as u
     >>> import numpy as np
     >>> from astropy.table import QTable
-
     >>> table = QTable({"frame": [0], "bin": [0], "wavelength": [1600.0] * u.nm})
     >>> for beam in ("right", "left"):
     ...     table[f"mueller_{beam}"], table[f"cov_{beam}"] = np.eye(4)[None], np.eye(16)[None]

@@ -1,8 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What the headers of frames tell: instrument, mode, date, and the angles of the stages.
-
-Which of a calibration's chains the light of a frame went through.
-"""
+"""What headers tell of frames, and whether a calibration and which of its chains hold for them."""
 
 import warnings
 
@@ -46,23 +43,9 @@ _OTHERS = {"exposure_time", "mjd", *TEXTS} - set(_SKY)
 
 
 def describe(header, instrument=None, stated=()):
-    """
-    Return what a header tells of a frame.
+    """Return ``instrument``, ``stated`` (as the header says), ``mode`` and ``date`` (ISO, UTC).
 
-    Parameters
-    ----------
-    header : `~astropy.io.fits.Header` or mapping
-        Primary header.
-    instrument : str or Instrument, optional
-        The instrument, by default that whose identity stands in the header.
-    stated : set of str
-        What is not to be looked for.
-
-    Returns
-    -------
-    dict
-        ``instrument`` (name), ``stated`` (what the header calls it), ``mode`` and ``date`` (ISO,
-        UTC); what is not told is None.
+    What is not told is None; what the user has ``stated`` is not looked for.
     """
     if instrument is None:
         found = _recognized(header)
@@ -124,23 +107,7 @@ def _time(header, layout):
 
 
 class FrameAngles:
-    """
-    The angles of frames from their headers, as `~astropolcal.instruments.Instrument` reads them.
-
-    Parameters
-    ----------
-    headers : list of mappings
-        One a frame.
-    instrument : Instrument
-        With a layout of its files.
-
-    Raises
-    ------
-    InstrumentError
-        If the instrument has no map of keywords.
-    ObservationError
-        If an angle is no number, cannot be right, or is missing in some of the frames.
-    """
+    """The angles of frames from their headers, as the instrument's layout of files reads them."""
 
     def __init__(self, headers, instrument):
         if instrument.files is None:
@@ -235,24 +202,9 @@ def _sky(column, values):
 
 
 def inner_optics(calibration, optics_in=None, beam=None, label="the calibration"):
-    """
-    Return the optics from the first on a stage of the instrument on.
+    """Return the optics from the first on a stage of the instrument on.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        It may have chains for several sets of optional optics.
-    optics_in : sequence of str, optional
-        All optional optics in the beam.
-    beam : dict of str to bool, optional
-        Single ones that are known to be in the beam or not; not used with ``optics_in``.
-    label : str
-        What messages call the calibration.
-
-    Raises
-    ------
-    ChainError
-        If no chain has these optics, or several have.
+    ``optics_in`` are all optional optics in the beam, ``beam`` those known to be in it or not.
     """
     instrument, kinds = instrument_of(calibration), {}
     known = None if optics_in is None else set(optics_in)
@@ -303,14 +255,7 @@ def telescope_optics(calibration):
 
 
 def told_beam(headers, instrument, labels=None):
-    """
-    Return what headers tell of optional optics, name to whether they are in the beam.
-
-    Raises
-    ------
-    ChainError
-        If the frames differ.
-    """
+    """Return what headers tell of optional optics, name to whether they are in the beam."""
     found = {}
     for i, header in enumerate(headers):
         label = f"frame {i}" if labels is None else labels[i]
@@ -327,38 +272,11 @@ _WAYS = {"date": "date= states it", "mode": "mode={}"}
 
 
 def check_frames(calibration, frames, name, *, max_age=None, light="sky", ways=None, dates=True):
-    """
-    Refuse frames for which a calibration does not hold, and warn if it is old for some.
+    """Refuse frames for which a calibration does not hold, and warn if it is old for some.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    frames : sequence of (str, str or `~astropy.time.Time`, str)
-        What to call each frame, when it was taken (UTC) and its mode; None where not known.
-    name : str
-        What to call the calibration.
-    max_age : `~astropy.units.Quantity`, optional
-        Age from which on there is a warning; by default that of the instrument, and none where
-        the end of the validity was stated.
-    light : {"sky", "internal"}
-        Whether the light passed the telescope, whose mirrors may have changed.
-    ways : dict of str to str, optional
-        What the caller can do about a missing ``date`` or ``mode``, and an ``other date``, in
-        words.
-    dates : bool
-        Whether the dates matter, or only the mode.
-
-    Raises
-    ------
-    CalibrationFileError
-        If the calibration holds for other dates or another mode, a frame lacks what would tell,
-        or the instrument has changed in between.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If the calibration is too old; once, for the frame that is furthest from its data.
+    ``frames`` are label, date (UTC) and mode, None where not known. ``light`` is "sky" or
+    "internal"; ``ways`` says what the caller can do about a missing ``date`` or ``mode``, or an
+    ``other date``.
     """
     held, ways = validity_of(calibration), _WAYS if ways is None else ways
     dated = dates and (held.valid_from is not None or held.valid_until is not None)

@@ -1,11 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Calibrations over the years: parameters against date, what changed, and how surely.
+"""
+Calibrations over the years: parameters against date, what changed, and how surely.
 
-A difference between calibrations is judged in the directions that the data of
-all of them determine, with the full covariance of each. Calibrations that share
-data are refused, because their errors are not independent.
-
-Refit what changed since a calibration, and hold the rest.
+A difference between calibrations is judged in the directions that the data of all of them
+determine, with the full covariance of each. Calibrations that share data are refused, because their
+errors are not independent. `restart` refits what changed since a calibration, and holds the rest.
 """
 
 from dataclasses import dataclass, field
@@ -80,8 +79,8 @@ def parameter_history(calibrations, parameters=None):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.pipeline import parameter_history
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -170,6 +169,7 @@ class Change:
 
     Examples
     --------
+    >>> from astropolcal.pipeline import Change
     >>> print(Change(["a", "b"], ["m3.diattenuation"], 30.0, 1, 4e-8))
     m3.diattenuation: changed from a to b at 5.5 sigma (chi-square 30.0 of 1, p = 4e-08)
     """
@@ -219,45 +219,11 @@ def _log_p(chi2, dof):
 
 
 def significance(calibrations, parameters=None):
-    """
-    Return how surely parameters differ between calibrations.
+    """Return how surely parameters differ between two or more calibrations, a `Change`.
 
-    Parameters
-    ----------
-    calibrations : Library or sequence
-        Two or more, see `parameter_history`.
-    parameters : sequence of str, optional
-        ``"optic.parameter"`` or ``"optic"``; by default all that are free in all of them.
-
-    Returns
-    -------
-    Change
-        The chi-square of one set of values for all of them, each with its full covariance, in
-        the directions that all determine. Angles are compared as they are: a
-        fit in another mirror branch counts as a change, so start the later fit from the
-        earlier one, see `~astropolcal.pipeline.restart`.
-
-    Raises
-    ------
-    FitError
-        If there are fewer than two, or two share a dataset.
-    ParameterError
-        If a parameter is not free in one of them, or they are on different wavelengths.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> years = [calibrate(chain, simulate(chain, charis.wavelength, frames, seed=i))
-    ...          for i in (5, 6)]
-    >>> found = significance(years, ["hwp.w_sio2", "hwp.w_mgf2"])
-    >>> found.dof, found.sigma < 4
-    (2, True)
+    The chi-square of one set of values for all, each with its covariance, in the directions that
+    all determine. A fit in another mirror branch counts as a change, so start it from the earlier
+    one.
     """
     named = _named(calibrations)
     if len(named) < 2:
@@ -393,8 +359,8 @@ def changes(calibrations, parameters=None):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.pipeline import changes
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -487,8 +453,8 @@ def restart(calibration, observations, free, *, chain=None, positions=None, **op
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.pipeline import restart
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

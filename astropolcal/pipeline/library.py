@@ -72,7 +72,8 @@ class Entry:
 
     Examples
     --------
-    >>> from astropolcal.calibration.result.validity import Validity
+    >>> from astropolcal.pipeline import Entry
+    >>> from astropolcal.calibration.result import Validity
     >>> Entry("cal.asdf", None, Validity("lab"), "00").validity.instrument
     'lab'
     """
@@ -139,8 +140,8 @@ class Library:
 
     Examples
     --------
+    >>> from astropolcal.pipeline import Library
     >>> import tempfile
-
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     len(Library(folder))
     0

@@ -72,9 +72,9 @@ class SystemMueller:
 
     Examples
     --------
+    >>> from astropolcal.pipeline import SystemMueller
     >>> import astropy.units as u
     >>> import numpy as np
-
     >>> one = SystemMueller(np.eye(4)[None], [1.6] * u.um, "right", {}, np.full((1, 4, 4, 1), 0.1))
     >>> one.covariance.shape, float(one.std[0, 0, 0])
     ((1, 16, 16), 0.1)
@@ -176,8 +176,8 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.pipeline import load
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear", optics_in=["nbs"])
@@ -255,8 +255,8 @@ class LoadedCalibration:
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.pipeline import load
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

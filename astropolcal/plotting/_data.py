@@ -7,7 +7,7 @@ import numpy as np
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
-from astropolcal.observations import is_star
+from astropolcal.observations.quality import is_star
 from astropolcal.optics import COORDINATES
 from astropolcal.plotting._style import (
     MINUS,

@@ -6,16 +6,26 @@ From FITS cubes to observations: headers, photometry of both beams, errors.
 one of tables that pyPolCal wrote.
 """
 
-from astropolcal.reduction.apertures import measure_internal
-from astropolcal.reduction.pypolcal import read_pypolcal
+from astropolcal.reduction.cubes import both_states, simulate_cubes, true_observations
 from astropolcal.reduction.run import Reduction, reduce_cubes, reduce_run
-from astropolcal.reduction.stars import measure_stars
+from astropolcal.reduction.spectrum import (
+    read_spectra,
+    spectra_from_table,
+    table_from_spectra,
+    write_spectra,
+)
+from astropolcal.reduction.tables import read_pypolcal
 
 __all__ = [
     "Reduction",
-    "measure_internal",
-    "measure_stars",
+    "both_states",
     "read_pypolcal",
+    "read_spectra",
     "reduce_cubes",
     "reduce_run",
+    "simulate_cubes",
+    "spectra_from_table",
+    "table_from_spectra",
+    "true_observations",
+    "write_spectra",
 ]

@@ -4,10 +4,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from astropy.stats import gaussian_fwhm_to_sigma, mad_std
+from astropy.stats import gaussian_fwhm_to_sigma, gaussian_sigma_to_fwhm, mad_std
 from scipy import ndimage
 
-__all__ = ["Pair", "find_pair"]
+from astropolcal.exceptions import ParameterError
+
+__all__ = []
 
 # all pairs of peaks are compared; a star and its ghosts are among the brightest
 _MAX_PEAKS = 25
@@ -17,66 +19,23 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class Pair:
-    """
-    A star's images in both beams.
+    """A star's images in both beams."""
 
-    Attributes
-    ----------
-    positions : `~numpy.ndarray`
-        (x, y) of the right and the left image, shape (2, 2); zeros if there is none.
-    fwhm : float
-        Diameter of the area above half of the maximum, in pixels.
-    reason : str
-        Why there is no unambiguous star; empty if there is.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.reduction.finding import Pair
-    >>> Pair(np.zeros((2, 2)), 0.0, "no star").reason
-    'no star'
-    """
-
+    # (x, y) of the right and the left image, (2, 2); zeros if there is none
     positions: np.ndarray
+    # diameter of the area above half of the maximum, pixels
     fwhm: float
+    # why there is no unambiguous star; empty if there is
     reason: str = ""
 
 
 def find_pair(image, good, offset, *, fwhm=4.0, significance=6.0, tolerance=4.0, companion=0.1):
     """
-    Find the brightest star that is seen in both beams.
+    Find the brightest star that is seen in both beams of an image (Y, X).
 
-    Parameters
-    ----------
-    image : `~numpy.ndarray`
-        Shape (Y, X).
-    good : `~numpy.ndarray` of bool
-        Pixels that have a value.
-    offset : tuple of float
-        (x, y) from the image in the left beam to that in the right one.
-    fwhm : float
-        Expected width in pixels; the image is smoothed with half of it.
-    significance : float
-        Lowest height of a peak, in standard deviations of the smoothed image.
-    tolerance : float
-        Largest deviation from the offset in pixels.
-    companion : float
-        A second pair brighter than this fraction of the first is another star.
-
-    Returns
-    -------
-    Pair
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.reduction.finding import find_pair
-    >>> rng, (y, x) = np.random.default_rng(1), np.indices((60, 80))
-    >>> image = rng.normal(0, 1, x.shape)
-    >>> for cx, cy in ((20, 20), (50, 35)):
-    ...     image += 50 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 8)
-    >>> find_pair(image, np.isfinite(image), (30, 15)).positions.tolist()
-    [[50.0, 35.0], [20.0, 20.0]]
+    ``offset`` is (x, y) from the left image to the right one, met within ``tolerance`` pixels;
+    peaks rise ``significance`` standard deviations above the image smoothed with half of ``fwhm``.
+    A second pair brighter than the fraction ``companion`` is another star.
     """
     smooth, level, noise = _smoothed(image, good, fwhm)
     if not noise > 0:
@@ -164,3 +123,167 @@ def _ambiguous(places, strength, best, companion, apart):
     distance = np.hypot(*(places - places[best]).T)
     others = (distance > apart) & (strength > companion * strength[best])
     return bool(others.any())
+
+
+# ---- Gaussians -----------------------------------------------------------------------------------
+# The fit is the one of `~astropy.modeling.fitting.LMLSQFitter` of an elliptical Gaussian2D on a
+# constant, with all images in one array: a frame has tens of them, and a fitter called for each
+# would take most of the time of a reduction.
+
+# at the start, least and most
+_DAMPING = (1e-3, 1e-9, 1e9)
+
+
+@dataclass(frozen=True)
+class GaussianFits:
+    """What `fit_gaussians` found, one value an image; pixels of the image."""
+
+    amplitude: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    background: np.ndarray
+    # geometric mean of the full widths along the two axes, and long axis over short one
+    fwhm: np.ndarray
+    elongation: np.ndarray
+    # root mean square of the residuals
+    noise: np.ndarray
+    converged: np.ndarray
+    # elements xx, xy, yy of the inverse covariance matrix, (K, 3)
+    shape: np.ndarray
+
+    def image(self, k, x, y):
+        """Return Gaussian and constant of fit ``k`` at pixels ``x`` and ``y``."""
+        xx, xy, yy = self.shape[k]
+        dx, dy = x - self.x[k], y - self.y[k]
+        exponent = 0.5 * (xx * dx**2 + yy * dy**2) + xy * dx * dy
+        return self.amplitude[k] * np.exp(-exponent) + self.background[k]
+
+
+def fit_gaussians(images, good=None, *, x, y, fwhm, max_iterations=40, tolerance=1e-5):
+    """
+    Fit an elliptical Gaussian on a constant to each of many images, (K, rows, columns).
+
+    Least squares by Levenberg and Marquardt, every image with its own damping, from x, y and fwhm,
+    scalar or (K,). An image is done when a step changes its sum of squares by less than
+    ``tolerance`` of it.
+    """
+    images = np.asarray(images, dtype=float)
+    if images.ndim != 3 or (good is not None and np.shape(good) != images.shape):
+        raise ParameterError(
+            f"images of shape {images.shape}, good of shape {np.shape(good)}; both must be "
+            "(K, rows, columns)"
+        )
+    count, rows, columns = images.shape
+    # 0 or 1: a pixel counts or does not
+    weight = np.ones_like(images) if good is None else np.asarray(good, dtype=float)
+    # NaN times a weight of zero would still be NaN
+    data = np.where(weight > 0, images, 0.0).reshape(count, -1)
+    weight = weight.reshape(count, -1)
+    grid = tuple(axis.ravel().astype(float) for axis in np.indices((rows, columns))[::-1])
+    p = _start(data, weight, *np.broadcast_arrays(x, y, fwhm, np.zeros(count))[:3])
+    p, cost, done = _minimize(p, data, weight, grid, max_iterations, tolerance)
+    # seven numbers are fitted
+    freedom = np.maximum(weight.sum(axis=1) - p.shape[1], 1.0)
+    return _result(p, np.sqrt(cost / freedom), done)
+
+
+def _start(data, weight, x, y, fwhm):
+    """Return amplitude, x, y, xx, xy, yy, background to start from."""
+    known = np.where(weight > 0, data, np.nan)
+    empty = ~(weight > 0).any(axis=1)
+    known[empty] = 0.0
+    background = np.nanmedian(known, axis=1)
+    amplitude = np.nanmax(known, axis=1) - background
+    # 1 / sigma^2, the same along both axes
+    curvature = (gaussian_sigma_to_fwhm / fwhm) ** 2
+    zero = np.zeros_like(background)
+    return np.stack([amplitude, x, y, curvature, zero, curvature, background], axis=1)
+
+
+def _minimize(p, data, weight, grid, max_iterations, tolerance):
+    model, jacobian = _model(p, grid)
+    cost = _cost(data, model, weight)
+    damping = np.full(len(p), _DAMPING[0])
+    done = np.zeros(len(p), dtype=bool)
+    # images still moving; model and jacobian have rows for these only
+    todo = np.arange(len(p))
+    for _ in range(max_iterations):
+        if not todo.size:
+            break
+        # what overflows is no better, and its step is refused
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            trial = p[todo] + _step(data[todo] - model, jacobian, weight[todo], damping[todo])
+            trial_model, trial_jacobian = _model(trial, grid)
+            trial_cost = _cost(data[todo], trial_model, weight[todo])
+        trial_cost = np.where(_sane(trial), trial_cost, np.inf)
+        better = trial_cost <= cost[todo]
+        small = better & (cost[todo] - trial_cost <= tolerance * cost[todo])
+        p[todo[better]], cost[todo[better]] = trial[better], trial_cost[better]
+        model[better], jacobian[better] = trial_model[better], trial_jacobian[better]
+        # towards Gauss-Newton after a good step, towards steepest descent after a bad one
+        damping[todo] = np.clip(damping[todo] * np.where(better, 0.1, 10.0), *_DAMPING[1:])
+        done[todo[small]] = True
+        # no step of any length helps: not done, and given up
+        stuck = small | (damping[todo] >= _DAMPING[2])
+        todo, model, jacobian = todo[~stuck], model[~stuck], jacobian[~stuck]
+    return p, cost, done
+
+
+def _model(p, grid):
+    """Return the models, (K, N), and their derivatives, (K, 7, N)."""
+    amplitude, x, y, xx, xy, yy, background = (column[:, None] for column in p.T)
+    dx, dy = grid[0] - x, grid[1] - y
+    # an ill shape must not overflow; its step is refused
+    exponent = np.clip(0.5 * (xx * dx**2 + yy * dy**2) + xy * dx * dy, -50.0, 700.0)
+    jacobian = np.empty((len(p), 7, len(grid[0])))
+    core = np.exp(-exponent, out=jacobian[:, 0])
+    light = amplitude * core
+    np.multiply(light, xx * dx + xy * dy, out=jacobian[:, 1])
+    np.multiply(light, xy * dx + yy * dy, out=jacobian[:, 2])
+    np.multiply(-0.5 * light, dx**2, out=jacobian[:, 3])
+    np.multiply(-light, dx * dy, out=jacobian[:, 4])
+    np.multiply(-0.5 * light, dy**2, out=jacobian[:, 5])
+    jacobian[:, 6] = 1.0
+    return light + background, jacobian
+
+
+def _cost(data, model, weight):
+    return np.einsum("kn,kn,kn->k", weight, data - model, data - model)
+
+
+def _step(residual, jacobian, weight, damping):
+    weighted = jacobian * weight[:, None, :]
+    normal = weighted @ jacobian.transpose(0, 2, 1)
+    gradient = weighted @ residual[:, :, None]
+    # (K, 7)
+    diagonal = np.einsum("kii->ki", normal)
+    scale = np.sqrt(np.maximum(diagonal, 1e-300))
+    # scaled to a unit diagonal, so that fluxes and pixels are solved for alike
+    normal = normal / (scale[:, :, None] * scale[:, None, :])
+    normal += (damping[:, None, None] + 1e-12) * np.eye(normal.shape[1])
+    return np.linalg.solve(normal, gradient / scale[:, :, None])[:, :, 0] / scale
+
+
+def _sane(p):
+    xx, xy, yy = p[:, 3], p[:, 4], p[:, 5]
+    # a positive definite matrix: an ellipse, and no saddle
+    return np.isfinite(p).all(axis=1) & (xx > 0) & (yy > 0) & (xx * yy > xy**2)
+
+
+def _result(p, noise, done):
+    amplitude, x, y, xx, xy, yy, background = p.T
+    determinant = xx * yy - xy**2
+    # eigenvalues of the inverse covariance are mean +- half
+    mean, half = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+    return GaussianFits(
+        amplitude=amplitude,
+        x=x,
+        y=y,
+        background=background,
+        # sqrt(sigma_1 sigma_2) = det^(-1/4)
+        fwhm=gaussian_sigma_to_fwhm * determinant**-0.25,
+        elongation=np.sqrt((mean + half) / np.maximum(mean - half, 1e-300)),
+        noise=noise,
+        converged=done,
+        shape=np.stack([xx, xy, yy], axis=1),
+    )

@@ -4,7 +4,7 @@
 import hashlib
 import warnings
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +13,18 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.fitscheck import open_fits, readable_fits
-from astropolcal.reduction.apertures import evenly_lit, measure_internal
-from astropolcal.reduction.beams import match_beams
-from astropolcal.reduction.errors import detector_of
 from astropolcal.reduction.headers import (
+    FrameHeader,
     add_pointing,
     not_of_instrument,
     observation_time,
     read_header,
     tracking_error,
 )
-from astropolcal.reduction.photometry import Photometry
+from astropolcal.reduction.photometry import Photometry, detector_of, evenly_lit, measure_internal
 from astropolcal.reduction.stars import measure_stars
 
-__all__ = ["Frame", "check_stars", "open_cube", "reduce_frame"]
+__all__ = []
 
 _ARRAYS = (
     *("flux", "variance", "covariance", "scale", "scale_err"),
@@ -36,41 +34,13 @@ _NEEDED = {"internal": ("hwp", "derotator"), "star": ("hwp", "derotator")}
 
 
 @dataclass
-class Frame:
-    """
-    What is known of one file.
+class Frame(FrameHeader):
+    """What is known of one file."""
 
-    Attributes
-    ----------
-    path : str
-        The cube.
-    number : int or None
-        Of the frame.
-    values : dict
-        Of the header, see `~astropolcal.reduction.headers.read_header`.
-    errors, doubts : list of str
-        Why it cannot be used, and what is odd.
-    unit : str
-        Of the fluxes.
-    photometry : Photometry or None
-        None if the file cannot be used.
-    digest : str
-        Of the fluxes, by which copies are recognized.
-
-    Examples
-    --------
-    >>> from astropolcal.reduction.frames import Frame
-    >>> Frame("CRSA00170808_cube.fits").usable
-    False
-    """
-
-    path: str
-    number: int | None = None
-    values: dict = field(default_factory=dict)
-    errors: list = field(default_factory=list)
-    doubts: list = field(default_factory=list)
+    # of the fluxes
     unit: str = ""
     photometry: Photometry | None = None
+    # of the fluxes, by which copies are recognized
     digest: str = ""
 
     @property
@@ -104,38 +74,10 @@ class Frame:
 
 def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
     """
-    Read a cube and measure both beams.
+    Read a cube and measure both beams; whatever is wrong with the file is in ``errors``.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    layout : FileLayout
-        Of the instrument.
-    source : {"internal", "star"}
-        Which photometry.
-    raw : dict of int to path-like, optional
-        Raw frames by number.
-    options : dict, optional
-        For `~astropolcal.reduction.measure_internal` or
-        `~astropolcal.reduction.measure_stars`.
-
-    Returns
-    -------
-    Frame
-        Whatever is wrong with the file is in its ``errors``.
-
-    Raises
-    ------
-    ParameterError
-        If an option is wrong: that would be so for every file.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.frames import reduce_frame
-    >>> reduce_frame("nowhere_00000001.fits", instruments.get("charis").files).errors
-    ['no such file']
+    ``raw`` are raw frames by number; options are those of `measure_internal` or `measure_stars`,
+    and a wrong one raises.
     """
     frame = Frame(str(path))
     try:
@@ -164,51 +106,18 @@ def reduce_frame(path, layout, *, source="internal", raw=None, options=None):
     result = frame.photometry
     frame.digest = hashlib.sha256(np.ascontiguousarray(result.flux).tobytes()).hexdigest()[:24]
     if result.failed.all():
-        frame.errors.append(f"no slice can be used: {_most(result.reasons)}")
+        most = max(set(result.reasons), key=result.reasons.count)
+        frame.errors.append(f"no slice can be used: {most}")
     return frame
-
-
-def _most(reasons):
-    return max(set(reasons), key=reasons.count)
 
 
 @contextmanager
 def open_cube(path, layout):
     """
-    Give a cube and its headers, memory-mapped, for the time of a ``with`` block.
+    Give primary header, header, cube (W, Y, X) and known pixels, for a ``with`` block.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    layout : FileLayout
-        With ``cube_extension`` and ``shape``.
-
-    Yields
-    ------
-    primary, header : `~astropy.io.fits.Header`
-        Of the file and of the cube's extension.
-    cube : `~numpy.ndarray`
-        Shape (W, Y, X).
-    good : `~numpy.ndarray` of bool or None
-        Where it has values, by itself and by the inverse variances that may
-        follow; None if everywhere.
-
-    Raises
-    ------
-    ObservationError
-        If the file is missing, truncated, no FITS file, or has no such extension
-        or one of another shape; or if no pixel has a value.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.frames import open_cube
-    >>> with open_cube("nowhere.fits", instruments.get("charis").files) as opened:
-    ...     pass
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: nowhere.fits: no such file
+    The cube is memory-mapped. Pixels with a value and an inverse variance above zero are known;
+    None if all are.
     """
     with ExitStack() as stack:
         with readable_fits(path), warnings.catch_warnings():
@@ -286,7 +195,8 @@ def _check_header(frame, layout, source):
     frame.errors += [
         f"no keyword {layout.keywords[column]} in its header"
         for column in _NEEDED[source]
-        if column not in values and not _complained(frame, layout.keywords[column])
+        if column not in values
+        and not any(error.startswith(layout.keywords[column]) for error in frame.errors)
     ]
     _add_time(values)
     # of stars `check_stars` looks
@@ -296,10 +206,6 @@ def _check_header(frame, layout, source):
             f"{layout.keywords['hwp_true']} and {layout.keywords['hwp']} differ by more than "
             f"{layout.tracking_tolerance:g} deg, though the plate does not follow the sky"
         )
-
-
-def _complained(frame, keyword):
-    return any(error.startswith(keyword) for error in frame.errors)
 
 
 def _add_time(values):
@@ -316,21 +222,7 @@ def check_stars(frames, layout):
     """
     Compute the angles of the sky that headers lack, and check that the plates followed it.
 
-    Parameters
-    ----------
-    frames : list of Frame
-        Of stars; what is wrong or odd is added to their ``errors`` and ``doubts``.
-    layout : FileLayout
-        Of the instrument.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.frames import Frame, check_stars
-    >>> frame = Frame("CRSA00170808_cube.fits", values={"hwp": 0.0})
-    >>> check_stars([frame], instruments.get("charis").files)
-    >>> frame.errors
-    ['no keyword PARANG and ALTITUDE in its header, and no date to compute the time from']
+    What is wrong or odd is added to the frames' ``errors`` and ``doubts``.
     """
     # what could not be opened says nothing
     frames = [frame for frame in frames if frame.values]
@@ -354,3 +246,73 @@ def _check_tracking(frame, layout):
             f"{layout.keywords['hwp_true']} = {values['hwp_true']:g} deg is {off:+.2f} deg off the "
             f"tracking law; up to {layout.tracking_tolerance:g} deg is allowed"
         )
+
+
+# ---- beams on two cameras, each with a file of its own -------------------------------------------
+
+# what the headers of both files must agree in, and by how much numbers may differ
+_COMMON = {"hwp": 0.1, "derotator": 0.5, "exposure_time": 1e-3, "flc_state": None, "filter": None}
+
+
+def match_beams(frame, layout, cube, detector):
+    """
+    Bring both images of a frame, the left one first, to the electrons of the right one.
+
+    Returns the detector with that of the left beam, and the cube. What contradicts the header of
+    the right file becomes an error of the frame.
+    """
+    path = layout.left_file(frame.path)
+    other = read_header(path, layout)
+    frame.errors += [f"{path.name}: {error}" for error in other.errors]
+    # what the plate did while the cameras were exposed must be one thing
+    frame.errors += _contradictions(frame.values, other.values, path.name)
+    frame.errors += _wrong_cameras(frame, other, layout)
+    unit = detector.unit.to_string()
+    # each camera is read out in its own way
+    left = detector_of(layout, unit, other.values.get("exposure_time"), other.values)
+    # to the electrons of the right one: single differences compare both beams
+    if left.gain != detector.gain:
+        width = cube.shape[-1] // 2
+        # the left image is the first half of the columns
+        factor = np.where(np.arange(cube.shape[-1]) < width, left.gain / detector.gain, 1.0)
+        cube = cube * factor
+    return replace(detector, left=left.in_units_of(detector)), cube
+
+
+def beam_scale(path, layout, values, unit=None):
+    """
+    Return by what the left image is multiplied to count electrons as the right one does.
+
+    1 where one file holds both beams. ``values`` are those of the right beam's header, ``unit`` its
+    BUNIT.
+    """
+    path = layout.left_file(path)
+    if path is None:
+        return 1.0
+    other = read_header(path, layout).values
+    gains = [detector_of(layout, unit, v.get("exposure_time"), v).gain for v in (other, values)]
+    # electrons per adu on the left over those on the right
+    return gains[0] / gains[1]
+
+
+def _contradictions(right, left, name):
+    """Return what the headers of both beams do not agree in."""
+    found = []
+    for column, tolerance in _COMMON.items():
+        ours, theirs = right.get(column), left.get(column)
+        same = ours == theirs
+        if tolerance is not None and None not in (ours, theirs):
+            same = abs(ours - theirs) <= tolerance
+        if not same:
+            found.append(f"{column} = {ours}, but {theirs} in {name}")
+    return found
+
+
+def _wrong_cameras(frame, other, layout):
+    """Return which files are not of the camera that their names say."""
+    keyword = layout.keywords.get("camera")
+    return [
+        f"{keyword} = {one.values['camera']:g}, its name says {mark!r}"
+        for one, mark in zip((frame, other), layout.beam_files, strict=True)
+        if "camera" in one.values and not mark.endswith(f"{one.values['camera']:g}")
+    ]

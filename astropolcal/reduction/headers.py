@@ -35,81 +35,29 @@ from astropolcal.observations import pointing as sky_pointing
 from astropolcal.observations.pointings import location_of, offline
 from astropolcal.units import iso_date, plain_number
 
-__all__ = [
-    "FrameHeader",
-    "add_pointing",
-    "check_sequence",
-    "frame_number",
-    "not_of_instrument",
-    "observation_time",
-    "pointing",
-    "raw_frames",
-    "read_header",
-    "tracking_error",
-]
+__all__ = []
 
 _SUFFIXES = (".fits", ".fit", ".fits.gz", ".fits.fz", ".fts")
 
 
 @dataclass
 class FrameHeader:
-    """
-    The keywords of a frame in the units of a layout.
-
-    Attributes
-    ----------
-    path : str
-        The cube.
-    number : int or None
-        Of the frame, from its name.
-    values : dict
-        Column to number (degree, second, day) or text; what is missing is absent.
-    errors : list of str
-        Why the frame cannot be used.
-    doubts : list of str
-        What is odd, but does not stop the frame from being used.
-
-    Examples
-    --------
-    >>> from astropolcal.reduction.headers import FrameHeader
-    >>> FrameHeader("CRSA00170808_cube.fits", 170808).errors
-    []
-    """
+    """The keywords of a frame in the units of a layout."""
 
     path: str
     number: int | None = None
+    # column to number (degree, second, day) or text; what is missing is absent
     values: dict = field(default_factory=dict)
+    # why it cannot be used; and what is odd, but does not matter
     errors: list = field(default_factory=list)
     doubts: list = field(default_factory=list)
 
 
 def frame_number(name, layout, header=None):
     """
-    Return the number that a cube shares with its raw frame.
+    Return the number that a cube shares with its raw frame; None if no name holds one.
 
-    Parameters
-    ----------
-    name : path-like
-        The file; only its name counts.
-    layout : FileLayout
-        With ``frame_pattern`` and ``original_name``.
-    header : `~astropy.io.fits.Header`, optional
-        Where the original name stands if the file was renamed.
-
-    Returns
-    -------
-    int or None
-        None if no name holds one.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.headers import frame_number
-    >>> layout = instruments.get("charis").files
-    >>> frame_number("CRSA00170808_cube.fits", layout)
-    170808
-    >>> frame_number("n0001e_skysub.fits", layout, {"ORIGNAME": "CRSA00170810.fits"})
-    170810
+    The header knows the name that a file had before it was renamed.
     """
     candidates = [Path(name).name]
     if header is not None:
@@ -124,32 +72,7 @@ def frame_number(name, layout, header=None):
 
 def raw_frames(folder, layout):
     """
-    Return the raw frames in a folder by number.
-
-    Parameters
-    ----------
-    folder : path-like
-        Its FITS files are looked at by name, not opened.
-    layout : FileLayout
-        With ``frame_pattern``.
-
-    Returns
-    -------
-    dict of int to `~pathlib.Path`
-
-    Raises
-    ------
-    ObservationError
-        If there is no such folder, or no frame in it has a number.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.headers import raw_frames
-    >>> raw_frames("nowhere", instruments.get("charis").files)
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: nowhere: no such folder
+    Return the paths of the raw frames in a folder by number; files are looked at by name only.
     """
     folder = Path(folder)
     if not os.path.isdir(folder):
@@ -166,38 +89,9 @@ def raw_frames(folder, layout):
 
 def read_header(path, layout, *, header=None, raw=None):
     """
-    Read what a layout asks for, from the cube and from the raw frame of the same number.
+    Read what a layout asks for, from the cube and from the raw frame of the same number (``raw``).
 
-    Parameters
-    ----------
-    path : path-like
-        The cube.
-    layout : FileLayout
-        The keywords.
-    header : `~astropy.io.fits.Header`, optional
-        Primary header of the cube, if it was read already.
-    raw : dict of int to path-like, optional
-        Raw frames by number, see `raw_frames`.
-
-    Returns
-    -------
-    FrameHeader
-        Nothing is raised for a keyword that is missing or impossible: see
-        ``errors`` and ``doubts``.
-
-    Raises
-    ------
-    ObservationError
-        If the file cannot be read.
-
-    Examples
-    --------
-    >>> from astropy.io import fits
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.headers import read_header
-    >>> header = fits.Header({"RET-ANG1": 22.5, "D_IMRANG": 45.0})
-    >>> read_header("CRSA00170808_cube.fits", instruments.get("charis").files, header=header).values
-    {'hwp': 22.5, 'derotator': 45.0}
+    Keywords that are missing or impossible are in ``errors`` and ``doubts``.
     """
     header = primary_header(path) if header is None else header
     frame = FrameHeader(str(path), frame_number(path, layout, header))
@@ -237,26 +131,7 @@ def _half_turn(angle):
 
 def not_of_instrument(values, layout):
     """
-    Return why a frame is none of a layout's instrument.
-
-    Parameters
-    ----------
-    values : dict
-        Of its header, see `read_header`.
-    layout : FileLayout
-        With the ``identities`` of the instrument.
-
-    Returns
-    -------
-    str
-        Empty if it is, or if either of them does not say.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.headers import not_of_instrument
-    >>> not_of_instrument({"instrument": "GPI"}, instruments.get("charis").files)
-    "INSTRUME = 'GPI', allowed are CHARIS"
+    Return why a frame is none of a layout's instrument; empty if it is, or if either does not say.
     """
     own = values.get("instrument")
     if own is None or not layout.identities or own in layout.identities:
@@ -329,36 +204,10 @@ def _allowed(low, high, unit):
 
 def pointing(values, site):
     """
-    Return altitude and parallactic angle of a target, from its place and the time.
+    Return altitude and parallactic angle of a target, degree.
 
-    Parameters
-    ----------
-    values : dict
-        ``right_ascension`` (hours, or degrees if it is a plain number),
-        ``declination`` (degrees, both J2000), and ``mjd`` or ``date`` and ``time``.
-    site : tuple of float
-        Longitude, latitude (degree), height (m).
-
-    Returns
-    -------
-    altitude, parallactic : float
-        Degree; the parallactic angle is positive west of the meridian.
-
-    Raises
-    ------
-    ObservationError
-        If something is missing or cannot be understood.
-
-    See Also
-    --------
-    astropolcal.observations.pointing : what computes them.
-
-    Examples
-    --------
-    >>> from astropolcal.reduction.headers import pointing
-    >>> values = {"right_ascension": "05:05:05", "declination": "+10:00:00", "mjd": 60250.5}
-    >>> [round(angle) for angle in pointing(values, (-155.4761, 19.8255, 4139.0))]
-    [76, -45]
+    By ``right_ascension`` (hours, or degrees if a plain number), ``declination`` (J2000) and the
+    time; ``site`` is (longitude, latitude, height).
     """
     (angles,) = _pointings([_target(values, site)], site)
     return angles
@@ -366,26 +215,9 @@ def pointing(values, site):
 
 def add_pointing(frames, layout, needed=True):
     """
-    Compute the angles of the sky that headers lack, of all frames at once.
+    Compute the angles of the sky that headers lack, of all frames at once, and say so in a doubt.
 
-    Parameters
-    ----------
-    frames : list of FrameHeader or Frame
-        Those that lack ``altitude`` or ``parallactic`` get them, and a doubt that says so.
-    layout : FileLayout
-        With ``site``.
-    needed : bool
-        Whether it is an error of a frame if they cannot be computed.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.headers import FrameHeader, add_pointing
-    >>> values = {"right_ascension": "05:05:05", "declination": "+10:00:00", "mjd": 60250.5}
-    >>> frame = FrameHeader("CRSA00170808_cube.fits", values=values)
-    >>> add_pointing([frame], instruments.get("charis").files)
-    >>> round(frame.values["altitude"], 1)
-    75.9
+    If they are ``needed`` and cannot be computed it is an error of the frame.
     """
     found = []
     for frame in frames:
@@ -442,29 +274,7 @@ def _is_number(text):
 
 
 def observation_time(values):
-    """
-    Return the time that a header states.
-
-    Parameters
-    ----------
-    values : dict
-        ``mjd``, or ``date`` and ``time`` (the latter may stand in the former, behind a T), UTC.
-
-    Returns
-    -------
-    `~astropy.time.Time`
-
-    Raises
-    ------
-    ObservationError
-        If something is missing or cannot be understood.
-
-    Examples
-    --------
-    >>> from astropolcal.reduction.headers import observation_time
-    >>> observation_time({"date": "2025-11-03", "time": "12:00:00"}).mjd
-    np.float64(60982.5)
-    """
+    """Return the UTC time that ``mjd``, or ``date`` and ``time`` (perhaps in the former) state."""
     try:
         if "mjd" in values:
             return in_calendar(Time(values["mjd"], format="mjd", scale="utc"))
@@ -482,28 +292,7 @@ def tracking_error(values, layout, *, on_sky=True):
     """
     Return how far the half-wave plate is from where the tracking law puts it.
 
-    Parameters
-    ----------
-    values : dict
-        ``hwp``, ``hwp_true``, ``parallactic`` and ``altitude`` in degree.
-    layout : FileLayout
-        With ``tracking``.
-    on_sky : bool
-        Whether the plate follows the sky; for an internal source it stands still.
-
-    Returns
-    -------
-    float or None
-        Degree, between -90 and 90: a half-wave plate turned by half a turn is the
-        same. None if an angle is missing.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.headers import tracking_error
-    >>> values = {"hwp": 45.0, "hwp_true": 302.0, "parallactic": 20.0, "altitude": 67.0}
-    >>> tracking_error(values, instruments.get("charis").files)
-    0.0
+    Degree, -90 to 90, as half a turn is none. None if an angle is missing.
     """
     laws = zip(("parallactic", "altitude"), layout.tracking, strict=True)
     law = {"hwp": 1.0} | (dict(laws) if on_sky else {})
@@ -516,35 +305,11 @@ def tracking_error(values, layout, *, on_sky=True):
 
 def check_sequence(hwp, derotator, layout, tolerance=0.5):
     """
-    Find commanded angles that do not fit the sequence of a run.
+    Return what is wrong with commanded angles (degree, in the order of the frames), by index.
 
-    Angles that are not a multiple of the layout's step do not fit. The frames,
-    in the order they were taken, are then cut into blocks of one derotator
-    angle; the angles that most blocks have are the sequence. A block may lack
-    some of them, but an angle that occurs more often in a block than in the
-    sequence does not fit.
-
-    Parameters
-    ----------
-    hwp, derotator : array_like of float
-        Degree, in the order of the frames.
-    layout : FileLayout
-        With ``hwp_step``.
-    tolerance : float
-        Degree.
-
-    Returns
-    -------
-    dict of int to str
-        Index of a frame to what is wrong with it.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.headers import check_sequence
-    >>> layout = instruments.get("charis").files
-    >>> check_sequence([0, 45, 22.5, 67.5, 0, 45, 30, 67.5], [45] * 4 + [90] * 4, layout)
-    {6: 'half-wave plate at 30 deg, no multiple of 11.25 deg; the sequence has 22.5 deg'}
+    Angles that are no multiple of the layout's step do not fit. The frames are cut into blocks of
+    one derotator angle; the angles that most blocks have are the sequence. A block may lack some of
+    them, but an angle that occurs more often in a block than in the sequence does not fit.
     """
     hwp, derotator = np.asarray(hwp, dtype=float), np.asarray(derotator, dtype=float)
     if not hwp.size:

@@ -1,11 +1,16 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What photometry gives for one cube: both beams at all wavelengths, and why cells failed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
+import astropy.units as u
 import numpy as np
 
-__all__ = ["BEAMS", "Photometry"]
+from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
+from astropolcal.observations.quality import MAD_TO_SIGMA
+
+__all__ = []
 
 BEAMS = ("right", "left")
 """Order of the beams in all arrays."""
@@ -16,49 +21,27 @@ class Photometry:
     """
     Fluxes of both beams in the slices of one cube.
 
-    All arrays have shape (2, W), the right beam first, but for the covariance,
-    the scale and the reasons.
-
-    Attributes
-    ----------
-    flux, variance : `~numpy.ndarray`
-        In the unit of the cube.
-    covariance : `~numpy.ndarray`
-        Of the two beams, shape (W,).
-    scale, scale_err : `~numpy.ndarray`
-        Factor of the aperture correction and its standard deviation, the same in both
-        beams, shape (W,); it is smooth over wavelength, so its error is too.
-    x, y, fwhm, radius : `~numpy.ndarray`
-        Of stars, pixels; zero for an internal source and where unknown.
-    background : `~numpy.ndarray`
-        Level that was subtracted from each pixel.
-    reasons : list of str
-        Why a slice cannot be used, empty where it can; length W.
-    outliers : int
-        Pixels that were left out of the apertures of an internal source, as they are far off
-        their neighbours.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.reduction.photometry import Photometry
-    >>> result = Photometry.empty(2)
-    >>> result.flag(np.array([True, False]), "saturated")
-    >>> result.reasons
-    ['saturated', '']
+    Arrays of shape (2, W), the right beam first, unless noted.
     """
 
+    # in the unit of the cube
     flux: np.ndarray
     variance: np.ndarray
+    # of the two beams, (W,)
     covariance: np.ndarray
+    # factor of the aperture correction, the same in both beams and smooth over wavelength, (W,)
     scale: np.ndarray
     scale_err: np.ndarray
+    # of stars, pixels; zero for an internal source and where unknown
     x: np.ndarray
     y: np.ndarray
     fwhm: np.ndarray
     radius: np.ndarray
+    # level that was subtracted from each pixel
     background: np.ndarray
+    # why a slice cannot be used, empty where it can; length W
     reasons: list
+    # pixels of an internal source that were left out, as they are far off their neighbours
     outliers: int = 0
 
     @classmethod
@@ -70,16 +53,7 @@ class Photometry:
         return cls(flux, variance, covariance, scale, scale_err, *others, [""] * n_wavelengths)
 
     def flag(self, bad, reason):
-        """
-        Mark slices as unusable; the first reason stays.
-
-        Parameters
-        ----------
-        bad : array_like of bool
-            Shape (W,), or one for all.
-        reason : str
-            Why.
-        """
+        """Mark slices, (W,) or one for all, as unusable; the first reason stays."""
         bad = np.broadcast_to(bad, len(self.reasons))
         self.reasons = [
             own or (reason if flagged else "")
@@ -90,3 +64,323 @@ class Photometry:
     def failed(self):
         """Which slices cannot be used, shape (W,)."""
         return np.array([bool(reason) for reason in self.reasons])
+
+
+# ---- errors of fluxes ----------------------------------------------------------------------------
+
+# variance of a median over that of a mean, for normal noise and many pixels
+_MEDIAN = np.pi / 2
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A detector in the unit of the data."""
+
+    unit: u.UnitBase
+    # electrons per unit of the data
+    gain: float
+    # of a pixel, in the unit of the data
+    read_noise: float
+    saturation: float
+    # by what factor electron multiplication raises the photon noise
+    excess_noise: float = 1.0
+    # that of the left beam, if it is another one
+    left: "Detector | None" = None
+
+    def variance(self, pixels):
+        """Return the variance of pixels: photon noise of what is above zero, and read noise."""
+        # below zero is noise of the read-out, not light
+        return self.photon_noise(np.maximum(pixels, 0.0)) + self.read_noise**2
+
+    def photon_noise(self, signal):
+        """Return the variance that the photons of a signal have, in squared units of the data."""
+        return self.excess_noise**2 * signal / self.gain
+
+    def of(self, beam):
+        """Return the detector of the right (0) or left (1) beam."""
+        return self.left if beam == 1 and self.left is not None else self
+
+    def in_units_of(self, other):
+        """Return the same detector where its electrons count as another one's do."""
+        # one own unit is so many of the other
+        factor = self.gain / other.gain
+        return replace(
+            self,
+            unit=other.unit,
+            gain=other.gain,
+            read_noise=self.read_noise * factor,
+            saturation=self.saturation * factor,
+        )
+
+
+def detector_of(layout, unit=None, exposure_time=None, values=None):
+    """
+    Return the detector of a layout in the unit that BUNIT gives (adu if absent).
+
+    A rate needs the exposure time in seconds. The ``values`` of the header say how it was read out.
+    """
+    own = _unit(unit)
+    # of a rate the photon noise depends on how long it was collected
+    rate = own.is_equivalent(u.adu / u.s) or own.is_equivalent(u.electron / u.s)
+    if rate and exposure_time is None:
+        raise ObservationError(f"BUNIT = {unit!r} is a rate, and the exposure time is unknown")
+    counts = 1 * own * (exposure_time * u.s if rate else 1)
+    how = layout.read_out(values or {})
+    if counts.unit.is_equivalent(u.adu):
+        electrons = float(how.gain * counts.to_value(u.adu))
+    else:
+        electrons = float(counts.to_value(u.electron))
+    # both in electrons, which no unit of the file changes
+    full = how.saturation * how.gain
+    noise = how.read_noise / electrons
+    return Detector(own, electrons, noise, full / electrons, how.excess_noise)
+
+
+def _unit(text):
+    """Return the unit that BUNIT names; counts and DN are adu."""
+    words = str(text or "adu").strip()
+    # the longer name first: "count" would leave an s behind
+    for name in ("counts", "count", "Counts", "DN", "ADU", "dn"):
+        words = words.replace(name, "adu")
+    words = words.replace("e-", "electron").replace("electrons", "electron")
+    try:
+        unit = u.Unit(words)
+    except (ValueError, TypeError):
+        unit = u.dimensionless_unscaled
+    if not any(unit.is_equivalent(kind / per) for kind in (u.adu, u.electron) for per in (1, u.s)):
+        raise ObservationError(f"BUNIT = {text!r}; allowed are adu, electron, and these per second")
+    return unit
+
+
+def flux_variance(photons, area, background_variance, n_background=np.inf):
+    """
+    Return the variance of an aperture's flux after background subtraction.
+
+    Photon noise of the source, area times the variance of a pixel, and the noise of the median of
+    ``n_background`` pixels.
+    """
+    # the same error of the level in every pixel: it grows as the area
+    median = _MEDIAN * np.square(area) / np.asarray(n_background, dtype=float)
+    return np.asarray(photons) + (area + median) * np.asarray(background_variance)
+
+
+def shared_background(area_right, area_left, background_variance, n_background):
+    """Return the covariance of two beams from which the same median background was subtracted."""
+    return _MEDIAN * np.multiply(area_right, area_left) * background_variance / n_background
+
+
+def shared_pixels(centre_distance, radius, background_variance):
+    """
+    Return the covariance of two beams whose circles of one radius overlap.
+
+    The variance of a pixel times the area of the overlap.
+    """
+    # cosine of half the angle that the overlap spans; beyond 1 there is none
+    half = np.clip(np.asarray(centre_distance) / (2.0 * np.asarray(radius)), 0.0, 1.0)
+    # area common to two circles of one radius
+    lens = 2.0 * np.square(radius) * (np.arccos(half) - half * np.sqrt(1.0 - half**2))
+    return lens * background_variance
+
+
+# ---- internal source -----------------------------------------------------------------------------
+# Rectangles keep clear of the edges of the field stop: McIntosh et al. 2026; 't Hart et al. 2021,
+# Proc. SPIE 11833.
+
+_BACKGROUNDS = ("none", "outside")
+# a background pixel is this far, in pixels, from both rectangles
+_CLEAR = 12.0
+# a pixel is far off its neighbours with twice their light, and so many standard deviations and
+# electrons more: where electrons are rare and multiplied, single ones are far off what is around
+_FACTOR, _SIGMAS, _ELECTRONS = 2.0, 10.0, 30.0
+# one pixel in so many tells the level of a rectangle
+_SAMPLED = 5
+# a rectangle whose median pixel has less than this part of the mean one holds a star
+_EVEN = 0.5
+
+
+@lru_cache(maxsize=8)
+def rectangles(apertures, shape):
+    """
+    Return the rectangles of the right and left beam: rows, columns, part of each pixel inside.
+
+    ``apertures`` are ((x, y) of the left, (x, y) of the right, width, height, rotation in radian).
+    """
+    from photutils.aperture import RectangularAperture
+
+    left, right, width, height, angle = apertures
+    found = []
+    for x, y in (right, left):
+        # exact: weights are the parts of pixels inside, and their sum is the area
+        mask = RectangularAperture((x, y), width, height, theta=angle).to_mask(method="exact")
+        box = mask.bbox
+        inside = box.iymin >= 0 and box.ixmin >= 0 and box.iymax <= shape[0]
+        if not (inside and box.ixmax <= shape[1]):
+            raise InstrumentError(
+                f"the rectangle at ({x:g}, {y:g}) leaves the image of {shape[1]} x {shape[0]} "
+                "pixels"
+            )
+        found.append((slice(box.iymin, box.iymax), slice(box.ixmin, box.ixmax), mask.data))
+    return tuple(found)
+
+
+@lru_cache(maxsize=8)
+def _outside(apertures, shape):
+    """Return the pixels that are clear of both rectangles."""
+    left, right, width, height, angle = apertures
+    # the wings of the beams reach farther than the rectangles
+    grown = (left, right, width + 2 * _CLEAR, height + 2 * _CLEAR, angle)
+    y, x = np.indices(shape)
+    clear = np.ones(shape, dtype=bool)
+    for cx, cy in grown[:2]:
+        # into the axes of the rectangle
+        along = (x - cx) * np.cos(angle) + (y - cy) * np.sin(angle)
+        across = (y - cy) * np.cos(angle) - (x - cx) * np.sin(angle)
+        clear &= (np.abs(along) > grown[2] / 2) | (np.abs(across) > grown[3] / 2)
+    return clear
+
+
+def measure_internal(cube, good, detector, layout, *, background="none", max_masked=0.2):
+    """
+    Measure both beams of an internal source in all slices of a cube (W, Y, X).
+
+    Pixels without a value are left out, and the sum is scaled to the full area. So are single
+    pixels far off their eight neighbours, such as hot ones and those hit by a cosmic ray. The
+    options are described in `reduce_run`.
+    """
+    if background not in _BACKGROUNDS:
+        raise ParameterError(f"background = {background!r}; allowed are {', '.join(_BACKGROUNDS)}")
+    if not 0 <= max_masked < 1:
+        raise ParameterError(f"max_masked = {max_masked:g}; allowed is 0 and above, below 1")
+    result = Photometry.empty(len(cube))
+    level, spread, number = np.zeros(len(cube)), np.full(len(cube), detector.read_noise**2), np.inf
+    if background == "outside":
+        level, spread, number = _level(cube, good, detector, layout)
+        result.background[:] = level
+    areas = []
+    for beam, (rows, columns, weights) in enumerate(
+        rectangles(layout.internal_apertures, cube.shape[1:])
+    ):
+        cut = cube[:, rows, columns]
+        known = None if good is None else good[:, rows, columns]
+        single = _outliers(cut, known, weights, detector.of(beam))
+        result.outliers += int(single.sum())
+        used = known if not single.any() else ~single if known is None else known & ~single
+        total, area, kept = _weighted(cut, used, weights)
+        scale = area / np.where(kept > 0, kept, 1.0)
+        result.flux[beam] = total * scale - level * area
+        own = detector.of(beam)
+        photons = own.photon_noise(np.maximum(total - level * kept, 0.0)) * scale**2
+        pixel = np.maximum(spread, own.read_noise**2)
+        result.variance[beam] = flux_variance(photons, area * scale, pixel, number)
+        result.flag(kept < (1 - max_masked) * area, f"{BEAMS[beam]} aperture masked")
+        result.flag(_peak(cut, known, weights) >= own.saturation, "saturated")
+        areas.append(area)
+    if background == "outside":
+        result.covariance[:] = shared_background(*areas, spread, number)
+    result.flag((result.flux <= 0).any(axis=0), "no light")
+    return result
+
+
+def evenly_lit(cube, good, layout):
+    """
+    Return whether the rectangles hold the light of a lamp rather than that of a star.
+
+    The median pixel of the brighter beam has at least half of the light of the mean pixel.
+    """
+    beams = []
+    for rows, columns, weights in rectangles(layout.internal_apertures, cube.shape[1:]):
+        inside = (slice(None), rows, columns)
+        values, whole = cube[inside], weights >= 1.0
+        if good is not None:
+            known = good[inside]
+            values = np.where(known, values, 0.0)
+            whole = whole & known.any(axis=0)
+            pixels = values.sum(axis=0, dtype=float)[whole] / known.sum(axis=0)[whole]
+        else:
+            # in the precision of the cube a damaged pixel would overflow
+            pixels = values.mean(axis=0, dtype=float)[whole]
+        beams.append((pixels.mean(), np.median(pixels)) if pixels.size else (0.0, 0.0))
+    # the brighter one: of light that is all in one polarization the other is dark
+    mean, median = max(beams)
+    return bool(median >= _EVEN * mean)
+
+
+def _weighted(cut, known, weights):
+    """Return the weighted sum of each slice, the area, and the area that has values."""
+    # (W, pixels) @ (pixels,): one product for all slices
+    flat, w = cut.reshape(len(cut), -1), weights.ravel()
+    area = w.sum()
+    if known is None:
+        return flat @ w, area, np.full(len(cut), area)
+    known = known.reshape(len(cut), -1)
+    return np.where(known, flat, 0.0) @ w, area, known @ w
+
+
+# damaged pixels may be beyond all numbers, and are then infinitely far off
+@np.errstate(over="ignore", invalid="ignore")
+def _outliers(cut, known, weights, detector):
+    """Return the single pixels that are far off their neighbours."""
+    sample = (slice(None), *(index[::_SAMPLED] for index in np.nonzero(weights)))
+    level, spread = _robust(cut[sample], None if known is None else known[sample])
+    # first those far off the others of their slice: only of these the neighbours are looked at
+    low, high = (limit[:, None, None] for limit in _limits(level, spread, detector))
+    kind = np.result_type(cut, np.float32)
+    found = ((cut > high.astype(kind)) | (cut < low.astype(kind))) & (weights > 0)
+    if known is not None:
+        found &= known
+    k, rows, columns = places = np.nonzero(found)
+    if k.size:
+        values = np.asarray(cut if known is None else np.where(known, cut, np.nan), dtype=float)
+        padded = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
+        steps = [step for step in np.ndindex(3, 3) if step != (1, 1)]
+        around = np.stack([padded[k, rows + y, columns + x] for y, x in steps], axis=1)
+        low, high = _limits(_median(around, ~np.isnan(around)), spread[k], detector)
+        # false where no neighbour has a value
+        found[places] = (values[places] > high) | (values[places] < low)
+    return found
+
+
+def _limits(level, spread, detector):
+    """Return between which values pixels are like those around them."""
+    reach = _SIGMAS * np.sqrt(spread**2 + detector.variance(level))
+    high = np.maximum(_FACTOR * level, level + reach + _ELECTRONS / detector.gain)
+    # there may be less light, down to none
+    return np.minimum(level, 0.0) - reach, high
+
+
+def _robust(pixels, known):
+    """Return the median of each row and its robust standard deviation, infinite without a value."""
+    level = _median(pixels, known)
+    return level, MAD_TO_SIGMA * _median(np.abs(pixels - level[:, None]), known)
+
+
+def _median(pixels, known):
+    # nanmedian takes ten times as long; of no value the infinite ones are left
+    number = np.full(len(pixels), pixels.shape[1]) if known is None else known.sum(axis=1)
+    ordered = np.sort(pixels if known is None else np.where(known, pixels, np.inf), axis=1)
+    row = np.arange(len(pixels))
+    return (ordered[row, (number - 1) // 2] + ordered[row, number // 2]) / 2.0
+
+
+def _peak(cut, known, weights):
+    # -inf never is the brightest
+    values = cut if known is None else np.where(known, cut, -np.inf)
+    return values[:, weights > 0].max(axis=1)
+
+
+def _level(cube, good, detector, layout):
+    """Return the median outside the beams, the variance of a pixel, and their number."""
+    clear = _outside(layout.internal_apertures, cube.shape[1:])
+    pixels = np.array(cube[:, clear], dtype=float)
+    # cubes hold exact zeros where the detector has no lenslets
+    unknown = pixels == 0.0
+    if good is not None:
+        unknown |= ~good[:, clear]
+    pixels[unknown] = np.nan
+    number = (~unknown).sum(axis=1)
+    pixels[number == 0] = 0.0
+    # a median, which stray light of the beams hardly moves
+    level = np.nanmedian(pixels, axis=1)
+    # never below the detector's own noise, as a slice of constants would have
+    spread = (MAD_TO_SIGMA * np.nanmedian(np.abs(pixels - level[:, None]), axis=1)) ** 2
+    return level, np.maximum(spread, detector.variance(level)), np.maximum(number, 1)

@@ -1,30 +1,29 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """From the cubes of a run to one table of observations."""
 
+import hashlib
+import json
 import os
 import re
 import warnings
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_all_start_methods, get_context
+from pathlib import Path
 
 import numpy as np
 
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
+from astropolcal.files import append_line, understood
 from astropolcal.fitscheck import primary_header
-from astropolcal.observations import Observations, is_star
+from astropolcal.observations import Observations
+from astropolcal.observations.quality import is_star
 from astropolcal.observations.reading import stated_date
-from astropolcal.reduction._sorting import (
-    consistent,
-    replace_angles,
-    set_aside,
-    without_repeats,
-)
 from astropolcal.reduction.frames import Frame, check_stars, reduce_frame
-from astropolcal.reduction.headers import raw_frames
-from astropolcal.reduction.journal import Journal
+from astropolcal.reduction.headers import check_sequence, raw_frames
 from astropolcal.reduction.tables import photometry_table, reduced_table, write_table
 
 __all__ = ["Reduction", "reduce_cubes", "reduce_run"]
@@ -46,7 +45,7 @@ class Reduction:
         Whose files they are.
     source : {"internal", "star"}
         The photometry.
-    frames : list of Frame
+    frames : list
         The files in the table, in the order they were taken.
     problems : dict of str to list of str
         File to why it is not in the table.
@@ -113,6 +112,7 @@ class Reduction:
 
     def summary(self):
         """Return what was reduced and what was not, as plain numbers and texts (dict)."""
+        plain = (str, int, float, bool)
         cells = sum(len(frame.photometry.reasons) for frame in self.frames)
         return {
             "instrument": self.instrument.name,
@@ -124,12 +124,8 @@ class Reduction:
             "flags": self.flags,
             "problems": self.problems,
             "doubts": self.doubts,
-            "meta": {key: value for key, value in self.meta.items() if _is_plain(value)},
+            "meta": {key: value for key, value in self.meta.items() if isinstance(value, plain)},
         }
-
-
-def _is_plain(value):
-    return isinstance(value, str | int | float | bool)
 
 
 def reduce_cubes(files, instrument, **options):
@@ -213,7 +209,20 @@ def reduce_run(
         Whether frames of an internal source are kept whose half-wave plate stands
         90 deg from that of another frame at the same derotator angle.
     **options
-        For `measure_internal` or `measure_stars`.
+        Of the photometry of an internal source:
+
+        ``background`` ("none", or "outside": the median of the pixels clear of both beams is
+        subtracted; the light of the source fills the field stop, so use it only if the pixels
+        outside show the same background as those inside) and ``max_masked`` (largest part of an
+        aperture that may lack values, 0.2).
+
+        Of stars: ``radius`` of the aperture ("fwhm": ``factor`` (3) times the width, at most
+        ``max_radius`` (45 pixels); "growth": where the curve of growth of the mean image reaches
+        99 %; or pixels), ``annulus`` (width of the ring of the background, 5 pixels),
+        ``aperture_correction`` (whether fluxes are scaled to all of the star's light, by a
+        profile of its wings; or "growth", to what circles of ``max_radius`` have), ``companion``
+        (a second star brighter than this fraction of the first, 0.1, spoils a frame) and
+        ``max_masked`` (0.1).
 
     Returns
     -------
@@ -264,7 +273,9 @@ def reduce_run(
     if not frames:
         raise ObservationError(_nothing(len(files), reduction.problems) + _hint(task, reduction))
     reduction.frames = frames
-    _doubt_light(frames)
+    for frame in frames:
+        if frame.values.get("light") == "uneven":
+            frame.doubts.append("the light in the rectangles is uneven, as that of a star")
     reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
     reduction.meta = _meta(frames, instrument, source, meta or {})
     return reduction
@@ -412,12 +423,6 @@ def _pool(workers):
 # --- what is said of the run -------------------------------------------------------
 
 
-def _doubt_light(frames):
-    for frame in frames:
-        if frame.values.get("light") == "uneven":
-            frame.doubts.append("the light in the rectangles is uneven, as that of a star")
-
-
 def _meta(frames, instrument, source, given):
     """Return the meta of the table."""
     values = [frame.values for frame in frames]
@@ -465,3 +470,191 @@ def _seen_source(frames):
     if modulation < _AMBIGUOUS[0]:
         return "unpolarized"
     return "polarized" if modulation > _AMBIGUOUS[1] else None
+
+
+# ---- which frames belong together ----------------------------------------------------------------
+
+# what all frames of a run must have in common
+_KINDS = {"internal": ("filter", "pickoff", "light"), "star": ("filter", "pickoff", "object")}
+
+
+def set_aside(frames, reduction):
+    """Leave out what cannot be used, copies, and frames of another kind than most."""
+    kept = []
+    seen = {}
+    for frame in frames:
+        if not frame.usable:
+            reduction.problems[frame.path] = frame.errors
+            continue
+        # a copy under another name has the same fluxes to the last bit
+        keys = [f"data {frame.digest}"]
+        keys += [f"number {frame.number}"] if frame.number is not None else []
+        first = next((seen[key] for key in keys if key in seen), None)
+        if first is not None:
+            same = "the same data as" if f"data {frame.digest}" in seen else "the same frame as"
+            name = first.path if first.name == frame.name else first.name
+            reduction.problems[frame.path] = [f"{same} {name}"]
+            continue
+        seen.update(dict.fromkeys(keys, frame))
+        kept.append(frame)
+    # before the rest: fluxes in other units cannot be compared at all
+    kept = _of_one_kind(kept, "unit", lambda frame: frame.unit, reduction)
+    for name in _KINDS[reduction.source]:
+        kept = _of_one_kind(kept, name, lambda frame, name=name: frame.values.get(name), reduction)
+    return sorted(kept, key=_order)
+
+
+def _of_one_kind(frames, what, value, reduction):
+    """Leave out frames that differ from most in what a run has in common."""
+    kinds = [None if value(frame) is None else _plain(value(frame)) for frame in frames]
+    counts = Counter(kind for kind in kinds if kind is not None)
+    if len(counts) < 2:
+        return frames
+    # whose frames are fewer is the intruder, even if it came first
+    usual = counts.most_common(1)[0][0]
+    words = value(frames[kinds.index(usual)])
+    kept = []
+    for frame, kind in zip(frames, kinds, strict=True):
+        # a header that says nothing contradicts nothing
+        if kind in (usual, None):
+            kept.append(frame)
+            continue
+        reduction.problems[frame.path] = [
+            f"{what} {value(frame)!r}, the others of the run have {words!r}"
+        ]
+    return kept
+
+
+def _plain(text):
+    """Return a name without what is written now so, now so: case, blanks, signs."""
+    # but BD+12 and BD-12 are two stars
+    return re.sub(r"[^\w+-]|_", "", text).casefold()
+
+
+def _order(frame):
+    """Order by frame number; what has none comes last, by time and name."""
+    if frame.number is not None:
+        return (0, frame.number, frame.name)
+    return (1, frame.values.get("mjd", np.inf), frame.name)
+
+
+def replace_angles(frames, sequence):
+    if sequence is None:
+        return
+    sequence = [float(angle) for angle in sequence]
+    if not sequence or len(frames) % len(sequence):
+        raise ObservationError(
+            f"{len(frames)} frames cannot be cut into sequences of {len(sequence)} angles; "
+            "frames are missing, and it is unclear which"
+        )
+    for i, frame in enumerate(frames):
+        stated, frame.values["hwp"] = frame.values["hwp"], sequence[i % len(sequence)]
+        # degree; what a header rounds
+        if abs(stated - frame.values["hwp"]) > 1e-3:
+            frame.doubts.append(
+                f"half-wave plate at {stated:g} deg in the header, replaced by "
+                f"{frame.values['hwp']:g} deg"
+            )
+
+
+def consistent(frames, reduction, layout, check):
+    """Leave out frames whose commanded angle does not fit the sequence of the run."""
+    if not check or not frames:
+        return frames
+    angles = ([frame.values[name] for frame in frames] for name in ("hwp", "derotator"))
+    wrong = check_sequence(*angles, layout)
+    for i, why in wrong.items():
+        reduction.problems[frames[i].path] = [why]
+    return [frame for i, frame in enumerate(frames) if i not in wrong]
+
+
+def without_repeats(frames, reduction):
+    """Leave out frames at 90 deg from another one, which measure the same again."""
+    kept = []
+    for frame in frames:
+        twin = next((other for other in kept if _repeats(frame, other)), None)
+        if twin is None:
+            kept.append(frame)
+        else:
+            reduction.problems[frame.path] = [
+                f"half-wave plate at {frame.values['hwp']:g} deg repeats that of {twin.name}"
+            ]
+    return kept
+
+
+def _repeats(frame, other):
+    hwp, derotator = (frame.values[k] - other.values[k] for k in ("hwp", "derotator"))
+    # a half-wave plate at 90 deg has the Mueller matrix of one at 0
+    return abs(abs(hwp) - 90.0) < 0.3 and abs(derotator) < 0.5
+
+
+# ---- journal -------------------------------------------------------------------------------------
+
+# what a line raises that was cut off, or is no frame
+_DAMAGE = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError)
+_DAMAGE += (RecursionError,)
+
+
+def _frame(content):
+    """Return a frame that has what a frame has, or raise."""
+    frame = Frame.from_dict(content)
+    if not isinstance(frame.path, str) or not isinstance(frame.values, dict):
+        raise TypeError("a frame has a path, and values by name")
+    for texts in (frame.errors, frame.doubts):
+        if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+            raise TypeError("errors and doubts are lists of texts")
+    frame.to_dict()
+    return frame
+
+
+class Journal:
+    """
+    Results of files as lines of JSON, written as they come; None keeps none.
+
+    A file counts as done if its name, size and time of change and the settings are those of the
+    journal. A line that was cut off is ignored.
+    """
+
+    def __init__(self, path, settings):
+        self.path = None if path is None else Path(path)
+        text = json.dumps(settings, sort_keys=True, default=repr)
+        self._settings = hashlib.sha256(text.encode()).hexdigest()[:16]
+        self._is_cut = False
+        self._known = {} if self.path is None else self._read()
+
+    def _read(self):
+        if not os.path.exists(self.path):
+            return {}
+        with understood(self.path, ObservationError, "cannot be read as a journal"):
+            text = self.path.read_text(encoding="utf-8")
+        lines, known = text.splitlines(), {}
+        self._is_cut = not text.endswith("\n") and bool(text)
+        for line in lines:
+            # a line may have been cut off when a run was stopped
+            with suppress(*_DAMAGE):
+                entry = json.loads(line)
+                known[str(entry["key"])] = _frame(entry["frame"])
+        if lines and not known:
+            raise ObservationError(f"{self.path}: not a journal of a reduction; take another name")
+        return known
+
+    def _key(self, path):
+        try:
+            state = os.stat(path)
+        except (OSError, ValueError):
+            return None
+        return f"{Path(path).resolve()}|{state.st_size}|{state.st_mtime_ns}|{self._settings}"
+
+    def done(self, path):
+        """Return the frame of a file that is done, else None."""
+        return self._known.get(self._key(path))
+
+    def add(self, frame):
+        """Write down a frame."""
+        key = self._key(frame.path)
+        if self.path is None or key is None:
+            return
+        # a line that was cut off ends here
+        start, self._is_cut = "\n" if self._is_cut else "", False
+        line = json.dumps({"key": key, "frame": frame.to_dict()})
+        append_line(self.path, start + line, ObservationError)

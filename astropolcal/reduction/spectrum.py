@@ -58,7 +58,7 @@ def spectra_from_table(table):
     --------
     >>> import astropy.units as u
     >>> from astropy.table import QTable
-    >>> from astropolcal.reduction.spectrum import spectra_from_table
+    >>> from astropolcal.reduction import spectra_from_table
     >>> table = QTable({"wavelength": [1.2, 1.6] * u.um, "intensity": [900, 800] * u.adu,
     ...                 "intensity_err": [3, 3] * u.adu, "q": [0.010, 0.008],
     ...                 "q_err": [2e-4, 2e-4], "u": [0.0, 0.001], "u_err": [2e-4, 2e-4]})
@@ -113,7 +113,7 @@ def table_from_spectra(spectra):
     --------
     >>> import astropy.units as u
     >>> from astropy.table import QTable
-    >>> from astropolcal.reduction.spectrum import spectra_from_table, table_from_spectra
+    >>> from astropolcal.reduction import spectra_from_table, table_from_spectra
     >>> table = QTable({"wavelength": [1.2, 1.6] * u.um, "intensity": [900, 800] * u.adu,
     ...                 "intensity_err": [3, 3] * u.adu, "q": [0.010, 0.008],
     ...                 "q_err": [2e-4, 2e-4], "u": [0.0, 0.001], "u_err": [2e-4, 2e-4]})
@@ -163,7 +163,7 @@ def write_spectra(spectra, path, *, overwrite=False):
 
     Examples
     --------
-    >>> from astropolcal.reduction.spectrum import write_spectra
+    >>> from astropolcal.reduction import write_spectra
     >>> write_spectra({}, "target.ecsv")
     Traceback (most recent call last):
     ...
@@ -195,7 +195,7 @@ def read_spectra(path):
 
     Examples
     --------
-    >>> from astropolcal.reduction.spectrum import read_spectra
+    >>> from astropolcal.reduction import read_spectra
     >>> read_spectra("nowhere.ecsv")
     Traceback (most recent call last):
     ...

@@ -17,13 +17,11 @@ from scipy import ndimage
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations.quality import MAD_TO_SIGMA
-from astropolcal.reduction.errors import flux_variance, shared_pixels
-from astropolcal.reduction.finding import find_pair
-from astropolcal.reduction.gaussians import fit_gaussians
-from astropolcal.reduction.photometry import BEAMS, Photometry
+from astropolcal.reduction.finding import find_pair, fit_gaussians
+from astropolcal.reduction.photometry import BEAMS, Photometry, flux_variance, shared_pixels
 from astropolcal.reduction.wings import wing_shares
 
-__all__ = ["choose_radius", "curve_of_growth", "measure_stars"]
+__all__ = []
 
 # a centre may be this far, in pixels or full widths, from those of its neighbours
 _OFF_TRACK = (1.5, 0.5)
@@ -52,68 +50,12 @@ def measure_stars(
     max_masked=0.1,
 ):
     """
-    Measure a star in both beams in all slices of a cube.
+    Measure a star in both beams in all slices of a cube (W, Y, X).
 
-    The star is found in the mean of the slices. In each slice a Gaussian gives
-    centre and width in both beams; both are measured with the same radius, so
-    that light outside of it does not look like polarization. Pixels without a
-    value are filled with the Gaussian and what the pixels around them have
-    beyond it.
-
-    Parameters
-    ----------
-    cube : `~numpy.ndarray`
-        Shape (W, Y, X).
-    good : `~numpy.ndarray` of bool or None
-        Pixels that have a value; None if all have.
-    detector : Detector
-        In the unit of the cube.
-    layout : FileLayout
-        With ``star_offset``, ``edge`` and ``fwhm``.
-    radius : {"fwhm", "growth"} or float
-        Of the aperture: ``factor`` times the width; where the curve of growth of
-        the mean image reaches 99 %; or pixels.
-    factor, max_radius : float
-        For a radius that follows the image.
-    annulus : float
-        Width of the ring in pixels.
-    aperture_correction : bool or "growth"
-        Whether fluxes are scaled to all of the star's light, by a profile of its wings
-        (`~astropolcal.reduction.wings.wing_shares`); or to what circles of
-        ``max_radius`` have. By the same factor in both beams, smooth over wavelength;
-        its error is in variance and covariance.
-    companion : float
-        A second star brighter than this fraction of the first spoils a frame.
-    max_masked : float
-        Largest part of an aperture that may lack values.
-
-    Returns
-    -------
-    Photometry
-        With a reason in every slice that cannot be used: ``no star``, ``two
-        stars``, ``one beam missing``, ``empty slice``, ``lost star``, ``bad
-        centroid``, ``edge``, ``aperture masked``, ``no background``,
-        ``saturated``, ``no aperture correction``.
-
-    Raises
-    ------
-    ParameterError
-        If an option is unknown or out of range.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.errors import detector_of
-    >>> from astropolcal.reduction.stars import measure_stars
-    >>> layout = instruments.get("charis").files
-    >>> rng, (y, x) = np.random.default_rng(1), np.indices(layout.shape[1:])
-    >>> image = sum(2000 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 8)
-    ...             for cx, cy in ((70, 85), (133.5, 118.1)))
-    >>> cube = image + rng.normal(0, 5, layout.shape)
-    >>> result = measure_stars(cube, None, detector_of(layout), layout)
-    >>> [round(float(v), 1) for v in result.flux[0, :1] / (2000 * 8 * np.pi)]
-    [1.0]
+    The star is found in the mean of the slices. In each slice a Gaussian gives centre and width in
+    both beams; both are measured with the same radius, so that light outside of it does not look
+    like polarization. Pixels without a value are filled with the Gaussian and what the pixels
+    around them have beyond it. The options are described in `reduce_run`.
     """
     _check(radius, factor, max_radius, annulus, companion, max_masked)
     if aperture_correction not in (False, True, "growth"):
@@ -146,7 +88,10 @@ def measure_stars(
         _correct(result, *_growth_shares(result, run, max_radius))
     elif aperture_correction:
         found = wing_shares(cube, good, result, level_variance, detector, layout, reach=max_radius)
-        _correct(result, *_spread_out(found, usable))
+        if found is None:
+            result.flag(True, "no aperture correction")
+        else:
+            _correct(result, found.values, found.covariance, usable)
     return result
 
 
@@ -385,12 +330,6 @@ def _growth_shares(result, cube, reach):
     return share[known], np.diag(spread[known] ** 2), known
 
 
-def _spread_out(found, usable):
-    if found is None:
-        return np.empty(0), np.empty((0, 0)), np.zeros_like(usable)
-    return found.values, found.covariance, usable
-
-
 def _correct(result, share, covariance, known):
     """Divide fluxes by the part of the light that they are."""
     if not known.any():
@@ -427,33 +366,7 @@ def curve_of_growth(image, place, radii):
     """
     Return the flux within circles around a star, as part of that within the largest.
 
-    Parameters
-    ----------
-    image : `~numpy.ndarray`
-        Shape (Y, X); the median of a ring beyond the largest circle is subtracted.
-    place : tuple of float
-        (x, y) of the star.
-    radii : `~numpy.ndarray`
-        Pixels, increasing.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape of the radii.
-
-    Raises
-    ------
-    ParameterError
-        If there is no light.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.reduction.stars import curve_of_growth
-    >>> y, x = np.indices((81, 81))
-    >>> image = np.exp(-((x - 40) ** 2 + (y - 40) ** 2) / (2 * 3.0**2))
-    >>> curve_of_growth(image, (40, 40), np.array([3.0, 6.0, 12.0, 24.0])).round(2).tolist()
-    [0.39, 0.86, 1.0, 1.0]
+    The radii (pixels) increase; the median of a ring beyond the largest is subtracted.
     """
     from photutils.profiles import CurveOfGrowth
 
@@ -468,32 +381,7 @@ def curve_of_growth(image, place, radii):
 
 
 def choose_radius(radii, curve, fraction=0.99):
-    """
-    Return the radius within which a curve of growth reaches a fraction of its end.
-
-    Parameters
-    ----------
-    radii, curve : `~numpy.ndarray`
-        See `curve_of_growth`.
-    fraction : float
-        Between 0 and 1.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    ParameterError
-        If the fraction is out of range.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.reduction.stars import choose_radius
-    >>> choose_radius(np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.98, 1.0]))
-    2.5
-    """
+    """Return the radius within which a curve of growth reaches a fraction of its end."""
     if not 0 < fraction < 1:
         raise ParameterError(f"fraction = {fraction:g}; allowed is between 0 and 1")
     curve = np.maximum.accumulate(curve / curve[-1])

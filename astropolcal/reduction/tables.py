@@ -1,15 +1,21 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Tables of reduced frames."""
 
+import csv
+import os
+from pathlib import Path
+
 import astropy.units as u
 import numpy as np
-from astropy.table import MaskedColumn, Table
+from astropy.table import MaskedColumn, QTable, Table
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.files import atomic_path, check_new
+from astropolcal.files import atomic_path, check_new, one_line, understood
+from astropolcal.observations import Observations
 from astropolcal.reduction.photometry import BEAMS
+from astropolcal.units import plain_number
 
-__all__ = ["photometry_table", "reduced_table", "write_table"]
+__all__ = ["read_pypolcal"]
 
 _ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
 _GEOMETRY = {"x": "pix", "y": "pix", "fwhm": "pix", "radius": "pix"}
@@ -17,30 +23,10 @@ _GEOMETRY = {"x": "pix", "y": "pix", "fwhm": "pix", "radius": "pix"}
 
 def reduced_table(frames, instrument, meta):
     """
-    Return the observation table of frames.
+    Return the observation table of frames in the order they were taken.
 
-    Parameters
-    ----------
-    frames : list of Frame
-        In the order they were taken.
-    instrument : Instrument
-        With the wavelengths of the slices.
-    meta : dict
-        Of the table.
-
-    Returns
-    -------
-    `~astropy.table.Table`
-        One row a frame and wavelength. The fluxes of a cell that failed are
-        masked, and ``mask_reason`` says why. Errors are those of the beams, or,
-        where the beams share noise, those of their difference and sum.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.tables import reduced_table
-    >>> len(reduced_table([], instruments.get("charis"), {}))
-    0
+    Fluxes of a cell that failed are masked, and ``mask_reason`` says why. Errors are those of the
+    beams, or, where the beams share noise, those of their difference and sum.
     """
     table = _frame_columns(frames, instrument)
     if not frames:
@@ -105,27 +91,10 @@ def _frame_columns(frames, instrument):
 
 def photometry_table(frames, instrument):
     """
-    Return all that was measured in frames.
+    Return all that was measured in frames, masked where a cell failed.
 
-    Parameters
-    ----------
-    frames : list of Frame
-        In the order they were taken.
-    instrument : Instrument
-        With the wavelengths of the slices.
-
-    Returns
-    -------
-    `~astropy.table.Table`
-        Columns such as ``x_right``, ``fwhm_left``, ``background_right``, and factor
-        and error of the aperture correction; masked where a cell failed.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction.tables import photometry_table
-    >>> len(photometry_table([], instruments.get("charis")))
-    0
+    Besides `reduced_table` centres, widths, radii, backgrounds and the factor of the aperture
+    correction.
     """
     table = reduced_table(frames, instrument, {})
     if not frames:
@@ -142,32 +111,137 @@ def photometry_table(frames, instrument):
 
 
 def write_table(table, path, overwrite=False):
-    """
-    Write a table as ECSV, completely or not at all.
+    """Write a table as ECSV, completely or not at all."""
+    path = check_new(path, overwrite, ObservationError)
+    with atomic_path(path, ObservationError) as temporary:
+        table.write(temporary, format="ascii.ecsv", overwrite=True)
+
+
+# ---- tables of pyPolCal --------------------------------------------------------------------------
+# One CSV file a wavelength bin, one row a frame: ``filepath``, ``D_IMRANG`` (derotator), ``RET-
+# ANG1`` (commanded half-wave plate), ``LCOUNTS`` and ``RCOUNTS``, their sum and difference
+# ``single_sum`` and ``single_diff`` with errors ``sum_std`` and ``diff_std``, ``wavelength_bin``
+# (nm), and for stars ``p`` and ``a`` (parallactic angle and altitude), all angles in degree.
+
+_NEEDED = ("filepath", "D_IMRANG", "RET-ANG1", "LCOUNTS", "RCOUNTS", "wavelength_bin")
+_PYPOLCAL_ANGLES = {"RET-ANG1": "hwp", "D_IMRANG": "derotator", "p": "parallactic", "a": "altitude"}
+_ERRORS = {"diff_std": "single_difference_err", "sum_std": "single_sum_err"}
+
+
+def read_pypolcal(files, meta=None, *, name=None):
+    r"""
+    Read the CSV files of pyPolCal for a run.
 
     Parameters
     ----------
-    table : `~astropy.table.Table`
-        The table.
-    path : path-like
-        The file.
-    overwrite : bool
-        Whether an existing file may be replaced.
+    files : path-like or sequence of path-like
+        One file a wavelength bin, or a folder of them.
+    meta : dict, optional
+        What the files do not say: ``instrument``, ``source``, ``date`` and so on; the
+        instrument is SCExAO/CHARIS unless given.
+    name : str, optional
+        By default that of the folder.
+
+    Returns
+    -------
+    Observations
 
     Raises
     ------
     ObservationError
-        If the file exists, or cannot be written.
+        If a file cannot be read, lacks a column, or contradicts the others; the
+        message names it and the row.
 
     Examples
     --------
-    >>> from astropy.table import Table
-    >>> from astropolcal.reduction.tables import write_table
-    >>> write_table(Table({"bin": [0]}), "no/run.ecsv")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: no/run.ecsv: cannot be written: there is no folder no
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from astropolcal.reduction import read_pypolcal
+    >>> columns = "filepath,D_IMRANG,RET-ANG1,LCOUNTS,RCOUNTS,sum_std,diff_std,wavelength_bin"
+    >>> rows = ["/a/CRSA00000001_cube.fits,45.0,0.0,5e5,1e6,1225,1225,1159.56",
+    ...         "/a/CRSA00000002_cube.fits,45.0,45.0,1e6,5e5,1225,1225,1159.56"]
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "bin0.csv"
+    ...     _ = path.write_text("\n".join([columns, *rows]))
+    ...     observations = read_pypolcal(path, {"source": "polarized"}, name="run")
+    >>> observations
+    <Observations 'run': SCExAO/CHARIS, polarized, 2 frames x 1 bin, 0 cells masked>
     """
-    path = check_new(path, overwrite, ObservationError)
-    with atomic_path(path, ObservationError) as temporary:
-        table.write(temporary, format="ascii.ecsv", overwrite=True)
+    paths = _paths(files)
+    rows = [(path, i, row) for path in paths for i, row in enumerate(_rows(path), start=2)]
+    if not rows:
+        raise ObservationError(f"{paths[0]}: no rows")
+    wavelength = _numbers(rows, "wavelength_bin")
+    # wavelengths that differ by less than 0.1 pm are one, spelled by two programs; what is too
+    # large to be rounded is refused with the other lengths that cannot be
+    with np.errstate(over="ignore"):
+        _, bins = np.unique(wavelength.round(4), return_inverse=True)
+    frames = _frame_numbers(rows, bins)
+    table = QTable({"file": [Path(row["filepath"]).name for _, _, row in rows]})
+    table["frame"], table["bin"], table["wavelength"] = frames, bins, wavelength * u.nm
+    for column, ours in _PYPOLCAL_ANGLES.items():
+        if all(column in row for _, _, row in rows):
+            table[ours] = _numbers(rows, column) * u.deg
+    table["flux_right"] = _numbers(rows, "RCOUNTS") * u.adu
+    table["flux_left"] = _numbers(rows, "LCOUNTS") * u.adu
+    if all(column in row for column in _ERRORS for _, _, row in rows):
+        for column, ours in _ERRORS.items():
+            table[ours] = _numbers(rows, column) * u.adu
+    table.meta.update({"instrument": "SCExAO/CHARIS"} | dict(meta or {}))
+    folder = paths[0].parent.name
+    return Observations.from_table(
+        table, name=name or (folder if len(paths) > 1 else paths[0].stem)
+    )
+
+
+def _paths(files):
+    if isinstance(files, str | Path):
+        folder = Path(files)
+        files = sorted(folder.glob("*.csv")) if os.path.isdir(folder) else [folder]
+        if not files:
+            raise ObservationError(f"{folder}: no CSV file in this folder")
+    paths = [Path(path) for path in files]
+    if not paths:
+        raise ObservationError("no files to read")
+    return paths
+
+
+def _rows(path):
+    with (
+        understood(path, ObservationError, "cannot be read as CSV"),
+        open(path, encoding="utf-8", newline="") as stream,
+    ):
+        reader = csv.DictReader(stream, skipinitialspace=True)
+        missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
+        if missing:
+            raise ObservationError(
+                f"{path}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}"
+            )
+        return [row for row in reader if any(row.values())]
+
+
+def _numbers(rows, column):
+    values = np.empty(len(rows))
+    for k, (path, i, row) in enumerate(rows):
+        try:
+            values[k] = plain_number(row[column])
+        except (TypeError, ValueError):
+            raise ObservationError(
+                f"{path}, line {i}: {column} = {one_line(row[column], 40)!r}, a number is needed"
+            ) from None
+    return values
+
+
+def _frame_numbers(rows, bins):
+    """Number the cubes in the order in which the first file lists them."""
+    numbers = {}
+    seen = {}
+    for (path, i, row), b in zip(rows, bins.tolist(), strict=True):
+        cube = row["filepath"].strip()
+        numbers.setdefault(cube, len(numbers))
+        if (cube, b) in seen:
+            raise ObservationError(
+                f"{path}, line {i}: {one_line(cube, 80)} is given already in {seen[cube, b]}"
+            )
+        seen[cube, b] = f"{path}, line {i}"
+    return np.array([numbers[row["filepath"].strip()] for _, _, row in rows])

@@ -14,14 +14,15 @@ seeing-limited image (Racine 1996, PASP 108, 699).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
+from numpy.polynomial.legendre import legfit, legval, legvander
 from scipy.optimize import least_squares
 
-from astropolcal.reduction._rings import Rings, Star
+from astropolcal.reduction.photometry import rectangles
 
-__all__ = ["HALO_BETA", "Shares", "wing_shares"]
+__all__ = []
 
 #: Exponent of the halo: that of a seeing-limited image, whose wings fall as r^-11/3.
 HALO_BETA = 11 / 6
@@ -43,90 +44,30 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class Shares:
-    """
-    Part of a star's light that its apertures have, at each wavelength.
+    """Part of a star's light that its apertures have, at each wavelength."""
 
-    Attributes
-    ----------
-    values : `~numpy.ndarray`
-        Measured flux of both beams over all of the light, shape (K,).
-    covariance : `~numpy.ndarray`
-        Of the values, shape (K, K).
-    chi_square : float
-        Of the profile, over its degrees of freedom.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.reduction.wings import Shares
-    >>> Shares(np.array([0.98]), np.array([[1e-6]]), 1.0).values.tolist()
-    [0.98]
-    """
-
+    # measured flux of both beams over all of the light, (K,), and covariance, (K, K)
     values: np.ndarray
     covariance: np.ndarray
+    # of the profile, over its degrees of freedom
     chi_square: float
 
 
 def wing_shares(cube, good, photometry, level_variance, detector, layout, *, reach=45.0):
-    r"""
+    """
     Return which part of a star's light the apertures of both beams have.
 
-    Parameters
-    ----------
-    cube : `~numpy.ndarray`
-        Shape (W, Y, X).
-    good : `~numpy.ndarray` of bool
-        Pixels that have a value.
-    photometry : Photometry
-        Of the apertures, without a correction.
-    level_variance : `~numpy.ndarray`
-        What the noise of the background level adds to the variance of a flux,
-        shape (2, W).
-    detector : Detector
-        In the unit of the cube.
-    layout : FileLayout
-        The rectangles of ``internal_apertures`` lie inside the field stop. Without
-        them there is no stop, and each beam has light of the other's image.
-    reach : float
-        Rings up to 1.5 times this radius are used.
+    None if too little of the wings is seen. Rings up to 1.5 times ``reach`` are used.
+    ``level_variance`` (2, W) is what the noise of the background adds to the variance of a flux.
+    With the flux F in the aperture the surface brightness at the distance r from the star is
 
-    Returns
-    -------
-    Shares or None
-        Of the slices that have not failed; None if too little of the wings is seen.
+        B + F [A (beta - 1) / (pi alpha^2) (1 + r^2 / alpha^2)^-beta
+               + H (5 / 6) / (pi alpha_h^2) (1 + r^2 / alpha_h^2)^(-11 / 6)].
 
-    Notes
-    -----
-    The surface brightness at the distance r from the star is
-
-    .. math::
-
-        B + F \left[A \frac{\beta - 1}{\pi\alpha^2}(1 + r^2/\alpha^2)^{-\beta}
-        + H \frac{5/6}{\pi\alpha_h^2}(1 + r^2/\alpha_h^2)^{-11/6}\right]
-
-    with the flux F in the aperture. One exponent :math:`\beta` and one radius
-    :math:`\alpha_h` hold for all slices, :math:`\ln\alpha`, A and H are linear in the number
-    of the slice, B is free in each. The Gaussian is the limit of large exponents. The halo
-    is taken to be as wide as the seeing, 0.5 arcsec within 35 %, unless the rings say
-    otherwise.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal import instruments
-    >>> from astropolcal.reduction import measure_stars
-    >>> from astropolcal.reduction.errors import detector_of
-    >>> from astropolcal.reduction.wings import wing_shares
-    >>> layout = instruments.get("charis").files
-    >>> y, x = np.indices(layout.shape[1:])
-    >>> image = sum(1e4 * (1 + ((x - cx) ** 2 + (y - cy) ** 2) / 16) ** -2.5
-    ...             for cx, cy in ((70, 85), (133.5, 118.1)))
-    >>> cube, detector = np.repeat(image[None], 2, axis=0), detector_of(layout)
-    >>> plain = measure_stars(cube, None, detector, layout)
-    >>> found = wing_shares(cube, cube > 0, plain, np.zeros((2, 2)), detector, layout)
-    >>> bool(abs(found.values[0] / (plain.flux[0, 0] / (1e4 * 16 * np.pi / 1.5)) - 1) < 1e-3)
-    True
+    One exponent beta and one radius alpha_h hold for all slices, ln(alpha), A and H are linear in
+    the number of the slice, B is free in each. The Gaussian is the limit of large exponents. The
+    halo is as wide as the seeing, 0.5 arcsec within 35 %, unless the rings say otherwise. Without
+    ``internal_apertures`` there is no field stop, and each beam has light of the other's image.
     """
     if photometry.failed.all():
         return None
@@ -314,3 +255,179 @@ def _shares(profile, found, covariance, chi_square):
     share = measured / total
     relative = share / total
     return Shares(share, noise * np.outer(relative, relative), chi_square)
+
+
+# ---- the wings as they are seen: means in rings, inside the field stop ---------------------------
+
+# rings from this many full widths on; further in the profile need not be a Moffat
+_FROM = 1.2
+_FEWEST_PIXELS, _FEWEST_RINGS = 10, 8
+
+
+@dataclass(frozen=True)
+class Star:
+    """
+    The slices of a star that can be used, and what was measured in them.
+
+    ``lit`` are the pixels of each beam, ``stopped`` says that a stop hides the light of the other
+    one there.
+    """
+
+    cube: np.ndarray
+    good: np.ndarray
+    photometry: object
+    level_variance: np.ndarray
+    usable: np.ndarray
+    lit: np.ndarray
+    stopped: bool
+
+    @classmethod
+    def of(cls, cube, good, photometry, level_variance, layout):
+        """Return the slices that have not failed."""
+        usable = np.flatnonzero(~photometry.failed)
+        # one map for all slices; without a stop, by the mean place of each image
+        lit, stopped = _lit(photometry, layout, cube.shape[1:], usable)
+        return cls(cube, good, photometry, level_variance[:, usable], usable, lit, stopped)
+
+    @cached_property
+    def x(self):
+        """Number of the slice, from -1 to 1."""
+        n = len(self.usable)
+        return np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
+
+    @cached_property
+    def flux(self):
+        """Of both beams, (2, K)."""
+        return self.photometry.flux[:, self.usable]
+
+    @cached_property
+    def radius(self):
+        """Of the apertures, (K,)."""
+        return self.photometry.radius[0, self.usable]
+
+    @cached_property
+    def width(self):
+        """Of the Gaussians, smooth over the slices, (K,)."""
+        # of both beams, which see one atmosphere
+        width = self.photometry.fwhm[:, self.usable].mean(axis=0)
+        return legval(self.x, legfit(self.x, width, min(2, len(width) - 1)))
+
+    @cached_property
+    def places(self):
+        """Of both images, (beam, x or y, K)."""
+        return np.stack([self.photometry.x, self.photometry.y], axis=1)[..., self.usable]
+
+    @cached_property
+    def unlit(self):
+        """
+        Pixels of the apertures that lie outside of the lit field.
+
+        A list of beam, slice, distances, weights, and the light that was measured.
+        """
+        return list(_unlit(self))
+
+    @property
+    def unlit_part(self):
+        """Largest part of an aperture that is not lit."""
+        parts = [w.sum() / (np.pi * self.radius[k] ** 2) for _, k, _, w, _ in self.unlit]
+        return max(parts, default=0.0)
+
+
+def _lit(photometry, layout, shape, usable):
+    if len(layout.internal_apertures) == 5:
+        maps = np.zeros((2, *shape), dtype=bool)
+        beams = rectangles(layout.internal_apertures, shape)
+        for lit, (rows, columns, weights) in zip(maps, beams, strict=True):
+            # pixels wholly inside; those on the edge are dark in part
+            lit[rows, columns] = weights > 0.999
+        return maps, True
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    middle = [(photometry.x[b, usable].mean(), photometry.y[b, usable].mean()) for b in range(2)]
+    # without a stop a pixel belongs to the nearer image
+    right, left = (np.hypot(columns - x, rows - y) for x, y in middle)
+    return np.stack([right < left, left < right]), False
+
+
+def _unlit(star):
+    from photutils.aperture import CircularAperture
+
+    for beam, lit in enumerate(star.lit):
+        for k, (place, radius) in enumerate(zip(star.places[beam].T, star.radius, strict=True)):
+            # quick look first: few apertures reach out of the field
+            mask = CircularAperture(place, radius).to_mask(method="center")
+            if lit[mask.get_overlap_slices(lit.shape)[0]].all():
+                continue
+            mask = CircularAperture(place, radius).to_mask(method="exact")
+            inside, part = mask.get_overlap_slices(lit.shape)
+            dark = ~lit[inside] & (mask.data[part] > 0)
+            if not dark.any():
+                continue
+            rows, columns = np.nonzero(dark)
+            r = np.hypot(columns + inside[1].start - place[0], rows + inside[0].start - place[1])
+            # (pixels in the dark part,) of the slice
+            values, known = (
+                array[star.usable[k]][inside][dark] for array in (star.cube, star.good)
+            )
+            weights = mask.data[part][dark]
+            yield beam, k, r, weights, float(weights @ np.where(known, values, 0.0))
+
+
+@dataclass(frozen=True)
+class Rings:
+    """
+    Mean values in rings of a pixel's width, and their pixels; (beam, slice, ring).
+
+    Distances from the own and the other image are mean less and plus standard deviation (first
+    axis): the mean of a smooth profile over a ring is that of its values at both.
+    """
+
+    values: np.ndarray
+    counts: np.ndarray
+    own: np.ndarray
+    other: np.ndarray | None
+
+    @classmethod
+    def of(cls, star, outer):
+        """Return the rings that are seen in all slices; None if there are too few."""
+        # from the innermost place at which all slices are in their wings
+        edges = np.arange(np.floor(np.minimum(_FROM * star.width, star.radius).max()), outer + 1)
+        if len(edges) <= _FEWEST_RINGS:
+            return None
+        found = np.array([_means(star, beam, edges) for beam in range(2)]).transpose(2, 0, 1, 3)
+        # one set of rings for all slices and beams, or the profile could not be common
+        full = (found[0] >= _FEWEST_PIXELS).all(axis=(0, 1))
+        if full.sum() < _FEWEST_RINGS:
+            return None
+        # (quantity, beam, slice, ring)
+        counts, values, *moments = found[..., full]
+        other = None if star.stopped else _interval(*moments[2:])
+        return cls(values, counts, _interval(*moments[:2]), other)
+
+
+def _means(star, beam, edges):
+    """Return number and mean of the pixels of each ring, and moments of their distances."""
+    found = []
+    rows, columns = np.nonzero(star.lit[beam])
+    for k, slice_ in enumerate(star.usable):
+        x, y = star.places[beam, :, k]
+        own = np.hypot(columns - x, rows - y)
+        used = (own >= edges[0]) & (own < edges[-1]) & star.good[slice_][rows, columns]
+        own, y_used, x_used = own[used], rows[used], columns[used]
+        moments = [star.cube[slice_][y_used, x_used], own, own**2]
+        if not star.stopped:
+            x, y = star.places[1 - beam, :, k]
+            other = np.hypot(x_used - x, y_used - y)
+            # mean and mean square, for the two points that stand for a ring
+            moments += [other, other**2]
+        # rings are a pixel wide
+        ring = (own - edges[0]).astype(int)
+        number = np.bincount(ring, minlength=len(edges) - 1)
+        sums = [np.bincount(ring, m, len(edges) - 1) for m in moments]
+        found.append([number, *(total / np.maximum(number, 1) for total in sums)])
+    return found
+
+
+def _interval(mean, square):
+    # rounding may leave a variance below zero
+    spread = np.sqrt(np.maximum(square - mean**2, 0.0))
+    return np.stack([mean - spread, mean + spread])

@@ -216,7 +216,7 @@ def run(arguments):
     from astropolcal.calibration.validation.held_out import add_standard
     from astropolcal.calibration.validation.stars import add_star_check
     from astropolcal.calibration.validation.targets import TARGETS
-    from astropolcal.observations import get_observable
+    from astropolcal.observations.observables import get_observable
 
     say = printer(arguments)
     check_suffix("-o", arguments.output, ".asdf")
@@ -296,7 +296,7 @@ def _written(arguments, written):
 def _is_known(observations):
     """Return whether a table is of a star whose polarization the catalogue knows."""
     from astropolcal import standards
-    from astropolcal.observations import is_star
+    from astropolcal.observations.quality import is_star
 
     if not is_star(observations.source):
         return False

@@ -88,7 +88,7 @@ def choose_calibration(arguments, files, raw=None):
     """
     from astropolcal import Calibration, instruments
     from astropolcal.converters.calibration import content_hash
-    from astropolcal.correction import sky_chain
+    from astropolcal.correction.rows import sky_chain
 
     path = Path(arguments.calibration)
     # a folder is searched when it is known what the frames need

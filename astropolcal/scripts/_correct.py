@@ -326,7 +326,7 @@ def _headers(files, instrument, arguments):
     """Return angles of all frames, places of the star, exposures, and scales of the left beam."""
     from astropy.table import QTable
 
-    from astropolcal.reduction.beams import beam_scale
+    from astropolcal.reduction.frames import beam_scale
     from astropolcal.reduction.headers import raw_frames
 
     layout = instrument.files

@@ -28,8 +28,7 @@ from astropolcal import Observations, calibrate, instruments
 from astropolcal.measurement import parameter_table
 from astropolcal.optics import PolarizedSource
 from astropolcal.plotting.reduction import plot_apertures
-from astropolcal.reduction import reduce_run
-from astropolcal.reduction.cubes import simulate_cubes
+from astropolcal.reduction import reduce_run, simulate_cubes
 from astropolcal.simulation import half_wave_plate_cycles
 
 charis = instruments.get("charis")

@@ -15,7 +15,8 @@ from scipy.ndimage import affine_transform
 from timing import fastest, report
 
 from astropolcal import instruments
-from astropolcal.correction import ScienceFrames, correct, derotate
+from astropolcal.correction import ScienceFrames, correct
+from astropolcal.correction.geometry import derotate
 
 N_FRAMES = 100
 #: Cubes of CHARIS; the two beams of a frame are two such arrays.

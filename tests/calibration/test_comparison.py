@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 
 from astropolcal import calibrate, instruments, optics
 from astropolcal.calibration import compare
-from astropolcal.calibration.result.comparison import comparison_text
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ParameterError
@@ -221,7 +220,6 @@ def test_what_the_data_leave_open_has_an_infinite_error():
     cal = calibrated(frames=half_wave_plate_cycles(derotator=[20] * u.deg))
     table = compare([cal])
     assert np.isinf(table["derotator_retardance_std"].to_value(u.deg)).any()
-    assert " ± inf" in comparison_text(table)
 
 
 def test_errors_survive_the_file(calibration, tmp_path):
@@ -230,27 +228,6 @@ def test_errors_survive_the_file(calibration, tmp_path):
     for key in QUANTITIES:
         name = f"{key}_std"
         np.testing.assert_allclose(u.Quantity(a[name]), u.Quantity(b[name]), rtol=1e-6)
-
-
-def test_text_has_two_digits_of_the_error():
-    table = compare({"bench": (bench(170, None), LAM)})
-    table["hwp_retardance_std"] = [0.0123, 4.0] * u.deg
-    table["path_diattenuation_std"] = [np.nan, 0.0011]
-    head, first, second = comparison_text(table).splitlines()
-    assert head.split() == COLUMNS[:10]
-    assert first.split()[:6] == ["bench", "-", "1200.0", "170.000", "±", "0.012"]
-    assert second.split()[3:6] == ["170.0", "±", "4.0"]
-    # no derotator; no error of the path; errors in percent like the value
-    assert first.split()[7:9] == ["-", "-"]
-    assert "0.00 ± 0.11" in second
-    assert "±" not in first.split(maxsplit=6)[-1]
-
-
-def test_text_names_filters_and_aligns():
-    lines = comparison_text(compare(["irdis"])).splitlines()
-    assert [line.split()[1] for line in lines[1:]] == ["Y", "J", "H", "Ks"]
-    place = lines[0].index("hwp_retardance")
-    assert all(line[place - 1] == " " and line[place] != " " for line in lines)
 
 
 def test_figure_has_a_bar_for_each_error(calibration):

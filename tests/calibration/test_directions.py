@@ -8,7 +8,7 @@ import pytest
 from astropolcal import optics
 from astropolcal.calibration.identifiability.analysis import (
     Identifiability,
-    analyse,
+    finding_of,
     physical_scale,
     telescope_words,
 )
@@ -281,7 +281,9 @@ def test_silent_parameters_are_axes_of_the_null_space(free):
     data = np.random.default_rng(1).normal(size=(free.size, 40))
     data[3] = 0
     data[0] = data[1]
-    finding, covariance = analyse(free, data / physical_scale(free)[:, None])
+    scale = physical_scale(free)
+    whitened = Whitened(data / scale[:, None], scale)
+    finding, covariance = finding_of(free, whitened), whitened.covariance()
     assert finding.silent == [NAMES[3]]
     assert finding.rank == free.size - 2
     assert np.flatnonzero(~finding.identifiable).tolist() == [0, 1, 3]

@@ -14,7 +14,8 @@ from astropolcal.calibration.result.summary import to_dict
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalWarning, CalibrationFileError, FitError
 from astropolcal.measurement import Measurement, Tie
-from astropolcal.observations import OBSERVABLES, NormalizedSingleDifference
+from astropolcal.observations import OBSERVABLES
+from astropolcal.observations.observables import NormalizedSingleDifference
 
 FEW = [1.2, 1.6, 2.0, 2.2] * u.um
 

@@ -17,14 +17,21 @@ from hypothesis import strategies as st
 
 from astropolcal import optics
 from astropolcal.calibration import calibrate, examine
-from astropolcal.calibration.identifiability.analysis import analyse, physical_scale
+from astropolcal.calibration.identifiability.analysis import finding_of as finding_of_problem
+from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened, near_null_directions
-from astropolcal.calibration.identifiability.sky import sky_consequences
+from astropolcal.calibration.identifiability.sky import consequences_along, view_of_measurement
 from astropolcal.measurement import Measurement, Normal
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 FRAMES = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)
+
+
+def analyse(free, jacobian, held=None):
+    """What the data alone determine, and the covariance for unit noise."""
+    whitened = Whitened(jacobian, physical_scale(free), None, held)
+    return finding_of_problem(free, whitened), whitened.covariance()
 
 
 def finding_of(measurement, held=None):
@@ -316,7 +323,8 @@ def test_the_effect_on_sky_is_that_of_one_standard_error(make):
             if slot.name in direction["parameters"]:
                 size = 0.01 if slot.unit is None else 1.0
                 change[slot.slice] = np.array(direction["parameters"][slot.name]) / size
-        (sky,) = sky_consequences(live, live.vector(), (change * scale)[None])
+        view = view_of_measurement(live, live.vector())
+        (sky,) = consequences_along(view, (change * scale)[None])
         # what moves least is left out
         for key in ("aolp_deg", "dolp_percent"):
             limit = 0.05 * np.abs(direction["sky"][key]).max() + 0.05

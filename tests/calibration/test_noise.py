@@ -14,7 +14,7 @@ from astropolcal.calibration.noise import (
     noise_from_null_channel,
     noise_from_replicates,
 )
-from astropolcal.calibration.noise.estimates import data_by_wavelength, equal_axes, estimate_noise
+from astropolcal.calibration.noise.estimates import data_by_wavelength, equal_axes
 from astropolcal.chain import join
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement
@@ -274,12 +274,6 @@ def test_too_few_angles_for_the_null_model(make, chain):
 
 
 # --- choice, several datasets, table ------------------------------------------------
-
-
-def test_replicates_are_preferred(faint, repeated):
-    assert estimate_noise(repeated).method == "replicates"
-    assert estimate_noise(faint).method == "null channel"
-    assert "smooth" in estimate_noise(faint, null_model="smooth").words
 
 
 def test_each_dataset_has_its_own_noise(make, chain, faint):

@@ -11,10 +11,9 @@ from astropy.table import QTable
 
 from astropolcal import calibrate, instruments, optics
 from astropolcal.calibration import target_accuracies
-from astropolcal.calibration.fit.strategies import BinProblem, settle
+from astropolcal.calibration.fit.strategies import BinProblem, settled
 from astropolcal.calibration.noise import noise_from_null_channel, noise_from_replicates
-from astropolcal.calibration.noise.estimates import estimate_noise
-from astropolcal.calibration.noise.weighting import outlying_data, robust_sigma
+from astropolcal.calibration.noise.weighting import Weighting, outlying_data, robust_sigma
 from astropolcal.calibration.posterior import LogPosterior, Posterior
 from astropolcal.calibration.result.summary import _target_lines
 from astropolcal.calibration.uncertainty import derived_efficiency, derived_sky
@@ -94,16 +93,12 @@ def test_replicates_at_some_wavelengths_only_are_not_enough(make, chain):
     """At the last wavelength the repeated angle is masked: the null channel is there for all."""
     frames = half_wave_plate_cycles(derotator=[45, 60, 60, 80] * u.deg)
     table = make.observe(chain, frames, LAM, seed=3)
-    whole = Measurement(chain, table)
-    assert estimate_noise(whole).method == "replicates"
     mask = np.zeros((table.n_frames, 3), dtype=bool)
     second = np.abs(np.rad2deg(table.position("derotator")) - 60) < 1
     mask[np.flatnonzero(second)[:8], 2] = True
     some = Measurement(chain, table.with_mask(mask, "test"))
     assert noise_from_replicates(some).dof.tolist()[2] == 0
-    found = estimate_noise(some)
-    assert found.method == "null channel"
-    np.testing.assert_allclose(found.sigma, noise_from_null_channel(some).sigma)
+    assert np.isfinite(noise_from_null_channel(some).sigma).all()
 
 
 def test_null_of_a_modulator_has_a_level_of_each_state():
@@ -217,13 +212,13 @@ def test_equal_weights_settle_as_none(make, data):
     found = []
     for equal in (False, True):
         measurement = Measurement(chain, data)
-        weight = np.full(measurement.n_data, 3.0) if equal else None
+        weighting = Weighting("given" if equal else None, np.full(measurement.n_data, 1 / 3))
         origin = measurement.vector()
         moved = origin.copy()
         for name in ("calibration_polarizer.theta", "hwp.theta"):
             moved[measurement.free.by_name[name].start] += np.deg2rad(0.5)
         measurement.parameters = moved
-        found.append((settle(BinProblem(measurement), weight, origin), measurement.vector()))
+        found.append((settled(BinProblem(measurement), weighting, origin)[0], measurement.vector()))
     assert found[0][0] == found[1][0]
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-4)
 
@@ -289,7 +284,7 @@ def test_a_chain_without_a_beam_splitter_has_no_efficiency():
 def test_a_chain_that_stands_still_has_no_sky():
     still = optics.Diattenuator(name="mirror") | optics.WollastonPrism(name="wollaston")
     calibration = SimpleNamespace(chains=[still], wavelength=LAM, ties={})
-    with pytest.raises(ChainError, match="no optic on a stage; give the chain of the sky"):
+    with pytest.raises(ChainError, match="no optic on a stage; give the chain from the sky"):
         derived_sky(calibration, 0.01, 0.0, {"hwp": 0 * u.deg})
 
 

@@ -12,9 +12,9 @@ from astropolcal.calibration import examine
 from astropolcal.calibration.identifiability.ambiguities import (
     harmonic_conditions,
     harmonic_words,
-    mirror_solutions,
+    mirror_branches,
 )
-from astropolcal.calibration.identifiability.sky import sky_consequences
+from astropolcal.calibration.identifiability.sky import consequences_along, view_of_measurement
 from astropolcal.chain import join
 from astropolcal.measurement import Measurement
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -92,22 +92,26 @@ def _polarimeter(**derotator):
     )
 
 
+def _mirrors(measurement):
+    return [branch["words"] for branch in mirror_branches(measurement, measurement.vector(), None)]
+
+
 def test_all_mirror_solutions_of_free_retarders():
     measurement = _measurement(_polarimeter())
-    found = mirror_solutions(measurement, measurement.vector())
+    found = _mirrors(measurement)
     assert [words.split(":")[0] for words in found] == ["hwp", "derotator", "hwp, derotator"]
 
 
 def test_bounds_exclude_mirror_solutions():
     bounds = dict.fromkeys(("horizontal", "diagonal", "circular"), (0, 360))
     measurement = _measurement(_polarimeter(bounds=bounds))
-    assert [w.split(":")[0] for w in mirror_solutions(measurement, measurement.vector())] == ["hwp"]
+    assert [w.split(":")[0] for w in _mirrors(measurement)] == ["hwp"]
 
 
 def test_a_waveplate_of_two_layers_has_no_other_hand():
     chain = CHARIS.chain("polarized", wavelength=WAVELENGTH)
     measurement = _measurement(chain)
-    found = mirror_solutions(measurement, measurement.vector())
+    found = _mirrors(measurement)
     assert [words.split(":")[0] for words in found] == ["derotator"]
 
 
@@ -121,11 +125,15 @@ def _direction(measurement, **changes):
     return out
 
 
+def _consequences(measurement, directions):
+    return consequences_along(view_of_measurement(measurement, measurement.vector()), directions)
+
+
 def test_efficiency_changes_the_dolp_alone():
     measurement = _measurement(_polarimeter())
     efficiency = np.array([0.98, 0.97, 0.96])
     one_percent = _direction(measurement, wollaston__efficiency=-0.01 * efficiency)
-    (sky,) = sky_consequences(measurement, measurement.vector(), one_percent)
+    (sky,) = _consequences(measurement, one_percent)
     # a model of one percent less efficiency finds one percent more polarization
     assert sky["dolp_percent"] == pytest.approx([1.0, 1.0], abs=1e-3)
     assert sky["aolp_deg"] == pytest.approx([0.0, 0.0], abs=1e-6)
@@ -137,7 +145,7 @@ def test_turning_everything_turns_the_sky():
         chain[name].theta.fixed = False
     measurement = _measurement(chain)
     turn = dict.fromkeys(("hwp__theta", "derotator__theta", "wollaston__theta"), np.deg2rad(1))
-    (sky,) = sky_consequences(measurement, measurement.vector(), _direction(measurement, **turn))
+    (sky,) = _consequences(measurement, _direction(measurement, **turn))
     assert sky["aolp_deg"] == pytest.approx([1.0, 1.0], abs=1e-4)
     assert sky["dolp_percent"] == pytest.approx([0.0, 0.0], abs=1e-3)
 
@@ -146,9 +154,7 @@ def test_the_polarizer_is_not_on_sky():
     chain = _polarimeter()
     chain["polarizer"].theta.fixed = False
     measurement = _measurement(chain)
-    (sky,) = sky_consequences(
-        measurement, measurement.vector(), _direction(measurement, polarizer__theta=1.0)
-    )
+    (sky,) = _consequences(measurement, _direction(measurement, polarizer__theta=1.0))
     for part in (sky, *sky["targets"]):
         assert part["aolp_deg"] == [0.0, 0.0]
     assert [t["dolp_change_percent"] for t in sky["targets"]] == [[0.0, 0.0]] * 3
@@ -158,7 +164,7 @@ def test_without_a_half_wave_plate_there_is_no_sky():
     chain = join([optics.LinearRetarder(retardance=90 * u.deg, mount="derotator", name="derotator"),
                   optics.WollastonPrism(name="wollaston")])  # fmt: skip
     measurement = _measurement(chain)
-    assert sky_consequences(measurement, measurement.vector(), np.ones((2, 2))) == [None, None]
+    assert _consequences(measurement, np.ones((2, 2))) == [None, None]
 
 
 # ---- all of it in a calibration -----------------------------------------------------------

@@ -14,7 +14,7 @@ import pytest
 
 from astropolcal import Calibration, calibrate, optics
 from astropolcal.calibration import sample
-from astropolcal.calibration.noise.weighting import residual_noise
+from astropolcal.calibration.noise.weighting import Weighting, around, noise_of
 from astropolcal.calibration.posterior import LogPosterior, Posterior
 from astropolcal.calibration.posterior import checkpoint as checkpoint_module
 from astropolcal.exceptions import (
@@ -172,7 +172,10 @@ def test_noise_from_residuals_is_unbiased():
         noise = rng.normal(0, NOISE, live.n_data)
         best = vector + np.linalg.lstsq(jacobian.T, noise, rcond=None)[0]
         live.observed = live.predict(vector) + noise
-        squares.append(residual_noise(live, best)[[0, -1]] ** 2 / NOISE**2)
+        live.parameters = best
+        equal = around(live, Weighting(None, np.full(live.n_data, np.nan)))
+        noise = Weighting("wavelength", np.full(live.n_data, NOISE)).updated(live, equal)
+        squares.append(noise.sigma[[0, -1]] ** 2 / NOISE**2)
     assert np.mean(squares, axis=0) == pytest.approx([1.0, 1.0], abs=4 * (2 / 7 / 1000) ** 0.5)
 
 
@@ -182,7 +185,7 @@ def test_no_noise_without_residuals():
     cal = calibrate(chain, exact_data, cross_validate=False)
     cal.measurement.observed[:] = cal.measurement.predict(cal.measurement.vector())
     with pytest.raises(FitError, match=r"1200\.0 nm: 8 data leave .* give noise="):
-        residual_noise(cal.measurement)
+        noise_of(cal.measurement, "wavelength")
 
 
 @pytest.mark.parametrize(

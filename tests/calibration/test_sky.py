@@ -19,10 +19,10 @@ from astropolcal.calibration.identifiability.sky import (
     FITTED,
     LEFT_OUT,
     PUBLISHED,
+    consequences_along,
     consequences_of,
     matters,
     shows_on_sky,
-    sky_consequences,
     sky_words,
     view_of_calibration,
     view_of_measurement,
@@ -89,7 +89,7 @@ def test_polarization_of_the_telescope_is_subtracted_at_a_wrong_angle():
         live = Measurement(chain, observed)
         step = np.zeros((1, live.free.size))
         step[0, live.free.by_name["hwp.theta"].start] = small
-        (found,) = sky_consequences(live, live.vector(), step)
+        (found,) = consequences_along(view_of_measurement(live, live.vector()), step)
         for target in found["targets"]:
             relative = share / (target["dolp_percent"] / 100)
             assert np.abs(target["dolp_change_percent"]).max() == pytest.approx(

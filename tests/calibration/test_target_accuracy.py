@@ -18,7 +18,7 @@ from astropolcal.calibration.validation.held_out import add_standard
 from astropolcal.calibration.validation.targets import absolute_accuracy, propagate_accuracy
 from astropolcal.exceptions import CalibrationFileError, FitError, ParameterError
 from astropolcal.measurement import Measurement
-from astropolcal.observations import get_observable
+from astropolcal.observations.observables import get_observable
 
 LAM = [1.2, 1.6, 2.2] * u.um
 PERCENT = st.floats(0, 5)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from astropolcal import calibrate, instruments
-from astropolcal.correction import measurement_rows, sky_chain
+from astropolcal.correction import measurement_rows
+from astropolcal.correction.rows import sky_chain
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 CHARIS = instruments.get("charis")

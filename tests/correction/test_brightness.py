@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import optics
-from astropolcal.correction import frame_brightness, measurement_rows
+from astropolcal.correction import measurement_rows
+from astropolcal.correction.solve import frame_brightness
 from astropolcal.exceptions import ObservationError
 
 HWP = np.array([0, 45, 22.5, 67.5, 0, 45, 22.5, 67.5])
@@ -67,14 +68,15 @@ def test_double_differences_give_the_same(rows):
     np.testing.assert_allclose(found, frame_brightness(rows, fluxes), rtol=1e-8)
 
 
-@pytest.mark.parametrize("value", [0.0, -3.0])
-def test_a_frame_without_light_is_named(rows, value):
-    fluxes = light(rows, np.outer([1.0, 0, 0, 0], np.ones(3)), np.ones(8))
-    fluxes[:, 5, 1] = value
-    with pytest.raises(
-        ObservationError, match=r"frame 5 has no light at wavelength 1: the sum of both beams is"
-    ):
-        frame_brightness(rows, fluxes)
+def test_a_frame_without_light_is_named(rows):
+    for value in [0.0, -3.0]:
+        fluxes = light(rows, np.outer([1.0, 0, 0, 0], np.ones(3)), np.ones(8))
+        fluxes[:, 5, 1] = value
+        with pytest.raises(
+            ObservationError,
+            match=r"frame 5 has no light at wavelength 1: the sum of both beams is",
+        ):
+            frame_brightness(rows, fluxes)
 
 
 def test_light_that_no_source_has_does_not_settle():

@@ -13,7 +13,9 @@ from star_data import CHARIS, META, track
 
 from astropolcal import calibrate, optics
 from astropolcal.chain import join, leaves
-from astropolcal.correction import RowModel, estimator, linear_systematic
+from astropolcal.correction.rows import RowModel
+from astropolcal.correction.solve import estimator
+from astropolcal.correction.systematic import linear_systematic
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

@@ -9,8 +9,9 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from astropolcal.correction import ScienceFrames, correct, frame_positions
-from astropolcal.correction.engine import run_blocks
+from astropolcal.correction import ScienceFrames, correct
+from astropolcal.correction.correcting import run_blocks
+from astropolcal.correction.frames import frame_positions
 from astropolcal.correction.sources import ArraySource, CubeFiles, TurnedSource
 from astropolcal.exceptions import AstropolcalError, ObservationError, ParameterError
 
@@ -51,7 +52,7 @@ def cubes_of_stars(sky, charis, track, tmp_path):
 
 def test_a_cluster_that_does_not_answer(star, sky, charis, monkeypatch):
     pytest.importorskip("distributed", reason="distributed is not installed")
-    from astropolcal.correction import engine
+    from astropolcal.correction import correcting as engine
 
     monkeypatch.setattr(engine, "_TIMEOUT", 0.5)
     frames = ScienceFrames.from_arrays(star.right, star.left, charis.wavelength, star.positions)
@@ -216,10 +217,10 @@ def test_the_plate_follows_the_sky(sky, charis):
     np.testing.assert_allclose(np.rad2deg(true["hwp"]), [80.2, 126.2])
 
 
-@pytest.mark.parametrize("name", ["hwp", "derotator", "parallactic", "altitude"])
-def test_a_missing_angle_is_named_with_its_frame(sky, charis, name):
-    with pytest.raises(ObservationError, match=rf"a\.fits: no angle '{name}'"):
-        frame_positions(charis, angles(**{name: None}), sky, names=["a.fits", "b.fits"])
-    table = angles(**{name: [30.0, np.nan]})
-    with pytest.raises(ObservationError, match=rf"b\.fits: no angle '{name}'"):
-        frame_positions(charis, table, sky, names=["a.fits", "b.fits"])
+def test_a_missing_angle_is_named_with_its_frame(sky, charis):
+    for name in ["hwp", "derotator", "parallactic", "altitude"]:
+        with pytest.raises(ObservationError, match=rf"a\.fits: no angle '{name}'"):
+            frame_positions(charis, angles(**{name: None}), sky, names=["a.fits", "b.fits"])
+        table = angles(**{name: [30.0, np.nan]})
+        with pytest.raises(ObservationError, match=rf"b\.fits: no angle '{name}'"):
+            frame_positions(charis, table, sky, names=["a.fits", "b.fits"])

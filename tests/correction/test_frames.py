@@ -12,7 +12,8 @@ from astropy.table import MaskedColumn, QTable
 from astropy.utils.masked import Masked
 
 from astropolcal import instruments, optics
-from astropolcal.correction import ScienceFrames, frame_positions, measurement_rows
+from astropolcal.correction import ScienceFrames, measurement_rows
+from astropolcal.correction.frames import frame_positions
 from astropolcal.exceptions import ObservationError, ParameterError
 
 LAM = [1.2, 1.6] * u.um
@@ -41,9 +42,8 @@ def test_attributes_are_taken_over():
     assert arrays(names=list("abcd")).names == list("abcd")
 
 
-@pytest.mark.parametrize(
-    ("hwp", "pairs"),
-    [
+def test_pairs_by_the_angles_of_the_plate():
+    for hwp, pairs in [
         ([0, 45, 22.5, 67.5], [[0, 1], [2, 3]]),
         ([0, 22.5, 45, 67.5], [[0, 2], [1, 3]]),
         ([0, 22.5, 0, 22.5], None),
@@ -51,11 +51,9 @@ def test_attributes_are_taken_over():
         ([0, 45, 22.5, 0], None),
         ([0, 45, 0, 45.1], [[0, 1], [2, 3]]),
         ([0, 45, 0, 0], [[0, 1]]),
-    ],
-)
-def test_pairs_by_the_angles_of_the_plate(hwp, pairs):
-    found = arrays(hwp=hwp * u.deg).pairs
-    assert (None if found is None else found.tolist()) == pairs
+    ]:
+        found = arrays(hwp=hwp * u.deg).pairs
+        assert (None if found is None else found.tolist()) == pairs, (hwp, pairs)
 
 
 def test_frames_of_two_derotator_angles_are_no_pair():
@@ -96,23 +94,20 @@ def test_differences_and_sums_are_beams():
     assert not without.source.has_variances
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
+def test_what_does_not_fit():
+    for changes, words in [
         ({"wavelength": [1.2] * u.um}, r"wavelength has shape \(1,\); the frames have 2 wave"),
         ({"positions": {"hwp": HWP[:3]}}, r"hwp has 3 positions; there are 4 frames"),
         ({"positions": {"hwp": np.zeros((5, 3)) * u.deg}}, r"hwp has 3 positions; there are 4"),
-    ],
-)
-def test_what_does_not_fit(changes, words):
-    good = arrays()
-    with pytest.raises(ObservationError, match=words):
-        dataclasses.replace(good, **changes)
+    ]:
+        good = arrays()
+        with pytest.raises(ObservationError, match=words):
+            dataclasses.replace(good, **changes)
 
 
-@pytest.mark.parametrize("position", [7 * u.deg, [7] * u.deg, np.zeros((5, 4)) * u.deg])
-def test_positions_of_all_frames_alike(position):
-    assert arrays(positions={"hwp": position}).positions["hwp"] is position
+def test_positions_of_all_frames_alike():
+    for position in [7 * u.deg, [7] * u.deg, np.zeros((5, 4)) * u.deg]:
+        assert arrays(positions={"hwp": position}).positions["hwp"] is position, position
 
 
 def test_brightness_counts_all_light_of_a_frame():
@@ -191,20 +186,17 @@ def test_what_files_give(cubes):
     assert turned.pixel_scale == 7.0
 
 
-@pytest.mark.parametrize(
-    ("centres", "right", "left"),
-    [
+def test_places_of_the_beams(cubes):
+    """Of both, or of the left one, from which the right one is 17 and 3 pixels away."""
+    for centres, right, left in [
         # row and column of the middle, as 100 row + column
         ([(27, 11), (10, 8)], 1127, 810),
         ((10, 8), 1127, 810),
         (np.tile([(10.0, 8.0)], (4, 1)), 1127, 810),
         (np.tile([[(26.0, 10.0), (9.0, 7.0)]], (4, 1, 1)), 1026, 709),
-    ],
-)
-def test_places_of_the_beams(cubes, centres, right, left):
-    """Of both, or of the left one, from which the right one is 17 and 3 pixels away."""
-    frames = from_files(cubes[1], centres=centres)
-    assert (middle(frames, 0), middle(frames, 1)) == (right, left)
+    ]:
+        frames = from_files(cubes[1], centres=centres)
+        assert (middle(frames, 0), middle(frames, 1)) == (right, left), (centres, right, left)
 
 
 def test_by_default_the_middle_of_the_field(cubes):
@@ -215,10 +207,12 @@ def test_by_default_the_middle_of_the_field(cubes):
     np.testing.assert_allclose(found.mean(axis=0), (19, 10))
 
 
-@pytest.mark.parametrize("centres", [[1.0, 2.0, 3.0], [(1.0, np.nan), (2.0, 3.0)], 5.0])
-def test_centres_that_are_none(cubes, centres):
-    with pytest.raises(ParameterError, match=r"centres of shape .*; x and y of each are needed"):
-        from_files(cubes[1], centres=centres)
+def test_centres_that_are_none(cubes):
+    for centres in [[1.0, 2.0, 3.0], [(1.0, np.nan), (2.0, 3.0)], 5.0]:
+        with pytest.raises(
+            ParameterError, match=r"centres of shape .*; x and y of each are needed"
+        ):
+            from_files(cubes[1], centres=centres)
 
 
 def test_files_of_two_cameras(tmp_path):
@@ -239,35 +233,29 @@ def test_files_of_two_cameras(tmp_path):
 # ---- positions -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "states", [None, ["A", ""], ["A", " "], np.ma.array(["A", "B"], mask=[0, 1])]
-)
-def test_a_modulator_needs_its_state(states):
-    modulator = optics.FerroelectricLiquidCrystal(mount="flc_state", name="flc")
-    chain = modulator | CHAIN
-    table = QTable({"hwp": [0, 45] * u.deg, "derotator": [60, 60] * u.deg})
-    if states is not None:
-        table["flc_state"] = states
-    name = "a.fits" if states is None else "b.fits"
-    with pytest.raises(ObservationError, match=f"{name}: no state of the modulator, flc_state"):
-        frame_positions(instruments.get("vampires"), table, chain, names=["a.fits", "b.fits"])
+def test_a_modulator_needs_its_state():
+    for states in [None, ["A", ""], ["A", " "], np.ma.array(["A", "B"], mask=[0, 1])]:
+        modulator = optics.FerroelectricLiquidCrystal(mount="flc_state", name="flc")
+        chain = modulator | CHAIN
+        table = QTable({"hwp": [0, 45] * u.deg, "derotator": [60, 60] * u.deg})
+        if states is not None:
+            table["flc_state"] = states
+        name = "a.fits" if states is None else "b.fits"
+        with pytest.raises(ObservationError, match=f"{name}: no state of the modulator, flc_state"):
+            frame_positions(instruments.get("vampires"), table, chain, names=["a.fits", "b.fits"])
 
 
-@pytest.mark.parametrize(
-    "hwp",
-    [
+def test_an_angle_that_is_masked_is_none():
+    for hwp in [
         [0, np.nan] * u.deg,
         [0, np.inf] * u.deg,
         Masked([0.0, 45.0] * u.deg, mask=[False, True]),
         MaskedColumn([0.0, 45.0], mask=[False, True]),
         MaskedColumn([0.0, 45.0], mask=[False, True], unit="deg"),
-    ],
-    ids=["nan", "inf", "quantity", "column", "column with a unit"],
-)
-def test_an_angle_that_is_masked_is_none(hwp):
-    table = QTable({"hwp": hwp, "derotator": [60, 60] * u.deg})
-    with pytest.raises(ObservationError, match="b: no angle 'hwp'"):
-        frame_positions(instruments.get("charis"), table, TABLE_CHAIN, names=["a", "b"])
+    ]:
+        table = QTable({"hwp": hwp, "derotator": [60, 60] * u.deg})
+        with pytest.raises(ObservationError, match="b: no angle 'hwp'"):
+            frame_positions(instruments.get("charis"), table, TABLE_CHAIN, names=["a", "b"])
 
 
 def test_the_table_of_the_user_is_not_changed():

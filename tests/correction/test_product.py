@@ -209,30 +209,31 @@ def test_a_scale_may_be_a_whole_number(path):
     assert (found, type(found)) == (16.0, float)
 
 
-@pytest.mark.parametrize("form", ["PA(999999999)", "QD(3)"])
-@pytest.mark.parametrize("name", ["WAVELENGTH", "FRAMES"])
-def test_a_column_in_a_heap_is_not_read(path, name, form):
+def test_a_column_in_a_heap_is_not_read(path):
     """It may claim terabytes; FITS files of ours have none."""
-    with fits.open(path) as hdus:
-        old = f"TFORM{len(hdus[name].columns)}  = '{hdus[name].columns.formats[-1]:8}'".encode()
-    content = path.read_bytes()
-    place = content.index(old, content.index(f"EXTNAME = '{name}".encode()) - 2880)
-    card = f"{old[:10].decode()}'{form}'".ljust(80).encode()
-    content = content[:place] + card + content[place + 80 :]
-    for key in (b"CHECKSUM=", b"DATASUM ="):
-        content = content.replace(key, b"COMMENT  ")
-    path.write_bytes(content)
-    with pytest.raises(ObservationError, match="not a readable product"):
-        Corrected.read(path)
+    for name in ["WAVELENGTH", "FRAMES"]:
+        for form in ["PA(999999999)", "QD(3)"]:
+            with fits.open(path) as hdus:
+                columns = hdus[name].columns
+                old = f"TFORM{len(columns)}  = '{columns.formats[-1]:8}'".encode()
+            content = path.read_bytes()
+            place = content.index(old, content.index(f"EXTNAME = '{name}".encode()) - 2880)
+            card = f"{old[:10].decode()}'{form}'".ljust(80).encode()
+            content = content[:place] + card + content[place + 80 :]
+            for key in (b"CHECKSUM=", b"DATASUM ="):
+                content = content.replace(key, b"COMMENT  ")
+            path.write_bytes(content)
+            with pytest.raises(ObservationError, match="not a readable product"):
+                Corrected.read(path)
 
 
-@pytest.mark.parametrize("cut", [1, 2880, 30_000])
-def test_a_file_that_was_cut_off_is_not_read(path, tmp_path, cut):
-    content = path.read_bytes()
-    short = tmp_path / "short.fits"
-    short.write_bytes(content[:-cut])
-    with pytest.raises(ObservationError, match=r"short.fits: not a readable"):
-        Corrected.read(short)
+def test_a_file_that_was_cut_off_is_not_read(path, tmp_path):
+    for cut in [1, 2880, 30_000]:
+        content = path.read_bytes()
+        short = tmp_path / "short.fits"
+        short.write_bytes(content[:-cut])
+        with pytest.raises(ObservationError, match=r"short.fits: not a readable"):
+            Corrected.read(short)
 
 
 def test_a_packed_product_is_read_alike(corrected, path, tmp_path):

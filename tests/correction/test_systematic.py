@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 
 from astropolcal import calibrate
-from astropolcal.correction import (
-    RowModel,
-    Systematic,
-    estimator,
-    linear_systematic,
-    sampled_systematic,
-)
+from astropolcal.correction import Systematic
+from astropolcal.correction.rows import RowModel
+from astropolcal.correction.solve import estimator
+from astropolcal.correction.systematic import linear_systematic, sampled_systematic
 from astropolcal.exceptions import ParameterError
 
 STOKES = np.array([1.0, 0.12, -0.2])

@@ -939,7 +939,7 @@ class Journal(Reader):
 
     def seeds(self):
         from astropolcal.reduction.frames import reduce_frame
-        from astropolcal.reduction.journal import Journal as Ours
+        from astropolcal.reduction.run import Journal as Ours
 
         with tempfile.TemporaryDirectory() as folder:
             cube, path = Path(folder) / "CRSA00000001_cube.fits", Path(folder) / "journal"
@@ -953,7 +953,7 @@ class Journal(Reader):
         return mutate.some(rng, kinds)(rng, content)
 
     def read(self, path):
-        from astropolcal.reduction.journal import Journal as Ours
+        from astropolcal.reduction.run import Journal as Ours
 
         return Ours(path, {"a": 1})
 

@@ -14,7 +14,8 @@ from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic, join
 from astropolcal.exceptions import AstropolcalError, ChainError, ObservationError
 from astropolcal.measurement import Measurement, Tie
-from astropolcal.observations import OBSERVABLES, NormalizedSingleDifference
+from astropolcal.observations import OBSERVABLES
+from astropolcal.observations.observables import NormalizedSingleDifference
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um

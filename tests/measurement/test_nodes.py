@@ -12,7 +12,8 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.measurement import Measurement, Normal
 from astropolcal.measurement.parameters import FreeParameters
-from astropolcal.observations import Observations, sky_positions
+from astropolcal.observations import Observations
+from astropolcal.observations.pointings import sky_positions
 
 
 def truth(**options):

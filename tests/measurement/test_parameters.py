@@ -9,7 +9,8 @@ from astropolcal import optics
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.measurement import Tie, parameter_table
 from astropolcal.measurement.parameters import FreeParameters, Slot
-from astropolcal.observations import Observations, common_wavelengths, example_table
+from astropolcal.observations import Observations, example_table
+from astropolcal.observations.reading import common_wavelengths
 
 
 def two_optics(**retarder):

@@ -2,9 +2,9 @@
 """The example table against what an ideal polarimeter measures."""
 
 import numpy as np
-import pytest
 
-from astropolcal.observations import Observations, example_table, get_observable
+from astropolcal.observations import Observations, example_table
+from astropolcal.observations.observables import get_observable
 
 
 def measure(obs):
@@ -13,12 +13,12 @@ def measure(obs):
     return get_observable("normalized_double_difference").evaluate(right, left)
 
 
-@pytest.mark.parametrize("polarization", [0.0, 0.3, 1.0 - 1e-6])
-def test_example_table_measures_its_polarization(polarization):
-    obs = Observations.from_table(example_table(polarization=polarization))
-    # at 0 deg the double difference is Q, at 22.5 deg it is U = 0
-    expected = [[polarization, 0.0]] * 3
-    np.testing.assert_allclose(measure(obs), expected, atol=1e-12)
+def test_example_table_measures_its_polarization():
+    for polarization in [0.0, 0.3, 1.0 - 1e-6]:
+        obs = Observations.from_table(example_table(polarization=polarization))
+        # at 0 deg the double difference is Q, at 22.5 deg it is U = 0
+        expected = [[polarization, 0.0]] * 3
+        np.testing.assert_allclose(measure(obs), expected, atol=1e-12)
 
 
 def test_derotator_turns_the_signal():

@@ -11,8 +11,13 @@ from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations import Observations, example_table
-from astropolcal.observations.grid import CELL_COLUMNS, REQUIRED, build_grid
-from astropolcal.observations.masking import mask_missing, mask_rows
+from astropolcal.observations.grid import (
+    CELL_COLUMNS,
+    REQUIRED,
+    build_grid,
+    mask_missing,
+    mask_rows,
+)
 
 N_FRAMES, N_BINS = 4, 3
 FLUXES = st.sampled_from([np.nan, np.inf, -1.0, 0.0, 3.0, 250.0])

@@ -8,7 +8,7 @@ from astropy.time import Time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.observations.hashing import hash_columns
+from astropolcal.observations.table import hash_columns
 
 
 def test_hash_depends_on_values_names_and_header():

@@ -6,7 +6,7 @@ import pytest
 from astropy.table import MaskedColumn, QTable
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.masking import mask_missing, mask_rows
+from astropolcal.observations.grid import mask_missing, mask_rows
 
 
 def judged(right, left, errors=None, reasons=None):
@@ -21,9 +21,8 @@ def judged(right, left, errors=None, reasons=None):
     return mask_rows(table, values, "night")
 
 
-@pytest.mark.parametrize(
-    ("right", "left", "reason", "shown"),
-    [
+def test_reason_and_first_row_of_bad_fluxes():
+    for right, left, reason, shown in [
         (np.nan, 1.0, "flux not finite", "flux_right = nan, flux_left = 1"),
         (1.0, -np.inf, "flux not finite", "flux_right = 1, flux_left = -inf"),
         # squares of what is beyond 1e100 overflow
@@ -33,21 +32,19 @@ def judged(right, left, errors=None, reasons=None):
         (1.0, 1e-101, "flux not positive", "flux_left = 1e-101"),
         # both are wrong: what is not finite comes first
         (np.nan, -1.0, "flux not finite", "flux_right = nan, flux_left = -1"),
-    ],
-)
-def test_reason_and_first_row_of_bad_fluxes(right, left, reason, shown):
-    words = rf"night: 1 cell masked, {reason} \(first: row 2: .*{shown}"
-    with pytest.warns(AstropolcalWarning, match=words):
-        code, reasons = judged([2.0, right, 3.0], [2.0, left, 3.0])
-    assert code.tolist() == [0, 1, 0]
-    assert reasons == [reason]
+    ]:
+        words = rf"night: 1 cell masked, {reason} \(first: row 2: .*{shown}"
+        with pytest.warns(AstropolcalWarning, match=words):
+            code, reasons = judged([2.0, right, 3.0], [2.0, left, 3.0])
+        assert code.tolist() == [0, 1, 0], (right, left, reason, shown)
+        assert reasons == [reason], (right, left, reason, shown)
 
 
-@pytest.mark.parametrize("flux", [1e-99, 1e99, 1.0])
-def test_extreme_but_usable_fluxes_stay(flux):
-    code, reasons = judged([flux], [flux], errors=([flux], [flux]))
-    assert code.tolist() == [0]
-    assert reasons == []
+def test_extreme_but_usable_fluxes_stay():
+    for flux in [1e-99, 1e99, 1.0]:
+        code, reasons = judged([flux], [flux], errors=([flux], [flux]))
+        assert code.tolist() == [0], flux
+        assert reasons == [], flux
 
 
 def test_errors_are_judged_after_fluxes():
@@ -92,13 +89,15 @@ def test_found_reason_joins_the_declared_one_of_the_same_name():
     assert reasons == ["flux not positive"]
 
 
-@pytest.mark.parametrize(("n_missing", "words"), [(1, "1 cell masked"), (2, "2 cells masked")])
-def test_missing_cells_name_the_first(n_missing, words):
-    code = np.zeros((2, 2), dtype=int)
-    code[1, :n_missing] = -1
-    reasons = ["cloud"]
-    with pytest.warns(AstropolcalWarning, match=rf"{words}, missing \(first: frame 7, bin 30 has"):
-        mask_missing(code, reasons, [5, 7], [30, 31], "night")
-    assert reasons == ["cloud", "missing"]
-    assert (code == 2).sum() == n_missing
-    assert (code >= 0).all()
+def test_missing_cells_name_the_first():
+    for n_missing, words in [(1, "1 cell masked"), (2, "2 cells masked")]:
+        code = np.zeros((2, 2), dtype=int)
+        code[1, :n_missing] = -1
+        reasons = ["cloud"]
+        with pytest.warns(
+            AstropolcalWarning, match=rf"{words}, missing \(first: frame 7, bin 30 has"
+        ):
+            mask_missing(code, reasons, [5, 7], [30, 31], "night")
+        assert reasons == ["cloud", "missing"], (n_missing, words)
+        assert (code == 2).sum() == n_missing, (n_missing, words)
+        assert (code >= 0).all(), (n_missing, words)

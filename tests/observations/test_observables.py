@@ -8,15 +8,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.observations import (
-    OBSERVABLES,
+from astropolcal.observations import OBSERVABLES, Observable
+from astropolcal.observations.observables import (
     NormalizedDoubleDifference,
-    Observable,
-    double_difference,
-    double_sum,
     get_observable,
-    single_difference,
-    single_sum,
 )
 
 N_BINS, N_DATA = 3, 5
@@ -49,21 +44,6 @@ def test_first_pair_of_dataset_1_by_hand():
     assert value[0, 0] == pytest.approx(16093510.3566 / 34842424.6578, rel=1e-10)
 
 
-def test_plain_differences_and_sums():
-    right, left = np.array([[5.0], [1.0]]), np.array([[2.0], [7.0]])
-    assert single_difference(right, left).tolist() == [[3.0], [-6.0]]
-    assert single_sum(right, left).tolist() == [[7.0], [8.0]]
-    assert double_difference(right, left).tolist() == [4.5]
-    assert double_sum(right, left).tolist() == [7.5]
-
-
-@given(fluxes, fluxes)
-def test_plain_functions_make_the_default_observable(right, left):
-    ratio = double_difference(right, left) / double_sum(right, left)
-    value = NormalizedDoubleDifference().evaluate(right, left)
-    np.testing.assert_allclose(value, ratio, rtol=1e-12, atol=1e-15)
-
-
 @given(fluxes, fluxes, gains, gains, gains)
 def test_ratio_method_ignores_beam_gain_and_flux(right, left, gain, plus, minus):
     frame = np.array([plus, minus])[:, None, None]
@@ -86,7 +66,7 @@ def test_per_frame_observables_ignore_the_flux(right, left, plus, minus):
 @given(arrays(float, (4, N_BINS, N_DATA), elements=st.floats(1.0, 1e6)), gains)
 def test_triple_difference_is_made_of_differences_of_states(fluxes, gain):
     right, left = fluxes, fluxes[::-1] * gain
-    x, total = single_difference(right, left), single_sum(right, left)
+    x, total = right - left, right + left
     plus, minus = x[0] - x[1], x[2] - x[3]
     value = get_observable("normalized_triple_difference").evaluate(right, left)
     np.testing.assert_allclose(value, (plus - minus) / total.sum(axis=0), rtol=1e-12, atol=1e-15)
@@ -277,11 +257,9 @@ def test_the_default_comes_first():
     assert next(iter(OBSERVABLES)) == "normalized_double_difference"
 
 
-@pytest.mark.parametrize(
-    "name", ["ratio", "RATIO", "Normalized-Double-Difference", "normalized double difference"]
-)
-def test_names_are_forgiving(name):
-    assert get_observable(name).name == name.lower().replace("-", "_").replace(" ", "_")
+def test_names_are_forgiving():
+    for name in ["ratio", "RATIO", "Normalized-Double-Difference", "normalized double difference"]:
+        assert get_observable(name).name == name.lower().replace("-", "_").replace(" ", "_"), name
 
 
 def test_an_observable_passes_through():

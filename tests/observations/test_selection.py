@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from astropolcal.exceptions import ObservationError
 from astropolcal.observations import Observations, example_table
 from astropolcal.observations.grid import build_grid
-from astropolcal.observations.selection import masked_grid, some_bins, some_frames
+from astropolcal.observations.table import masked_grid, some_bins, some_frames
 
 ARRAYS = ("flux_right", "flux_left")
 
@@ -66,9 +66,8 @@ def test_a_grid_is_not_changed(grid):
     assert grid.reasons == ()
 
 
-@pytest.mark.parametrize(
-    ("mask", "reason", "words"),
-    [
+def test_bad_masks_are_refused(grid):
+    for mask, reason, words in [
         (np.zeros((4, 3)), "x", r"mask of type float64 and shape \(4, 3\); .*\(4, 3\) or \(4,\)"),
         (np.zeros(3, dtype=bool), "x", r"shape \(3,\); allowed are booleans of shape"),
         (np.zeros((3, 4), dtype=bool), "x", r"shape \(3, 4\)"),
@@ -76,11 +75,9 @@ def test_a_grid_is_not_changed(grid):
         (np.zeros(4, dtype=bool), "   ", "some words are needed"),
         (np.zeros(4, dtype=bool), None, "reason = None"),
         (np.ones(4, dtype=bool), "cloud", "masking 'cloud' would leave no usable cell of 12"),
-    ],
-)
-def test_bad_masks_are_refused(grid, mask, reason, words):
-    with pytest.raises(ObservationError, match=f"night: .*{words}|night: {words}"):
-        masked_grid(grid, mask, reason, "night")
+    ]:
+        with pytest.raises(ObservationError, match=f"night: .*{words}|night: {words}"):
+            masked_grid(grid, mask, reason, "night")
 
 
 def test_the_last_usable_cell_counts_with_those_masked_before(holed):
@@ -107,9 +104,8 @@ def test_frames_come_in_the_order_of_the_table(index):
     np.testing.assert_array_equal(some_frames(grid, flags, "night").flux_left, found.flux_left)
 
 
-@pytest.mark.parametrize(
-    ("frames", "words"),
-    [
+def test_bad_indices_are_refused(grid):
+    for frames, words in [
         ([4], "frame index 4, allowed are 0 to 3"),
         ([-5, 0], "frame index -5, allowed are 0 to 3"),
         ([1, 2, 1], "frame index 1 is given twice"),
@@ -118,11 +114,9 @@ def test_frames_come_in_the_order_of_the_table(index):
         ([0.0, 1.0], "frames of type float64"),
         ([[0, 1]], r"shape \(1, 2\); allowed are 4 booleans or a list of indices"),
         ([], "frames of type float64"),
-    ],
-)
-def test_bad_indices_are_refused(grid, frames, words):
-    with pytest.raises(ObservationError, match=f"night: .*{words}|night: {words}"):
-        some_frames(grid, frames, "night")
+    ]:
+        with pytest.raises(ObservationError, match=f"night: .*{words}|night: {words}"):
+            some_frames(grid, frames, "night")
 
 
 @pytest.mark.parametrize(("frames", "count"), [([0], "1 frame selected"), ([0, 1], None)])
@@ -147,10 +141,12 @@ def test_bins_keep_their_numbers(grid):
     assert len(found.frames) == 4
 
 
-@pytest.mark.parametrize("bins", [[0, 1], [True, False], [[True, True, True]], [1.0, 0.0, 1.0]])
-def test_bins_must_be_one_boolean_each(grid, bins):
-    with pytest.raises(ObservationError, match=r"night: bins of type .*; allowed are 3 booleans"):
-        some_bins(grid, bins, "night")
+def test_bins_must_be_one_boolean_each(grid):
+    for bins in [[0, 1], [True, False], [[True, True, True]], [1.0, 0.0, 1.0]]:
+        with pytest.raises(
+            ObservationError, match=r"night: bins of type .*; allowed are 3 booleans"
+        ):
+            some_bins(grid, bins, "night")
 
 
 def test_no_bin_at_all_has_no_usable_cell(grid):

@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal.observations.variances import BEAM_ERRORS, SINGLE_ERRORS, beam_variances
+from astropolcal.observations.grid import BEAM_ERRORS, SINGLE_ERRORS, beam_variances
 
 positive = st.floats(1e-3, 1e6)
 

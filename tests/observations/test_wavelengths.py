@@ -11,8 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.observations import SAME_WAVELENGTH, Observations, common_wavelengths
-from astropolcal.observations.wavelengths import filter_wavelength, stated_wavelength
+from astropolcal.observations import Observations
+from astropolcal.observations.reading import (
+    SAME_WAVELENGTH,
+    common_wavelengths,
+    filter_wavelength,
+    stated_wavelength,
+)
 
 
 def at(*wavelengths, unit=u.um):
@@ -24,9 +29,11 @@ def test_union_is_sorted_and_in_micrometre():
     np.testing.assert_allclose(found, [1.2, 1.6, 2.2])
 
 
-@pytest.mark.parametrize(("step", "number"), [(0.9, 1), (1.1, 2)])
-def test_nearly_the_same_is_the_same(step, number):
-    assert len(common_wavelengths([at(1.2), at(1.2 * (1 + step * SAME_WAVELENGTH))])) == number
+def test_nearly_the_same_is_the_same():
+    for step, number in [(0.9, 1), (1.1, 2)]:
+        assert (
+            len(common_wavelengths([at(1.2), at(1.2 * (1 + step * SAME_WAVELENGTH))])) == number
+        ), (step, number)
 
 
 def test_given_grid_is_taken_as_it_is():
@@ -45,28 +52,24 @@ def test_union_does_not_depend_on_how_tables_are_cut(wavelengths, cut):
 # ---- filters -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("instrument", ["VAMPIRES", "vampires", "SCExAO/VAMPIRES"])
-@pytest.mark.parametrize("name", ["625-50", "625 50", "62550"])
-def test_spelling_of_a_filter_does_not_matter(instrument, name):
-    assert filter_wavelength(instrument, name) == 625 * u.nm
+def test_spelling_of_a_filter_does_not_matter():
+    for name in ["625-50", "625 50", "62550"]:
+        for instrument in ["VAMPIRES", "vampires", "SCExAO/VAMPIRES"]:
+            assert filter_wavelength(instrument, name) == 625 * u.nm, (instrument, name)
 
 
-@pytest.mark.parametrize(
-    ("instrument", "name", "words"),
-    [
+def test_unknown_filter_names_those_that_are_known():
+    for instrument, name, words in [
         ("VAMPIRES", "H", r"VAMPIRES: no wavelength is known of filter 'H'; known are .*625-50"),
         ("nobody", "H", "known are none; give the wavelength"),
         (None, "H", "None: no wavelength is known of filter 'H'"),
-    ],
-)
-def test_unknown_filter_names_those_that_are_known(instrument, name, words):
-    with pytest.raises(ObservationError, match=words):
-        filter_wavelength(instrument, name)
+    ]:
+        with pytest.raises(ObservationError, match=words):
+            filter_wavelength(instrument, name)
 
 
-@pytest.mark.parametrize(
-    ("meta", "wavelength"),
-    [
+def test_wavelength_that_meta_state():
+    for meta, wavelength in [
         ({}, None),
         ({"instrument": "VAMPIRES"}, None),
         ({"wavelength": "625 nm"}, 625 * u.nm),
@@ -74,19 +77,20 @@ def test_unknown_filter_names_those_that_are_known(instrument, name, words):
         ({"filter": "750-50", "instrument": "VAMPIRES"}, 750 * u.nm),
         # what is stated as a number goes before the filter
         ({"wavelength": "0.77 um", "filter": "750-50", "instrument": "VAMPIRES"}, 770 * u.nm),
-    ],
-)
-def test_wavelength_that_meta_state(meta, wavelength):
-    found = stated_wavelength(meta, "night")
-    assert found is wavelength if wavelength is None else np.isclose(found, wavelength)
+    ]:
+        found = stated_wavelength(meta, "night")
+        assert found is wavelength if wavelength is None else np.isclose(found, wavelength), (
+            meta,
+            wavelength,
+        )
 
 
-@pytest.mark.parametrize(
-    "value", ["625", "625 s", 0 * u.nm, "-1 um", [1, 2] * u.um, "wide", float("nan"), 625]
-)
-def test_what_is_no_length_is_refused(value):
-    with pytest.raises(ObservationError, match=r"night: wavelength = .* in the meta; allowed is"):
-        stated_wavelength({"wavelength": value}, "night")
+def test_what_is_no_length_is_refused():
+    for value in ["625", "625 s", 0 * u.nm, "-1 um", [1, 2] * u.um, "wide", float("nan"), 625]:
+        with pytest.raises(
+            ObservationError, match=r"night: wavelength = .* in the meta; allowed is"
+        ):
+            stated_wavelength({"wavelength": value}, "night")
 
 
 def test_unknown_filter_of_a_table_names_the_table():

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from astropolcal import Observations, calibrate, instruments, optics
 from astropolcal.chain import leaves
 from astropolcal.exceptions import CalibrationFileError, ParameterError, WavelengthRangeError
-from astropolcal.observations import get_observable
+from astropolcal.observations.observables import get_observable
 from astropolcal.plotting import plot_double_differences, plot_residuals
 from astropolcal.plotting._data import DataGrid
 from astropolcal.plotting.differences import _looks

@@ -7,9 +7,8 @@ from astropy.io import fits
 
 from astropolcal.exceptions import ObservationError
 from astropolcal.instruments.layout import FileLayout, ReadOut
-from astropolcal.reduction.beams import beam_scale, match_beams
-from astropolcal.reduction.errors import detector_of
-from astropolcal.reduction.frames import Frame, open_cube
+from astropolcal.reduction.frames import Frame, beam_scale, match_beams, open_cube
+from astropolcal.reduction.photometry import detector_of
 
 KEYWORDS = {
     "hwp": "HWP", "derotator": "ROT", "exposure_time": "EXPTIME", "flc_state": "FLC",

@@ -18,10 +18,10 @@ from astropolcal import instruments
 from astropolcal.exceptions import InstrumentError, ObservationError, ParameterError
 from astropolcal.observations import Observations, pointing
 from astropolcal.reduction import read_pypolcal, reduce_cubes, reduce_run
-from astropolcal.reduction.apertures import rectangles
 from astropolcal.reduction.cubes import simulate_cubes
 from astropolcal.reduction.frames import Frame, reduce_frame
-from astropolcal.reduction.journal import Journal
+from astropolcal.reduction.photometry import rectangles
+from astropolcal.reduction.run import Journal
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 LAYOUT = Small.files

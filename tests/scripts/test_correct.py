@@ -11,7 +11,8 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from astropolcal import calibrate, instruments
-from astropolcal.correction import Corrected, engine
+from astropolcal.correction import Corrected
+from astropolcal.correction import correcting as engine
 from astropolcal.exceptions import AstropolcalError
 from astropolcal.reduction.cubes import simulate_cubes
 from astropolcal.scripts import _correct

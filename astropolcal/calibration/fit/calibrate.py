@@ -134,7 +134,7 @@ def calibrate(
         the fit happens to end. The choice is recorded in ``settings``.
     loss : {"linear", "huber", "cauchy", "bisquare"}
         With another loss than the linear one, which is least squares, data that depart far
-        from the model count less, see `~astropolcal.calibration.robust_sigma`. It sets the
+        from the model count less. It sets the
         noise of each datum, so ``weights`` counts for the first fit only.
     fix : dict of str to `~astropy.units.Quantity` or None, optional
         Parameters to hold, ``"optic.parameter"``, at a value or (None) at
@@ -480,26 +480,25 @@ def _errors(measurement, whitened, how):
 def _lack_of_fit(calibration):
     """Hold the residuals against the noise that the table states, and that the data show."""
     found = []
-    for method in (noise_from_errors, _smooth_null):
+    live = calibration.measurement
+    smooth = {"null_model": "smooth"}
+    for method, options in ((noise_from_errors, {}), (noise_from_null_channel, smooth)):
         try:
-            noise = method(calibration.measurement)
-            test = lack_of_fit(calibration.measurement, calibration, noise)
+            noise = method(live, **options)
+            test = lack_of_fit(live, calibration, noise)
         except AstropolcalError:
             continue  # no errors in the table, or no pairs: nothing to hold against
+        # unknown where no degree of freedom is left
+        ratio = test.chi2 / test.expected if test.expected > 0 else np.nan
         found.append(
             {
                 "noise": noise.method,
-                "times_noise": _ratio(test),
+                "times_noise": float(np.sqrt(ratio)),
                 "p_value": float(test.p_value),
                 "words": test.words,
             }
         )
     return found
-
-
-def _ratio(test):
-    """Return residuals over noise; unknown where no degree of freedom is left."""
-    return float(np.sqrt(test.chi2 / test.expected)) if test.expected > 0 else np.nan
 
 
 def _outliers(calibration):
@@ -515,10 +514,6 @@ def _outliers(calibration):
         }
         for row in table
     ]
-
-
-def _smooth_null(measurement):
-    return noise_from_null_channel(measurement, null_model="smooth")
 
 
 def _record(measurement, i, residuals):

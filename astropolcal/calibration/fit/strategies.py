@@ -1,25 +1,20 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Starts for a fit that has mirror solutions.
+"""
+Starts, steps and gauges of a fit.
 
-With the global parameters held, the bins of a calibration are independent of
-each other. So all bins are searched at once: a coarse scan along the main
-retardance of each optic finds the valleys, and a Levenberg-Marquardt step that
-is batched over the bins polishes the best few. The result is a start for the
-joint fit, and later a check whether a bin sits in the wrong valley.
+Starts: with the global parameters held, the bins of a calibration are independent of each other. So
+all are searched at once: a coarse scan along the main retardance of each optic finds the valleys,
+and a Levenberg-Marquardt step that is batched over the bins polishes the best few. The result is a
+start for the joint fit, and later a check whether a bin sits in the wrong valley.
 
-Calibrations in steps, each of which holds what the steps before have found.
+Steps, each of which holds what the steps before have found. Two-step: the polarized internal source
+as in McIntosh et al. (2026, Sec. 5.2). Sequential: one dataset after another, as the paper goes
+from the polarized source to the unpolarized one and to the star.
 
-Two-step: the polarized internal source as in McIntosh et al. (2026, Sec. 5.2). Sequential: one
-dataset after another, as the paper goes from the polarized source to the unpolarized one
-and to the star.
-
-Choice of a gauge: one of the solutions that the data cannot tell apart.
-
-Where the data leave directions open, every point along them fits equally well,
-and where a fit ends is an accident of its start. The *minimal* gauge takes the
-solution whose parameters common to all wavelengths (the misalignments) have
-moved least from where they started. A user names another gauge by holding
-parameters (``fix=``) or by a prior.
+Gauge: where the data leave directions open, every point along them fits equally well, and where a
+fit ends is an accident of its start. The *minimal* gauge takes the solution whose parameters common
+to all wavelengths (the misalignments) have moved least from where they started. A user names
+another gauge by holding parameters (``fix=``) or by a prior.
 """
 
 from itertools import groupby
@@ -29,7 +24,7 @@ import numpy as np
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.noise.scatter import kind_of_source
-from astropolcal.calibration.noise.weighting import Weighting, around
+from astropolcal.calibration.noise.weighting import around
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import FitError
 from astropolcal.measurement import Measurement, parameter_table
@@ -45,32 +40,9 @@ _STUCK = 1.0
 
 
 class BinProblem:
-    """
-    The fit of the parameters given per wavelength, all bins at once.
+    """The fit of the parameters given per wavelength, all bins at once.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    weights : `~numpy.ndarray`, optional
-        Weight of each datum, shape (n_data,).
-    noise : float
-        Noise of a datum of weight one, against which priors weigh; zero leaves
-        them out.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> problem = BinProblem(Measurement(charis.chain(), observations))
-    >>> problem.costs(problem.measurement.vector()).shape
-    (22,)
+    ``noise`` is that of a datum of weight one, against which priors weigh; zero leaves them out.
     """
 
     def __init__(self, measurement, weights=None, noise=1.0):
@@ -130,24 +102,10 @@ class BinProblem:
         return normal, gradient
 
     def polish(self, vector, iterations=12, still_gaining=_STILL_GAINING):
-        """
-        Improve the per-wavelength parameters by batched Levenberg-Marquardt.
+        """Improve the per-wavelength parameters by batched Levenberg-Marquardt.
 
-        Parameters
-        ----------
-        vector : `~numpy.ndarray`
-            Start, shape (n_free,).
-        iterations : int
-            Largest number of steps.
-        still_gaining : float
-            It ends when no bin falls below this share of its cost in a step.
-
-        Returns
-        -------
-        vector : `~numpy.ndarray`
-            Shape (n_free,); no bin is worse than at the start.
-        costs : `~numpy.ndarray`
-            Cost of each bin there.
+        Returns the vector, where no bin is worse than at the start, and the cost of each bin. It
+        ends when no bin falls below the share ``still_gaining`` of its cost in a step.
         """
         vector = vector.copy()
         if not self.slots:
@@ -198,14 +156,7 @@ class BinProblem:
         return found
 
     def valleys(self, vector, row, low, high):
-        """
-        Return the best few values of one slot, from a scan over its bounds.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Shape (n_valleys, n_bins), best first.
-        """
+        """Return the best values of one slot from a scan over its bounds, (n_valleys, n_bins)."""
         grid = np.arange(low, high + _SCAN_STEP / 2, _SCAN_STEP).clip(low, high)
         trial = vector.copy()
         costs = np.empty((grid.size, self.n_bins))
@@ -220,40 +171,10 @@ class BinProblem:
 
 
 def search_branches(problem, vector, origin=None):
-    """
-    Return a start in which every bin sits in its best valley.
+    """Return a start in which every bin sits in its best valley, and which bins moved there.
 
-    Parameters
-    ----------
-    problem : BinProblem
-        The bins of the measurement.
-    vector : `~numpy.ndarray`
-        Current values; its own valley is kept unless another is clearly
-        (1 %) better.
-    origin : `~numpy.ndarray`, optional
-        Where the scans begin, by default at ``vector``; shape (n_free,). Only
-        its per-wavelength parameters matter.
-
-    Returns
-    -------
-    vector : `~numpy.ndarray`
-        Shape (n_free,).
-    moved : `~numpy.ndarray`
-        True for the bins that changed their valley.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> measurement = Measurement(charis.chain(), observations)
-    >>> search_branches(BinProblem(measurement), measurement.vector())[1].any()
-    np.False_
+    A bin keeps its own valley unless another is clearly (1 %) better. Scans begin at the
+    per-wavelength parameters of ``origin``, by default at ``vector``.
     """
     if not problem.slots:
         return vector, np.zeros(problem.n_bins, dtype=bool)
@@ -296,47 +217,10 @@ _ORDER = ("polarized", "unpolarized", "star")
 
 
 def two_step(measurement, weighting, joint, run, options):
-    """
-    Fit per wavelength with misalignments held, then global, then per wavelength again.
+    """Fit per wavelength with misalignments held, then global, then per wavelength again.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        Fitted in place.
-    weighting : Weighting
-        Noise of the data.
-    joint, run : callable
-        Take a measurement and a weighting, fit in place, with and without a search of
-        branches; return how it went, and the noise.
-    options : dict
-        Further arguments of the measurements of each step.
-
-    Returns
-    -------
-    outcome : dict
-        How it went.
-    weighting : Weighting
-        The noise.
-    stages : list of dict
-        Values after each step.
-
-    Raises
-    ------
-    FitError
-        If no dataset is of a polarized source.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> data = simulate(chain, charis.wavelength, frames, seed=2)
-    >>> cal = calibrate(chain, data, strategy="two-step", cross_validate=False)
-    >>> [stage["title"] for stage in cal.stages][:2]
-    ['per wavelength, misalignments held', 'global']
+    ``joint`` and ``run`` fit a measurement in place, with and without a search of branches. Returns
+    how it went, the noise, and the values after each step.
     """
     parts = [dataset.observations for dataset in measurement.datasets]
     _check_polarized(parts)
@@ -348,7 +232,8 @@ def two_step(measurement, weighting, joint, run, options):
     stages = []
 
     # in the first step each wavelength has its own retardance, also of a plate that follows a law
-    loose = [_loosened(chain, measurement.wavelength * u.um) for chain in measurement.chains]
+    grid = measurement.wavelength * u.um
+    loose = [join(leaf.loosened(grid) for leaf in leaves(c.copy())) for c in measurement.chains]
     first = _step_of(loose, single, parts, ties, options)
     outcome, weighting = joint(first, weighting)
     outcomes = [outcome]
@@ -376,43 +261,11 @@ def _check_polarized(parts):
 
 
 def sequential(measurement, weights, joint, run, options):
-    """
-    Fit one kind of source after another and hold what was found.
+    """Fit one kind of source after another and hold what was found: polarized, unpolarized, stars.
 
-    First the polarized internal source, then the unpolarized one, then stars; datasets of one
-    kind are fitted together. Errors of the steps before do not enter the later ones, and the
-    later data do not improve what is held: that is the paper's procedure.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        Of all datasets; its parameters are set.
-    weights : callable
-        Takes the measurement of a step, returns its first weighting.
-    joint, run, options
-        As for `two_step`; the first step searches branches, the others go downhill.
-
-    Returns
-    -------
-    outcome : dict
-        How it went.
-    stages : list of dict
-        Values after each step.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> sources = ["polarized", "unpolarized"]
-    >>> chains = [charis.chain(source, derotator="linear") for source in sources]
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> data = [simulate(chain, charis.wavelength, frames, seed=2, meta={"source": source})
-    ...         for chain, source in zip(chains, sources)]
-    >>> cal = calibrate(chains, data, strategy="sequential", cross_validate=False)
-    >>> [stage["title"] for stage in cal.stages]
-    ['polarized', 'unpolarized, what came before held']
+    Errors of the steps before do not enter the later ones, and later data do not improve what is
+    held: that is the paper's procedure. ``weights`` returns the first weighting of the measurement
+    of a step.
     """
     measurement.put_back()
     ties, chains = measurement.free.ties, measurement.chains
@@ -441,36 +294,10 @@ def sequential(measurement, weights, joint, run, options):
 
 
 def telescope_alone(measurement, options):
-    """
-    Return the fit of what stars alone see and all wavelengths share, such as a law of M3.
+    """Return the fit of what stars alone see and all wavelengths share, such as a law of M3.
 
-    Such parameters can be nearly degenerate, so that a fit takes hundreds of steps. With all
-    others held these are cheap, and bring the fit of everything near its end.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        Of all datasets.
-    options : dict
-        As for `two_step`.
-
-    Returns
-    -------
-    Measurement or None
-        None where there is nothing of the kind.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
-    >>> lamp = Measurement(charis.chain(), simulate(charis.chain(), charis.wavelength, frames))
-    >>> telescope_alone(lamp, {"positions": None}) is None
-    True
+    Such parameters can be nearly degenerate, so that a fit takes hundreds of steps; with all others
+    held these are cheap. None where there is nothing of the kind.
     """
     chains, parts = measurement.put_back(), [d.observations for d in measurement.datasets]
     seen = [kind_of_source(part.source) == "star" for part in parts]
@@ -494,30 +321,7 @@ def telescope_alone(measurement, options):
 
 
 def copy_fitted(origin, target):
-    """
-    Give a measurement the values that another one has found, name by name.
-
-    Parameters
-    ----------
-    origin, target : Measurement
-        The second is changed.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
-    >>> data = simulate(charis.chain(), charis.wavelength, frames)
-    >>> first, second = (Measurement(charis.chain(), data) for _ in range(2))
-    >>> first.parameters = 1.01 * first.vector()
-    >>> copy_fitted(first, second)
-    >>> bool((first.vector() == second.vector()).all())
-    True
-    """
+    """Give the measurement ``target`` the values that ``origin`` has found, name by name."""
     vector = target.vector()
     for slot in origin.free.slots:
         known = target.free.by_name.get(slot.name)
@@ -537,10 +341,6 @@ def _step_of(chains, held, parts, ties, options):
     # a tie needs a source that is free in this step
     live = {n: tie for n, tie in ties.items() if n in known and tie.source in known - held}
     return Measurement(_held(chains, held | (set(ties) - set(live))), parts, ties=live, **options)
-
-
-def _loosened(chain, wavelength):
-    return join(leaf.loosened(wavelength) for leaf in leaves(chain.copy()))
 
 
 def _held(chains, names):
@@ -587,54 +387,12 @@ _OPEN = 1e-3
 _SILENT = 1e-12
 
 
-def settle(problem, weight, origin):
-    """
-    Move a solution along the directions that no datum sees, to the minimal gauge.
-
-    Directions that a prior closes are not open.
-
-    Parameters
-    ----------
-    problem : BinProblem
-        The bins of the fitted measurement; its values are changed.
-    weight : `~numpy.ndarray`, Weighting or None
-        Weight of each datum, or the noise that the fit assumed.
-    origin : `~numpy.ndarray`
-        Where the fit started, shape (n_free,).
-
-    Returns
-    -------
-    list of str
-        Parameters common to all wavelengths that the data leave open; those
-        that were brought home, if the gauge is minimal.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.published()
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
-    >>> measurement = Measurement(chain, simulate(chain, charis.wavelength, frames, noise=False))
-    >>> settle(BinProblem(measurement), None, measurement.vector())
-    ['calibration_polarizer.theta', 'hwp.theta', 'derotator.theta']
-    """
-    measurement = problem.measurement
-    weighting = weight if isinstance(weight, Weighting) else _weighting(measurement, weight)
-    return settled(problem, weighting, origin)[0]
-
-
-def _weighting(measurement, weight):
-    if weight is None:
-        return Weighting(None, np.full(measurement.n_data, np.nan))
-    return Weighting("given", 1 / np.asarray(weight, dtype=float))
-
-
 def settled(problem, weighting, origin):
-    """Settle; return the open parameters and the linear problem around the new solution."""
+    """Move a solution along the directions that neither data nor priors see, to the minimal gauge.
+
+    ``origin`` is where the fit started. Returns the parameters that were left open, and the linear
+    problem around the new solution.
+    """
     measurement = problem.measurement
     vector = measurement.vector()
     scale, leaders = physical_scale(measurement.free), _leaders(measurement.free)
@@ -658,7 +416,9 @@ def settled(problem, weighting, origin):
 
 def open_parameters(free, whitened):
     """Return the parameters common to all wavelengths that data and priors leave open."""
-    return _open(free, whitened.together.null)
+    null = whitened.together.null
+    moving = [slot for slot in free.slots if np.abs(null[:, slot.slice]).max(initial=0) > _OPEN]
+    return [s.name for s in moving if not s.per_wavelength] or [s.name for s in moving]
 
 
 def hold_silent(measurement, origin):
@@ -677,12 +437,6 @@ def hold_silent(measurement, origin):
             vector = trial
     if still.any():
         measurement.parameters = vector
-
-
-def _open(free, null):
-    """Return the names of what moves along the open directions, leaders first."""
-    moving = [slot for slot in free.slots if np.abs(null[:, slot.slice]).max(initial=0) > _OPEN]
-    return [s.name for s in moving if not s.per_wavelength] or [s.name for s in moving]
 
 
 def _leaders(free):
@@ -713,37 +467,9 @@ def _move(problem, vector, step):
 
 
 def describe_gauge(gauge, chosen, free, held):
-    """
-    Say which of the equivalent solutions a calibration reports, and why.
+    """Say which of the equivalent solutions a calibration reports, and why.
 
-    Parameters
-    ----------
-    gauge : str or None
-        What was asked for.
-    chosen : sequence of str
-        Parameters that the data leave open.
-    free : FreeParameters
-        The free parameters.
-    held : sequence of str
-        Parameters that the user holds.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    FitError
-        If the gauge is unknown.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-
-    >>> from astropolcal.measurement import FreeParameters
-    >>> free = FreeParameters([optics.WollastonPrism(name="wollaston")], 1)
-    >>> describe_gauge("minimal", [], free, ["hwp.theta"])
-    'held: hwp.theta; the data determine every free parameter'
+    ``chosen`` are parameters that the data leave open, ``held`` those that the user holds.
     """
     if gauge not in GAUGES:
         raise FitError(f"gauge = {gauge!r}; allowed are 'minimal' and None")

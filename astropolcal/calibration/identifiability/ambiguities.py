@@ -1,17 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Which star settles on sky what the data leave open.
+"""
+What other values give the same data, and what data would tell them apart.
 
-What a set of half-wave-plate angles can separate.
+Discrete mirror solutions: each candidate is tried on the measurement and counts only if it predicts
+the same data and stays within the bounds. What the bounds, or the model of an optic, exclude may be
+the truth all the same: it is told where it matters on sky.
 
-A perfect plate puts the polarization into harmonic 4 of its angle, an imperfect
-one also into 2, and a wedge or dust into 1. Angles from 0 to 78.75 deg cover
+Harmonics of the half-wave plate: a perfect plate puts the polarization into harmonic 4 of its
+angle, an imperfect one also into 2, and a wedge or dust into 1. Angles from 0 to 78.75 deg cover
 one period of harmonic 4 only: there the others look alike.
-
-Discrete mirror solutions: other values that give exactly the same data.
-
-Each candidate is tried on the measurement and counts only if it predicts the
-same data and stays within the bounds. What the bounds, or the model of an optic,
-exclude may be the truth all the same: it is told where it matters on sky.
 """
 
 from functools import lru_cache
@@ -74,28 +71,7 @@ _POOR = 10.0
 
 
 def harmonic_conditions(angles):
-    """
-    Return how well harmonics of the half-wave-plate angle can be separated.
-
-    Parameters
-    ----------
-    angles : array_like
-        Angles in radian, one a frame.
-
-    Returns
-    -------
-    dict of tuple to float
-        Set of harmonics to the condition number of their design matrix;
-        infinite where there are too few angles.
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> found = harmonic_conditions(np.deg2rad(np.arange(8) * 11.25))
-    >>> [round(value, 1) for value in found.values()]
-    [1.4, 27.5, 14184.1]
-    """
+    """Return the condition number of each set of harmonics for plate angles in radian."""
     return {
         harmonics: _condition(np.asarray(angles, dtype=float), harmonics) for harmonics, _ in SETS
     }
@@ -113,27 +89,7 @@ def _condition(angles, harmonics):
 
 
 def harmonic_words(angles):
-    """
-    Say which harmonics the angles cannot separate, and which angles to add.
-
-    Parameters
-    ----------
-    angles : array_like
-        Angles in radian, one a frame.
-
-    Returns
-    -------
-    list of str
-        One sentence a set of harmonics that is poorly separated.
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> print(harmonic_words(np.deg2rad(np.arange(8) * 11.25))[0])
-    half-wave-plate angles 0 to 78.75 deg separate harmonic 2 badly from 0, 4 (condition 27, \
-from a half-wave plate that is not perfect): add 90 to 168.75 deg
-    """
+    """Say which harmonics plate angles in radian cannot separate, and which angles to add."""
     degrees = np.unique(np.round(np.rad2deg(angles), 3))
     words = []
     for harmonics, origin in SETS:
@@ -176,45 +132,10 @@ _FEW = 64
 _SAME_DATA = "all retardances with the other sign (circular ones keep theirs) give the same data"
 
 
-def mirror_solutions(measurement, vector):
-    """
-    Return the mirror solutions of a fit, in words.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    vector : `~numpy.ndarray`
-        The solution, canonical values, shape (n_free,).
-
-    Returns
-    -------
-    list of str
-        One sentence a mirror solution within the bounds.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain()
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60] * u.deg)
-    >>> measurement = Measurement(chain, simulate(chain, charis.wavelength, frames, seed=1))
-    >>> mirror_solutions(measurement, measurement.vector())[0][:43]
-    'derotator: a retardance d (length |d|) and '
-    """
-    return [branch["words"] for branch in _within_bounds(measurement, vector)]
-
-
 def mirror_branches(measurement, vector, view):
-    """
-    Return the mirror solutions with what they do on sky.
+    """Return the mirror solutions as dicts: ``words``, and ``sky`` as in `consequences_along`.
 
-    Dicts with ``words``, and ``sky`` as in `sky_consequences`, None without a view of the sky;
-    with them the other hand of the whole instrument, if only bounds or models exclude it and it
+    With them the other hand of the whole instrument, if only bounds or models exclude it and it
     matters on sky.
     """
     branches = _within_bounds(measurement, vector)

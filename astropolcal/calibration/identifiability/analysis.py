@@ -1,11 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What the data determine: rank, null directions in words, honest errors.
+"""
+What the data determine: rank, null directions in words, honest errors.
 
-A parameter is *identifiable* if no combination of parameters that leaves all
-data unchanged moves it. An error is given for identifiable parameters only:
-a pseudo-inverse would return a small and wrong number for the others.
-
-What stars leave open of the telescope's mirrors, and what would determine it.
+A parameter is *identifiable* if no combination of parameters that leaves all data unchanged moves
+it. An error is given for identifiable parameters only: a pseudo-inverse would return a small and
+wrong number for the others.
 """
 
 import re
@@ -63,7 +62,7 @@ class Identifiability:
         Whether each parameter is determined, shape (n_free,).
     directions : list of dict
         For each null direction its ``words``, the ``parameters`` that move, and
-        what it does to the ``sky``, see `sky_consequences`.
+        what it does to the ``sky``: changes of AoLP and DoLP of ``targets``.
     sampling : list of str
         Harmonics that the half-wave-plate angles cannot separate, and what stars leave open
         of the telescope.
@@ -81,8 +80,8 @@ class Identifiability:
 
     Examples
     --------
+    >>> from astropolcal.calibration.identifiability import Identifiability
     >>> import numpy as np
-
     >>> Identifiability(["a.theta"], 1, np.ones(1), np.zeros((0, 1)), np.ones(1, bool)).n_free
     1
     """
@@ -120,72 +119,11 @@ class Identifiability:
 
 
 def null_space(free, jacobian):
-    """
-    Return the directions in which no datum changes.
+    """Return orthonormal directions in which no datum changes, (n_free - rank, n_free).
 
-    Parameters
-    ----------
-    free : FreeParameters
-        The free parameters.
-    jacobian : `~numpy.ndarray`
-        Whitened derivative of the data, shape (n_free, n_data).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Orthonormal rows, shape (n_free - rank, n_free), in steps of a degree,
-        a micrometre or a percent.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal import optics
-
-    >>> from astropolcal.measurement import FreeParameters
-    >>> free = FreeParameters([optics.WollastonPrism(name="wollaston")], 1)
-    >>> null_space(free, np.zeros((1, 4))).shape
-    (1, 1)
+    In steps of a degree, micrometre or percent; ``jacobian`` is whitened, (n_free, n_data).
     """
     return decompose((jacobian * physical_scale(free)[:, None]).T).null
-
-
-def analyse(free, jacobian, held=None, priors=None):
-    """
-    Find the rank, the null directions and the unscaled covariance.
-
-    Parameters
-    ----------
-    free : FreeParameters
-        The free parameters.
-    jacobian : `~numpy.ndarray`
-        Whitened derivative of the data, shape (n_free, n_data).
-    held : `~numpy.ndarray`, optional
-        True for parameters that sit at a bound; they count as fixed.
-    priors : `~numpy.ndarray`, optional
-        Derivative of the priors' residuals in units of the noise, shape
-        (n_free, n_priors). They enter the covariance, not the rank.
-
-    Returns
-    -------
-    identifiability : Identifiability
-        What the data alone determine.
-    covariance : `~numpy.ndarray`
-        Shape (n_free, n_free), canonical units, for unit noise; NaN in the
-        rows and columns of parameters that are held, or that data and priors
-        together do not determine.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-
-    >>> from astropolcal.measurement import FreeParameters
-    >>> import numpy as np
-    >>> free = FreeParameters([optics.WollastonPrism(name="wollaston")], 1)
-    >>> analyse(free, np.ones((1, 4)))[0].rank
-    1
-    """
-    whitened = Whitened(jacobian, physical_scale(free), priors, held)
-    return finding_of(free, whitened), whitened.covariance()
 
 
 def finding_of(free, whitened):
@@ -247,45 +185,10 @@ def examine(measurement, weights=None):
 
 
 def complete(finding, measurement, vector, whitened=None, level=1.0, *, view=None):
-    """
-    Add to a finding what it means on sky, the sampling and the mirror solutions.
+    """Add to a finding what it means on sky, the sampling and the mirror solutions.
 
-    Parameters
-    ----------
-    finding : Identifiability
-        As `analyse` gives it; it is changed.
-    measurement : Measurement
-        The measurement.
-    vector : `~numpy.ndarray`
-        The solution, canonical values, shape (n_free,).
-    whitened : Whitened, optional
-        The problem around the solution. With it the directions are added that
-        are determined badly.
-    level : float
-        Noise of a datum of weight one.
-    view : SkyView, optional
-        What the solution sees of the sky; by default without a published telescope.
-
-    Returns
-    -------
-    Identifiability
-        The same object.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
-    >>> observations = simulate(charis.published(), charis.wavelength, frames, seed=1)
-    >>> measurement = Measurement(charis.chain(optics_in=["nbs"]), observations)
-    >>> vector = measurement.vector()
-    >>> finding, _ = analyse(measurement.free, measurement.jacobian(vector))
-    >>> complete(finding, measurement, vector).directions[0]["sky"]["aolp_deg"]
-    [1.0, 1.0]
+    With the problem ``whitened`` around the solution also the directions that are badly determined
+    for the noise ``level`` of a datum of weight one.
     """
     free = measurement.free
     scaled = [direction for direction, _ in led(free, finding.null_vectors)]
@@ -328,27 +231,7 @@ def _settled_by_a_star(finding, view):
 
 
 def physical_scale(free):
-    """
-    Return one degree, one micrometre or one percent of each parameter, canonical.
-
-    Parameters
-    ----------
-    free : FreeParameters
-        The free parameters.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_free,).
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-
-    >>> from astropolcal.measurement import FreeParameters
-    >>> physical_scale(FreeParameters([optics.WollastonPrism(name="wollaston")], 1)).tolist()
-    [0.01]
-    """
+    """Return one degree, micrometre or percent of each free parameter, in canonical units."""
     kinds = [step_of(slot.unit)[0] for slot in free.slots]
     return np.repeat(kinds, [slot.size for slot in free.slots])
 
@@ -357,36 +240,17 @@ def physical_scale(free):
 
 
 def telescope_words(finding, measurement):
-    """
-    Say which parameters of the mirrors before the half-wave plate the stars leave open.
-
-    Parameters
-    ----------
-    finding : Identifiability
-        With its null directions and those that are determined badly.
-    measurement : Measurement
-        The measurement.
-
-    Returns
-    -------
-    list of str
-        One sentence a mirror, if something is open.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-
-    >>> telescope_words(SimpleNamespace(directions=[], near_null=[]), SimpleNamespace(datasets=[]))
-    []
-    """
+    """Say which parameters of the mirrors upstream of the half-wave plate the stars leave open."""
     open_names = {
         name
         for direction in (*finding.directions, *finding.near_null)
         for name in direction["parameters"]
     }
-    held = measurement.free.at_bounds(measurement.vector()) if measurement.datasets else []
     # what ran to a bound is as open as what drifts
-    at_bound = [n for n, stuck in zip(_names(measurement), held, strict=True) if stuck]
+    at_bound = []
+    if measurement.datasets:
+        held = measurement.free.at_bounds(measurement.vector())
+        at_bound = [measurement.free.names[i] for i in np.flatnonzero(held)]
     words = []
     for mirror in sorted(_mirrors(measurement)):
         own = sorted(n for n in {*open_names, *at_bound} if n.startswith(f"{mirror}."))
@@ -398,10 +262,6 @@ def telescope_words(finding, measurement):
                 "a measured film or index (a prior) does the rest"
             )
     return words
-
-
-def _names(measurement):
-    return measurement.free.names if measurement.datasets else []
 
 
 def _mirrors(measurement):

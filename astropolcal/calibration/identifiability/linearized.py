@@ -1,8 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Derivatives of data and priors in units of the noise, decomposed once for all who ask.
-
-Directions in the space of the parameters, in words.
-"""
+"""The linear problem around a solution, decomposed once for all who ask, and its directions."""
 
 from functools import cached_property
 from typing import NamedTuple
@@ -48,11 +45,7 @@ class Directions(NamedTuple):
 
 
 def decompose(rows):
-    """
-    Decompose rows of derivatives, shape (n_rows, n_columns).
-
-    All right vectors are there even if there are fewer rows than columns.
-    """
+    """Decompose rows of derivatives, with all right vectors however few rows."""
     n_rows, n_columns = rows.shape
     # null directions need all right vectors; with more rows than columns they are there anyway
     _, singular, right = np.linalg.svd(rows, full_matrices=n_rows < n_columns)
@@ -63,19 +56,10 @@ def decompose(rows):
 
 
 class Whitened:
-    """
-    The problem around a solution, linear, with steps of a degree, micrometre or percent.
+    """The linear problem around a solution, in steps of a degree, micrometre or percent.
 
-    Parameters
-    ----------
-    data : `~numpy.ndarray`
-        Derivative of the data times their weights, shape (n_free, n_data).
-    scale : `~numpy.ndarray`
-        Step of each parameter, shape (n_free,).
-    priors : `~numpy.ndarray`, optional
-        Derivative of the priors' residuals times their weight, shape (n_free, n_priors).
-    held : `~numpy.ndarray`, optional
-        True for parameters that count as known.
+    ``data`` (n_free, n_data) and ``priors`` (n_free, n_priors) are derivatives in units of the
+    noise, ``scale`` the step of each parameter; parameters that are ``held`` count as known.
     """
 
     def __init__(self, data, scale, priors=None, held=None):
@@ -115,7 +99,7 @@ class Whitened:
     def leverage(self):
         """Derivative of each fitted to its observed datum, shape (n_data,)."""
         # diagonal of the hat matrix J (J^T J + P)^-1 J^T
-        return np.sum((self.rows[:, self.live] @ self.errors.half.T) ** 2, axis=1)
+        return np.sum(self.along(self.rows) ** 2, axis=1)
 
     @cached_property
     def n_taken(self):
@@ -123,7 +107,11 @@ class Whitened:
         if not len(self.prior_rows):
             # trace of a projection
             return float(self.errors.rank)
-        return float(np.sum((self._square[:, self.live] @ self.errors.half.T) ** 2))
+        return float(np.sum(self.along(self._square) ** 2))
+
+    def along(self, rows):
+        """Return rows of derivatives along the determined directions, each one error long."""
+        return rows[:, self.live] @ self.errors.half.T
 
     def factor(self):
         """Return `errors.half` over all columns, zero for what is held, in steps."""
@@ -139,11 +127,7 @@ class Whitened:
         return out
 
     def covariance(self):
-        """
-        Return the covariance for unit noise, canonical, shape (n_free, n_free).
-
-        NaN in the rows and columns of what is held or not determined.
-        """
+        """Return the canonical covariance for unit noise; NaN for what is held or open."""
         out = np.full((self.scale.size, self.scale.size), np.nan)
         # a pseudo-inverse would give a small number for what is open; it gets none
         known = self.errors.determined
@@ -173,11 +157,9 @@ _EQUAL = 1e-6
 
 
 def ranked(values, equal=None):
-    """
-    Return the indices of values, largest first; equal ones keep their order.
+    """Return the indices of values, largest first; equal ones keep their order.
 
-    Which of two that are equal comes out larger hangs on the processor. Equal are by default
-    those that differ by rounding.
+    Which of two that are equal up to rounding comes out larger hangs on the processor.
     """
     values = np.asarray(values, dtype=float)
     if equal is None:
@@ -319,12 +301,11 @@ def plain(moved):
 
 
 def near_null_directions(free, whitened, level, sky_of):
-    """
-    Say what data and priors determine so badly that it hardly counts as determined.
+    """Say what data and priors determine so badly that it hardly counts as determined.
 
-    Of the principal directions of the errors those along which some parameter
-    is uncertain by more than `LARGE`, or whose singular value is 1e4 times
-    smaller than the largest. ``sky_of`` returns what canonical changes do on sky.
+    Principal directions of the errors along which some parameter is uncertain by more than `LARGE`,
+    or with a singular value 1e4 times smaller than the largest; ``sky_of`` gives what they do on
+    sky.
     """
     found = whitened.errors
     # each row is a principal direction, as long as its standard error at the noise of the fit
@@ -336,7 +317,10 @@ def near_null_directions(free, whitened, level, sky_of):
     # the sign of a singular vector is arbitrary: the worst parameter goes up
     errors = errors * np.sign(errors[np.arange(len(errors)), leads])[:, None]
     worst = [i for i in np.argsort(singular, kind="stable") if bad[i]]
-    skies = _skies(errors[worst] * whitened.scale, sky_of)
+    # each direction costs two evaluations of the whole chain
+    changes = errors[worst] * whitened.scale
+    skies = sky_of(changes[:_ON_SKY]) if worst else []
+    skies += [None] * (len(worst) - len(skies))
     return [
         _near_null(free, errors[i], times_large[i], condition[i], sky)
         for i, sky in zip(worst, skies, strict=True)
@@ -349,12 +333,6 @@ def _large(free):
     return np.repeat(
         [LARGE[unit] / size for size, unit in kinds], [slot.size for slot in free.slots]
     )
-
-
-def _skies(changes, sky_of):
-    # each direction costs two evaluations of the whole chain
-    some = sky_of(changes[:_ON_SKY]) if len(changes) else []
-    return some + [None] * (len(changes) - len(some))
 
 
 def _near_null(free, error, times_large, condition, sky):

@@ -1,14 +1,13 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""A standard observation of the sky, and how the Stokes parameters that it finds change.
+"""
+What open directions and mirror branches do to the polarization measured on sky.
 
-Cycles of the half-wave plate at a few positions of telescope and derotator, each solved by itself
-for I, Q and U from normalized double differences, as `~astropolcal.correction.correct` does it.
-
-What an open direction, or a mirror branch, does to the polarization measured on sky.
-
-The data that were fitted may not change, and yet the q and u that the same optics give of the sky
-do. Rotation and gain are the same for all degrees of polarization; instrumental polarization that
-is subtracted wrongly is not, and matters the more the fainter the polarization is.
+A standard observation is cycles of the half-wave plate at a few positions of telescope and
+derotator, each solved by itself for I, Q and U from normalized double differences, as
+`~astropolcal.correction.correct` does it. The data that were fitted may not change, and yet the q
+and u that the same optics give of the sky do. Rotation and gain are the same for all degrees of
+polarization; instrumental polarization that is subtracted wrongly is not, and matters the more the
+fainter the polarization is.
 """
 
 import warnings
@@ -18,12 +17,11 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments
-from astropolcal.calibration.system import Rows
+from astropolcal.calibration.system import Rows, free_of, from_first_stage
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
 from astropolcal.instruments import SkyLaw
 from astropolcal.instruments.base import without_nuisance
-from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.optics import COORDINATES
 
 __all__ = []
@@ -56,21 +54,12 @@ def chain_from_sky(chains, instrument=None, wavelength=None, date=None):
     """Return the optics from the sky on, and what their telescope is in words."""
     seen = next((chain for chain in chains if "parallactic" in stages(chain)), None)
     if seen is not None:
-        return _from_stage(without_nuisance(seen), ("parallactic",)), FITTED
+        return from_first_stage(without_nuisance(seen), ("parallactic",)), FITTED
     if instrument is not None and instrument.has_telescope:
         known = {"wavelength": wavelength, "date": date}
         options = {key: known[key] for key in instrument.sky_options}
         return instrument.on_sky(chains[0], **options), PUBLISHED
-    chain = without_nuisance(chains[0])
-    return _from_stage(chain, [s for s in stages(chain) if s not in COORDINATES]), LEFT_OUT
-
-
-def _from_stage(chain, wanted):
-    found = leaves(chain)
-    first = next((i for i, leaf in enumerate(found) if leaf.stage in wanted), None)
-    if first is None:
-        raise ChainError("the chain has no optic on a stage; give the chain from the sky")
-    return join(found[first:])
+    return from_first_stage(without_nuisance(chains[0])), LEFT_OUT
 
 
 def settings_of(measurement):
@@ -100,14 +89,12 @@ def view_of_measurement(measurement, vector, name=None):
 
 def view_of_calibration(calibration):
     """Return the view of the sky that a calibration has, None without a half-wave plate."""
-    grid = calibration.wavelength
-    free = FreeParameters(calibration.chains, len(grid), calibration.ties)
     settings = calibration.fit.get("sky_settings")
     if settings is None and calibration.measurement is not None:
         settings = settings_of(calibration.measurement)
     metas = [record.meta for record in calibration.datasets]
-    chains, lam = calibration.chains, grid.to_value(u.um)
-    return _view(chains, free, lam, metas, calibration.instrument, settings or {})
+    chains, lam = calibration.chains, calibration.wavelength.to_value(u.um)
+    return _view(chains, free_of(calibration), lam, metas, calibration.instrument, settings or {})
 
 
 def _view(chains, free, lam, metas, name, settings):
@@ -181,8 +168,7 @@ class SkyView:
 
     @cached_property
     def changes(self):
-        """
-        How I, Q and U that are found change with each free parameter, per declared unit.
+        """How I, Q and U that are found change with each free parameter, per declared unit.
 
         Shape (n_wavelengths, n_settings, 3, 3, n_free), the last but one axis that of the light.
         """
@@ -239,64 +225,12 @@ _NOTHING = 0.005
 _MATTERS = {"aolp_deg": 0.1, "dolp_change_percent": 1.0}
 
 
-def sky_consequences(measurement, vector, directions, instrument=None):
-    """
-    Return how recovered AoLP and DoLP change along given directions.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement. The light comes from the sky through the telescope of a star's chain, or
-        through that which the instrument publishes; where there is neither the telescope is left
-        out, and the light begins with the first optic on a stage.
-    vector : `~numpy.ndarray`
-        The solution, canonical values, shape (n_free,).
-    directions : `~numpy.ndarray`
-        Canonical changes, shape (n_directions, n_free).
-    instrument : str, optional
-        Name of the instrument, for its telescope.
-
-    Returns
-    -------
-    list of dict or None
-        For each direction ``targets``, a list with an entry for sources of 30, 1 and 0.1 %
-        (``dolp_percent``): least and largest change of the AoLP in degree, ``aolp_deg``, and of
-        the DoLP in percent of itself, ``dolp_change_percent``, to first order, over wavelengths,
-        angles of polarization, and a few settings of telescope and derotator, each one cycle of
-        the half-wave plate. ``aolp_deg`` and ``dolp_percent`` beside it are those of 30 %. None
-        where the chain has no half-wave plate.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[60, 85] * u.deg)
-    >>> measurement = Measurement(chain, simulate(chain, charis.wavelength, frames, seed=1))
-    >>> turn = np.zeros((1, measurement.free.size))
-    >>> turn[0, measurement.free.by_name["hwp.theta"].start] = np.deg2rad(1)
-    >>> sky = sky_consequences(measurement, measurement.vector(), turn)[0]
-    >>> [round(max(map(abs, target["aolp_deg"])), 1) for target in sky["targets"]]
-    [2.1, 2.1, 2.1]
-
-    The tertiary mirror polarizes, and with a plate at a wrong angle its polarization is
-    subtracted at a wrong angle, too:
-
-    >>> sky = sky_consequences(measurement, measurement.vector(), turn, "charis")[0]
-    >>> [round(max(map(abs, target["aolp_deg"])), 1) for target in sky["targets"]]
-    [2.4, 5.7, 37.4]
-    """
-    view = view_of_measurement(measurement, vector, instrument)
-    return consequences_along(view, directions)
-
-
 def consequences_along(view, directions):
-    """Return the consequences of small steps; None for each direction without a view."""
+    """Return how AoLP and DoLP change for small steps along canonical directions, to first order.
+
+    For each a dict with ``targets``, an entry for sources of 30, 1 and 0.1 % (``dolp_percent``):
+    least and largest change ``aolp_deg`` and ``dolp_change_percent``; None without a view.
+    """
     if view is None or not len(directions):
         return [None] * len(directions)
     return [_consequences(change[view.good], _small) for change in view.along(directions)]

@@ -1,15 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Noise of the data, from stated errors or from repeated data.
+"""
+Noise of the data: from stated errors, from repeated data, or from the null channel.
 
-A chi-square means something only beside a noise that does not come from the
-residuals it is compared with. There are three sources: the errors in the
-table, the scatter among data taken at the same settings, and the null channel
-(`~astropolcal.calibration.noise.estimates`). Each says what it includes.
-
-Noise of the data from the null channel, which the double difference cancels.
-
-Every pair of frames gives a null beside its datum, so that this noise is there for every
-table that has no repeated data; `estimate_noise` takes the better of the two.
+A chi-square means something only beside a noise that does not come from the residuals it is
+compared with. Each of the three says what it includes. The null channel, which the double
+difference cancels, is there for every table that has no repeated data.
 """
 
 from dataclasses import dataclass
@@ -49,6 +44,7 @@ class NoiseEstimate:
 
     Examples
     --------
+    >>> from astropolcal.calibration.noise import noise_from_errors
     >>> from astropolcal import optics
     >>> from astropolcal.measurement import Measurement
     >>> from astropolcal.observations import Observations, example_table
@@ -78,36 +74,9 @@ class NoiseEstimate:
 
 
 def data_by_wavelength(measurement):
-    """
-    Return which data belong to each wavelength of each dataset.
+    """Return number of the dataset, wavelength, and indices of unmasked data of each cell.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-
-    Returns
-    -------
-    dataset : `~numpy.ndarray` of int
-        Shape (n_rows,).
-    wavelength : `~astropy.units.Quantity`
-        Shape (n_rows,).
-    rows : list of `~numpy.ndarray`
-        Indices of the data, those that are not masked.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.observations import Observations, example_table
-    >>> chain = (optics.LinearPolarizer(name="polarizer")
-    ...          | optics.LinearRetarder(mount="hwp", name="hwp")
-    ...          | optics.WollastonPrism(name="wollaston"))
-    >>> measurement = Measurement(chain, Observations.from_table(example_table()))
-    >>> dataset, wavelength, rows = data_by_wavelength(measurement)
-    >>> wavelength[1], rows[1].tolist()
-    (<Quantity 1600. nm>, [2, 3])
+    A cell is a wavelength of a dataset.
     """
     numbers, wavelengths, rows = [], [], []
     for i, part in enumerate(measurement.datasets):
@@ -120,36 +89,9 @@ def data_by_wavelength(measurement):
 
 
 def noise_of_cells(measurement, sigma, dof, method, words):
-    """
-    Return an estimate of one noise for each wavelength of each dataset.
+    """Return an estimate with one noise for each cell of `data_by_wavelength`.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    sigma : array_like
-        Standard deviation of a datum, dimensionless, in the order of `data_by_wavelength`.
-    dof : array_like
-        Degrees of freedom of each; without any the noise is not known.
-    method, words : str
-        As `NoiseEstimate` has them.
-
-    Returns
-    -------
-    NoiseEstimate
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.observations import Observations, example_table
-    >>> chain = (optics.LinearPolarizer(name="polarizer")
-    ...          | optics.LinearRetarder(mount="hwp", name="hwp")
-    ...          | optics.WollastonPrism(name="wollaston"))
-    >>> measurement = Measurement(chain, Observations.from_table(example_table()))
-    >>> noise_of_cells(measurement, [0.01, 0.02, 0.03], [4, 4, 0], "made up", "").sigma
-    <Quantity [ 1.,  2., nan] %>
+    Without any degree of freedom the noise of a cell is not known.
     """
     numbers, wavelength, rows = data_by_wavelength(measurement)
     sigma = np.where(np.asarray(dof) > 0, sigma, np.nan)
@@ -192,7 +134,7 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     Examples
     --------
     >>> import numpy as np
-
+    >>> from astropolcal.calibration.noise import noise_from_errors
     >>> from astropolcal import optics
     >>> from astropolcal.measurement import Measurement
     >>> from astropolcal.observations import Observations, example_table
@@ -289,8 +231,8 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.noise import noise_from_replicates
     >>> from astropolcal import instruments
-
     >>> from astropolcal.measurement import Measurement
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
@@ -344,28 +286,7 @@ def _same_settings(part, tolerance):
 
 
 def equal_axes(angle, tolerance):
-    """
-    Number axes, angles modulo 180 deg, so that those of one number lie within a tolerance.
-
-    Parameters
-    ----------
-    angle : `~numpy.ndarray`
-        In radian, shape (n,).
-    tolerance : float
-        Largest difference among those of one number, in radian.
-
-    Returns
-    -------
-    `~numpy.ndarray` of int
-        Shape (n,).
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> equal_axes(np.deg2rad([0, 45, 179.95, 225]), np.deg2rad(0.1)).tolist()
-    [0, 1, 0, 1]
-    """
+    """Number axes (radian, modulo 180 deg) so that those of one number lie within a tolerance."""
     axis = np.mod(angle, np.pi)
     order = np.argsort(axis, kind="stable")
     gaps = np.diff(axis[order], append=axis[order[0]] + np.pi)
@@ -436,8 +357,8 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.noise import noise_from_null_channel
     >>> from astropolcal import instruments
-
     >>> from astropolcal.measurement import Measurement
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
@@ -525,48 +446,3 @@ def _null_design(observations, frames, null_model):
 
 def _harmonics(angle):
     return np.cos(angle), np.sin(angle)
-
-
-def estimate_noise(measurement, vector=None, *, null_model="constant"):
-    """
-    Return the noise estimated from the data, replicates where there are any.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    vector : array_like, optional
-        Parameters, by default the current ones.
-    null_model : {"constant", "smooth"}
-        For the null channel, see `noise_from_null_channel`.
-
-    Returns
-    -------
-    NoiseEstimate
-        Of replicates where every wavelength has some, otherwise of the null channel.
-
-    Raises
-    ------
-    FitError
-        If neither is possible.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 57.5, 57.5] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> estimate_noise(Measurement(charis.chain(), observations)).method
-    'replicates'
-    """
-    try:
-        noise = noise_from_replicates(measurement, vector)
-    except FitError:
-        return noise_from_null_channel(measurement, vector, null_model=null_model)
-    if (noise.dof > 0).all():
-        return noise
-    return noise_from_null_channel(measurement, vector, null_model=null_model)

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-r"""Groups of data that cross-validation leaves out together.
-
-How residuals scatter and hang together, and what this does to the errors.
+r"""
+How residuals scatter and hang together, and the groups that are left out together.
 
 What a model gets wrong is not independent from datum to datum: neighbouring wavelengths of a pair
 of frames depart alike, and so do the pairs at one setting of the derotator. Errors that count all
@@ -23,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.exceptions import FitError
-from astropolcal.observations import cycle_numbers, is_star
+from astropolcal.observations.quality import cycle_numbers, is_star
 
 __all__ = []
 
@@ -40,35 +39,10 @@ _RUNS = 8
 
 
 def leave_out_groups(measurement):
-    """
-    Return the group of each datum for cross-validation: its derotator angle.
+    """Return the group of each datum for cross-validation: its derotator angle, per dataset.
 
-    On sky the derotator turns slowly, so there a group is one of eight runs of
-    consecutive cycles of the half-wave plate, or one cycle where there are fewer.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Number of the group, shape (n_data,); datasets have their own groups.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames)
-    >>> measurement = Measurement(charis.chain(), observations)
-    >>> int(leave_out_groups(measurement).max())
-    2
+    On sky the derotator turns slowly, so there a group is one of eight runs of consecutive cycles
+    of the half-wave plate, or one cycle where there are fewer.
     """
     groups, first = [], 0
     for dataset in measurement.datasets:
@@ -98,44 +72,11 @@ def _star_runs(dataset):
 
 
 def groups_by(measurement, by="derotator"):
-    """
-    Return the group of each datum for cross-validation.
+    """Return the group of each datum, numbered from 0, by "derotator", "cycle" or "dataset".
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    by : {"derotator", "cycle", "dataset"}
-        A group is a derotator angle of a dataset (of a star: a run of cycles); a cycle of
-        the half-wave plate; or a whole dataset (a night). A cycle is the column ``cycle`` of the
-        frames where there is one; otherwise it ends where a plate angle
-        (of one state of a modulator) comes again or the derotator moves. A
-        datum belongs to the cycle of its plus frame.
-
-    Returns
-    -------
-    `~numpy.ndarray` of int
-        Shape (n_data,); numbered from 0.
-
-    Raises
-    ------
-    FitError
-        If a group has a single member at each wavelength, or there is one
-        group only, or no such way of grouping.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 60] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames)
-    >>> measurement = Measurement(charis.chain(), observations)
-    >>> [int(groups_by(measurement, by).max()) for by in ("derotator", "cycle")]
-    [1, 2]
+    A cycle is the column ``cycle`` of the frames where there is one; otherwise it ends where a
+    plate angle (of one state of a modulator) comes again or the derotator moves. The plus frame of
+    a datum counts.
     """
     if by not in GROUPS:
         raise FitError(f"groups by {by!r}; allowed are {', '.join(GROUPS)}")
@@ -184,25 +125,7 @@ def _members(measurement, groups, by):
 
 
 def what_is_left_out(calibration):
-    """
-    Return what the cross-validation of a calibration has left out, in words.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; its ``fit["groups"]`` counts, by default "derotator".
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-
-    >>> what_is_left_out(SimpleNamespace(fit={"groups": "cycle"}))
-    'half-wave-plate cycles'
-    """
+    """Return what the cross-validation of a calibration has left out, in words."""
     return GROUPS.get(calibration.fit.get("groups", "derotator"), "groups")
 
 
@@ -287,18 +210,7 @@ class _Part:
 
 
 class Scatter:
-    """
-    Covariance of the residuals of a fit.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        Fitted.
-    weighting : Weighting
-        The noise that its fit assumed; only its pattern counts.
-    whitened : Whitened
-        The problem around the solution.
-    """
+    """Covariance of the residuals of a fit; of the weighting only its pattern counts."""
 
     def __init__(self, measurement, weighting, whitened):
         self.measurement = measurement
@@ -306,7 +218,7 @@ class Scatter:
         self._level = 1.0 / weight * np.ones(measurement.n_data)
         residuals = measurement.residuals() * weight
         #: Derivatives of the data to the determined directions, each one standard error long.
-        self.slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T
+        self.slopes = whitened.along(whitened.rows)
         groups = leave_out_groups(measurement)
         self.parts = [
             self._part(i, groups, residuals, whitened.leverage)
@@ -380,18 +292,9 @@ class Scatter:
         return (total + total.T) / 2
 
     def at_settings(self, i):
-        """
-        Return the error of q and of u that all pairs at a setting share, per wavelength.
+        """Return the error of q and u that all pairs at a setting share, per wavelength.
 
-        Parameters
-        ----------
-        i : int
-            Number of the dataset.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Standard deviation, shape (n_wavelengths,); NaN where the dataset has no data.
+        NaN where the dataset has no data.
         """
         part = self.parts[i]
         variance = sum(
@@ -421,11 +324,10 @@ def _uneven(errors):
 
 
 def _found(errors):
-    """
-    Return the correlation of wavelengths that the errors at the settings have, if there is one.
+    """Return the correlation of wavelengths that the errors at the settings have, if there is one.
 
-    Their principal components that have more of the variance than those of independent wavelengths
-    would by chance (Marchenko & Pastur 1967).
+    Of principal components with more variance than independent wavelengths would have by chance
+    (Marchenko & Pastur 1967).
     """
     count, size = errors.shape
     _, singular, shapes = np.linalg.svd(errors, full_matrices=False)
@@ -478,12 +380,11 @@ def _amplitude(bins, residuals, spare):
 
 
 def model_error(measurement, scatter):
-    """
-    Return the error of the model at a setting that it has not seen, for ``Calibration.fit``.
+    """Return the error of the model at a setting that it has not seen, for `Calibration.fit`.
 
-    ``relative_percent`` multiplies the polarization, from sources that are fully polarized;
-    ``absolute_percent`` does not depend on it, from all others. Both are standard errors of Stokes
-    q and u per wavelength; zero, and named in ``missing``, where no dataset tells.
+    ``relative_percent`` multiplies the polarization, from polarized sources; ``absolute_percent``
+    does not, from all others. Standard errors of q and u per wavelength; zero, and in ``missing``,
+    where none tells.
     """
     squares = {"relative": [], "absolute": []}
     if not scatter.is_known:
@@ -502,27 +403,8 @@ def model_error(measurement, scatter):
     return found
 
 
-def kind_of_source(source, chain=None):
-    """
-    Return what a dataset calibrates.
-
-    Parameters
-    ----------
-    source : str or None
-        As the table says.
-    chain : Optic or `~astropy.modeling.CompoundModel`, optional
-        Decides where the table does not say: a polarizer in front is "polarized".
-
-    Returns
-    -------
-    {"polarized", "unpolarized", "star"}
-
-    Examples
-    --------
-    >>> from astropolcal.calibration.noise.scatter import kind_of_source
-    >>> kind_of_source("unpolarized standard star"), kind_of_source("unpolarized")
-    ('star', 'unpolarized')
-    """
+def kind_of_source(source):
+    """Return "polarized", "unpolarized" or "star", from the words of a table."""
     if is_star(source):
         return "star"
     return "unpolarized" if "unpolarized" in (source or "").lower() else "polarized"

@@ -1,15 +1,14 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Robust fits, and the frames that are at odds with a calibration.
-
-A robust loss lets data that depart far from the model count less, by iterated weights: a
-datum with residual r has the noise that a least-squares fit would need to give it the
-weight of the loss. Nothing is dropped; `outlying_data` says which frames depart.
-
+"""
 One noise for all who need it: fit, errors, gauge, tests and sampler.
 
-The noise of a datum is its weight in the fit, the scale of all errors, and the
-width of the likelihood. So that these agree, it is worked out here only, for
-every choice of ``weights``, and stays with the fitted measurement.
+The noise of a datum is its weight in the fit, the scale of all errors, and the width of the
+likelihood. So that these agree, it is worked out here only, for every choice of ``weights``, and
+stays with the fitted measurement.
+
+A robust loss lets data that depart far from the model count less, by iterated weights: a datum with
+residual r has the noise that a least-squares fit would need to give it the weight of the loss.
+Nothing is dropped; `outlying_data` says which frames depart.
 """
 
 from dataclasses import dataclass
@@ -22,12 +21,10 @@ from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import NoiseEstimate, data_by_wavelength
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.observations.quality import MAD_TO_SIGMA
+from astropolcal.observations.quality import MAD_TO_SIGMA, brightness
 
 __all__ = ["outlying_data"]
 
-# noise of a wavelength is at least this share of the median of its dataset
-_ROBUST_FLOOR = 0.1
 # robust standard deviations beyond which a frame is at odds with the model
 _FAR = 4.0
 # smallest weight, so that no datum is lost altogether
@@ -45,40 +42,7 @@ LOSSES = {
 
 
 def robust_sigma(measurement, loss):
-    """
-    Return the noise of every datum that gives it the weight of a robust loss.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        At the values of a fit.
-    loss : str
-        One of `LOSSES`.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_data,).
-
-    Raises
-    ------
-    FitError
-        If the loss is unknown.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
-    >>> data = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> sigma = robust_sigma(Measurement(charis.chain(), data), "huber")
-    >>> bool((sigma < 0.01).all())
-    True
-    """
+    """Return the noise of every datum that gives it the weight of a loss, one of `LOSSES`."""
     if loss not in LOSSES:
         raise FitError(f"loss = {loss!r}; allowed are {', '.join(LOSSES)}")
     residuals = measurement.residuals()
@@ -94,7 +58,7 @@ def _scales(measurement, residuals):
     for row in rows:
         scale[row] = MAD_TO_SIGMA * np.median(np.abs(residuals[row])) if np.size(row) else 0.0
     for where in measurement.segments:
-        least = _ROBUST_FLOOR * np.median(scale[where]) if scale[where].size else 0.0
+        least = _FLOOR * np.median(scale[where]) if scale[where].size else 0.0
         scale[where] = np.maximum(scale[where], max(least, 1e-12))
     return scale
 
@@ -130,8 +94,8 @@ def outlying_data(calibration, limit=_FAR):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.noise import outlying_data
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -147,16 +111,12 @@ def outlying_data(calibration, limit=_FAR):
         rows += _outliers(part, residuals[where], scaled[where], limit)
     rows.sort(key=lambda row: -row[3])
     names = ("dataset", "frames", "residual", "sigma", "brightness")
-    units = {"residual": "percent"}
     table = QTable(rows=rows or None, names=names, dtype=(str, str, float, float, float))
-    for name, unit in units.items():
-        table[name].unit = unit
+    table["residual"].unit = "percent"
     return QTable(table)
 
 
 def _outliers(part, residuals, scaled, limit):
-    from astropolcal.observations import brightness
-
     groups = np.unique(part.group_of_datum)
     members = [part.group_of_datum == g for g in groups]
     # one number a pair of frames, the median over its wavelengths
@@ -200,28 +160,11 @@ _LARGEST = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Weighting:
-    """
-    Noise that a fit assumes of its data.
+    """Noise that a fit assumes of its data.
 
-    Parameters
-    ----------
-    choice : {None, "wavelength", "errors", "given"}
-        Where the noise comes from: one level from the residuals of all data,
-        one a dataset and wavelength from theirs, the errors of the table, or
-        the user.
-    sigma : `~numpy.ndarray`
-        Standard deviation of every datum, shape (n_data,); NaN as long as no
-        fit has told it.
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> equal = Weighting(None, np.full(4, 0.02))
-    >>> print(equal.weight, equal.level)
-    None 0.02
-    >>> Weighting("errors", np.array([0.5, 0.25])).weight.tolist()
-    [2.0, 4.0]
+    ``choice`` says where it comes from: None for one level from all residuals, "wavelength",
+    "errors" of the table, or "given"; ``sigma`` is that of every datum, NaN as long as no fit has
+    told it.
     """
 
     choice: str | None
@@ -261,8 +204,7 @@ class Weighting:
         return Weighting(self.choice, np.full(measurement.n_data, level))
 
     def updated(self, measurement, whitened=None):
-        """
-        Return the noise that the residuals of a fit with this noise show.
+        """Return the noise that the residuals of a fit with this noise show.
 
         ``whitened`` is the linear problem of the measurement with this noise, if at hand.
         """
@@ -270,7 +212,7 @@ class Weighting:
             return self
         whitened = around(measurement, self) if whitened is None else whitened
         if self.choice == "wavelength":
-            sigma = _by_wavelength(measurement, measurement.vector(), whitened.leverage)
+            sigma = _by_wavelength(measurement, whitened.leverage)
             return Weighting(self.choice, sigma)
         freedom = measurement.n_data - whitened.n_taken
         total = np.sum(measurement.residuals() ** 2)
@@ -317,50 +259,10 @@ def first_weighting(measurement, weights):
 
 
 def noise_of(measurement, weights=None):
-    """
-    Return the noise of every datum for a choice of weights.
+    """Return the noise of every datum for a choice of weights, as `calibrate` takes it.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement; where the noise comes from residuals, its current
-        values are those of a fit.
-    weights : {None, "wavelength", "errors"}, NoiseEstimate, Weighting or array_like
-        As for `calibrate`. ``"wavelength"`` is the restricted maximum
-        likelihood of one level for each wavelength of each dataset [1]_.
-
-    Returns
-    -------
-    Weighting
-        That of the fit, if `calibrate` fitted the measurement with the same choice.
-
-    Raises
-    ------
-    FitError
-        If the choice is unknown, the table has no errors, or the residuals
-        tell no noise.
-    ParameterError
-        If the noise given has the wrong shape or is not positive.
-
-    References
-    ----------
-    .. [1] Patterson, H. D. & Thompson, R. 1971, "Recovery of inter-block
-       information when block sizes are unequal", Biometrika 58, 545,
-       doi:10.1093/biomet/58.3.545
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> equal, own = (noise_of(cal.measurement, w).sigma for w in (None, "wavelength"))
-    >>> len(set(equal.round(9))), len(set(own.round(9)))
-    (1, 22)
+    "wavelength" is the restricted maximum likelihood of one level per wavelength of each dataset
+    (Patterson & Thompson 1971, Biometrika 58, 545, doi:10.1093/biomet/58.3.545).
     """
     fitted = measurement.weighting
     same = isinstance(weights, str) or weights is None
@@ -377,36 +279,7 @@ def noise_of(measurement, weights=None):
 
 
 def weighting_of(calibration):
-    """
-    Return the noise that a calibration assumes of its data.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        A calibration with its data.
-
-    Returns
-    -------
-    Weighting
-
-    Raises
-    ------
-    CalibrationFileError
-        If the calibration was read from a file, which holds no data.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> bool(weighting_of(cal).level < 0.01)
-    True
-    """
+    """Return the noise that a calibration, which needs its data, assumes of them."""
     measurement, settings = calibration.live_measurement(), calibration.settings
     if measurement.weighting is None:
         given = settings.get("weights") == GIVEN
@@ -418,8 +291,6 @@ def weighting_of(calibration):
 def _from_settings(measurement, settings):
     """Return a noise given to a fit of the same data, as far as `describe` has kept it."""
     if settings.get("loss", "linear") != "linear":
-        # robust imports the noise, as this module does
-
         return Weighting(GIVEN, robust_sigma(measurement, settings["loss"]))
     _, _, rows = data_by_wavelength(measurement)
     kept = [value for part in settings["noise"] for value in part["sigma_percent"]]
@@ -462,61 +333,13 @@ def _rms(values):
 # ---- from residuals ---------------------------------------------------------------------
 
 
-def residual_noise(measurement, vector=None):
-    r"""
-    Return the noise of every datum as the scatter of a fit's residuals.
+def _by_wavelength(measurement, leverage):
+    r"""Return one level a dataset and wavelength, not below the floor.
 
-    One level for each wavelength of each dataset,
-    :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)`, where the leverage
-    :math:`h_i`, the derivative of a fitted to its observed datum, sums up to
-    the number of parameters determined: data that the parameters follow
-    closely scatter less than their noise [1]_. The leverages are those of a
-    fit with equal weights; see `noise_of` for others.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    vector : array_like, optional
-        Fitted canonical values, by default the measurement's.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_data,); at least a tenth of the median of the dataset.
-
-    Raises
-    ------
-    FitError
-        If at some wavelength no datum is left over by the parameters, or the
-        residuals are zero.
-
-    References
-    ----------
-    .. [1] Hoaglin, D. C. & Welsch, R. E. 1978, "The Hat Matrix in Regression
-       and ANOVA", The American Statistician 32, 17, doi:10.2307/2683469
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> bool(residual_noise(cal.measurement).max() < 0.01)
-    True
+    :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)` with the leverages h (Hoaglin & Welsch 1978, The
+    American Statistician 32, 17).
     """
-    vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
-    equal = Weighting(None, np.full(measurement.n_data, np.nan))
-    return _by_wavelength(measurement, vector, around(measurement, equal, vector).leverage)
-
-
-def _by_wavelength(measurement, vector, leverage):
-    """Return one level a dataset and wavelength, not below the floor."""
-    squares, spare = measurement.residuals(vector) ** 2, 1 - leverage
+    squares, spare = measurement.residuals() ** 2, 1 - leverage
     numbers, wavelength, rows = data_by_wavelength(measurement)
     sigma, levels = np.empty(measurement.n_data), np.full(len(rows), np.nan)
     for i, row in enumerate(rows):

@@ -42,15 +42,9 @@ _PAGE = 4096
 
 
 class Chain:
-    """
-    The steps of a run in memory, and on disk where there is a checkpoint.
+    """The steps of a run in memory, and on disk, every few kept steps, where there is a checkpoint.
 
-    Parameters
-    ----------
-    shape : tuple
-        (n_kept, n_walkers, n_parameters).
-    every : int
-        Number of kept steps after which the file is brought up to date.
+    ``shape`` is (n_kept, n_walkers, n_parameters).
     """
 
     def __init__(self, shape, every):
@@ -68,19 +62,10 @@ class Chain:
 
     @contextmanager
     def open(self, path, description, arrays, resume):
-        """
-        Tie the chain to a checkpoint while a run lasts, continuing what is there.
+        """Tie the chain to a checkpoint while a run lasts, continuing what is there.
 
-        Parameters
-        ----------
-        path : path-like or None
-            The file; None for a run in memory.
-        description : dict
-            What must be the same, in words of JSON.
-        arrays : dict of str to `~numpy.ndarray`
-            What must be the same, as numbers.
-        resume : bool
-            Whether to go on from a file that exists; otherwise it is replaced.
+        ``description`` (JSON) and ``arrays`` must be the same; without ``resume`` a file is
+        replaced.
         """
         if path is None:
             yield self

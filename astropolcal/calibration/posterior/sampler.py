@@ -1,17 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Log-posterior of a measurement, for many parameter vectors at once.
-
-The likelihood is that of normal noise; the priors are those of the fit. It is
-what `~astropolcal.calibration.sample` hands to the sampler, and good for any
-other one.
-
-Where the walkers of a sampler start, and how they move.
-
+"""
 Sample the posterior of a calibration with an ensemble of walkers (emcee).
 
-A run with a checkpoint can be killed at any moment; called again it goes on
-with the same random numbers, so that the chain is the same as without the
-interruption.
+The likelihood is that of normal noise; the priors are those of the fit. A run with a checkpoint can
+be killed at any moment; called again it goes on with the same random numbers, so that the chain is
+the same as without the interruption.
 """
 
 import warnings
@@ -67,8 +60,8 @@ class LogPosterior:
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.posterior import LogPosterior
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -220,16 +213,9 @@ _BIASED_SNOOKER = (3, 1, 6)
 
 
 class Laplace:
-    """
-    The normal distribution around a fit, with the covariance of data and priors.
+    """The normal distribution around a fit, with the covariance of data and priors.
 
-    It leaves out what sits at a bound. Along directions that are not
-    determined it is narrow.
-
-    Parameters
-    ----------
-    log_posterior : LogPosterior
-        The log-posterior, whose centre is the fit.
+    It leaves out what sits at a bound. Along directions that are not determined it is narrow.
     """
 
     def __init__(self, log_posterior):
@@ -265,11 +251,10 @@ class Laplace:
         return coords
 
     def start(self, n_walkers, rng):
-        """
-        Return places of walkers within the bounds, where there is probability.
+        """Return places of walkers within the bounds, where there is probability.
 
-        What is outside of the bounds is drawn again, and mirrored if that does
-        not help; what is impossible comes closer to the fit.
+        What is outside of the bounds is drawn again, and mirrored if that does not help; what is
+        impossible comes closer to the fit.
         """
         low, high, centre = self.log_posterior.low, self.log_posterior.high, self.centre
         coords = self._draw(n_walkers, rng)
@@ -305,13 +290,11 @@ def _inward(log_posterior):
 
 
 def default_moves(emcee, laplace):
-    """
-    Return what moves the walkers, with the share of each.
+    """Return what moves the walkers, with the share of each.
 
-    For few parameters the stretch move. For more, steps around the fit, which
-    in a posterior that is nearly normal are as good in a hundred parameters as
-    in one; steps of what sits at a bound alone; and differential evolution,
-    which needs neither a fit nor a normal posterior.
+    For few parameters the stretch move. For more, steps around the fit, as good in a hundred
+    parameters as in one; steps of what sits at a bound alone; and differential evolution, which
+    needs no fit.
     """
     if laplace.centre.size <= _FEW:
         return [(emcee.moves.StretchMove(), 1.0)]
@@ -324,11 +307,10 @@ def default_moves(emcee, laplace):
 
 
 def _crank_nicolson(emcee, laplace):
-    """
-    Return a step that keeps the normal distribution around the fit.
+    """Return a step that keeps the normal distribution around the fit.
 
-    It is accepted as far as the posterior is that distribution (Cotter et al.
-    2013, Statistical Science 28, 424, doi:10.1214/13-STS421).
+    It is accepted as far as the posterior is that distribution (Cotter et al. 2013, Statistical
+    Science 28, 424, doi:10.1214/13-STS421).
     """
     moved = laplace.determined
 

@@ -1,10 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Packages of the extra ``mcmc``, imported when they are needed.
-
-Whether a chain of samples is long enough, and what the whole of it says.
-
-Samples of a posterior: quantiles, covariance, and whether to believe them.
-"""
+"""Samples of a posterior: quantiles, covariance, and whether the chain is long enough."""
 
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
@@ -21,21 +16,7 @@ __all__ = ["Posterior"]
 
 
 def need(module, what):
-    """
-    Return an optional module, or say how to install it.
-
-    Parameters
-    ----------
-    module : str
-        Name of the module.
-    what : str
-        What needs it, for the message.
-
-    Raises
-    ------
-    AstropolcalError
-        If it is not installed.
-    """
+    """Return an optional module of the extra ``mcmc``, or say how to install it."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -62,28 +43,10 @@ _TAIL = (0.05, 0.95)
 
 
 def autocorrelation(chain):
-    """
-    Return the autocorrelation of an ensemble, averaged over its walkers.
+    """Return the autocorrelation of (n_steps, n_walkers); NaN where nothing moves.
 
-    Deviations are taken from the mean of all walkers, so that walkers that
-    stay in different places count as correlated.
-
-    Parameters
-    ----------
-    chain : array_like
-        One parameter, shape (n_steps, n_walkers).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        For lags 0 to n_steps - 1; NaN where nothing moves.
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> float(autocorrelation(np.random.default_rng(1).normal(size=(100, 8)))[0])
-    1.0
+    Deviations are from the mean of all, so that walkers that stay in different places count as
+    correlated.
     """
     chain = np.asarray(chain, dtype=float)
     deviation = chain - chain.mean()
@@ -99,35 +62,11 @@ def _is_flat(chain):
 
 
 def autocorrelation_time(chain):
-    r"""
-    Return the integrated autocorrelation time of an ensemble, in steps.
+    r"""Return the integrated autocorrelation time of (n_steps, n_walkers), in steps.
 
-    :math:`\tau = 1 + 2\sum_{t=1}^{M}\rho(t)` with the smallest window M that
-    is at least :math:`5\tau` [1]_, [2]_.
-
-    Parameters
-    ----------
-    chain : array_like
-        One parameter, shape (n_steps, n_walkers).
-
-    Returns
-    -------
-    float
-        NaN where nothing moves.
-
-    References
-    ----------
-    .. [1] Sokal, A. 1997, "Monte Carlo Methods in Statistical Mechanics",
-       doi:10.1007/978-1-4899-0319-8_6
-    .. [2] Goodman, J. & Weare, J. 2010, CAMCoS 5, 65, doi:10.2140/camcos.2010.5.65
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> noise = np.random.default_rng(1).normal(size=(5000, 8))
-    >>> round(autocorrelation_time(noise), 1)
-    1.0
+    :math:`\tau = 1 + 2\sum_{t=1}^{M}\rho(t)` with the smallest window M of at least :math:`5\tau`
+    (Sokal 1997; Goodman & Weare 2010, CAMCoS 5, 65, doi:10.2140/camcos.2010.5.65); NaN where
+    nothing moves.
     """
     time = 2 * np.cumsum(autocorrelation(chain)) - 1
     wide = np.arange(len(time)) >= _WINDOW * time
@@ -135,77 +74,17 @@ def autocorrelation_time(chain):
 
 
 def autocorrelation_times(chain):
-    """
-    Return the autocorrelation time of every parameter, in kept steps.
-
-    Parameters
-    ----------
-    chain : `~numpy.ndarray`
-        Shape (n_steps, n_walkers, n_parameters).
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_parameters,).
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> noise = np.random.default_rng(1).normal(size=(5000, 8, 2))
-    >>> autocorrelation_times(noise).round(1)
-    array([1., 1.])
-    """
+    """Return the autocorrelation time of each parameter of a (n_steps, n_walkers, n) chain."""
     return np.array([autocorrelation_time(chain[:, :, i]) for i in range(chain.shape[2])])
 
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
-    r"""
-    What a run of walkers says of itself, and of each of its parameters.
+    r"""What a run of walkers says of itself and of each parameter after the burn-in.
 
-    It is worked out from all steps behind the burn-in and stays with a
-    posterior that is thinned. Arrays have one value a parameter, the
-    quantiles in its unit; NaN where a parameter did not move.
-
-    Parameters
-    ----------
-    n_steps : int
-        Steps of the sampler, burn-in included.
-    burn_in : int
-        Steps of the sampler that were left out at the start.
-    n_draws : int
-        Samples of all walkers from which the rest is worked out.
-    times : array_like
-        Integrated autocorrelation times, in steps of the sampler.
-    median, lower, upper : array_like
-        Quantiles 0.5, 0.16 and 0.84.
-    std : array_like
-        Standard deviations.
-    r_hat : array_like or None
-        Rank-normalized split :math:`\hat R` over the walkers [1]_; None
-        without arviz-stats.
-    ess_bulk, ess_tail : array_like or None
-        Effective sample sizes of the middle and of the quantiles 0.05 and
-        0.95 [1]_.
-
-    Raises
-    ------
-    ParameterError
-        If the arrays differ in shape.
-
-    References
-    ----------
-    .. [1] Vehtari, A. et al. 2021, Bayesian Analysis 16, 667, doi:10.1214/20-BA1221
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> noise = np.random.default_rng(1).normal(size=(500, 8, 1))
-    >>> found = Convergence.of(noise)
-    >>> found.converged, found.n_draws
-    (True, 4000)
+    Steps are those of the sampler. :math:`\hat R` is rank-normalized and split; ``ess_bulk`` and
+    ``ess_tail`` are effective sample sizes (Vehtari et al. 2021, Bayesian Analysis 16, 667); None
+    without arviz-stats.
     """
 
     n_steps: int
@@ -233,23 +112,9 @@ class Convergence:
 
     @classmethod
     def of(cls, chain, *, thin=1, burn_in=0, times=None):
-        """
-        Work it out.
+        """Work it out from a chain (n_steps, n_walkers, n_parameters), thinned by ``thin``.
 
-        Parameters
-        ----------
-        chain : array_like
-            Shape (n_steps, n_walkers, n_parameters).
-        thin : int
-            Steps of the sampler for each step of the chain.
-        burn_in : int
-            Steps of the chain to leave out.
-        times : array_like, optional
-            Autocorrelation times in steps of the sampler, if they are known.
-
-        Returns
-        -------
-        Convergence
+        ``burn_in`` counts steps of the chain, ``times`` those of the sampler.
         """
         used = np.asarray(chain, dtype=float)[burn_in:]
         times = autocorrelation_times(used) * thin if times is None else times
@@ -278,19 +143,7 @@ class Convergence:
         return not self.complaints(["?"] * self.times.size)
 
     def complaints(self, names):
-        """
-        Return what is wrong, one sentence without a full stop each.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Name of each parameter.
-
-        Returns
-        -------
-        list of str
-            Empty for a run that has converged.
-        """
+        """Return what is wrong, one sentence without a full stop each."""
         stuck = [name for name, time in zip(names, self.times, strict=True) if np.isnan(time)]
         if stuck:
             return [f"{', '.join(stuck)} did not move"]
@@ -321,14 +174,7 @@ class Convergence:
         return int(np.ceil(needed / step) * step)
 
     def agreement(self):
-        """
-        Return the largest R-hat and the smallest effective sample size in words.
-
-        Returns
-        -------
-        str
-            Empty where they are not known.
-        """
+        """Return the largest R-hat and the smallest effective sample size in words, if known."""
         if self.r_hat is None or not np.isfinite(self.times).all():
             return ""
         size = min(self.ess_bulk.min(), self.ess_tail.min())
@@ -423,9 +269,9 @@ class Posterior:
 
     Examples
     --------
+    >>> from astropolcal.calibration.posterior import Posterior
     >>> import astropy.units as u
     >>> import numpy as np
-
     >>> chain = np.random.default_rng(1).normal(3.0, 0.1, size=(4000, 4, 1))
     >>> posterior = Posterior(["hwp.theta"], [u.deg], chain, np.zeros((4000, 4)))
     >>> posterior.quantile("hwp.theta", 0.5).round(1)

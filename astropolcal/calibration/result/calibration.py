@@ -1,8 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""The result of a calibration: chains, errors, accuracy, posterior, provenance.
-
-Bring a calibration that was read from a file and its observations together again.
-"""
+"""The result of a calibration: chains, errors, accuracy, posterior, provenance."""
 
 import warnings
 from copy import deepcopy
@@ -49,29 +46,7 @@ def _above(name):
 
 @dataclass
 class DatasetRecord:
-    """
-    What a calibration remembers of one dataset.
-
-    Parameters
-    ----------
-    name : str
-        Name of the dataset.
-    source : str or None
-        What sent the light.
-    content_hash : str
-        SHA-256 of the table's content.
-    meta : dict
-        The table's meta: instrument, date, optics in the beam.
-    n_frames, n_masked : int
-        Frames, and cells of frame and wavelength that were masked.
-    accuracy : `~astropy.table.QTable`
-        Accuracy per wavelength, see `accuracy_table`.
-
-    Examples
-    --------
-    >>> DatasetRecord("night1", "polarized", "00", {}, 64, 0).name
-    'night1'
-    """
+    """What a calibration remembers of a dataset; masked are cells of frame and wavelength."""
 
     name: str
     source: str | None
@@ -521,23 +496,9 @@ _SHOWN = 12
 
 
 def measurement_of_all(calibration, observations, positions=None):
-    """
-    Return the measurement that a calibration was fitted to.
+    """Return the measurement that a calibration read from a file was fitted to.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    observations : Observations or sequence of Observations
-        Its datasets, in any order.
-    positions : dict or sequence of dict, optional
-        Position of every stage, for each of ``observations``.
-
-    Raises
-    ------
-    CalibrationFileError
-        If a table is missing or is another one, or the residuals are not those
-        of the calibration.
+    Tables are recognized by content, and the residuals have to be those of the fit.
     """
     given = [observations] if isinstance(observations, Observations) else list(observations)
     positions = [positions] if isinstance(positions, dict) else positions

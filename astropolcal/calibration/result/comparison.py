@@ -138,11 +138,10 @@ def _rows(label, chain, wavelength, instrument, calibration):
 
 
 class _Optics:
-    """
-    What is compared of a chain, continued smoothly around its values.
+    """What is compared of a chain, continued smoothly around its values.
 
-    Retardances are folded to 0 to 180 deg and diattenuations are lengths: both have a kink, which
-    a central difference would step over. The vectors of the chain itself say which side to follow.
+    Retardances are folded to 0 to 180 deg and diattenuations are lengths: both have a kink, which a
+    central difference would step over. The vectors of the chain itself say which side to follow.
     """
 
     def __init__(self, chain, wavelength):
@@ -219,11 +218,10 @@ def _quaternions(optic, wavelength):
 
 
 def _retardance(quaternions, about):
-    """
-    Return angles of turn in degree, from 0 to 180 deg at the quaternions ``about``.
+    """Return angles of turn in degree, from 0 to 180 deg at the quaternions ``about``.
 
-    A quaternion and its negative are the same turn; the one nearer to ``about`` continues the
-    angle beyond 180 deg, where half a wave has neither a sign nor a kink.
+    A quaternion and its negative are the same turn; the one nearer to ``about`` continues the angle
+    beyond 180 deg, where half a wave has neither a sign nor a kink.
     """
     near = np.sign(np.sum(quaternions * about, axis=-1, keepdims=True)) * quaternions
     return 2 * np.rad2deg(np.arctan2(np.linalg.norm(near[..., 1:], axis=-1), near[..., 0]))
@@ -253,48 +251,3 @@ def _filters(instrument, wavelength):
         str(names[i]) if off[i] <= _SAME_FILTER else ""
         for off, i in zip(nearest, nearest.argmin(axis=1), strict=True)
     ]
-
-
-def comparison_text(table):
-    """
-    Return the table of `compare` as text, each quantity with its error.
-
-    Parameters
-    ----------
-    table : `~astropy.table.QTable`
-        What `compare` returned.
-
-    Returns
-    -------
-    str
-        One line for each member and wavelength, retardances in degree, diattenuations and
-        efficiencies in percent; ``-`` where an instrument has no such optic. Where the table has
-        no error, there is none.
-
-    Examples
-    --------
-    >>> from astropolcal.calibration import compare
-    >>> print(comparison_text(compare(["irdis"]))[:42])
-    label  filter  wavelength  hwp_retardance
-    """
-    lines = [["label", "filter", "wavelength", *_COMPARED]]
-    for row in table:
-        wavelength = f"{row['wavelength'].to_value(u.nm):.1f}"
-        words = [_words(key, row[key], row[f"{key}_std"]) for key in _COMPARED]
-        lines.append([str(row["label"]), str(row["filter"]) or "-", wavelength, *words])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    padded = ([f"{word:<{n}}" for word, n in zip(line, widths, strict=True)] for line in lines)
-    return "\n".join("  ".join(line).rstrip() for line in padded)
-
-
-def _words(key, value, std):
-    """Return a value with its error, to two digits of the error."""
-    # degrees, percent, and shares of one; as exact as optics are known where there is no error
-    scale, digits = (1, 1) if key.endswith("_retardance") else (100, 2)
-    value, std = (scale * float(getattr(x, "value", x)) for x in (value, std))
-    if np.isnan(value):
-        return "-"
-    if not np.isfinite(std):
-        return f"{value:.{digits}f}" + (" ± inf" if np.isinf(std) else "")
-    digits = int(np.clip(1 - np.floor(np.log10(std)), 0, 6))
-    return f"{value:.{digits}f} ± {std:.{digits}f}"

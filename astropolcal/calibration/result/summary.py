@@ -1,8 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""A calibration in words for the terminal, and in numbers for machines.
-
-What a summary says of mirrors, of stars that no fit saw, and of what is left open on sky.
-"""
+"""A calibration in words for the terminal, and in numbers for machines."""
 
 import re
 import textwrap
@@ -43,39 +40,7 @@ _ELEMENT = re.compile(r"(\w+\.\w+)\[(\d+)\]")
 
 
 def summary(calibration, targets=TARGETS, full=False):
-    """
-    Return a calibration as text of at most 80 columns.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    targets : sequence of (dolp, aolp)
-        Targets whose accuracy is given, see
-        `~astropolcal.calibration.target_accuracies`.
-    full : bool
-        Whether to say everything; by default the text has less than 24 lines.
-
-    Returns
-    -------
-    str
-        The five lines of `~astropolcal.calibration.verdict`, the parameters and how
-        good the fit is. In full also the accuracy of each dataset, the parameters
-        given per wavelength, what the data do not determine, and the gauge.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> print(summary(cal).splitlines()[0])
-    Usable
-    """
+    """Return a calibration as text of at most 80 columns, in less than 24 lines unless ``full``."""
     found = verdict(calibration, targets)
     if not full:
         return "\n".join([*compact_lines(calibration, found, HEIGHT - 1), HINT])
@@ -390,37 +355,7 @@ def _fitted_star(table):
 
 
 def to_dict(calibration, targets=TARGETS):
-    """
-    Return a calibration as plain numbers, lists and strings, ready for JSON.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    targets : sequence of (dolp, aolp)
-        Targets whose accuracy is given, see
-        `~astropolcal.calibration.target_accuracies`.
-
-    Returns
-    -------
-    dict
-        Keys ``verdict, instrument, observable, fitter, strategy, seconds, n_data,
-        n_free, rank, converged, datasets, standards, targets, parameters,
-        null_directions`` and others; what is not a number is None.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> to_dict(cal)["n_free"]
-    49
-    """
+    """Return a calibration as plain numbers, lists and strings, ready for JSON; NaN is None."""
     settings, fit = calibration.settings, calibration.fit
     content = {
         "verdict": verdict(calibration, targets).to_dict(),
@@ -617,11 +552,10 @@ def _entry(table):
 
 
 def open_on_sky(calibration):
-    """
-    Return what is open or badly determined and changes what is measured on sky.
+    """Return what is open or badly determined and changes what is measured on sky, worst first.
 
-    Of each direction ``kind``, ``words`` and the changes ``aolp_deg`` and
-    ``dolp_percent``, least and largest of the wavelengths; the worst first.
+    Of each direction ``kind``, ``words``, and least and largest change ``aolp_deg`` and
+    ``dolp_percent``.
     """
     finding = calibration.identifiability
     return [

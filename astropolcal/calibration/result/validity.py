@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""For what a calibration holds: instrument, mode, dates, optics in the beam; and its hash."""
+"""For what a calibration holds: instrument, mode, dates, optics in the beam."""
 
 from dataclasses import asdict, dataclass, replace
 
@@ -41,6 +41,7 @@ class Validity:
 
     Examples
     --------
+    >>> from astropolcal.calibration.result import Validity
     >>> validity = Validity("charis", valid_from="2025-10-01", optics_in=["nbs"])
     >>> validity.holds("2025-10-05T09:30"), validity.holds("2025-09-30")
     (True, False)
@@ -129,33 +130,9 @@ def optics_sets(optics_in):
 
 
 def validity_of(calibration):
-    """
-    Return for what a calibration holds.
+    """Return for what a calibration holds: what was stated with `with_validity`, else its datasets.
 
-    What was stated with `with_validity` counts. Of the rest, mode, start (the first
-    date) and optics come from the datasets that it was made from.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-
-    Returns
-    -------
-    Validity
-
-    Raises
-    ------
-    CalibrationFileError
-        If what was stated makes no sense, or the date of a dataset is not one.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-
-    >>> night = SimpleNamespace(meta={"date": "2025-10-05", "mode": "J"}, source="star", name="n")
-    >>> print(validity_of(SimpleNamespace(settings={}, instrument="lab", datasets=[night])))
-    lab, J, from 2025-10-05 on, optics in the beam not known
+    Mode, start (the first date) and optics come from the datasets.
     """
     stated = calibration.settings.get("validity") or {}
     if not isinstance(stated, dict) or set(stated) - set(_STATED):

@@ -1,8 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Whether a calibration can be used, and if not why, in five lines for the top of a summary.
-
-A summary that fits a terminal of 80 columns and 24 lines.
-"""
+"""Whether a calibration can be used, and why not, in five lines; and a page for 80 columns."""
 
 import textwrap
 from dataclasses import dataclass
@@ -57,6 +54,7 @@ class Verdict:
 
     Examples
     --------
+    >>> from astropolcal.calibration.result import Verdict
     >>> Verdict(False, ["the fit did not converge"], [], ["NOT USABLE AS IT IS: ..."]).usable
     False
     """
@@ -79,35 +77,7 @@ class Verdict:
 
 
 def verdict(calibration, targets=TARGETS):
-    """
-    Return whether a calibration can be used, and why not.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; one read from a file will do.
-    targets : sequence of (dolp, aolp)
-        Targets whose accuracy the words give, see
-        `~astropolcal.calibration.target_accuracies`.
-
-    Returns
-    -------
-    Verdict
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> found = verdict(cal)
-    >>> found.usable, len(found.words)
-    (True, 5)
-    """
+    """Return whether a calibration can be used, and why not; ``targets`` are (DoLP, AoLP)."""
     known = calibration.parameter_values()
     free = {n: e for n, e in known.items() if not (e["fixed"] or e["tied"])}
     tables = target_accuracies(calibration, targets)

@@ -1,13 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Covariance of calibrated parameters, with their names and units.
+"""
+Covariance of calibrated parameters, with names and units, and errors at a bound.
 
-The matrix has no number for a parameter that the data leave open. What the
-data do know of such parameters (a sum of two angles, say) is kept beside it:
-the determined directions with their errors (``factor``) and the open ones
-(``null``). With these, the error of anything derived from the parameters is
-right: finite where the open directions do not move it, infinite where they do.
-
-Errors at a bound, and next to one.
+The matrix has no number for a parameter that the data leave open. What the data do know of such
+parameters (a sum of two angles, say) is kept beside it: the determined directions with their errors
+(``factor``) and the open ones (``null``). With these, the error of anything derived from the
+parameters is right: finite where the open directions do not move it, infinite where they do.
 
 A parameter at its bound has no standard error: chi-square still falls beyond. How far it may go
 inward is known, and is its one-sided error. The errors of all others include that it may; where
@@ -22,7 +20,6 @@ from astropolcal.calibration.identifiability.linearized import LARGE, declared_s
 from astropolcal.calibration.noise.scatter import Scatter
 from astropolcal.calibration.noise.weighting import Weighting, around, weighting_of
 from astropolcal.exceptions import ParameterError
-from astropolcal.units import canonical_factor
 
 __all__ = ["Covariance"]
 
@@ -62,8 +59,8 @@ class Covariance:
 
     Examples
     --------
+    >>> from astropolcal.calibration.uncertainty import Covariance
     >>> import astropy.units as u
-
     >>> covariance = Covariance(["hwp.theta"], [u.deg], [[0.04]])
     >>> covariance.std("hwp.theta")
     <Quantity 0.2 deg>
@@ -112,27 +109,6 @@ class Covariance:
             raise ParameterError(f"{key} of a covariance has a value that is not finite")
         return rows
 
-    @classmethod
-    def from_canonical(cls, free, matrix):
-        """
-        Make it from a matrix in canonical units.
-
-        Parameters
-        ----------
-        free : FreeParameters
-            The free parameters that the rows belong to.
-        matrix : `~numpy.ndarray`
-            Shape (n_free, n_free), in radian, micrometre or 1.
-
-        Returns
-        -------
-        Covariance
-        """
-        units = [slot.unit for slot in free.slots for _ in range(slot.size)]
-        per_unit = np.array([1 / canonical_factor(unit) for unit in units])
-        # one factor for the row and one for the column
-        return cls(free.names, units, matrix * np.outer(per_unit, per_unit))
-
     def __len__(self):
         return len(self.names)
 
@@ -179,6 +155,7 @@ class Covariance:
 
         Examples
         --------
+        >>> from astropolcal.calibration.uncertainty import Covariance
         >>> one = Covariance(["wollaston.efficiency"], [None], [[1e-4]])
         >>> float(one.std("wollaston.efficiency"))
         0.01
@@ -223,9 +200,9 @@ class Covariance:
         --------
         Of two angles the data know the sum only:
 
+        >>> from astropolcal.calibration.uncertainty import Covariance
         >>> import astropy.units as u
         >>> import numpy as np
-
         >>> covariance = Covariance(["a.theta", "b.theta"], [u.deg, u.deg],
         ...                         np.full((2, 2), np.nan), factor=[[0.1, 0.1]], null=[[1, -1]])
         >>> float(covariance.propagate([1, 1]).round(3)), float(covariance.propagate([1, 0]))
@@ -241,8 +218,7 @@ class Covariance:
 
     def _spread(self, slopes):
         axes = self._axes()
-        scaled = slopes * axes.steps
-        return axes.spread(scaled @ axes.known.T, scaled @ axes.open.T, scaled @ axes.blind.T)
+        return axes.spread(*axes.along(slopes))
 
     def _axes(self):
         """Split the space of the parameters, each in degree, micrometre or percent."""
@@ -284,6 +260,11 @@ class _Axes:
     blind: np.ndarray
     partial: bool
 
+    def along(self, slopes):
+        """Return slopes per declared unit along known, open and blind directions."""
+        scaled = slopes * self.steps
+        return tuple(scaled @ part.T for part in (self.known, self.open, self.blind))
+
     def spread(self, along_known, along_open, along_blind):
         """Return the spread of quantities from their slopes along the axes, (k, n_axes) each."""
         parts = [along_known, along_open, along_blind]
@@ -321,33 +302,9 @@ class _Spread:
 
 
 def full_covariance(calibration):
-    """
-    Return the covariance of a calibration with its determined and open directions.
+    """Return the covariance of a calibration with its determined and open directions.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration. One read from a file gives the directions only if the
-        file holds them; otherwise errors are known for what depends on
-        determined parameters, and the rest is NaN or infinite.
-
-    Returns
-    -------
-    Covariance
-        With the matrix of ``calibration.covariance``, ``factor`` and ``null``.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> full_covariance(cal).factor.shape
-    (49, 49)
+    From an old file without directions only what depends on determined parameters has an error.
     """
     known = calibration.covariance
     if known.factor is not None:
@@ -361,32 +318,16 @@ def full_covariance(calibration):
 
 
 def covariance_around(measurement, whitened, weighting, scatter=None):
-    """
-    Return the covariance with its directions, of a problem that is decomposed once.
+    """Return the covariance with its directions, of a problem that is decomposed once.
 
-    It is the sandwich (White 1980, Econometrica 48, 817) of how the residuals scatter and hang
-    together at the wavelengths, pairs and settings of each dataset; where residuals do not tell
-    it, that of independent data. What is at a bound may go inward by its one-sided error.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    whitened : Whitened
-        The problem around its solution.
-    weighting : Weighting
-        The noise; without any there is no error.
-    scatter : Scatter, optional
-        Of the residuals, if it is at hand.
-
-    Returns
-    -------
-    Covariance
+    It is the sandwich (White 1980, Econometrica 48, 817) of how residuals scatter and hang
+    together; where they do not tell, that of independent data. What is at a bound may go inward by
+    its error.
     """
     scatter = Scatter(measurement, weighting, whitened) if scatter is None else scatter
     if not scatter.is_known:
         return white_covariance(measurement, whitened, weighting)
-    prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T * weighting.level
+    prior = whitened.along(whitened.prior_rows) * weighting.level
     slack = slack_of_bounds(measurement, whitened)
     return sandwich(measurement, whitened, scatter.middle() + prior.T @ prior, slack)
 
@@ -394,17 +335,21 @@ def covariance_around(measurement, whitened, weighting, scatter=None):
 def white_covariance(measurement, whitened, weighting):
     """Return the covariance of independent data with the noise that the fit assumed."""
     free, level = measurement.free, weighting.level
-    known = Covariance.from_canonical(free, whitened.covariance() * level**2)
+    # canonical to declared units: one factor for the row and one for the column
+    declared = 1 / free.factors()
+    matrix = whitened.covariance() * level**2 * np.outer(declared, declared)
     per_unit = whitened.scale / free.factors()
     factor = whitened.factor() * (level * per_unit) if np.isfinite(level) else None
-    return Covariance(
-        known.names, known.units, known.matrix, factor=factor, null=whitened.null() * per_unit
-    )
+    null = whitened.null() * per_unit
+    return Covariance(free.names, _units(free), matrix, factor=factor, null=null)
+
+
+def _units(free):
+    return [slot.unit for slot in free.slots for _ in range(slot.size)]
 
 
 def sandwich(measurement, whitened, middle, slack=None):
-    """
-    Return the covariance from that of the pulls on the determined directions.
+    """Return the covariance from that of the pulls on the determined directions.
 
     ``slack`` has further directions, each one standard error long, in the steps of the problem.
     """
@@ -417,14 +362,13 @@ def sandwich(measurement, whitened, middle, slack=None):
     # back to orthogonal directions, as `Covariance` keeps them
     _, sizes, principal = np.linalg.svd(rows, full_matrices=False)
     free = measurement.free
-    units = [slot.unit for slot in free.slots for _ in range(slot.size)]
     per_unit = whitened.scale / free.factors()
     factor, null = sizes[:, None] * principal * per_unit, whitened.null() * per_unit
     matrix = np.full((free.size, free.size), np.nan)
     columns = whitened.live[whitened.errors.determined]
     determined = factor[:, columns]
     matrix[np.ix_(columns, columns)] = determined.T @ determined
-    return Covariance(free.names, units, matrix, factor=factor, null=null)
+    return Covariance(free.names, _units(free), matrix, factor=factor, null=null)
 
 
 def residual_variance(calibration):
@@ -479,47 +423,10 @@ _UNIFORM = 1 / np.sqrt(12)
 
 
 def errors_at_bounds(measurement, whitened):
-    r"""
-    Return one-sided errors of parameters at a bound, and what they do to the other errors.
+    """Return one-sided errors at bounds (``inward``) and what they do to others (``released``).
 
-    In the linear problem around the solution, with all others refitted, chi-square in units of the
-    noise rises inward by :math:`2 g t + t^2 / s^2`: *g* is the gradient that pushes the parameter
-    against its bound, *s* its error were there no bound. The one-sided error is where that is one.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The fitted measurement, with its ``weighting``.
-    whitened : Whitened
-        The linear problem around its solution.
-
-    Returns
-    -------
-    dict
-        ``inward``: name to the one-sided error in the parameter's unit, infinite where the data do
-        not limit it before the opposite bound. ``released``: name of every other parameter whose
-        error grows by more than a tenth without the bounds, to the ratio of the two errors,
-        ``times``, with the bound as exact in the smaller one; the names of those at a bound that
-        matter, ``by``; and what they add to its error in its unit, as far as they may go inward,
-        ``slack``, and if there were no bounds, ``without``.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.calibration.noise.weighting import around
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> data = simulate(chain, charis.wavelength, frames, seed=2)
-    >>> polarizer = chain["calibration_polarizer"]
-    >>> polarizer.theta, polarizer.theta.bounds = 91 * u.deg, (90.2, 95)
-    >>> cal = calibrate(chain, data, fix={"hwp.theta": None, "derotator.theta": None})
-    >>> problem = around(cal.measurement, cal.measurement.weighting)
-    >>> list(errors_at_bounds(cal.measurement, problem)["inward"])
-    ['calibration_polarizer.theta']
+    With all others refitted, chi-square rises inward by 2 g t + t^2 / s^2: g is the gradient that
+    pushes against the bound, s the error were there none. The one-sided error is where that is one.
     """
     if not whitened.held.any():
         return {"inward": {}, "released": {}}
@@ -539,29 +446,9 @@ def errors_at_bounds(measurement, whitened):
 
 
 def slack_of_bounds(measurement, whitened):
-    """
-    Return how the parameters move while one at its bound goes inward by its one-sided error.
+    """Return how parameters move while one at its bound goes inward by its one-sided error.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The fitted measurement, with its ``weighting``.
-    whitened : Whitened
-        The linear problem around its solution.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_held, n_free), in steps of a degree, micrometre or percent.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> import numpy as np
-
-    >>> nothing = SimpleNamespace(held=np.zeros(3, dtype=bool), scale=np.ones(3))
-    >>> slack_of_bounds(None, nothing).shape
-    (0, 3)
+    Shape (n_held, n_free), in steps of a degree, micrometre or percent.
     """
     if not whitened.held.any():
         return np.zeros((0, whitened.scale.size))
@@ -574,7 +461,9 @@ def _inward(measurement, whitened):
     held = np.flatnonzero(whitened.held)
     columns, residual, response = _without_others(measurement, whitened, held)
     low, high = measurement.free.bounds()
-    inward = np.where(_at_low(measurement, held), 1.0, -1.0)
+    vector = measurement.vector()
+    # from the lower bound up, from the upper one down
+    inward = np.where((vector - low <= high - vector)[held], 1.0, -1.0)
     widths = (high - low)[held] / whitened.scale[held]
     steps = _one_sided(columns * inward, residual, measurement.weighting.level, widths)
     return held, columns, response, steps, widths
@@ -590,12 +479,6 @@ def _moved(whitened, held, response, steps, widths):
     return rows * np.where(np.isfinite(steps), steps, 0.0)[:, None]
 
 
-def _at_low(measurement, held):
-    """Return which of those at a bound are at the lower one."""
-    vector, (low, high) = measurement.vector(), measurement.free.bounds()
-    return (vector - low <= high - vector)[held]
-
-
 def _without_others(measurement, whitened, held):
     """Return derivatives and residuals less what the live parameters take up, and how these go."""
     vector, weighting = measurement.vector(), measurement.weighting
@@ -605,7 +488,7 @@ def _without_others(measurement, whitened, held):
     priors = weighting.level * measurement.free.prior_residuals(vector)
     residual = np.concatenate([data, priors])
     # orthonormal: each determined direction in units of its standard error
-    basis = rows[:, whitened.live] @ whitened.errors.half.T
+    basis = whitened.along(rows)
     along = basis.T @ rows[:, held]
     columns = rows[:, held] - basis @ along
     size = np.linalg.norm(columns, axis=0)
@@ -667,32 +550,10 @@ def _released(names, whitened, held, columns, response):
 
 
 def status_of(entry):
-    """
-    Say of each element of a parameter whether it can be trusted.
+    """Return one of `STATUSES` for each element of an entry of `Calibration.parameter_values`.
 
-    Parameters
-    ----------
-    entry : dict
-        As `~astropolcal.calibration.Calibration.parameter_values` has it: ``std``,
-        ``std_released``, ``unit``, ``bounds``, ``fixed``, ``tied``, ``at_bound``,
-        ``identifiable``.
-
-    Returns
-    -------
-    `~numpy.ndarray` of str
-        One of `STATUSES` each, of the shape of ``std``. Badly determined is what has an error of
-        more than 5 deg, 0.05 mm or 0.05, or larger than that of something anywhere between its
-        bounds.
-
-    Examples
-    --------
-    >>> import numpy as np
-
-    >>> entry = {"std": np.array([0.01, 0.2]), "std_released": np.full(2, np.nan), "unit": None}
-    >>> entry |= {"fixed": False, "tied": None, "at_bound": np.zeros(2, dtype=bool)}
-    >>> entry |= {"bounds": (0, 1), "identifiable": np.ones(2, dtype=bool)}
-    >>> status_of(entry).tolist()
-    ['determined', 'badly determined']
+    Badly determined is an error of more than 5 deg, 0.05 mm or 0.05, or larger than that of a value
+    anywhere between the bounds.
     """
     shape = np.shape(entry["std"])
     if entry["fixed"] or entry["tied"]:

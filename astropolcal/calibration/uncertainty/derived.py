@@ -1,14 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Quantities that follow from a calibration, with their errors.
+"""
+Quantities that follow from a calibration, with their errors.
 
-To first order: with g the derivative of a quantity to the parameters and C
-their covariance, the variance is g C g. A quantity that moves along a
-direction which the data leave open has an infinite error, however small the
-change: no pseudo-inverse hides it.
-
-Retardances, efficiencies, matrices, predictions and sky Stokes parameters with their errors.
-
-Diattenuation and retardance of calibrated mirrors, beside those of bare metals.
+To first order: with g the derivative of a quantity to the parameters and C their covariance, the
+variance is g C g. A quantity that moves along a direction which the data leave open has an infinite
+error, however small the change: no pseudo-inverse hides it.
 """
 
 from dataclasses import dataclass, field
@@ -18,10 +14,10 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import led
+from astropolcal.calibration.system import free_of, from_first_stage
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import (
     find_optic,
-    join,
     leaves,
     system_mueller,
     system_mueller_derivatives,
@@ -30,7 +26,6 @@ from astropolcal.chain import (
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.optics import (
-    COORDINATES,
     Diattenuator,
     DiattenuatorRetarder,
     MetalMirror,
@@ -75,8 +70,8 @@ class Derived:
 
     Examples
     --------
+    >>> from astropolcal.calibration.uncertainty import Derived
     >>> import numpy as np
-
     >>> Derived(np.array([0.9]), np.array([0.01]), lambda: np.array([[1e-4]])).is_determined
     array([ True])
     """
@@ -169,9 +164,7 @@ def propagate(calibration, function, derivatives=None):
         else np.zeros((np.size(value), 0))
         for rows in (axes.known, axes.open, axes.blind)
     ]
-    # the basis of open directions is arbitrary; a user asks what one degree of a parameter does
-    changes = parts[1] @ _to_leads(free, axes.open) if len(axes.open) else None
-    return _package(free, axes, value, axes.spread(*parts), changes)
+    return _package(free, axes, value, parts)
 
 
 def slopes_of(free, derivatives, shape):
@@ -198,23 +191,16 @@ def slopes_of(free, derivatives, shape):
 def derive(calibration, free, value, slopes):
     """Return a quantity with its error from its derivatives per declared unit."""
     axes = full_covariance(calibration)._axes()
-    scaled = slopes * axes.steps
-    along_open = scaled @ axes.open.T
-    spread = axes.spread(scaled @ axes.known.T, along_open, scaled @ axes.blind.T)
-    changes = along_open @ _to_leads(free, axes.open) if len(axes.open) else None
-    return _package(free, axes, value, spread, changes)
+    return _package(free, axes, value, axes.along(slopes))
 
 
-def _to_leads(free, null):
-    """Return what turns changes along the open directions into those per leading parameter."""
-    reduced = np.array([vector for vector, _ in led(free, null)])
-    return null @ reduced.T
-
-
-def _package(free, axes, value, spread, changes):
-    shape, moved = np.shape(value), {}
-    if changes is not None and spread.is_open.any():
-        names = [lead for _, lead in led(free, axes.open)]
+def _package(free, axes, value, along):
+    """Return a quantity with its error from its slopes along the axes of the covariance."""
+    shape, moved, spread = np.shape(value), {}, axes.spread(*along)
+    if spread.is_open.any():
+        # the basis of open directions is arbitrary; a user asks what one degree of a parameter does
+        reduced, names = zip(*led(free, axes.open), strict=True)
+        changes = along[1] @ axes.open @ np.array(reduced).T
         limit = 1e-5 * np.abs(changes).max()
         moved = {
             name: change.reshape(shape)
@@ -262,8 +248,8 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import derived_retardance
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -325,8 +311,8 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import derived_efficiency
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -373,7 +359,7 @@ def _at_wavelengths(calibration, leaf, keys, lam):
 
 def _of_parameters(calibration, leaf, keys, value, slopes, weights):
     """Return a quantity that depends on parameters of one optic at the same wavelength."""
-    free = _free(calibration)
+    free = free_of(calibration)
     derivatives = {}
     for key, slope in zip(keys, slopes, strict=True):
         parameter = getattr(leaf, key)
@@ -419,8 +405,8 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import derived_mueller
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -437,7 +423,7 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
         for name, slope in system_mueller_derivatives(chain, lam, positions).items()
     }
     axis = None if lam.ndim == 0 else -3
-    free = _free(calibration)
+    free = free_of(calibration)
     return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
 
 
@@ -447,17 +433,13 @@ def _grid(calibration, wavelength):
     if wavelength is None:
         return grid
     lam = u.Quantity(wavelength)
-    several = [slot for slot in _free(calibration).slots if slot.per_wavelength]
+    several = [slot for slot in free_of(calibration).slots if slot.per_wavelength]
     if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=1e-6)):
         raise ParameterError(
             f"{several[0].name} is known at the {grid.size} calibrated wavelengths only: "
             "leave out wavelength"
         )
     return lam
-
-
-def _free(calibration):
-    return FreeParameters(calibration.chains, len(calibration.wavelength), calibration.ties)
 
 
 def _spread_out(free, slopes, axis):
@@ -505,8 +487,8 @@ def derived_data(calibration, observations=None, dataset=0):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import derived_data
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -522,7 +504,7 @@ def derived_data(calibration, observations=None, dataset=0):
     vector = measurement.vector()
     # per declared unit, (n_data, n_free)
     jacobian = measurement.jacobian(vector).T * measurement.free.factors()
-    free = _free(calibration)
+    free = free_of(calibration)
     slopes = np.zeros((measurement.n_data, free.size))
     columns = {name: i for i, name in enumerate(free.names)}
     # a dataset's chain may have fewer parameters than the whole calibration
@@ -577,8 +559,8 @@ def derived_sky(
     Examples
     --------
     >>> import astropy.units as units
+    >>> from astropolcal.calibration.uncertainty import derived_sky
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -591,7 +573,8 @@ def derived_sky(
     if not np.hypot(q, u) <= 1:
         raise ParameterError(f"q = {q}, u = {u}: more than 100 % of polarization")
     lam = _grid(calibration, wavelength)
-    sky = _sky_chain(calibration.chains[dataset]) if chain is None else chain
+    # what stands before the first optic on a stage belongs to the source
+    sky = from_first_stage(calibration.chains[dataset]) if chain is None else chain
     numerator, denominator = _double_difference_rows(sky, lam, positions, modulator)
     stokes = np.array([1.0, q, u, 0.0])
     total = denominator[""] @ stokes
@@ -606,28 +589,15 @@ def derived_sky(
             change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
             slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
     value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
-    free = _free(calibration)
+    free = free_of(calibration)
     axis = None if np.ndim(lam) == 0 else -2
     return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
 
 
-def _sky_chain(chain):
-    """Return the optics from the first on a stage: those before belong to the source."""
-    found = leaves(chain)
-    first = next(
-        (i for i, leaf in enumerate(found) if leaf.stage not in (None, *COORDINATES)), None
-    )
-    if first is None:
-        raise ChainError("the chain has no optic on a stage; give the chain of the sky observation")
-    return join(found[first:])
-
-
 def _double_difference_rows(chain, lam, positions, modulator):
-    """
-    Return rows of difference and sum of the four beams, and their derivatives.
+    """Return rows of difference and sum of the four beams (``""``), and their derivatives.
 
-    Two dicts, ``""`` for the rows and ``"optic.parameter"`` for derivatives, of
-    shape (n_pairs, n_wavelengths, 4).
+    Two dicts of arrays of shape (n_pairs, n_wavelengths, 4).
     """
     if modulator not in positions:
         raise ChainError(f"no position of {modulator!r}; positions has {sorted(positions)}")
@@ -672,80 +642,20 @@ _MIRRORS = (Diattenuator, DiattenuatorRetarder, MetalMirror, PowerLawMirror)
 
 
 def mirror_names(calibration):
-    """
-    Return the names of the mirrors, and of other diattenuators, of a calibration.
+    """Return the names of mirrors and other diattenuators, in the order of the light.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-
-    Returns
-    -------
-    list of str
-        In the order the light travels; without those that are fixed and do nothing.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, optics
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = (optics.Diattenuator(diattenuation=[0.01] * 3, name="fold_mirror")
-    ...          | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
-    ...          | optics.WollastonPrism(fixed={"efficiency": True}, name="wollaston"))
-    >>> chain["hwp"].retardance.fixed = True
-    >>> data = simulate(chain, [1.2, 1.6, 2.2] * u.um, half_wave_plate_cycles(), seed=2)
-    >>> cal = calibrate(chain, data)
-    >>> mirror_names(cal)
-    ['fold_mirror']
+    Those that are fixed and do nothing are left out.
     """
     found = {leaf.name: leaf for chain in calibration.chains for leaf in leaves(chain)}
     return [name for name, leaf in found.items() if isinstance(leaf, _MIRRORS)]
 
 
 def mirror_values(calibration, name, incidence=45 * u.deg):
-    """
-    Return diattenuation and retardance of a mirror, with errors, beside those of metals.
+    """Return diattenuation and retardance of a mirror per wavelength, beside those of metals.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; one read from a file will do.
-    name : str
-        The mirror, see `mirror_names`.
-    incidence : `~astropy.units.Quantity`
-        Angle of incidence for the metals.
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-        One row a wavelength: ``wavelength``; ``diattenuation`` and its error; ``retardance`` and
-        its error, where the optic has one (0 to 360 deg, 180 of an ideal mirror); and of each
-        metal, bare, with the indices of Rakić et al. (1998), ``diattenuation_silver``,
-        ``retardance_silver`` and so on. Errors are NaN where the data do not determine a
-        value alone, and where it is held. Meta ``name``, and ``held``: whether the retardance is.
-
-    Raises
-    ------
-    ChainError
-        If there is no such mirror.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, optics
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = (optics.Diattenuator(diattenuation=[0.01] * 3, name="fold_mirror")
-    ...          | optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
-    ...          | optics.WollastonPrism(fixed={"efficiency": True}, name="wollaston"))
-    >>> chain["hwp"].retardance.fixed = True
-    >>> data = simulate(chain, [1.2, 1.6, 2.2] * u.um, half_wave_plate_cycles(), seed=2)
-    >>> cal = calibrate(chain, data)
-    >>> table = mirror_values(cal, "fold_mirror")
-    >>> table["diattenuation"][0].round(2), table["diattenuation_gold"][0].round(2)
-    (<Quantity 1. %>, <Quantity 0.94 %>)
+    Retardance is 0 to 360 deg, 180 of an ideal mirror. Metals are bare, with the indices of Rakic
+    et al. (1998). Errors are NaN where the data do not determine a value alone, and where it is
+    held.
     """
     known = mirror_names(calibration)
     if name not in known:
@@ -758,7 +668,8 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
         if hasattr(leaf, key):
             value, std = _with_error(calibration, name, key)
             table[key], table[f"{key}_err"] = value * unit, std * unit
-    table.meta |= {"name": name, "held": _is_held(leaf)}
+    fitted = ["retardance"] if isinstance(leaf, DiattenuatorRetarder) else leaf.own_names
+    table.meta |= {"name": name, "held": all(getattr(leaf, key).fixed for key in fitted)}
     for metal in METALS:
         mirror = MetalMirror(material=metal, incidence=incidence)
         table[f"diattenuation_{metal}"] = mirror.diattenuation(wavelength) * percent
@@ -768,13 +679,6 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
 
 def _leaf(chains, name):
     return next(leaf for chain in chains for leaf in leaves(chain) if leaf.name == name)
-
-
-def _is_held(leaf):
-    """Return whether the retardance is not fitted."""
-    if not isinstance(leaf, DiattenuatorRetarder):
-        return all(getattr(leaf, key).fixed for key in leaf.own_names)
-    return bool(leaf.retardance.fixed)
 
 
 def _with_error(calibration, name, key):

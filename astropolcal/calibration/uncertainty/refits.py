@@ -1,24 +1,18 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Quick fits from a known solution: with other weights, or with parameters held.
+"""
+Errors of parameters that do not come from one covariance: refits, and robust estimates.
 
-Profile likelihood: chi-square along one parameter, all others refitted.
+Profile: where a parameter enters the model non-linearly, the interval in which chi-square rises by
+one, all others refitted, is a better statement than a standard error, and need not be symmetric.
+Where the data leave a parameter open the profile is flat.
 
-Where a parameter enters the model non-linearly, the interval in which the
-profile rises by one is a better statement than a standard error, and need not
-be symmetric. Where the data leave a parameter open the profile is flat.
+Bootstrap: frames of one half-wave-plate cycle share what the model lacks (a lamp that drifts, a
+derotator that stands slightly wrong), so their residuals are not independent, and errors from the
+Jacobian are too small. Drawing whole cycles with replacement keeps that dependence (Kuensch 1989,
+Ann. Statist. 17, 1217, https://doi.org/10.1214/aos/1176347265).
 
-Bootstrap over blocks of frames: errors that do not trust the noise model.
-
-Frames of one half-wave-plate cycle share what the model lacks (a lamp that
-drifts, a derotator that stands slightly wrong), so their residuals are not
-independent, and errors from the Jacobian are too small. Drawing whole cycles
-with replacement keeps that dependence (Kuensch 1989, Ann. Statist. 17, 1217,
-https://doi.org/10.1214/aos/1176347265).
-
-Standard errors of parameters: of the full covariance, robust, and as published ones are.
-
-The sandwich estimate reads from the residuals of whole groups of data how far each
-group pulls the parameters (White 1980; Liang & Zeger 1986).
+Sandwich: the residuals of whole groups of data tell how far each group pulls the parameters (White
+1980; Liang & Zeger 1986).
 """
 
 from dataclasses import dataclass
@@ -74,11 +68,9 @@ class Refit:
         return np.concatenate([data, priors], axis=1).T
 
     def fit(self, start, counts=None, held=()):
-        """
-        Fit from a start.
+        """Return the vector, chi-square, and whether the fit arrived.
 
-        ``counts`` tells how often each datum occurs, ``held`` which elements
-        stay as they are. Returns the vector, chi-square, and whether it arrived.
+        ``counts`` tells how often each datum occurs, ``held`` which elements stay as they are.
         """
         from scipy.optimize import least_squares
 
@@ -140,8 +132,8 @@ class Profile:
 
     Examples
     --------
+    >>> from astropolcal.calibration.uncertainty import Profile
     >>> import numpy as np
-
     >>> made = Profile("wollaston.efficiency", 0.9, np.array([0.8, 0.9, 1.0]),
     ...                np.array([4.0, 0.0, 4.0]), np.zeros((3, 1)))
     >>> [round(end, 3) for end in made.interval()]
@@ -353,8 +345,8 @@ class Resampled:
 
     Examples
     --------
+    >>> from astropolcal.calibration.uncertainty import Resampled
     >>> import numpy as np
-
     >>> made = Resampled(["wollaston.efficiency"], [None], np.array([[0.97], [0.99]]), "pair", 8, 0)
     >>> float(made.stds[0].round(4))
     0.0141
@@ -480,7 +472,11 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
         vector = _resample(refit, counts, wanted)
         if vector is None:
             rejected += 1
-            _check_patience(rejected, n)
+            if rejected > _PATIENCE * n + 10:
+                raise FitError(
+                    f"{rejected} resamples could not be fitted: the data have too few blocks for "
+                    "the model"
+                )
             continue
         samples.append(vector)
         if progress is not None:
@@ -527,13 +523,6 @@ def _singular_values(refit, scale):
     size = np.linalg.norm(jacobian, axis=0)
     singular = np.linalg.svd(jacobian / np.where(size > 0, size, 1.0), compute_uv=False)
     return singular[singular > 1e-9 * singular[0]] if np.ndim(scale) == 0 else singular
-
-
-def _check_patience(rejected, n):
-    if rejected > _PATIENCE * n + 10:
-        raise FitError(
-            f"{rejected} resamples could not be fitted: the data have too few blocks for the model"
-        )
 
 
 def _result(calibration, refit, vectors, block, groups, rejected):
@@ -609,8 +598,8 @@ def standard_errors(calibration, method=None, groups=None):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import standard_errors
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -705,8 +694,8 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.uncertainty import robust_covariance
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -725,7 +714,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     if weighting.weight is not None:
         residuals = residuals * weighting.weight
     # derivatives to the determined directions, each in units of its standard error
-    slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T
+    slopes = whitened.along(whitened.rows)
     # (n_groups, rank): how far each group alone pulls the solution, in standard errors
     pulls = np.array(
         [_pull(slopes[labels == g], residuals[labels == g], correction) for g in set(labels)]
@@ -736,7 +725,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
         n, k, n_groups = len(labels), slopes.shape[1], len(pulls)
         middle *= n_groups / (n_groups - 1) * (n - 1) / max(n - k, 1)
     # priors are taken at their word: their variance is not read from residuals
-    prior = weighting.level * whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T
+    prior = weighting.level * whitened.along(whitened.prior_rows)
     middle += prior.T @ prior
     return sandwich(measurement, whitened, middle)
 
@@ -785,14 +774,11 @@ def _per_wavelength(calibration):
         rows = measurement.bins == i
         if own.size and rows.sum() > own.size:
             scale = physical_scale(free)[own]
-            unit_noise = _stds(jacobian[np.ix_(own, rows)].T * scale) * scale
+            found = decompose(jacobian[np.ix_(own, rows)].T * scale)
+            # no number for what the data leave open
+            half = np.linalg.norm(found.half, axis=0)
+            unit_noise = np.where(found.determined, half, np.nan) * scale
             # the common parameters count as known, so that only a wavelength's own take freedom
             variance = np.sum(residuals[rows] ** 2) / (rows.sum() - own.size)
             stds[own] = np.sqrt(variance) * unit_noise
     return stds / free.factors()
-
-
-def _stds(jacobian):
-    """Return the errors for unit noise, NaN for what the data leave open."""
-    found = decompose(jacobian)
-    return np.where(found.determined, np.linalg.norm(found.half, axis=0), np.nan)

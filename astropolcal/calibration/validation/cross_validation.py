@@ -1,13 +1,11 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Accuracy of a calibration per wavelength: s_res, s_mean, s_cv and s_standard.
+"""
+Accuracy of a calibration per wavelength (s_res, s_mean, s_cv, s_standard), and its chi-square.
 
-The first two look back at the data of the fit. The others are errors of
-predictions: of settings that were left out of the fit, and of a dataset that the
-fit never saw (a standard).
-
-Goodness of fit: whether the residuals exceed the noise.
-
-Chi-square where the noise is known, F where it is itself estimated.
+The first two accuracies look back at the data of the fit. The others are errors of predictions: of
+settings that were left out of the fit, and of a dataset that the fit never saw (a standard).
+Whether the residuals exceed the noise is told by chi-square where the noise is known, and by F
+where it is itself estimated.
 """
 
 import warnings
@@ -40,47 +38,11 @@ _ALONE = 1e-7
 
 
 def accuracy_table(measurement, dataset, residuals, held_out=None):
-    r"""
-    Return the accuracies of one dataset at each wavelength.
+    r"""Return the accuracies of one dataset at each wavelength, in percent.
 
-    ``s_res`` is the corrected sample standard deviation of the residuals,
-    :math:`\sqrt{\sum r_i^2/(n-k)}`; ``s_mean`` is ``s_res`` over
-    :math:`\sqrt{n}`, the paper's s_rel (paper, Sec. 2.3), with k the number of
-    free parameters that act at that wavelength; ``s_cv`` is the rms of
-    residuals predicted for frames left out in groups; ``s_standard``, which
-    `add_standard` fills, that of datasets that the fit never saw.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    dataset : int
-        Which of its datasets.
-    residuals : `~numpy.ndarray`
-        Residuals of all data, shape (n_data,).
-    held_out : `~numpy.ndarray`, optional
-        Residuals of all data when left out of the fit; NaN where none.
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-        Columns ``wavelength``, ``n``, ``k``, ``s_res``, ``s_mean``, ``s_cv``,
-        ``s_standard``, the last four in percent, NaN where there are too few
-        data or none.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 80] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames)
-    >>> measurement = Measurement(charis.chain(), observations)
-    >>> accuracy_table(measurement, 0, measurement.residuals()).colnames
-    ['wavelength', 'n', 'k', 's_res', 's_mean', 's_cv', 's_standard']
+    ``s_res`` is :math:`\sqrt{\sum r_i^2/(n-k)}`, ``s_mean`` that over :math:`\sqrt n`, the paper's
+    s_rel (Sec. 2.3), with k the free parameters that act there; ``s_cv`` the rms of held-out
+    residuals.
     """
     part = measurement.datasets[dataset]
     residuals = residuals[measurement.segments[dataset]]
@@ -114,50 +76,10 @@ def _rms(values):
 
 
 def cross_validated_residuals(measurement, vector, weights=None, groups=None):
-    """
-    Return the residual of every datum predicted by a fit that left its group out.
+    """Return the residual of every datum predicted by a fit that left its group out.
 
-    Up to 16 groups each have a fit; of more, which weigh little, the fits are
-    linear steps from that of all data.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The measurement.
-    vector : `~numpy.ndarray`
-        The fitted values, where each fit starts.
-    weights : `~numpy.ndarray`, optional
-        Weight of each datum.
-    groups : `~numpy.ndarray`, optional
-        Group of each datum; by default `leave_out_groups`.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_data,). NaN where the other groups do not determine the
-        prediction, and everywhere if there are fewer than three derotator angles
-        or, of groups that are given, fewer than two.
-
-    Raises
-    ------
-    FitError
-        If given groups are not one a datum, have a single member, or cannot be
-        predicted from the others.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> measurement = Measurement(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> residuals = cross_validated_residuals(measurement, measurement.vector())
-    >>> bool(abs(residuals).max() < 0.01)
-    True
+    Up to 16 groups each have a fit; of more, which weigh little, the fits are linear steps. NaN
+    where the other groups do not determine the prediction, or where there are too few.
     """
     # two derotator angles are too few to predict one from the other; nights need not be
     fewest = 3 if groups is None else 2
@@ -181,8 +103,7 @@ def cross_validated_residuals(measurement, vector, weights=None, groups=None):
 
 
 def _held_out_linearly(measurement, vector, jacobian, weights, labels, groups):
-    """
-    Return what a fit without each of many groups predicts, by one step of linear algebra.
+    """Return what a fit without each of many groups predicts, by one step of linear algebra.
 
     The residuals of a group g become (1 - H_g)^-1 r_g, with H_g its part of the hat matrix: exact
     for a linear model, and a small group moves no parameter far.
@@ -191,7 +112,7 @@ def _held_out_linearly(measurement, vector, jacobian, weights, labels, groups):
     free = measurement.free
     priors = free.prior_jacobian(vector) * prior_noise(measurement, weights)
     problem = Whitened(jacobian * weight, physical_scale(free), priors, free.at_bounds(vector))
-    root = problem.rows[:, problem.live] @ problem.errors.half.T
+    root = problem.along(problem.rows)
     residuals = measurement.residuals(vector) * weight
     order = np.argsort(labels, kind="stable")
     ends = np.flatnonzero(labels[order][1:] != labels[order][:-1]) + 1
@@ -232,11 +153,7 @@ def _checked(measurement, groups):
 
 
 def _undetermined(measurement, vector, jacobian, out, weights):
-    """
-    Return the moves that only the data left out can see, and which of these see them.
-
-    The moves are canonical, shape (n_moves, n_free).
-    """
+    """Return canonical moves that only data left out see, (n_moves, n_free), and which."""
     scale = physical_scale(measurement.free)
     kept = jacobian[:, ~out] * (1.0 if weights is None else weights[~out])
     kept = np.concatenate([kept, measurement.free.prior_jacobian(vector)], axis=1)
@@ -310,8 +227,8 @@ class LackOfFit:
 
     Examples
     --------
+    >>> from astropolcal.calibration.validation import LackOfFit
     >>> from astropy.table import QTable
-
     >>> LackOfFit(QTable(), 12.0, 10.0, 0.285, "the residuals agree with the noise").p_value
     0.285
     """
@@ -372,8 +289,8 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.validation import lack_of_fit
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")
@@ -451,8 +368,7 @@ def _test_by_wavelength(measurement, vector, noise, left, right):
 
 
 def _low_rank(measurement, vector, sigma, weights, fitted):
-    """
-    Return P and Q of C = 1 + P Q^T, the covariance of residuals over the noise.
+    """Return P and Q of C = 1 + P Q^T, the covariance of residuals over the noise.
 
     One row a datum, and behind them one a prior of the fit.
     """

@@ -9,7 +9,7 @@ from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, FitError, ObservationError
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import PolarizedSource
 
 __all__ = ["add_standard"]
@@ -19,36 +19,7 @@ _WORTH_A_WORD = 0.1
 
 
 def refuse_fitted(calibration, observations):
-    """
-    Refuse observations that took part in the fit.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    observations : Observations
-        What is to be an independent standard.
-
-    Raises
-    ------
-    FitError
-        If the content is that of a fitted dataset.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> observations = simulate(chain, charis.wavelength, frames, seed=2)
-    >>> refuse_fitted(calibrate(chain, observations), observations)
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.FitError: simulated is no independent standard: ...
-    """
+    """Refuse observations with the content of a fitted dataset."""
     seen = {record.content_hash: record.name for record in calibration.datasets}
     if observations.content_hash in seen:
         raise FitError(
@@ -58,65 +29,15 @@ def refuse_fitted(calibration, observations):
 
 
 def standard_accuracy(calibration, chain, observations, positions=None):
-    r"""
-    Return how well a calibration predicts a dataset that its fit never saw.
+    """Return how well a calibration predicts a dataset that its fit never saw.
 
-    Nothing is fitted. Optics of the chain that the calibration has, by name, take
-    its values; the others keep theirs.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; one read from a file will do.
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        Chain of the standard.
-    observations : Observations
-        The standard: a source, a night or settings that did not take part in the
-        fit.
-    positions : dict of str to `~numpy.ndarray`, optional
-        Position of every stage in radian, shape (n_frames,).
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-        Columns ``wavelength``; ``n``, the number of data; ``s_standard``, rms of the
-        errors of prediction; ``bias``, their mean; ``scatter``, their standard
-        deviation about it; ``s_cv``, that of the calibration's data of the same source,
-        or of all of them; and ``chi``, the ratio ``s_standard / s_cv``: 1 where the
-        standard is predicted as well as settings left out of the fit. Meta ``name``,
-        ``source``, ``content_hash``, ``n_frames``, ``words``; ``open_percent``: by how
-        much the prediction moves, at most, for one degree, micrometre or percent along
-        what the calibration leaves open; and ``not_calibrated``: optics whose values are
-        those of the chain.
-
-    Raises
-    ------
-    FitError
-        If the observations took part in the fit, or the chain has free parameters
-        of optics that were not calibrated.
-    ChainError
-        If an optic is of another kind than that of the same name.
-    ObservationError
-        If a wavelength is none of the calibration's.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> table = standard_accuracy(cal, chain, simulate(chain, charis.wavelength, frames, seed=3))
-    >>> bool((abs(table["bias"]) < table["s_standard"]).all())
-    True
+    The table of `add_standard`, which keeps it with the calibration.
     """
     refuse_fitted(calibration, observations)
     rows = rows_on_grid(calibration, observations)
     predicted = _calibrated_chain(calibration, chain, rows, observations.name)
     known = parameter_table([predicted])
+    fitted = {leaf.name for item in calibration.chains for leaf in leaves(item)}
     measurement = Measurement(
         predicted,
         observations,
@@ -134,7 +55,7 @@ def standard_accuracy(calibration, chain, observations, positions=None):
         "content_hash": observations.content_hash,
         "n_frames": int(observations.n_frames),
         "open_percent": _moved_by_open(calibration, measurement, rows),
-        "not_calibrated": _not_calibrated(calibration, chain),
+        "not_calibrated": [leaf.name for leaf in leaves(chain) if leaf.name not in fitted],
     }
     table.meta["words"] = _words(table, bool(_of_source(calibration, observations.source)))
     return table
@@ -171,7 +92,10 @@ def _calibrated_chain(calibration, chain, rows, name, sources=False):
         if is_source:
             pass
         elif own is None:
-            unknown += [f"{leaf.name}.{key}" for key in leaf.param_names if _is_open(leaf, key)]
+            parameters = ((key, getattr(leaf, key)) for key in leaf.param_names)
+            # free, and nothing is known of it
+            is_open = (k for k, p in parameters if not p.fixed and p.prior is None)
+            unknown += [f"{leaf.name}.{key}" for key in is_open]
         elif type(own) is not type(leaf):
             raise ChainError(
                 f"{name}: {leaf.name} is of class {type(leaf).__name__}, but that of the "
@@ -185,17 +109,6 @@ def _calibrated_chain(calibration, chain, rows, name, sources=False):
             "optics; hold them at known values"
         )
     return join(train)
-
-
-def _is_open(leaf, key):
-    """Return whether a parameter is free and nothing is known of it."""
-    parameter = getattr(leaf, key)
-    return not parameter.fixed and parameter.prior is None
-
-
-def _not_calibrated(calibration, chain):
-    fitted = {leaf.name for item in calibration.chains for leaf in leaves(item)}
-    return [leaf.name for leaf in leaves(chain) if leaf.name not in fitted]
 
 
 def _at_rows(leaf, source, rows, grid, free=False):
@@ -295,25 +208,42 @@ def add_standard(calibration, chain, observations, positions=None):
     Parameters
     ----------
     calibration : Calibration
-        The calibration; it is changed.
-    chain, observations, positions
-        As for `standard_accuracy`.
+        The calibration, which is changed; one read from a file will do.
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        Chain of the standard. Nothing is fitted: optics that the calibration has, by name, take
+        its values; the others keep theirs.
+    observations : Observations
+        The standard: a source, a night or settings that did not take part in the fit.
+    positions : dict of str to `~numpy.ndarray`, optional
+        Position of every stage in radian, shape (n_frames,).
 
     Returns
     -------
     `~astropy.table.QTable`
-        As `standard_accuracy` gives it.
+        Columns ``wavelength``; ``n``, the number of data; ``s_standard``, rms of the errors of
+        prediction; ``bias``, their mean; ``scatter``, their standard deviation about it; ``s_cv``,
+        that of the calibration's data of the same source, or of all; and ``chi``, the ratio
+        ``s_standard / s_cv``: 1 where the standard is predicted as well as settings left out of
+        the fit. Meta ``name``, ``source``, ``content_hash``, ``n_frames``, ``words``;
+        ``open_percent``: by how much the prediction moves, at most, for one degree, micrometre or
+        percent along what the calibration leaves open; and ``not_calibrated``: optics whose values
+        are those of the chain.
 
     Raises
     ------
-    FitError, ChainError, ObservationError
-        As `standard_accuracy`.
+    FitError
+        If the observations took part in the fit, or the chain has free parameters of optics that
+        were not calibrated.
+    ChainError
+        If an optic is of another kind than that of the same name.
+    ObservationError
+        If a wavelength is none of the calibration's.
 
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration import add_standard
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

@@ -1,8 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Polarization of stars as a calibrated instrument sees it, cycle by cycle.
-
-Check of a calibration with a star of known polarization that no fit has seen.
-"""
+"""Polarization of stars as a calibration sees it, and the check with a star no fit has seen."""
 
 import astropy.units as u
 import numpy as np
@@ -19,7 +16,7 @@ from astropolcal.exceptions import (
     WavelengthRangeError,
 )
 from astropolcal.measurement import Measurement
-from astropolcal.observations import cycle_numbers
+from astropolcal.observations.quality import cycle_numbers
 from astropolcal.optics import PolarizedSource, StarSource
 from astropolcal.stokes import polarization_angle
 
@@ -65,8 +62,8 @@ def star_stokes(calibration, chain, observations, positions=None):
     Frames of a star behind a telescope that does nothing, seen as they are:
 
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.validation import star_stokes
     >>> from astropolcal import calibrate, instruments, optics
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> lam = [1.2, 1.6, 2.2] * u.um
@@ -168,10 +165,10 @@ def star_accuracy(table, q=0.0, u_=0.0):
 
     Examples
     --------
+    >>> from astropolcal.calibration.validation import star_accuracy
     >>> import astropy.units as u
     >>> import numpy as np
     >>> from astropy.table import QTable
-
     >>> table = QTable({"wavelength": [1.6] * u.um, "q": [1] * u.percent, "u": [0] * u.percent,
     ...                 "q_cycles": [[0.9, 1.1]] * u.percent,
     ...                 "u_cycles": [[0.1, -0.1]] * u.percent})
@@ -225,8 +222,8 @@ def fitted_stars(calibration):
     --------
     >>> import astropy.units as u
     >>> import numpy as np
+    >>> from astropolcal.calibration import fitted_stars
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.observations import Observations
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
@@ -468,46 +465,7 @@ def _words(table):
 
 
 def add_star_check(calibration, chain, observations, positions=None):
-    """
-    Check a calibration with a star and keep the result with the calibration.
-
-    It goes into ``calibration.fit["stars"]``, and so into summary, JSON and file.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; it is changed.
-    chain, observations, positions
-        As for `star_check`.
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-        As `star_check` gives it.
-
-    Raises
-    ------
-    FitError, ObservationError, ChainError
-        As `star_check`.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments, optics
-
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> lam = [1.2, 1.6, 2.2] * u.um
-    >>> chain = charis.chain(derotator="linear", wavelength=lam)
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, lam, frames, seed=2))
-    >>> sky = optics.PolarizedSource(name="star") | chain["hwp"] | chain["derotator"]
-    >>> sky = sky | chain["wollaston"]
-    >>> night = simulate(sky, lam, frames, seed=3, meta={"object": "HD 293396"})
-    >>> table = add_star_check(cal, sky, night)
-    >>> cal.fit["stars"][0]["star"]
-    'HD 293396'
-    """
+    """Check a calibration with a star, as `star_check`, and keep the result in ``fit["stars"]``."""
     table = star_check(calibration, chain, observations, positions)
     entry = {key: table.meta[key] for key in ("name", "star", "words")}
     entry["content_hash"] = observations.content_hash

@@ -1,11 +1,10 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Errors of q, u, degree and angle of polarization of a target, from the covariance of a fit.
+"""
+What an accuracy means for a target: errors of q, u, degree and angle of polarization.
 
-What an accuracy means for a target, and four accuracies side by side.
-
-`target_accuracies` is what a calibration claims. The equations of McIntosh et al. (2026, Sec. 2.3),
-after van Holstein et al. 2020, A&A 633, A64 (doi:10.1051/0004-6361/201834996), stand beside it as
-`paper_accuracies`.
+`target_accuracies` is what a calibration claims, from its covariance. The equations of McIntosh et
+al. (2026, Sec. 2.3), after van Holstein et al. 2020, A&A 633, A64
+(doi:10.1051/0004-6361/201834996), stand beside it as `paper_accuracies`.
 """
 
 import astropy.units as u
@@ -23,7 +22,7 @@ from astropolcal.calibration.validation.cross_validation import (
 from astropolcal.calibration.validation.held_out import refuse_fitted
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
-from astropolcal.observations import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import LinearPolarizer
 from astropolcal.units import angle_to_rad
 
@@ -40,21 +39,19 @@ class SkyErrors:
     def __init__(self, calibration, view, ignore=False):
         self._good, self._ignore = view.good, ignore
         axes = full_covariance(calibration)._axes()
-        # the nine in one axis, in degree, micrometre or percent
-        slopes = view.changes.reshape(*view.good.shape, 9, -1) * axes.steps
-        known, is_open, is_blind = (slopes @ part.T for part in (axes.known, axes.open, axes.blind))
-        self._known, self._open, self._blind = map(_products, (known, is_open, is_blind))
+        # the nine in one axis
+        along = axes.along(view.changes.reshape(*view.good.shape, 9, -1))
+        self._known, self._open, self._blind = map(_products, along)
         self._partial = axes.partial
         extra = model_error(calibration.fit, view.lam)
         extra = np.moveaxis(extra.reshape(len(extra), len(view.lam), 9), 0, -1)
-        self._covariance = _products(known * axes.sigmas) + _products(extra)[:, None]
+        self._covariance = _products(along[0] * axes.sigmas) + _products(extra)[:, None]
 
     def of_target(self, dolp, double):
-        """
-        Return the rms over the settings of the errors of q, u, degree and angle, as fractions.
+        """Return the rms over the settings of the errors of q, u, degree and angle, as fractions.
 
-        Shape (4, n_wavelengths, n_angles) for angles of which the double is given in radian;
-        infinite where an open direction changes a quantity.
+        Shape (4, n_wavelengths, n_angles) for double angles in radian; infinite where an open
+        direction acts.
         """
         weights = _weights(dolp, double).reshape(-1, 9)
         variance, known, is_open, blind = (
@@ -213,36 +210,7 @@ def _made_of(calibration, view):
 
 
 def keep_sky_accuracy(calibration, view=None):
-    """
-    Keep what a calibration claims on sky in its ``fit``, and with it in its file.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration; its ``fit`` gets ``sky_accuracy``, a list with ``dolp_percent``,
-        ``aolp_deg`` (None for any), ``wavelength_nm``, ``s_q_percent``, ``s_u_percent``,
-        ``s_p_percent``, ``s_chi_deg`` and ``words`` of each of the usual targets, and
-        ``sky_settings``, the angles of the stages for which it holds, in radian.
-    view : SkyView, optional
-        What it sees of the sky, if that is known already.
-
-    Returns
-    -------
-    Calibration
-        Itself.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import calibrate, instruments
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)
-    >>> cal = calibrate(chain, simulate(chain, charis.wavelength, frames, seed=2))
-    >>> [entry["dolp_percent"] for entry in cal.fit["sky_accuracy"]]
-    [30.0, 1.0, 0.1]
-    """
+    """Keep what a calibration claims of the usual targets in its ``fit``, and so in its file."""
     if calibration.measurement is not None:
         calibration.fit["sky_settings"] = settings_of(calibration.measurement)
     view = view_of_calibration(calibration) if view is None else view
@@ -268,72 +236,15 @@ def _kept(table):
 
 
 def absolute_accuracy(s_unpol, s_sky):
-    r"""
-    Return the error that scales with the intensity.
-
-    :math:`s_\mathrm{abs} = \sqrt{s_\mathrm{unpol}^2 + s_\mathrm{sky}^2}`
-    (paper, Sec. 2.3).
-
-    Parameters
-    ----------
-    s_unpol, s_sky : `~astropy.units.Quantity`
-        Accuracies of the unpolarized internal and of the on-sky calibration.
-
-    Returns
-    -------
-    `~astropy.units.Quantity`
-
-    Examples
-    --------
-    >>> import astropy.units as u
-
-    >>> absolute_accuracy(0.03 * u.percent, 0.04 * u.percent)
-    <Quantity 0.05 %>
-    """
+    """Return the error that scales with the intensity, s_abs^2 = s_unpol^2 + s_sky^2 (Sec. 2.3)."""
     return np.hypot(s_unpol, s_sky)
 
 
 def propagate_accuracy(dolp, aolp, s_rel, s_abs):
-    r"""
-    Return the accuracy of q, u, degree and angle of polarization of a target.
+    """Return ``s_Q``, ``s_U``, ``s_p`` and ``s_chi`` of a target (paper, Sec. 2.3).
 
-    With :math:`q = p\cos 2\chi`, :math:`u = p\sin 2\chi` (paper, Sec. 2.3)
-
-    .. math::
-
-        s_Q = s_\mathrm{abs} + s_\mathrm{rel}|q|, \quad
-        s_U = s_\mathrm{abs} + s_\mathrm{rel}|u|, \quad
-        s_p = \sqrt{\frac{q^2 s_Q^2 + u^2 s_U^2}{q^2 + u^2}}, \quad
-        s_\chi = \frac{\sqrt{q^2 s_U^2 + u^2 s_Q^2}}{2 (q^2 + u^2)}.
-
-    Parameters
-    ----------
-    dolp : `~astropy.units.Quantity` or float
-        Degree of linear polarization, 0 to 1 (0 to 100 %).
-    aolp : `~astropy.units.Quantity`
-        Angle of linear polarization.
-    s_rel, s_abs : `~astropy.units.Quantity` or float
-        Relative and absolute accuracy. All four broadcast.
-
-    Returns
-    -------
-    dict of str to `~astropy.units.Quantity`
-        ``s_Q``, ``s_U``, ``s_p`` in percent; ``s_chi`` in degree, infinite for an
-        unpolarized target. It is linear error propagation: above some 30 deg
-        the angle is simply unknown.
-
-    Raises
-    ------
-    ParameterError
-        If a degree of polarization or an accuracy is not a possible one.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-
-    >>> s = propagate_accuracy(1 * u.percent, 0 * u.deg, 0.1 * u.percent, 0.03 * u.percent)
-    >>> s["s_p"].round(6), s["s_chi"].round(2)
-    (<Quantity 0.031 %>, <Quantity 0.86 deg>)
+    s_Q = s_abs + s_rel |q|, s_U likewise; s_p^2 = (q^2 s_Q^2 + u^2 s_U^2) / (q^2 + u^2); s_chi =
+    sqrt(q^2 s_U^2 + u^2 s_Q^2) / (2 (q^2 + u^2)), infinite for an unpolarized target.
     """
     p = _fraction("dolp", dolp, 1.0)
     rel, absolute = (_fraction(n, v) for n, v in (("s_rel", s_rel), ("s_abs", s_abs)))
@@ -393,9 +304,9 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
 
     Examples
     --------
+    >>> from astropolcal.calibration.validation import target_accuracy
     >>> import astropy.units as u
     >>> from astropy.table import QTable
-
     >>> lam = [1.2, 1.6] * u.um
     >>> lamp = QTable({"wavelength": lam, "s_mean": [0.10, 0.05] * u.percent})
     >>> star = QTable({"wavelength": lam, "s_mean": [0.03, 0.02] * u.percent})
@@ -491,8 +402,8 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     Examples
     --------
     >>> import astropy.units as u
+    >>> from astropolcal.calibration.validation import paper_accuracies
     >>> from astropolcal import calibrate, instruments
-
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> charis = instruments.get("charis")
     >>> chain = charis.chain(derotator="linear")

@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass
 
+import astropy.units as u
 import numpy as np
 from astropy.stats import gaussian_fwhm_to_sigma
 from scipy.special import erf
@@ -11,6 +12,9 @@ from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.reduction.photometry import BEAMS
 from astropolcal.reduction.wings import HALO_BETA
 from astropolcal.simulation import check_electrons
+from astropolcal.units import angle_to_rad
+
+__all__ = []
 
 # three-point Gauss rule over a pixel
 _NODES, _WEIGHTS = np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15), np.array([5.0, 8.0, 5.0]) / 18
@@ -192,3 +196,49 @@ class Detector:
         extra = self.excess_noise**2 - 1
         # each electron becomes an exponentially distributed number of them
         return extra * rng.gamma(electrons / extra) if extra > 0 else electrons
+
+
+# ---- arguments -----------------------------------------------------------------------------------
+
+# milliarcsecond in a degree, the unit of a layout's pixel scale
+_MAS_PER_DEG = 3.6e6
+
+
+def choice(name, value, allowed):
+    """Refuse a word that is not among those allowed."""
+    if value not in allowed:
+        raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
+
+
+def number(name, value, *, least=0.0, above=-np.inf, most=np.inf):
+    """Return a number within its bounds, of which ``above`` is itself not allowed."""
+    value = float(value)
+    # NaN compares as false and is refused as well
+    if not (np.isfinite(value) and least <= value <= most and value > above):
+        bounds = f"above {above:g}" if above > least or above == least else f"{least:g} and above"
+        raise ParameterError(f"{name} = {value:g}; allowed is {bounds}, up to {most:g}")
+    return value
+
+
+def per_wavelength(name, value, n_wavelengths):
+    """Return numbers that are not negative, one a wavelength, shape (W,)."""
+    value = np.asarray(value, dtype=float)
+    if value.shape not in ((), (n_wavelengths,)) or not np.all(np.isfinite(value) & (value >= 0)):
+        raise ParameterError(
+            f"{name} = {value}; allowed are numbers not negative, of shape () or ({n_wavelengths},)"
+        )
+    return np.broadcast_to(value, (n_wavelengths,))
+
+
+def pixels(name, value, layout, n_wavelengths, least=0.5):
+    """Return a length on the detector in pixels, one a wavelength."""
+    # a plain number, and a Quantity without a unit, are pixels already
+    if isinstance(value, u.Quantity) and value.unit is not u.dimensionless_unscaled:
+        if value.unit.is_equivalent(u.pix):
+            value = value.to_value(u.pix)
+        else:
+            value = np.rad2deg(angle_to_rad(value, name)) * _MAS_PER_DEG / layout.pixel_scale
+    value = per_wavelength(name, value, n_wavelengths)
+    if value.min() < least:
+        raise ParameterError(f"{name} = {value.min():g} pixels; allowed are {least:g} and above")
+    return value
