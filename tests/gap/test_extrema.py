@@ -124,7 +124,8 @@ def test_a_held_source_is_looked_at_like_all_others():
         (cause,) = found.causes
         group = [cause, *(one for one, _ in cause.aliases)]
         assert any(
-            one.cell.place == "source" and one.cell.dependence == "constant" for one in group
+            one.cell and (one.cell.place, one.cell.dependence) == ("source", "constant")
+            for one in group
         )
         source = {"standard_polarization", "source/diattenuation_d/constant"}
         assert source & {one.name for one in group}
