@@ -36,6 +36,7 @@ def test_stokes_come_back(sky, charis, star):
         assert not solution.flags(), observable
 
 
+@pytest.mark.slow
 @given(weights=st.lists(st.floats(0.1, 10), min_size=16, max_size=16))
 def test_no_weights_change_what_is_exact(sky, charis, star, weights):
     rows = measurement_rows(sky, star.positions, charis.wavelength)

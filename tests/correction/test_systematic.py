@@ -30,6 +30,7 @@ def linear(model, solution):
     return linear_systematic(model, solution)
 
 
+@pytest.mark.slow
 def test_linear_agrees_with_sampled(model, solution, linear):
     sampled = sampled_systematic(model, solution, n_samples=400, seed=3)
     for w in (0, 8, 21):

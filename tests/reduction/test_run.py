@@ -380,6 +380,7 @@ def test_frames_survive_the_journal(tmp_path, small):
     assert again.values == frame.values
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_and_report_progress(tmp_path, small):
     paths = star_frames(tmp_path)
     counts = []

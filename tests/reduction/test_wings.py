@@ -65,6 +65,7 @@ def pulls_of(profile, seeds, **options):
 # --- all of the flux -------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_left_without_noise_is_far_below_the_errors():
     for profile in PROFILES:
         pulls, bias = pulls_of(profile, range(3), noise=False)
@@ -72,6 +73,7 @@ def test_what_is_left_without_noise_is_far_below_the_errors():
         assert abs(bias.mean()) < 5e-4, profile
 
 
+@pytest.mark.slow
 def test_fluxes_are_unbiased_with_honest_errors():
     """The error of the correction is common to a frame, so frames are what counts."""
     for profile in PROFILES:
