@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import ParameterError, WavelengthRangeError
+from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement import FreeParameters
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
@@ -199,17 +199,14 @@ def match_wavelengths(grid, chain, wavelength):
 
 def errors(calibration, axes, value, slopes, bins):
     """Return the factor of the covariance, and which elements are open or blind."""
-    grid = calibration.wavelength
-    free = FreeParameters(calibration.chains, len(grid), calibration.ties)
-    shape = value.shape
+    free, shape = free_of(calibration), value.shape
     factor = np.empty((*shape, len(axes.sigmas)))
     is_open, is_blind = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for w in range(shape[-3]):
         at = (..., w, slice(None), slice(None))
         place = None if bins is None else bins[w]
-        # derivatives per degree, micrometre or percent, (n_elements of the matrices, n_free)
-        scaled = _along(free, slopes, at, place, value[at].shape) * axes.steps
-        spread = axes.spread(scaled @ axes.known.T, scaled @ axes.open.T, scaled @ axes.blind.T)
+        slopes_here = _along(free, slopes, at, place, value[at].shape)
+        spread = axes.spread(*axes.along(slopes_here))
         here = value[at].shape
         factor[(*at, slice(None))] = spread.moved.reshape(*here, -1)
         is_open[at] = spread.is_open.reshape(here)
@@ -232,6 +229,23 @@ def _along(free, slopes, at, place, shape):
     return result
 
 
+def free_of(calibration):
+    """Return the free parameters of a calibration's chains."""
+    return FreeParameters(calibration.chains, len(calibration.wavelength), calibration.ties)
+
+
+def from_first_stage(chain, wanted=None):
+    """Return the optics from the first on a stage, or on one of those that are wanted."""
+    found = leaves(chain)
+    for i, leaf in enumerate(found):
+        on_stage = (
+            leaf.stage not in (None, *COORDINATES) if wanted is None else leaf.stage in wanted
+        )
+        if on_stage:
+            return join(found[i:])
+    raise ChainError("the chain has no optic on a stage; give the chain from the sky")
+
+
 def split_chain(chain):
     """Return the optics in front of the first stage of the instrument, and the others."""
     found = leaves(chain)
@@ -248,13 +262,10 @@ def at_bins(chain, bins, size):
     chain = chain.copy()
     if bins is None or np.array_equal(bins, np.arange(size)):
         return chain
-    return join(_sliced(leaf, bins, size) for leaf in leaves(chain))
-
-
-def _sliced(leaf, bins, size):
-    """Return an optic at some bins of its parameters given per wavelength."""
-    several = [key for key in leaf.param_names if np.size(getattr(leaf, key).value) == size > 1]
-    values = {key: getattr(leaf, key) for key in several}
-    return leaf.with_parameters(
-        **{key: own.value[bins] * (own.unit or 1) for key, own in values.items()}
-    )
+    sliced = []
+    for leaf in leaves(chain):
+        several = [k for k in leaf.param_names if np.size(getattr(leaf, k).value) == size > 1]
+        own = {key: getattr(leaf, key) for key in several}
+        values = {key: p.value[bins] * (p.unit or 1) for key, p in own.items()}
+        sliced.append(leaf.with_parameters(**values))
+    return join(sliced)

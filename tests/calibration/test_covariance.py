@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from astropolcal import optics
 from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.uncertainty.covariance import Covariance, full_covariance
 from astropolcal.exceptions import ParameterError
-from astropolcal.measurement import FreeParameters, Normal
+from astropolcal.measurement import Normal
 
 NAMES, UNITS = ["hwp.theta", "hwp.w_sio2", "wollaston.efficiency"], [u.deg, u.mm, None]
 MATRIX = np.array([[0.04, 0.001, np.nan], [0.001, 0.0001, np.nan], [np.nan, np.nan, np.nan]])
@@ -86,16 +85,6 @@ def test_asymmetric_matrix_is_refused(stds):
     for upper, lower in ((0.5, -0.5), (0.5, 0.49), (np.nan, 0.5)):
         with pytest.raises(ParameterError, match=r"symmetric: that of a\.b and a\.c is "):
             made(upper, lower)
-
-
-def test_canonical_matrix_is_converted():
-    """A variance of 1 rad^2 or 1 um^2 in the units of the parameters."""
-    chain = optics.TwoLayerWaveplate(name="plate", fixed={"theta": False, "w_mgf2": True})
-    free = FreeParameters([chain | optics.WollastonPrism(name="wollaston")], 1)
-    covariance = Covariance.from_canonical(free, np.ones((3, 3)))
-    assert covariance.names == ["plate.theta", "plate.w_sio2", "wollaston.efficiency"]
-    np.testing.assert_allclose(covariance.stds, [np.rad2deg(1), 1e-3, 1])
-    assert covariance.matrix[0, 1] == pytest.approx(np.rad2deg(1) * 1e-3)
 
 
 # --- what depends on the parameters -------------------------------------------------------

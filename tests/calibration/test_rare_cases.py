@@ -284,7 +284,7 @@ def test_a_chain_without_a_beam_splitter_has_no_efficiency():
 def test_a_chain_that_stands_still_has_no_sky():
     still = optics.Diattenuator(name="mirror") | optics.WollastonPrism(name="wollaston")
     calibration = SimpleNamespace(chains=[still], wavelength=LAM, ties={})
-    with pytest.raises(ChainError, match="no optic on a stage; give the chain of the sky"):
+    with pytest.raises(ChainError, match="no optic on a stage; give the chain from the sky"):
         derived_sky(calibration, 0.01, 0.0, {"hwp": 0 * u.deg})
 
 

@@ -99,7 +99,7 @@ class Whitened:
     def leverage(self):
         """Derivative of each fitted to its observed datum, shape (n_data,)."""
         # diagonal of the hat matrix J (J^T J + P)^-1 J^T
-        return np.sum((self.rows[:, self.live] @ self.errors.half.T) ** 2, axis=1)
+        return np.sum(self.along(self.rows) ** 2, axis=1)
 
     @cached_property
     def n_taken(self):
@@ -107,7 +107,11 @@ class Whitened:
         if not len(self.prior_rows):
             # trace of a projection
             return float(self.errors.rank)
-        return float(np.sum((self._square[:, self.live] @ self.errors.half.T) ** 2))
+        return float(np.sum(self.along(self._square) ** 2))
+
+    def along(self, rows):
+        """Return rows of derivatives along the determined directions, each one error long."""
+        return rows[:, self.live] @ self.errors.half.T
 
     def factor(self):
         """Return `errors.half` over all columns, zero for what is held, in steps."""
@@ -313,7 +317,10 @@ def near_null_directions(free, whitened, level, sky_of):
     # the sign of a singular vector is arbitrary: the worst parameter goes up
     errors = errors * np.sign(errors[np.arange(len(errors)), leads])[:, None]
     worst = [i for i in np.argsort(singular, kind="stable") if bad[i]]
-    skies = _skies(errors[worst] * whitened.scale, sky_of)
+    # each direction costs two evaluations of the whole chain
+    changes = errors[worst] * whitened.scale
+    skies = sky_of(changes[:_ON_SKY]) if worst else []
+    skies += [None] * (len(worst) - len(skies))
     return [
         _near_null(free, errors[i], times_large[i], condition[i], sky)
         for i, sky in zip(worst, skies, strict=True)
@@ -326,12 +333,6 @@ def _large(free):
     return np.repeat(
         [LARGE[unit] / size for size, unit in kinds], [slot.size for slot in free.slots]
     )
-
-
-def _skies(changes, sky_of):
-    # each direction costs two evaluations of the whole chain
-    some = sky_of(changes[:_ON_SKY]) if len(changes) else []
-    return some + [None] * (len(changes) - len(some))
 
 
 def _near_null(free, error, times_large, condition, sky):

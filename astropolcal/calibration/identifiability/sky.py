@@ -17,11 +17,10 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import instruments
-from astropolcal.calibration.system import Rows
+from astropolcal.calibration.system import Rows, free_of, from_first_stage
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
 from astropolcal.instruments import SkyLaw, without_nuisance
-from astropolcal.measurement import FreeParameters
 from astropolcal.optics import COORDINATES
 
 __all__ = []
@@ -54,21 +53,12 @@ def chain_from_sky(chains, instrument=None, wavelength=None, date=None):
     """Return the optics from the sky on, and what their telescope is in words."""
     seen = next((chain for chain in chains if "parallactic" in stages(chain)), None)
     if seen is not None:
-        return _from_stage(without_nuisance(seen), ("parallactic",)), FITTED
+        return from_first_stage(without_nuisance(seen), ("parallactic",)), FITTED
     if instrument is not None and instrument.has_telescope:
         known = {"wavelength": wavelength, "date": date}
         options = {key: known[key] for key in instrument.sky_options}
         return instrument.on_sky(chains[0], **options), PUBLISHED
-    chain = without_nuisance(chains[0])
-    return _from_stage(chain, [s for s in stages(chain) if s not in COORDINATES]), LEFT_OUT
-
-
-def _from_stage(chain, wanted):
-    found = leaves(chain)
-    first = next((i for i, leaf in enumerate(found) if leaf.stage in wanted), None)
-    if first is None:
-        raise ChainError("the chain has no optic on a stage; give the chain from the sky")
-    return join(found[first:])
+    return from_first_stage(without_nuisance(chains[0])), LEFT_OUT
 
 
 def settings_of(measurement):
@@ -98,14 +88,12 @@ def view_of_measurement(measurement, vector, name=None):
 
 def view_of_calibration(calibration):
     """Return the view of the sky that a calibration has, None without a half-wave plate."""
-    grid = calibration.wavelength
-    free = FreeParameters(calibration.chains, len(grid), calibration.ties)
     settings = calibration.fit.get("sky_settings")
     if settings is None and calibration.measurement is not None:
         settings = settings_of(calibration.measurement)
     metas = [record.meta for record in calibration.datasets]
-    chains, lam = calibration.chains, grid.to_value(u.um)
-    return _view(chains, free, lam, metas, calibration.instrument, settings or {})
+    chains, lam = calibration.chains, calibration.wavelength.to_value(u.um)
+    return _view(chains, free_of(calibration), lam, metas, calibration.instrument, settings or {})
 
 
 def _view(chains, free, lam, metas, name, settings):

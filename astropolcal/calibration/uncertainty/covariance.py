@@ -20,7 +20,6 @@ from astropolcal.calibration.identifiability.linearized import LARGE, declared_s
 from astropolcal.calibration.noise.scatter import Scatter
 from astropolcal.calibration.noise.weighting import Weighting, around, weighting_of
 from astropolcal.exceptions import ParameterError
-from astropolcal.units import canonical_factor
 
 __all__ = ["Covariance"]
 
@@ -109,27 +108,6 @@ class Covariance:
         if not np.isfinite(rows).all():
             raise ParameterError(f"{key} of a covariance has a value that is not finite")
         return rows
-
-    @classmethod
-    def from_canonical(cls, free, matrix):
-        """
-        Make it from a matrix in canonical units.
-
-        Parameters
-        ----------
-        free : FreeParameters
-            The free parameters that the rows belong to.
-        matrix : `~numpy.ndarray`
-            Shape (n_free, n_free), in radian, micrometre or 1.
-
-        Returns
-        -------
-        Covariance
-        """
-        units = [slot.unit for slot in free.slots for _ in range(slot.size)]
-        per_unit = np.array([1 / canonical_factor(unit) for unit in units])
-        # one factor for the row and one for the column
-        return cls(free.names, units, matrix * np.outer(per_unit, per_unit))
 
     def __len__(self):
         return len(self.names)
@@ -240,8 +218,7 @@ class Covariance:
 
     def _spread(self, slopes):
         axes = self._axes()
-        scaled = slopes * axes.steps
-        return axes.spread(scaled @ axes.known.T, scaled @ axes.open.T, scaled @ axes.blind.T)
+        return axes.spread(*axes.along(slopes))
 
     def _axes(self):
         """Split the space of the parameters, each in degree, micrometre or percent."""
@@ -282,6 +259,11 @@ class _Axes:
     open: np.ndarray
     blind: np.ndarray
     partial: bool
+
+    def along(self, slopes):
+        """Return slopes per declared unit along known, open and blind directions."""
+        scaled = slopes * self.steps
+        return tuple(scaled @ part.T for part in (self.known, self.open, self.blind))
 
     def spread(self, along_known, along_open, along_blind):
         """Return the spread of quantities from their slopes along the axes, (k, n_axes) each."""
@@ -345,7 +327,7 @@ def covariance_around(measurement, whitened, weighting, scatter=None):
     scatter = Scatter(measurement, weighting, whitened) if scatter is None else scatter
     if not scatter.is_known:
         return white_covariance(measurement, whitened, weighting)
-    prior = whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T * weighting.level
+    prior = whitened.along(whitened.prior_rows) * weighting.level
     slack = slack_of_bounds(measurement, whitened)
     return sandwich(measurement, whitened, scatter.middle() + prior.T @ prior, slack)
 
@@ -353,12 +335,17 @@ def covariance_around(measurement, whitened, weighting, scatter=None):
 def white_covariance(measurement, whitened, weighting):
     """Return the covariance of independent data with the noise that the fit assumed."""
     free, level = measurement.free, weighting.level
-    known = Covariance.from_canonical(free, whitened.covariance() * level**2)
+    # canonical to declared units: one factor for the row and one for the column
+    declared = 1 / free.factors()
+    matrix = whitened.covariance() * level**2 * np.outer(declared, declared)
     per_unit = whitened.scale / free.factors()
     factor = whitened.factor() * (level * per_unit) if np.isfinite(level) else None
-    return Covariance(
-        known.names, known.units, known.matrix, factor=factor, null=whitened.null() * per_unit
-    )
+    null = whitened.null() * per_unit
+    return Covariance(free.names, _units(free), matrix, factor=factor, null=null)
+
+
+def _units(free):
+    return [slot.unit for slot in free.slots for _ in range(slot.size)]
 
 
 def sandwich(measurement, whitened, middle, slack=None):
@@ -375,14 +362,13 @@ def sandwich(measurement, whitened, middle, slack=None):
     # back to orthogonal directions, as `Covariance` keeps them
     _, sizes, principal = np.linalg.svd(rows, full_matrices=False)
     free = measurement.free
-    units = [slot.unit for slot in free.slots for _ in range(slot.size)]
     per_unit = whitened.scale / free.factors()
     factor, null = sizes[:, None] * principal * per_unit, whitened.null() * per_unit
     matrix = np.full((free.size, free.size), np.nan)
     columns = whitened.live[whitened.errors.determined]
     determined = factor[:, columns]
     matrix[np.ix_(columns, columns)] = determined.T @ determined
-    return Covariance(free.names, units, matrix, factor=factor, null=null)
+    return Covariance(free.names, _units(free), matrix, factor=factor, null=null)
 
 
 def residual_variance(calibration):
@@ -475,7 +461,9 @@ def _inward(measurement, whitened):
     held = np.flatnonzero(whitened.held)
     columns, residual, response = _without_others(measurement, whitened, held)
     low, high = measurement.free.bounds()
-    inward = np.where(_at_low(measurement, held), 1.0, -1.0)
+    vector = measurement.vector()
+    # from the lower bound up, from the upper one down
+    inward = np.where((vector - low <= high - vector)[held], 1.0, -1.0)
     widths = (high - low)[held] / whitened.scale[held]
     steps = _one_sided(columns * inward, residual, measurement.weighting.level, widths)
     return held, columns, response, steps, widths
@@ -491,12 +479,6 @@ def _moved(whitened, held, response, steps, widths):
     return rows * np.where(np.isfinite(steps), steps, 0.0)[:, None]
 
 
-def _at_low(measurement, held):
-    """Return which of those at a bound are at the lower one."""
-    vector, (low, high) = measurement.vector(), measurement.free.bounds()
-    return (vector - low <= high - vector)[held]
-
-
 def _without_others(measurement, whitened, held):
     """Return derivatives and residuals less what the live parameters take up, and how these go."""
     vector, weighting = measurement.vector(), measurement.weighting
@@ -506,7 +488,7 @@ def _without_others(measurement, whitened, held):
     priors = weighting.level * measurement.free.prior_residuals(vector)
     residual = np.concatenate([data, priors])
     # orthonormal: each determined direction in units of its standard error
-    basis = rows[:, whitened.live] @ whitened.errors.half.T
+    basis = whitened.along(rows)
     along = basis.T @ rows[:, held]
     columns = rows[:, held] - basis @ along
     size = np.linalg.norm(columns, axis=0)

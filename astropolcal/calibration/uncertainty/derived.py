@@ -14,10 +14,10 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import led
+from astropolcal.calibration.system import free_of, from_first_stage
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import (
     find_optic,
-    join,
     leaves,
     system_mueller,
     system_mueller_derivatives,
@@ -26,7 +26,6 @@ from astropolcal.chain import (
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement import FreeParameters
 from astropolcal.optics import (
-    COORDINATES,
     Diattenuator,
     DiattenuatorRetarder,
     MetalMirror,
@@ -165,9 +164,7 @@ def propagate(calibration, function, derivatives=None):
         else np.zeros((np.size(value), 0))
         for rows in (axes.known, axes.open, axes.blind)
     ]
-    # the basis of open directions is arbitrary; a user asks what one degree of a parameter does
-    changes = parts[1] @ _to_leads(free, axes.open) if len(axes.open) else None
-    return _package(free, axes, value, axes.spread(*parts), changes)
+    return _package(free, axes, value, parts)
 
 
 def slopes_of(free, derivatives, shape):
@@ -194,23 +191,16 @@ def slopes_of(free, derivatives, shape):
 def derive(calibration, free, value, slopes):
     """Return a quantity with its error from its derivatives per declared unit."""
     axes = full_covariance(calibration)._axes()
-    scaled = slopes * axes.steps
-    along_open = scaled @ axes.open.T
-    spread = axes.spread(scaled @ axes.known.T, along_open, scaled @ axes.blind.T)
-    changes = along_open @ _to_leads(free, axes.open) if len(axes.open) else None
-    return _package(free, axes, value, spread, changes)
+    return _package(free, axes, value, axes.along(slopes))
 
 
-def _to_leads(free, null):
-    """Return what turns changes along the open directions into those per leading parameter."""
-    reduced = np.array([vector for vector, _ in led(free, null)])
-    return null @ reduced.T
-
-
-def _package(free, axes, value, spread, changes):
-    shape, moved = np.shape(value), {}
-    if changes is not None and spread.is_open.any():
-        names = [lead for _, lead in led(free, axes.open)]
+def _package(free, axes, value, along):
+    """Return a quantity with its error from its slopes along the axes of the covariance."""
+    shape, moved, spread = np.shape(value), {}, axes.spread(*along)
+    if spread.is_open.any():
+        # the basis of open directions is arbitrary; a user asks what one degree of a parameter does
+        reduced, names = zip(*led(free, axes.open), strict=True)
+        changes = along[1] @ axes.open @ np.array(reduced).T
         limit = 1e-5 * np.abs(changes).max()
         moved = {
             name: change.reshape(shape)
@@ -369,7 +359,7 @@ def _at_wavelengths(calibration, leaf, keys, lam):
 
 def _of_parameters(calibration, leaf, keys, value, slopes, weights):
     """Return a quantity that depends on parameters of one optic at the same wavelength."""
-    free = _free(calibration)
+    free = free_of(calibration)
     derivatives = {}
     for key, slope in zip(keys, slopes, strict=True):
         parameter = getattr(leaf, key)
@@ -433,7 +423,7 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
         for name, slope in system_mueller_derivatives(chain, lam, positions).items()
     }
     axis = None if lam.ndim == 0 else -3
-    free = _free(calibration)
+    free = free_of(calibration)
     return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
 
 
@@ -443,17 +433,13 @@ def _grid(calibration, wavelength):
     if wavelength is None:
         return grid
     lam = u.Quantity(wavelength)
-    several = [slot for slot in _free(calibration).slots if slot.per_wavelength]
+    several = [slot for slot in free_of(calibration).slots if slot.per_wavelength]
     if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=1e-6)):
         raise ParameterError(
             f"{several[0].name} is known at the {grid.size} calibrated wavelengths only: "
             "leave out wavelength"
         )
     return lam
-
-
-def _free(calibration):
-    return FreeParameters(calibration.chains, len(calibration.wavelength), calibration.ties)
 
 
 def _spread_out(free, slopes, axis):
@@ -518,7 +504,7 @@ def derived_data(calibration, observations=None, dataset=0):
     vector = measurement.vector()
     # per declared unit, (n_data, n_free)
     jacobian = measurement.jacobian(vector).T * measurement.free.factors()
-    free = _free(calibration)
+    free = free_of(calibration)
     slopes = np.zeros((measurement.n_data, free.size))
     columns = {name: i for i, name in enumerate(free.names)}
     # a dataset's chain may have fewer parameters than the whole calibration
@@ -587,7 +573,8 @@ def derived_sky(
     if not np.hypot(q, u) <= 1:
         raise ParameterError(f"q = {q}, u = {u}: more than 100 % of polarization")
     lam = _grid(calibration, wavelength)
-    sky = _sky_chain(calibration.chains[dataset]) if chain is None else chain
+    # what stands before the first optic on a stage belongs to the source
+    sky = from_first_stage(calibration.chains[dataset]) if chain is None else chain
     numerator, denominator = _double_difference_rows(sky, lam, positions, modulator)
     stokes = np.array([1.0, q, u, 0.0])
     total = denominator[""] @ stokes
@@ -602,20 +589,9 @@ def derived_sky(
             change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
             slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
     value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
-    free = _free(calibration)
+    free = free_of(calibration)
     axis = None if np.ndim(lam) == 0 else -2
     return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
-
-
-def _sky_chain(chain):
-    """Return the optics from the first on a stage: those before belong to the source."""
-    found = leaves(chain)
-    first = next(
-        (i for i, leaf in enumerate(found) if leaf.stage not in (None, *COORDINATES)), None
-    )
-    if first is None:
-        raise ChainError("the chain has no optic on a stage; give the chain of the sky observation")
-    return join(found[first:])
 
 
 def _double_difference_rows(chain, lam, positions, modulator):
@@ -692,7 +668,8 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
         if hasattr(leaf, key):
             value, std = _with_error(calibration, name, key)
             table[key], table[f"{key}_err"] = value * unit, std * unit
-    table.meta |= {"name": name, "held": _is_held(leaf)}
+    fitted = ["retardance"] if isinstance(leaf, DiattenuatorRetarder) else leaf.own_names
+    table.meta |= {"name": name, "held": all(getattr(leaf, key).fixed for key in fitted)}
     for metal in METALS:
         mirror = MetalMirror(material=metal, incidence=incidence)
         table[f"diattenuation_{metal}"] = mirror.diattenuation(wavelength) * percent
@@ -702,13 +679,6 @@ def mirror_values(calibration, name, incidence=45 * u.deg):
 
 def _leaf(chains, name):
     return next(leaf for chain in chains for leaf in leaves(chain) if leaf.name == name)
-
-
-def _is_held(leaf):
-    """Return whether the retardance is not fitted."""
-    if not isinstance(leaf, DiattenuatorRetarder):
-        return all(getattr(leaf, key).fixed for key in leaf.own_names)
-    return bool(leaf.retardance.fixed)
 
 
 def _with_error(calibration, name, key):

@@ -472,7 +472,11 @@ def bootstrap(calibration, n=200, block="derotator", seed=None, progress=None):
         vector = _resample(refit, counts, wanted)
         if vector is None:
             rejected += 1
-            _check_patience(rejected, n)
+            if rejected > _PATIENCE * n + 10:
+                raise FitError(
+                    f"{rejected} resamples could not be fitted: the data have too few blocks for "
+                    "the model"
+                )
             continue
         samples.append(vector)
         if progress is not None:
@@ -519,13 +523,6 @@ def _singular_values(refit, scale):
     size = np.linalg.norm(jacobian, axis=0)
     singular = np.linalg.svd(jacobian / np.where(size > 0, size, 1.0), compute_uv=False)
     return singular[singular > 1e-9 * singular[0]] if np.ndim(scale) == 0 else singular
-
-
-def _check_patience(rejected, n):
-    if rejected > _PATIENCE * n + 10:
-        raise FitError(
-            f"{rejected} resamples could not be fitted: the data have too few blocks for the model"
-        )
 
 
 def _result(calibration, refit, vectors, block, groups, rejected):
@@ -717,7 +714,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     if weighting.weight is not None:
         residuals = residuals * weighting.weight
     # derivatives to the determined directions, each in units of its standard error
-    slopes = whitened.rows[:, whitened.live] @ whitened.errors.half.T
+    slopes = whitened.along(whitened.rows)
     # (n_groups, rank): how far each group alone pulls the solution, in standard errors
     pulls = np.array(
         [_pull(slopes[labels == g], residuals[labels == g], correction) for g in set(labels)]
@@ -728,7 +725,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
         n, k, n_groups = len(labels), slopes.shape[1], len(pulls)
         middle *= n_groups / (n_groups - 1) * (n - 1) / max(n - k, 1)
     # priors are taken at their word: their variance is not read from residuals
-    prior = weighting.level * whitened.prior_rows[:, whitened.live] @ whitened.errors.half.T
+    prior = weighting.level * whitened.along(whitened.prior_rows)
     middle += prior.T @ prior
     return sandwich(measurement, whitened, middle)
 
@@ -777,14 +774,11 @@ def _per_wavelength(calibration):
         rows = measurement.bins == i
         if own.size and rows.sum() > own.size:
             scale = physical_scale(free)[own]
-            unit_noise = _stds(jacobian[np.ix_(own, rows)].T * scale) * scale
+            found = decompose(jacobian[np.ix_(own, rows)].T * scale)
+            # no number for what the data leave open
+            half = np.linalg.norm(found.half, axis=0)
+            unit_noise = np.where(found.determined, half, np.nan) * scale
             # the common parameters count as known, so that only a wavelength's own take freedom
             variance = np.sum(residuals[rows] ** 2) / (rows.sum() - own.size)
             stds[own] = np.sqrt(variance) * unit_noise
     return stds / free.factors()
-
-
-def _stds(jacobian):
-    """Return the errors for unit noise, NaN for what the data leave open."""
-    found = decompose(jacobian)
-    return np.where(found.determined, np.linalg.norm(found.half, axis=0), np.nan)

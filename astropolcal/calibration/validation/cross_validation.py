@@ -112,7 +112,7 @@ def _held_out_linearly(measurement, vector, jacobian, weights, labels, groups):
     free = measurement.free
     priors = free.prior_jacobian(vector) * prior_noise(measurement, weights)
     problem = Whitened(jacobian * weight, physical_scale(free), priors, free.at_bounds(vector))
-    root = problem.rows[:, problem.live] @ problem.errors.half.T
+    root = problem.along(problem.rows)
     residuals = measurement.residuals(vector) * weight
     order = np.argsort(labels, kind="stable")
     ends = np.flatnonzero(labels[order][1:] != labels[order][:-1]) + 1

@@ -39,14 +39,13 @@ class SkyErrors:
     def __init__(self, calibration, view, ignore=False):
         self._good, self._ignore = view.good, ignore
         axes = full_covariance(calibration)._axes()
-        # the nine in one axis, in degree, micrometre or percent
-        slopes = view.changes.reshape(*view.good.shape, 9, -1) * axes.steps
-        known, is_open, is_blind = (slopes @ part.T for part in (axes.known, axes.open, axes.blind))
-        self._known, self._open, self._blind = map(_products, (known, is_open, is_blind))
+        # the nine in one axis
+        along = axes.along(view.changes.reshape(*view.good.shape, 9, -1))
+        self._known, self._open, self._blind = map(_products, along)
         self._partial = axes.partial
         extra = model_error(calibration.fit, view.lam)
         extra = np.moveaxis(extra.reshape(len(extra), len(view.lam), 9), 0, -1)
-        self._covariance = _products(known * axes.sigmas) + _products(extra)[:, None]
+        self._covariance = _products(along[0] * axes.sigmas) + _products(extra)[:, None]
 
     def of_target(self, dolp, double):
         """Return the rms over the settings of the errors of q, u, degree and angle, as fractions.
