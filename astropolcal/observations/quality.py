@@ -3,8 +3,8 @@
 Frames of a run that cannot be used, found from the table and masked with a reason.
 
 Nothing is dropped: a masked frame stays in the table with its reason, and one warning a
-reason says how many there are and which. See also `astropolcal.observations.grid`, which judges
-single cells while a table is read.
+reason says how many there are and which. Single cells are
+judged while a table is read.
 """
 
 import re
