@@ -506,7 +506,11 @@ def set_aside(frames, reduction):
 
 def _of_one_kind(frames, what, value, reduction):
     """Leave out frames that differ from most in what a run has in common."""
-    kinds = [None if value(frame) is None else _plain(value(frame)) for frame in frames]
+    # case, blanks and signs are written now so, now so; but BD+12 and BD-12 are two stars
+    kinds = [
+        None if value(frame) is None else re.sub(r"[^\w+-]|_", "", value(frame)).casefold()
+        for frame in frames
+    ]
     counts = Counter(kind for kind in kinds if kind is not None)
     if len(counts) < 2:
         return frames
@@ -523,12 +527,6 @@ def _of_one_kind(frames, what, value, reduction):
             f"{what} {value(frame)!r}, the others of the run have {words!r}"
         ]
     return kept
-
-
-def _plain(text):
-    """Return a name without what is written now so, now so: case, blanks, signs."""
-    # but BD+12 and BD-12 are two stars
-    return re.sub(r"[^\w+-]|_", "", text).casefold()
 
 
 def _order(frame):

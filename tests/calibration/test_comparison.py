@@ -12,7 +12,7 @@ from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError, ParameterError
 from astropolcal.instruments.telescope import published_mirror, telescope
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.plotting import plot_comparison
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

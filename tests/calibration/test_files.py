@@ -18,7 +18,8 @@ from astropolcal.calibration.uncertainty.covariance import Covariance
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import calibration_from_node, node_from_calibration
 from astropolcal.exceptions import CalibrationFileError
-from astropolcal.measurement import Normal, Tie, Uniform
+from astropolcal.measurement import Normal, Tie
+from astropolcal.measurement.priors import Uniform
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um

@@ -165,7 +165,7 @@ def test_covariance_is_that_of_the_parameters(calibration, loaded):
 def test_covariance_agrees_with_samples(calibration, loaded):
     rng = np.random.default_rng(3)
     found = loaded.system_mueller(HEADER)
-    from astropolcal.measurement import FreeParameters
+    from astropolcal.measurement.parameters import FreeParameters
 
     chains = [chain.copy() for chain in calibration.chains]
     free = FreeParameters(chains, 3, calibration.ties)

@@ -9,7 +9,7 @@ and width 1 +- 1/sqrt(2 n).
 import numpy as np
 import pytest
 
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 
 pytestmark = pytest.mark.slow
 N = 60

@@ -24,7 +24,8 @@ from astropolcal.exceptions import (
     FitError,
     ParameterError,
 )
-from astropolcal.measurement import Normal, Uniform
+from astropolcal.measurement import Normal
+from astropolcal.measurement.priors import Uniform
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 NOISE = 0.01

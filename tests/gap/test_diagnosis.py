@@ -13,7 +13,7 @@ from star_data import WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments
 from astropolcal.exceptions import GapError
-from astropolcal.gap import EFFECTS, diagnose, model
+from astropolcal.gap import EFFECTS, diagnose, model, problem
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.model import thinned
 from astropolcal.instruments.telescope import published_mirror
@@ -224,14 +224,11 @@ def test_bad_input_is_refused_in_one_line(monkeypatch):
         with pytest.raises(GapError, match=message) as refused:
             diagnose(chains, observations, **options)
         assert "\n" not in str(refused.value)
-    real = model.nominal_calibration
-
-    def stopped(chains, observations):
-        found = real(chains, observations)
-        found.fit["converged"] = False
-        return found
-
-    monkeypatch.setattr(model, "nominal_calibration", stopped)
+    monkeypatch.setattr(
+        problem.GapProblem,
+        "fit",
+        lambda self, *args, **kwargs: problem.Fit(self.start, np.inf, False),
+    )
     with pytest.raises(GapError, match="the nominal fit did not converge"):
         diagnose(chain, observed)
 
