@@ -178,6 +178,7 @@ def test_frame_optic_stands_still_unless_it_says_otherwise(position, theta, slop
 # --- what they are for -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(
     sign=st.sampled_from(["", "-"]),
     harmonic=st.sampled_from([1, 2, 4]),
