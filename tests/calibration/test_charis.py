@@ -125,9 +125,9 @@ def test_rank_is_91_of_93(calibrated, number):
     assert len(finding.directions) == 2
 
 
-@pytest.mark.parametrize("name", ["hwp.theta", "derotator.theta", "derotator.circular[9]"])
-def test_gauge_parameters_have_no_error(calibrated, name):
-    assert np.isnan(calibrated[3].covariance.std(name))
+def test_gauge_parameters_have_no_error(calibrated):
+    for name in ["hwp.theta", "derotator.theta", "derotator.circular[9]"]:
+        assert np.isnan(calibrated[3].covariance.std(name)), name
 
 
 def test_fixed_angles_give_full_rank(charis_data):
@@ -173,31 +173,26 @@ def test_horizontal_retardance_in_h_and_k(calibrated, published):
     assert np.abs(ours - theirs)[band].max() < 2.0
 
 
-@pytest.mark.parametrize(
-    ("name", "column", "tolerance", "in_h_and_k"),
-    [
-        ("hwp.retardance", "hwp_retardance", 1.5, 1.2),
-        ("derotator.horizontal", "derotator_horizontal", 0.3, 0.1),
-        ("derotator.diagonal", "derotator_45", 1.5, 0.7),
-        ("derotator.circular", "derotator_circular", 1.7, 0.5),
-    ],
-)
-def test_first_step_reproduces_the_published_retardances(
-    two_step, published, name, column, tolerance, in_h_and_k
-):
+def test_first_step_reproduces_the_published_retardances(two_step, published):
     """
     Where no published value sits at a bound (their circular retardance does, in J).
 
     The published values are not the least-squares minimum: ours has the
     smaller residuals, at distances of up to the tolerances (deg).
     """
-    at_bound = np.asarray(published["derotator_circular"]) < 0.1
-    theirs = np.asarray(published[column])
-    ours = np.abs(two_step.stages[0]["parameters"][name].to_value(u.deg))
-    difference = np.abs(_branch(ours, theirs) - theirs)
-    assert difference[~at_bound].max() < tolerance
-    band = np.asarray(published["wavelength"]) > 1450
-    assert difference[band].max() < in_h_and_k
+    for name, column, tolerance, in_h_and_k in [
+        ("hwp.retardance", "hwp_retardance", 1.5, 1.2),
+        ("derotator.horizontal", "derotator_horizontal", 0.3, 0.1),
+        ("derotator.diagonal", "derotator_45", 1.5, 0.7),
+        ("derotator.circular", "derotator_circular", 1.7, 0.5),
+    ]:
+        at_bound = np.asarray(published["derotator_circular"]) < 0.1
+        theirs = np.asarray(published[column])
+        ours = np.abs(two_step.stages[0]["parameters"][name].to_value(u.deg))
+        difference = np.abs(_branch(ours, theirs) - theirs)
+        assert difference[~at_bound].max() < tolerance, (name, column, tolerance, in_h_and_k)
+        band = np.asarray(published["wavelength"]) > 1450
+        assert difference[band].max() < in_h_and_k, (name, column, tolerance, in_h_and_k)
 
 
 def test_published_values_are_not_the_minimum(two_step, published):
@@ -275,31 +270,31 @@ def _cases(folder):
     return {name: case["base"] for name, case in key.items() if case["effect"] == "none"}
 
 
-@pytest.mark.parametrize("index", range(3))
-def test_simulated_calibrations_without_effect_give_back_the_truth(shared_data, index):
+def test_simulated_calibrations_without_effect_give_back_the_truth(shared_data):
     """The nominal model on data of a simulator that shares no code with this package."""
-    folder = shared_data / "gap-cases"
-    name, truth = list(_cases(folder).items())[index]
-    data = Observations.read(folder / name / "polarized.ecsv")
-    chain = CHARIS.chains_for([data], derotator="linear")
-    # the ratio method is free of the lamp's drift and flicker
-    cal = calibrate(chain, data, weights="errors", observable="ratio", cross_validate=False)
-    assert cal.identifiability.rank == 49
-    expected = {
-        "hwp.w_sio2": truth["w_sio2"],
-        "hwp.w_mgf2": truth["w_mgf2"],
-        "hwp.theta": np.rad2deg(truth["d_hwp"]),
-        "calibration_polarizer.theta": 90 + np.rad2deg(truth["d_cal"]),
-        "derotator.theta": np.rad2deg(truth["d_der"]),
-        "derotator.retardance": np.rad2deg(truth["ret_h"]),
-        "wollaston.efficiency": truth["eta"],
-    }
-    known = cal.parameter_values()
-    for parameter, true in expected.items():
-        value, std = known[parameter]["value"], known[parameter]["std"]
-        if parameter == "derotator.retardance":
-            value = np.abs(value)  # both signs are exact mirrors, see the instrument
-        assert np.abs((value - true) / std).max() < 4, parameter
-    chi2 = np.sum((cal.residuals / cal.measurement.sigma) ** 2)
-    freedom = cal.measurement.n_data - 49
-    assert abs(chi2 - freedom) < 4 * np.sqrt(2 * freedom)
+    for index in range(3):
+        folder = shared_data / "gap-cases"
+        name, truth = list(_cases(folder).items())[index]
+        data = Observations.read(folder / name / "polarized.ecsv")
+        chain = CHARIS.chains_for([data], derotator="linear")
+        # the ratio method is free of the lamp's drift and flicker
+        cal = calibrate(chain, data, weights="errors", observable="ratio", cross_validate=False)
+        assert cal.identifiability.rank == 49
+        expected = {
+            "hwp.w_sio2": truth["w_sio2"],
+            "hwp.w_mgf2": truth["w_mgf2"],
+            "hwp.theta": np.rad2deg(truth["d_hwp"]),
+            "calibration_polarizer.theta": 90 + np.rad2deg(truth["d_cal"]),
+            "derotator.theta": np.rad2deg(truth["d_der"]),
+            "derotator.retardance": np.rad2deg(truth["ret_h"]),
+            "wollaston.efficiency": truth["eta"],
+        }
+        known = cal.parameter_values()
+        for parameter, true in expected.items():
+            value, std = known[parameter]["value"], known[parameter]["std"]
+            if parameter == "derotator.retardance":
+                value = np.abs(value)  # both signs are exact mirrors, see the instrument
+            assert np.abs((value - true) / std).max() < 4, parameter
+        chi2 = np.sum((cal.residuals / cal.measurement.sigma) ** 2)
+        freedom = cal.measurement.n_data - 49
+        assert abs(chi2 - freedom) < 4 * np.sqrt(2 * freedom)

@@ -116,17 +116,14 @@ def test_derivatives_may_be_given(full_rank):
     np.testing.assert_allclose(given.std, numeric.std, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
+def test_wrong_derivatives_are_refused(full_rank):
+    for name, value, message in [
         ("hwp.w_sio2", np.ones(2), "expected is"),
         ("wollaston.efficiency", 1.0, "expected is"),
         ("hwp.theta", 1.0, "no such free parameter"),
-    ],
-)
-def test_wrong_derivatives_are_refused(full_rank, name, value, message):
-    with pytest.raises(ParameterError, match=message):
-        propagate(full_rank, lambda chain: 1.0, lambda chain: {name: value})
+    ]:
+        with pytest.raises(ParameterError, match=message):
+            propagate(full_rank, lambda chain: 1.0, lambda chain, n=name, v=value: {n: v})
 
 
 def test_parameter_itself_has_its_own_error(full_rank):
@@ -399,17 +396,14 @@ def test_sky_chain_may_be_given(full_rank):
     )
 
 
-@pytest.mark.parametrize(
-    ("positions", "error", "message"),
-    [
+def test_positions_must_determine_q_and_u(full_rank):
+    for positions, error, message in [
         ({"hwp": 0 * u.deg, "derotator": 60 * u.deg}, ParameterError, "do not determine q and u"),
         ({"hwp": [5, 5] * u.deg, "derotator": 60 * u.deg}, ParameterError, "0 and 22.5 deg"),
         ({"derotator": 60 * u.deg}, ChainError, "no position of 'hwp'"),
-    ],
-)
-def test_positions_must_determine_q_and_u(full_rank, positions, error, message):
-    with pytest.raises(error, match=message):
-        derived_sky(full_rank, 0.1, 0.0, positions)
+    ]:
+        with pytest.raises(error, match=message):
+            derived_sky(full_rank, 0.1, 0.0, positions)
 
 
 def test_unphysical_source_is_refused(full_rank):

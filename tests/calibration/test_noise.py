@@ -88,12 +88,12 @@ def test_gain_of_the_table_reproduces_the_errors_of_the_simulation(make, chain):
     np.testing.assert_allclose(noise.sigma_of_data, measurement.sigma, rtol=1e-12)
 
 
-@pytest.mark.parametrize("settings", [{"gain": 0.0}, {"gain": np.nan}, {"gain": -1.0}])
-def test_impossible_gain_is_refused(faint, settings):
-    with pytest.raises(FitError, match="gain = "):
-        noise_from_errors(faint, **settings)
-    with pytest.raises(FitError, match="read_noise = -1"):
-        noise_from_errors(faint, gain=1.0, read_noise=-1.0)
+def test_impossible_gain_is_refused(faint):
+    for settings in [{"gain": 0.0}, {"gain": np.nan}, {"gain": -1.0}]:
+        with pytest.raises(FitError, match="gain = "):
+            noise_from_errors(faint, **settings)
+        with pytest.raises(FitError, match="read_noise = -1"):
+            noise_from_errors(faint, gain=1.0, read_noise=-1.0)
 
 
 def test_table_without_errors_needs_a_gain(faint):

@@ -209,18 +209,15 @@ def test_groups_make_standard_errors_robust(few):
     np.testing.assert_array_equal(given["std"], table["std"])
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_bad_choices_are_refused(few):
+    for options, message in [
         ({"groups": "night"}, "block = 'night'; allowed are derotator, pair"),
         ({"groups": np.zeros(4)}, r"groups of shape \(4,\); allowed are \(96,\), one a datum"),
         ({"groups": np.zeros(96)}, "1 groups; a robust covariance needs 3"),
         ({"correction": "none"}, "correction = 'none'; allowed are leverage, number"),
-    ],
-)
-def test_bad_choices_are_refused(few, options, message):
-    with pytest.raises(FitError, match=message):
-        robust_covariance(few, **options)
+    ]:
+        with pytest.raises(FitError, match=message):
+            robust_covariance(few, **options)
 
 
 def test_other_methods_know_no_groups(few):

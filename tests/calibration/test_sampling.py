@@ -187,9 +187,8 @@ def test_no_noise_without_residuals():
         noise_of(cal.measurement, "wavelength")
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
+def test_bad_log_posterior(small):
+    for options, error, message in [
         ({"parameters": ["hwp.theta"]}, ParameterError, r"no free parameter 'hwp\.theta'; allowed"),
         ({"parameters": ["hwp.retardance"] * 2}, ParameterError, "nothing twice"),
         ({"parameters": []}, ParameterError, "must name something"),
@@ -204,17 +203,15 @@ def test_no_noise_without_residuals():
         ({"noise": 1 * u.m}, ParameterError, "wrong unit"),
         ({"noise": "much"}, ParameterError, "not a number"),
         ({"weights": "equal"}, FitError, "allowed are None, 'wavelength', 'errors'"),
-    ],
-)
-def test_bad_log_posterior(small, options, error, message):
-    with pytest.raises(error, match=message):
-        LogPosterior(small.measurement, **options)
+    ]:
+        with pytest.raises(error, match=message):
+            LogPosterior(small.measurement, **options)
 
 
-@pytest.mark.parametrize("shape", [(2,), (4,), (5, 2), (2, 2, 3), ()])
-def test_log_posterior_of_a_wrong_shape(small, shape):
-    with pytest.raises(ParameterError, match="values of shape"):
-        LogPosterior(small.measurement)(np.zeros(shape))
+def test_log_posterior_of_a_wrong_shape(small):
+    for shape in [(2,), (4,), (5, 2), (2, 2, 3), ()]:
+        with pytest.raises(ParameterError, match="values of shape"):
+            LogPosterior(small.measurement)(np.zeros(shape))
 
 
 def test_weights_without_errors():
@@ -569,9 +566,8 @@ def test_killed_runs_lose_one_interval_at_most(tmp_path, request):
 # --- bad input ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_bad_numbers(small):
+    for options, message in [
         ({"n_walkers": 5}, r"n_walkers = 5; 3 parameters need a whole number from 6 up"),
         ({"n_walkers": 10.0}, r"n_walkers = 10\.0"),
         ({"n_steps": 0}, "n_steps = 0; allowed are whole numbers"),
@@ -579,13 +575,11 @@ def test_killed_runs_lose_one_interval_at_most(tmp_path, request):
         ({"thin": 0}, "thin = 0"),
         ({"thin": 40}, "n_steps = .*; allowed are whole numbers from 80 up, as one in 40"),
         ({"checkpoint_every": -1}, "checkpoint_every = -1"),
-    ],
-)
-def test_bad_numbers(small, options, message):
-    with pytest.raises(FitError, match=message) as caught:
-        sample(small, **(RUN | options))
-    # a command says it in words of its options
-    assert str(caught.value).startswith(f"{caught.value.argument} = ")
+    ]:
+        with pytest.raises(FitError, match=message) as caught:
+            sample(small, **(RUN | options))
+        # a command says it in words of its options
+        assert str(caught.value).startswith(f"{caught.value.argument} = ")
 
 
 def test_calibration_from_a_file_has_no_data(small, tmp_path):

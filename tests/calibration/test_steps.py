@@ -72,18 +72,15 @@ def fitted(data):
 # --- what calibrates what -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("source", "kind"),
-    [
+def test_kind_of_a_source():
+    for source, kind in [
         ("polarized", "polarized"),
         ("unpolarized", "unpolarized"),
         ("unpolarized standard star", "star"),
         ("polarized standard star", "star"),
         (None, "polarized"),
-    ],
-)
-def test_kind_of_a_source(source, kind):
-    assert kind_of_source(source) == kind
+    ]:
+        assert kind_of_source(source) == kind, (source, kind)
 
 
 # --- joint and sequential -------------------------------------------------------------------------

@@ -219,20 +219,17 @@ def test_estimate_of_the_noise_may_be_given(truth, data):
     assert lack_of_fit(cal.measurement, cal, noise).p_value > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("weights", "error", "message"),
-    [
+def test_bad_weights_are_refused(truth, data):
+    for weights, error, message in [
         ("none", FitError, "'none'; allowed are None, 'wavelength', 'errors', or the noise"),
         ("given", FitError, "was not fitted with a noise given"),
         (0.0, ParameterError, "must be positive"),
         ([0.1, 0.2], ParameterError, r"shape \(2,\); allowed are one value, 4"),
         (3 * u.mm, ParameterError, "wrong unit"),
         (1 / 0.002, ParameterError, "noise of 5e[+]04 %: weights takes the noise"),
-    ],
-)
-def test_bad_weights_are_refused(truth, data, weights, error, message):
-    with pytest.raises(error, match=message):
-        fit(truth, data, weights)
+    ]:
+        with pytest.raises(error, match=message):
+            fit(truth, data, weights)
 
 
 def test_estimate_of_another_measurement_is_refused(make, truth, data):
@@ -317,47 +314,47 @@ def test_choice_is_written_and_read(fitted, tmp_path, choice):
         weighting_of(again)
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_same_data_give_the_same_noise_again(truth, data, fitted, choice):
+def test_same_data_give_the_same_noise_again(truth, data, fitted):
     """As after reading from a file, where the measurement is made anew."""
-    cal = fitted[choice]
-    anew = dataclasses.replace(cal, measurement=Measurement(cal.chains, data))
-    assert anew.measurement.weighting is None
-    again = weighting_of(anew)
-    np.testing.assert_allclose(again.sigma, weighting_of(cal).sigma, rtol=0.01)
-    assert again.choice == weighting_of(cal).choice
+    for choice in CHOICES:
+        cal = fitted[choice]
+        anew = dataclasses.replace(cal, measurement=Measurement(cal.chains, data))
+        assert anew.measurement.weighting is None
+        again = weighting_of(anew)
+        np.testing.assert_allclose(again.sigma, weighting_of(cal).sigma, rtol=0.01)
+        assert again.choice == weighting_of(cal).choice
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_sampler_assumes_the_noise_of_the_fit(fitted, choice):
-    cal = fitted[choice]
-    for options in ({}, {"weights": cal.settings["weights"]}):
-        sigma = LogPosterior(cal.measurement, **options).sigma
-        np.testing.assert_array_equal(sigma, weighting_of(cal).sigma)
+def test_sampler_assumes_the_noise_of_the_fit(fitted):
+    for choice in CHOICES:
+        cal = fitted[choice]
+        for options in ({}, {"weights": cal.settings["weights"]}):
+            sigma = LogPosterior(cal.measurement, **options).sigma
+            np.testing.assert_array_equal(sigma, weighting_of(cal).sigma)
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_posterior_peaks_at_the_fit_with_its_width(fitted, choice):
+def test_posterior_peaks_at_the_fit_with_its_width(fitted):
     """By finite differences of the log-posterior along every parameter."""
-    cal = fitted[choice]
-    posterior = LogPosterior(cal.measurement)
-    curvature = np.linalg.inv(cal.covariance.matrix)
-    for i, std in enumerate(cal.covariance.stds):
-        step = np.zeros(len(cal.covariance))
-        step[i] = 0.1 * std * posterior.factors[i]
-        up, here, down = (posterior(posterior.centre + s * step) for s in (1, 0, -1))
-        drop = 2 * here - up - down
-        assert drop == pytest.approx(curvature[i, i] * (0.1 * std) ** 2, rel=0.01)
-        assert abs(up - down) / 2 < 0.02 * np.sqrt(drop)
+    for choice in CHOICES:
+        cal = fitted[choice]
+        posterior = LogPosterior(cal.measurement)
+        curvature = np.linalg.inv(cal.covariance.matrix)
+        for i, std in enumerate(cal.covariance.stds):
+            step = np.zeros(len(cal.covariance))
+            step[i] = 0.1 * std * posterior.factors[i]
+            up, here, down = (posterior(posterior.centre + s * step) for s in (1, 0, -1))
+            drop = 2 * here - up - down
+            assert drop == pytest.approx(curvature[i, i] * (0.1 * std) ** 2, rel=0.01)
+            assert abs(up - down) / 2 < 0.02 * np.sqrt(drop)
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_refits_stay_at_the_fit(fitted, choice):
-    cal = fitted[choice]
-    vector, _, arrived = Refit(cal).fit(cal.measurement.vector())
-    assert arrived
-    moved = (vector - cal.measurement.vector()) / cal.measurement.free.factors()
-    assert np.abs(moved / cal.covariance.stds).max() < 0.01
+def test_refits_stay_at_the_fit(fitted):
+    for choice in CHOICES:
+        cal = fitted[choice]
+        vector, _, arrived = Refit(cal).fit(cal.measurement.vector())
+        assert arrived
+        moved = (vector - cal.measurement.vector()) / cal.measurement.free.factors()
+        assert np.abs(moved / cal.covariance.stds).max() < 0.01
 
 
 def test_profile_and_bootstrap_know_the_weights(fitted):
