@@ -103,7 +103,7 @@ def test_every_optic_has_a_converter():
     missing = sorted(set(OPTICS) ^ set(OPTIC_MODULES))
     assert not missing, (
         f"{missing}: an optic that calibration files can hold needs its module in OPTIC_MODULES "
-        "(converters/optics.py), a schema resources/schemas/optics/<name>-1.0.0.yaml with each "
+        "(converters/extension.py), a schema resources/schemas/optics/<name>-1.0.0.yaml with each "
         "parameter and its unit, and an entry in resources/manifests"
     )
     for name, cls in OPTICS.items():
