@@ -25,7 +25,7 @@ from astropolcal.exceptions import (
     ObservationError,
 )
 from astropolcal.gap.effects import EFFECTS, Context, Roles, adapted, check_effect, get_effect
-from astropolcal.gap.effects import roles as roles_module
+from astropolcal.gap.effects import where as roles_module
 from astropolcal.instruments import IRDIS
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations, pointing

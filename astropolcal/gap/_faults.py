@@ -18,16 +18,7 @@ _TAKEN_UP = 0.02
 
 
 class Fault:
-    """
-    What a simulated calibration has and its nominal model lacks.
-
-    Parameters
-    ----------
-    bench : Bench
-        The instrument.
-    told : dict
-        What the key says of it; what is missing is drawn.
-    """
+    """What a simulated calibration has and its nominal model lacks."""
 
     def __init__(self, bench, told):
         self.bench, self.told = bench, dict(told)
@@ -148,11 +139,6 @@ class Fault:
         self._absent = {p.name: p.canonical_neutral for p in edit.parameters}
         sizes = [p.canonical_limit / np.abs(self._laws[p.name]).max() for p in edit.parameters]
         self.largest = 0.9 * min(sizes) if sizes else 1.0
-
-    @property
-    def is_whole(self):
-        """Whether it is there or not, without a size."""
-        return self.told.get("what") == "exchanged"
 
     def cells(self, residual, fit):
         """Return the share of its signal that each cell carries; its own is all of it."""

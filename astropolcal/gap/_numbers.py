@@ -28,14 +28,7 @@ _TINY = 1e-9
 
 
 class Fitted:
-    """
-    What a model says of the sizes of its effects.
-
-    Parameters
-    ----------
-    model : Model
-        A fitted model with effects.
-    """
+    """What a model says of the sizes of its effects."""
 
     def __init__(self, model):
         self.model, self.problem = model, model.problem
@@ -197,14 +190,7 @@ def _number(values):
 
 
 class Doubles:
-    """
-    Normalized double differences of a model.
-
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    """
+    """Normalized double differences of a model."""
 
     def __init__(self, model):
         self.problem = model.problem

@@ -138,7 +138,7 @@ def _size(value, std, unit, limit):
         return "not determined by these data" + (" at any wavelength" if several else "")
     # shares are given in percent
     values, errors = np.array(good).T * (1 if unit else 100)
-    ends, digits = f" {unit or '%'}", _digits(np.median(errors))
+    ends, digits = f" {unit or '%'}", decimals(np.median(errors))
     middle, low, high = (f"{f(values):.{digits}f}" for f in (np.median, np.min, np.max))
     least, most = (percent(f(errors), 2) for f in (np.min, np.max))
     text = f"{low} to {high}{ends}, median {middle}, errors {least} to {most}{ends}"
@@ -154,7 +154,7 @@ def is_determined(std, limit):
     return std is not None and std <= _DETERMINED * limit
 
 
-def _digits(std):
+def decimals(std):
     """Return the decimals that show two digits of an error."""
     # an error of 0.0123 is written with three decimals
     return max(0, 1 - int(np.floor(np.log10(std)))) if std > 0 else 3

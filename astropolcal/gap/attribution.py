@@ -16,10 +16,9 @@ from functools import cache, cached_property
 import numpy as np
 from scipy import stats
 
-from astropolcal.gap._bases import law_basis
 from astropolcal.gap.cells import Cell, Probes, Reduced
-from astropolcal.gap.effects.cell import CellEffect
-from astropolcal.gap.problem import GapProblem
+from astropolcal.gap.effects.effect import CellEffect
+from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.optics.perturbations import split_run
 
 __all__ = ["Candidate", "Scan", "false_discovery", "scan"]
@@ -298,7 +297,7 @@ def scan(model, effects=(), *, cells=True, temper=1.0, without=None, like=None):
     --------
     >>> import astropy.units as u
     >>> from astropolcal import instruments
-    >>> from astropolcal.gap import scan
+    >>> from astropolcal.gap.attribution import scan
     >>> from astropolcal.gap.model import nominal_model
     >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
     >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)

@@ -13,7 +13,10 @@ together, so that neither counts as a gap.
 
 import numpy as np
 
-__all__ = ["CHANNELS", "Channels"]
+from astropolcal.exceptions import FitError
+from astropolcal.observations.quality import MAD_TO_SIGMA
+
+__all__ = []
 
 #: Names of the channels, in the order of the first axis of all arrays.
 CHANNELS = ("difference", "sum")
@@ -21,32 +24,12 @@ _LARGEST_DEGREE = 6
 _LARGEST_COLOR = 2
 # a flicker below this is not told to what depends on the flux
 _LARGE_FLICKER = 0.1
+# the share of the frames' freedom that harmonics may take from the measure of the noise
+_MOST_TURNING = 0.7
 
 
 class Channels:
-    """
-    Both channels of one dataset, whitened by their noise.
-
-    Parameters
-    ----------
-    dataset : `~astropolcal.measurement.datasets.Dataset`
-        A dataset with one frame a datum.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.channels import Channels
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 90] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> measurement = Measurement(charis.chain(), observations,
-    ...                           observable="normalized_single_difference")
-    >>> Channels(measurement.datasets[0]).observed.shape
-    (2, 22, 16)
-    """
+    """Both channels of one dataset, whitened by their noise."""
 
     def __init__(self, dataset):
         obs = dataset.observations
@@ -97,42 +80,23 @@ class Channels:
 
     def set_noise(self, sigma, residual, saturating):
         """
-        Set the noise of both channels, and fit the lamp.
+        Set the noise of both channels, (2, W, F), and fit the lamp.
 
-        Parameters
-        ----------
-        sigma : `~numpy.ndarray`
-            Standard deviation of every datum, shape (2, W, F).
-        residual : `~numpy.ndarray`
-            Observed minus predicted, shape (2, W, F): its sums tell how the lamp
-            drifts and flickers.
-        saturating : `~numpy.ndarray`
-            What optics could do to the sum of a frame, columns (F, k); it is
-            taken away before the flicker is measured, lest a missing optic be
-            taken for a restless lamp.
+        The sums of the residual, (2, W, F), tell how the lamp drifts and flickers. What optics
+        could do to the sum of a frame, columns (F, k), is taken away first, lest a missing optic be
+        taken for a restless lamp.
         """
         weight = np.where(self.valid, 1 / sigma, 0.0)
         self.sigma = sigma
         self.lamp = _Lamp(residual[1], weight[1], self.sequence, saturating)
         # the flicker makes the sums of a frame correlated: its inverse root is a rank-one change
         self._whitening = weight, self.lamp.shrink(weight[1])
+        design = self._sum_whitened(self.lamp.design(self.valid))
         #: Orthonormal directions of the sums that the lamp takes up, (W * F, n).
-        self.nuisance = _orthonormal(self._sum_whitened(self.lamp.design(self.valid)))
+        self.nuisance = orthonormal(design.reshape(len(design), -1).T)
 
     def whiten(self, array):
-        """
-        Divide by the noise and take the lamp out.
-
-        Parameters
-        ----------
-        array : `~numpy.ndarray`
-            Residuals or derivatives, shape (..., 2, W, F).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Of the same shape; what is left has unit noise.
-        """
+        """Divide residuals or derivatives, (..., 2, W, F), by the noise and take the lamp out."""
         out = self.whiten_frames(array)
         sums = out[..., 1, :, :]
         flat = sums.reshape(*sums.shape[:-2], sums.shape[-2] * sums.shape[-1])
@@ -141,19 +105,7 @@ class Channels:
         return out
 
     def whiten_frames(self, array):
-        """
-        Divide by the noise and by the flicker, frame by frame: the lamp's drift stays.
-
-        Parameters
-        ----------
-        array : `~numpy.ndarray`
-            Residuals or derivatives, shape (..., 2, W, F).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Of the same shape.
-        """
+        """Divide by noise and flicker only, frame by frame: the lamp's drift stays; as `whiten`."""
         out = np.empty(array.shape)
         out[..., 0, :, :] = array[..., 0, :, :] * self._whitening[0][0]
         out[..., 1, :, :] = self._sum_whitened(array[..., 1, :, :])
@@ -213,19 +165,10 @@ class _Lamp:
 
     def brightness(self, shift, weight):
         """
-        Return the brightness of each frame, less what is but its noise.
+        Return the brightness of each frame, (F,), less what is but its noise.
 
-        Parameters
-        ----------
-        shift : `~numpy.ndarray`
-            As measured, in the logarithm of the flux, shape (F,).
-        weight : `~numpy.ndarray`
-            One over its variance, shape (F,).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            The drift; where it is large, the flicker about it as far as it exceeds the noise.
+        It is measured in the logarithm of the flux; the weight is one over its variance. Where the
+        drift is large, the flicker about it is kept as far as it exceeds the noise.
         """
         curve, root = self._curve(self.degree), np.sqrt(weight)
         drift = curve @ np.linalg.lstsq(curve * root[:, None], shift * root, rcond=None)[0]
@@ -282,10 +225,130 @@ def _best_degree(sequence, values, seen):
     return degree
 
 
-def _orthonormal(columns):
-    """Return an orthonormal basis of the columns, shape (n, rank)."""
-    flat = columns.reshape(len(columns), -1).T
-    norms = np.linalg.norm(flat, axis=0)
-    flat = flat[:, norms > 0] / norms[norms > 0]
-    u, s, _ = np.linalg.svd(flat, full_matrices=False)
-    return u[:, s > 1e-9 * s.max(initial=0.0)]
+def _by_state(waves, angles):
+    """Return the waves, and for a modulator with two states those that change sign with them."""
+    state = angles.get("flc_state", np.zeros(1))
+    if np.ptp(state) == 0:
+        return waves
+    return [w for wave in waves for w in (wave, wave * (1 - 2 * state))]
+
+
+def settings(angles, n):
+    """
+    Return what optics could do to the sums: columns of the plate angle, (F, k).
+
+    Not of the derotator angle alone, which changes as slowly as a lamp drifts.
+    """
+    if "hwp" not in angles:
+        return np.zeros((n, 0))
+    plate = angles["hwp"]
+    waves = [np.exp(1j * k * plate) for k in (2, 4)]
+    columns = list(waves)
+    if "derotator" in angles:
+        turn = np.exp(2j * angles["derotator"])
+        columns += [wave * other for wave in waves for other in (turn, turn.conj())]
+    # last, as the list is cut where frames are few: two columns each, at most a third of the
+    # frames
+    columns += [np.exp(1j * k * plate) for k in (1, 3, 6, 8)]
+    columns = _by_state(columns, angles)[: n // 6]
+    return np.array([part(c) for c in columns for part in (np.real, np.imag)]).reshape(-1, n).T
+
+
+def noise(channel, residual, angles):
+    """
+    Return the noise of every datum: the stated errors, or more where the data say so.
+
+    What optics that stand still or turn can do to a beam is a sum of a few
+    harmonics of the stages' angles, sharp in wavelength or not; everything else
+    is smooth in wavelength. So noise is what is left without either.
+    """
+    sigma = np.sqrt(channel.variance)
+    basis = _turning(angles, channel.valid)
+    for i in range(2):
+        rough = _roughness(residual[i], channel.valid, basis)
+        stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & channel.valid
+        if not stated.any():
+            if not rough > 0:
+                raise FitError("no errors in the table, and the residuals tell no noise")
+            sigma[i] = rough
+            continue
+        if np.isfinite(rough):
+            sigma[i] *= max(1.0, rough / _roughness_of(sigma[i], channel.valid))
+        sigma[i] = np.where(stated, sigma[i], np.median(sigma[i][stated]))
+    return sigma
+
+
+def _turning(angles, valid):
+    """Return an orthonormal basis of the harmonics of the stages, (F, k); k may be 0."""
+    waves = [np.ones(valid.shape[1], dtype=complex)]
+    for stage, orders in (("hwp", (2, 4)), ("derotator", (2, 4))):
+        if stage in angles:
+            turns = [np.exp(1j * k * angles[stage]) for k in orders]
+            waves += [wave * t for wave in waves for turn in turns for t in (turn, turn.conj())]
+    waves = _by_state(waves, angles)
+    whole = _whole(valid)
+    columns = np.concatenate([part(np.array(waves)) for part in (np.real, np.imag)]).T
+    basis = orthonormal(columns * whole[:, None], keep=1e-6)
+    # too few frames would be left to tell the noise
+    return basis if basis.shape[1] <= _MOST_TURNING * whole.sum() else basis[:, :0]
+
+
+def _whole(valid):
+    """Return which frames have a datum at every wavelength, (F,)."""
+    # a wavelength that is masked through the run, as in a band of water, makes no frame incomplete
+    return valid[valid.any(axis=1)].all(axis=0)
+
+
+def _roughness(residual, valid, basis):
+    """Return the scatter of second differences along the wavelengths, per datum."""
+    if len(residual) < 5:
+        return np.nan
+    whole = _whole(valid) if basis.shape[1] else np.ones(valid.shape[1], dtype=bool)
+    left = np.where(whole, residual, 0.0)
+    left = left - (left @ basis) @ basis.T
+    # white noise of unit variance has second differences of variance 1 + 4 + 1
+    second = (left[:-2] - 2 * left[1:-1] + left[2:]) / np.sqrt(6)
+    # what stands still at a wavelength, as its brightness, is no noise
+    second = second - np.median(second, axis=1, keepdims=True)
+    keep = valid[:-2] & valid[1:-1] & valid[2:] & whole
+    # projection takes the freedom of its columns from the scatter
+    shrunk = np.sqrt(1 - basis.shape[1] / whole.sum())
+    # a median, lest a few sharp features of the optics count as noise
+    return float(MAD_TO_SIGMA * np.median(np.abs(second[keep])) / shrunk) if keep.any() else np.nan
+
+
+def _roughness_of(sigma, valid):
+    total = np.sqrt((sigma[:-2] ** 2 + 4 * sigma[1:-1] ** 2 + sigma[2:] ** 2) / 6)
+    keep = valid[:-2] & valid[1:-1] & valid[2:]
+    return float(np.median(total[keep]))
+
+
+def expected_fluxes(channel, sweep):
+    """
+    Return the fluxes of both beams as chain and lamp give them, shape (2, W, F).
+
+    An effect that depends on the flux must not depend on the noise of the datum
+    that it is to explain.
+    """
+    right, left = sweep.fluxes
+    level = channel.observed[1] - np.log(right + left)
+    weight = channel.valid / np.square(channel.sigma[1])
+    level = np.where(channel.valid, level, 0.0)
+    scale = (level * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
+    certain = np.maximum(weight.sum(axis=0), 1e-300)
+    shift = ((level - scale[:, None]) * weight).sum(axis=0) / certain
+    shift = channel.lamp.brightness(shift, certain)
+    lamp = np.exp(scale[:, None] + shift)
+    return np.stack([right * lamp, left * lamp])
+
+
+def orthonormal(columns, keep=1e-9):
+    """
+    Return an orthonormal basis, (n_rows, rank), of columns, (n_rows, k), compared at unit length.
+    """
+    norm = np.linalg.norm(columns, axis=0)
+    columns = columns[:, norm > 0] / norm[norm > 0]
+    if not columns.shape[1]:
+        return np.zeros((len(columns), 0))
+    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, singular > keep * singular[0]]

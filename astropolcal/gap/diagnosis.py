@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from astropolcal.exceptions import GapError
-from astropolcal.gap.alternatives import starting_model
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.frames import suspect_frames, without_frames
-from astropolcal.gap.model import Model, nominal_model
+from astropolcal.gap.model import Model, nominal_model, starting_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, explained_by_one, select

@@ -11,17 +11,20 @@ that is in all frames is none of theirs: without the few frames that are named t
 fit must be down to the noise, or nearly all of its excess be gone.
 """
 
+import copy
+import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import stats
 
-from astropolcal.gap._frame_looks import angle_stages
-from astropolcal.gap._frame_search import Search, usual
-from astropolcal.gap._frame_trials import Frame, Trial
-from astropolcal.gap.remainders import off_the_drift
+from astropolcal.gap._frame_looks import Frame, Look, Trial, angle_stages, kept_rows
+from astropolcal.gap.channels import noise, settings
+from astropolcal.gap.model import Model, nominal_calibration
+from astropolcal.gap.problem import GapProblem
+from astropolcal.observations.quality import MAD_TO_SIGMA, robust_curve
 
-__all__ = ["FrameFault", "suspect_frames", "without_frames"]
+__all__ = []
 
 # one frame in so many runs of any length is thought to be wrong beforehand, and the share of
 # these that nobody can explain
@@ -31,54 +34,46 @@ _BETTER, _PARTNERS = 10.0, 5
 _CERTAIN = 0.99
 # a beam is called by its name where it is it with this share
 _TELLS = 0.95
+# brightness off by so many robust standard deviations is at odds with the drift of the lamp
+_FAR, _LARGEST_DRIFT = 6.0, 4
+# chance of a false accusation in a run, and the share of the frames that may be accused
+_ALPHA = 1e-3
+_MOST, _LEAST_MOST = 0.05, 2
+# a fit is down to the noise at this chance; else so much of the excess has to be gone, and the
+# accused have to stand so far above the others
+_NOISE, _GONE, _APART = 1e-3, 0.8, 10.0
+# of very many frames several are taken at once, those nearly as bad as the worst
+_AT_ONCE, _NEARLY = 12, 0.5
+# as bad frames are found, so little of the excess is left that the noise is measured anew
+_NEARLY_GONE = 0.1
+_STEPS, _SHARE = 20, 1e-5
 _STAGES = {"hwp": "the half-wave plate", "derotator": "the derotator"}
 
 
 @dataclass
 class FrameFault:
-    """
-    A frame whose data are not what the table says.
-
-    Parameters
-    ----------
-    dataset : str
-        Name of the dataset.
-    frame : int
-        The frame's number in the table.
-    what : str
-        ``"hwp angle"`` (or that of another stage), ``"exchanged"``, ``"one beam"``,
-        ``"unknown"`` where neither of these describes it, or ``"lamp"`` where only the
-        brightness is off its drift, which does not harm the differences.
-    with_ : int or None
-        Number of the frame with which it was exchanged.
-    value, error : float or None
-        Angle at which the stage stood, in degree; factor of the beam or of the lamp.
-    evidence : float
-        By how much chi-square is lower than without the fault, less what the freedom of
-        size, kind and frame costs.
-    probability : float
-        That it is this, and neither noise nor another of these faults.
-    words : str
-        One sentence.
-    place : tuple of int
-        Index of the dataset and of the frame.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.frames import FrameFault
-    >>> FrameFault("night", 5, "unknown", probability=0.9).to_dict()["frame"]
-    5
-    """
+    """A frame whose data are not what the table says."""
 
     dataset: str
+    #: The frame's number in the table.
     frame: int
+    #: ``"hwp angle"`` (or that of another stage), ``"exchanged"``, ``"one beam"``, ``"unknown"``
+    #: where neither of these describes it, or ``"lamp"`` where only the brightness is off its
+    #: drift, which does not harm the differences.
     what: str
+    #: Number of the frame with which it was exchanged.
     with_: int | None = None
+    #: Angle at which the stage stood, in degree; factor of the beam or of the lamp.
     value: float | None = None
+    #: Angle at which the stage stood, in degree; factor of the beam or of the lamp.
     error: float | None = None
+    #: By how much chi-square is lower than without the fault, less what the freedom of size, kind
+    #: and frame costs.
     evidence: float = 0.0
+    #: That it is this, and neither noise nor another of these faults.
     probability: float = 0.0
     words: str = ""
+    #: Index of the dataset and of the frame.
     place: tuple = field(default=(0, 0), repr=False)
 
     def to_dict(self):
@@ -89,37 +84,11 @@ class FrameFault:
 
 def suspect_frames(model):
     """
-    Find frames whose data are not what the table says.
+    Return the frames whose data are not what the table says, the most evident first.
 
-    Where an optic is missing from the model everywhere, a small fault of one frame cannot be
-    told from it: look again once the optic is in.
-
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-
-    Returns
-    -------
-    list of FrameFault
-        The most evident first, frames of which only the lamp is off last. It is empty where no
-        frame stands out, or so many that the model is at fault and not the frames.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.frames import suspect_frames
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 75, 90] * u.deg)
-    >>> frames["hwp_true"] = frames["hwp"] + np.where(np.arange(32) == 5, 1.0, 0.0) * u.deg
-    >>> data = simulate(chain, charis.wavelength, frames, seed=3)
-    >>> [(fault.frame, fault.what) for fault in suspect_frames(nominal_model([chain], [data]))]
-    [(5, 'hwp angle')]
+    Those of which only the lamp is off come last. There are none where no frame stands out, or so
+    many that the model is at fault and not the frames. Where an optic is missing from the model
+    everywhere, a small fault of one frame cannot be told from it: look again once the optic is in.
     """
     search = Search(model)
     accused, last = search.accused()
@@ -133,29 +102,7 @@ def suspect_frames(model):
 
 
 def without_frames(observations, faults):
-    """
-    Mask the frames that are not what the table says.
-
-    Parameters
-    ----------
-    observations : sequence of Observations
-        The datasets, in the order in which the model had them.
-    faults : sequence of FrameFault
-        Frames of which only the lamp is off are left as they are.
-
-    Returns
-    -------
-    list of Observations
-
-    Examples
-    --------
-    >>> from astropolcal.gap.frames import FrameFault, without_frames
-    >>> from astropolcal.observations import Observations, example_table
-    >>> night = Observations.from_table(example_table())
-    >>> fault = FrameFault("night", 1, "one beam", place=(0, 1))
-    >>> without_frames([night], [fault])[0].mask_reasons
-    {'not as the table says: one beam': 3}
-    """
+    """Mask the frames that are not what the table says."""
     observations = list(observations)
     for fault in faults:
         if fault.what != "lamp":
@@ -315,19 +262,216 @@ def _words(fault, told, beam=""):
 def _lamp(model):
     """Return the frames of which the brightness is off the drift of the lamp."""
     found = []
-    for i, (observations, far, deviation, score) in enumerate(off_the_drift(model)):
-        numbers = observations.frames["frame"]
-        for f in np.flatnonzero(far):
+    problem, gaps = model.problem, model.problem.differences(model.fit.coefficients)
+    for i, channel in enumerate(problem.channels):
+        observations = problem.datasets[i].observations
+        deviation, score = _off_the_drift(channel, gaps[i][1])
+        far = np.flatnonzero(np.abs(np.nan_to_num(score)) > _FAR)
+        for f in far:
             fault = FrameFault(
                 observations.name,
-                int(numbers[f]),
+                int(observations.frames["frame"][f]),
                 "lamp",
                 value=float(np.exp(deviation[f])),
                 error=float(abs(deviation[f] / score[f])),
                 evidence=float(score[f] ** 2),
-                probability=float(1 - 2 * far.size * stats.norm.sf(abs(score[f]))),
+                probability=float(1 - 2 * score.size * stats.norm.sf(abs(score[f]))),
                 place=(i, int(f)),
             )
             fault.words = _words(fault, None)
             found.append(fault)
     return sorted(found, key=lambda fault: -fault.evidence)
+
+
+def _off_the_drift(channel, gap):
+    """
+    Return by how much the brightness of every frame is off a smooth drift, (F,) each.
+
+    As the logarithm of the flux that is common to all wavelengths, and in robust standard
+    deviations; ``gap`` is that of the sums, (W, F).
+    """
+    sigma = channel.sigma[1]
+    table = np.where(channel.valid & np.isfinite(sigma), gap, np.nan)
+    with warnings.catch_warnings():
+        # a frame that is masked at all wavelengths has no median
+        warnings.simplefilter("ignore", RuntimeWarning)
+        common = np.nanmedian(table - np.nanmedian(table, axis=1, keepdims=True), axis=0)
+        # the variance of a median of n is pi / 2 times that of their mean: 1.25 squared
+        count = np.maximum(np.isfinite(table).sum(axis=0), 1)
+        error = np.nanmedian(np.nanmedian(sigma, axis=0) * 1.25 / np.sqrt(count))
+    least, n = np.inf, np.isfinite(common).sum()
+    # the curve whose median deviation is least for what its degree costs
+    for degree in range(min(_LARGEST_DRIFT, n // 4) + 1):
+        curve = robust_curve(2 * channel.sequence - 1, common, degree)
+        middle = np.nanmedian(np.abs(common - curve))
+        cost = n * np.log(max(middle, 1e-12)) + degree * np.log(max(n, 2))
+        if cost < least:
+            least, deviation, spread = cost, common - curve, max(MAD_TO_SIGMA * middle, error)
+    return deviation, deviation / spread
+
+
+# ---- the search --------------------------------------------------------------------------------
+
+
+class Search:
+    """A search for frames that stand out."""
+
+    def __init__(self, model):
+        self.model, self.problem = model, model.problem
+        self.n_frames = int(sum(c.valid.any(axis=0).sum() for c in self.problem.channels))
+        self.most = max(_LEAST_MOST, int(_MOST * self.n_frames))
+        nobody = _marked(self.problem, [])
+        self.first = Look(model, model.fit.coefficients, nobody)
+        #: The frames that bent the fit most.
+        self.worst = set()
+
+    def accused(self):
+        """
+        Return the frames that stand out, and the look at all without them.
+
+        Index of dataset and frame, in the order of accusation; none if too many stand out.
+        """
+        trail = self._trail([], self.first)
+        # the first few, without which nearly all is gone: in a fit that they have bent, more
+        # frames look bad than are
+        few = (one for one in trail if one[0] and self._is_nearly_gone(one[1]))
+        places, look = next(few, ([], self.first))
+        if not places:
+            return [], self.first
+        self.worst = set(places)
+        self._start_again(places, look)
+        self.first = Look(self.model, look.coefficients, _marked(self.problem, []))
+        few = places, self._look(places, look.coefficients)
+        *_, (places, look) = self._trail(*few)
+        return (places, look) if places else few
+
+    def _trail(self, places, look):
+        """Yield the frames that are accused step by step, with the look without them."""
+        while True:
+            yield places, look
+            # a frame that is far off makes others look bad; these are heard and let go
+            suspects = _worst(look, self.n_frames)[: max(1, self.most // _AT_ONCE)]
+            if not suspects:
+                return
+            if len(places) >= 2 * self.most or self._is_hopeless(look, len(places)):
+                yield [], look
+                return
+            places = places + suspects
+            look = self._look(places, look.coefficients)
+
+    def _is_nearly_gone(self, look):
+        excess = [one.chi2 / one.freedom - 1 for one in (self.first, look)]
+        return look.chance > _NOISE or excess[1] < _NEARLY_GONE * excess[0]
+
+    def _look(self, places, coefficients):
+        out = _marked(self.problem, places)
+        rows = kept_rows(self.problem, out)
+        fit = self.problem.fit(coefficients, rows=rows, steps=_STEPS, share=_SHARE)
+        look = Look(self.model, fit.coefficients, out)
+        if look.chance > _NOISE:
+            return look
+        # from where bad frames had bent it a fit need not find back
+        other = self.problem.fit(self.problem.start, rows=rows, steps=_STEPS, share=_SHARE)
+        return Look(self.model, other.coefficients, out) if other.chi2 < fit.chi2 else look
+
+    def _start_again(self, places, look):
+        """Measure the noise without some frames, and find a start for the fit that has them not."""
+        old, out = self.problem, _marked(self.problem, places)
+        chains = self.model.chains
+        if look.chance < _NOISE and not self.model.added:
+            seen = zip(self.model.observations, out, strict=True)
+            left = [o.with_mask(mask, "accused") if mask.any() else o for o, mask in seen]
+            chains = nominal_calibration(chains, left).chains
+        problem = GapProblem(
+            chains,
+            self.model.observations,
+            ties=old.ties,
+            laws=old.laws,
+            priors=old.priors,
+            neutral=old.neutral,
+            limits=old.limits,
+        )
+        q = problem.start if look.chance < _NOISE else look.coefficients
+        for channel, dataset, residual, without in zip(
+            problem.channels, problem.datasets, problem.differences(q), out, strict=True
+        ):
+            angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
+            sigma = _noise_of_others(channel, residual, angles, without)
+            channel.set_noise(sigma, residual, settings(angles, dataset.observations.n_frames))
+        self.model, self.problem = Model(problem, self.model.fit), problem
+
+    def _is_hopeless(self, look, n):
+        """Return whether so little went with the frames left out that no few of them will do."""
+        excess = [one.chi2 - one.freedom for one in (self.first, look)]
+        gone = 1 - excess[1] / excess[0] if excess[0] > 0 else 1.0
+        return look.chance < _NOISE and n > 2 and gone < 0.5 * n / self.most
+
+    def is_settled(self, places, look):
+        """Return whether what was wrong is gone without some frames."""
+        if not places or len(places) > self.most:
+            return False
+        marked = {(i, int(f)) for i, out in enumerate(look.out) for f in np.flatnonzero(out)}
+        if marked != set(places):
+            look = self._look(places, look.coefficients)
+        if look.chance > _NOISE:
+            return True
+        excess = [one.chi2 / one.freedom - 1 for one in (self.first, look)]
+        if excess[1] > (1 - _GONE) * excess[0]:
+            return False
+        falls = [look.deleted(i)[0] for i in range(len(look.out))]
+        left = max(np.max(fall, where=look.kept(i), initial=0.0) for i, fall in enumerate(falls))
+        return all(falls[i][f] > _APART * left for i, f in places)
+
+
+def _noise_of_others(channel, residual, angles, without):
+    """Return the noise of every datum, as it is where some frames take no part."""
+    others = copy.copy(channel)
+    others.valid = channel.valid & ~without
+    sigma, stated = noise(others, residual, angles), np.sqrt(channel.variance)
+    for own, told in zip(sigma, stated, strict=True):
+        known = others.valid & np.isfinite(told) & (told > 0)
+        if known.any():
+            wanted = without & channel.valid & np.isfinite(told) & (told > 0)
+            own[wanted] = told[wanted] * np.median(own[known] / told[known])
+    return sigma
+
+
+def _marked(problem, places):
+    """Return which frames are among some places, one array a dataset."""
+    out = [np.zeros(c.shape[2], dtype=bool) for c in problem.channels]
+    for i, f in places:
+        out[i][f] = True
+    return out
+
+
+def _worst(look, n_frames):
+    """Return the frames that stand out most, none if all are as noise and the others are."""
+    scores, looks = [], 1
+    for i in range(len(look.out)):
+        keep = look.kept(i)
+        tests = [look.deleted(i)]
+        for kind, columns in look.columns(i).items():
+            tests.append((look.lowering(i, columns[:1]), np.ones(len(keep))))
+            if kind.endswith("beam"):
+                tests.append((look.lowering(i, columns), np.full(len(keep), len(columns))))
+        looks = max(looks, len(tests))
+        scores.append(np.max([_surprise(*test, keep) for test in tests], axis=0))
+    places = [(i, f) for i, score in enumerate(scores) for f in range(len(score))]
+    every = np.concatenate(scores)
+    least = max(np.log(n_frames * looks / _ALPHA), _NEARLY * every.max())
+    return [places[k] for k in np.argsort(-every, kind="stable") if every[k] > least]
+
+
+def _surprise(fall, freedom, keep):
+    """Return minus the logarithm of the chance of every frame's fall among the others, (F,)."""
+    fall = np.where(keep, fall, 0.0) / usual(fall, freedom, keep)
+    # far out the chance is no number any more
+    return np.minimum(-stats.chi2.logsf(fall, np.maximum(freedom, 1)), fall / 2)
+
+
+def usual(fall, freedom, keep):
+    """Return how much larger than noise a statistic, (F,), is in most frames, at least 1."""
+    if not keep.any():
+        return 1.0
+    usual = stats.chi2.median(np.maximum(np.median(freedom[keep]), 1))
+    return float(max(np.median(fall[keep]) / usual, 1.0))

@@ -10,61 +10,55 @@ import astropy.units as u
 import numpy as np
 from scipy import stats
 
-from astropolcal.calibration import calibrate
+from astropolcal.calibration import Calibration, calibrate
+from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
-from astropolcal.gap._branches import NOISE, in_branch, off_extremum
-from astropolcal.gap.effects import Context
+from astropolcal.gap.cells import FINITE
+from astropolcal.gap.effects import Context, adapted
+from astropolcal.gap.effects.effect import tracking_laws
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.mueller import is_physical
-from astropolcal.optics import Perturbation, Rotator
+from astropolcal.observations.reading import common_wavelengths
+from astropolcal.optics import LinearRetarder, Perturbation, Rotator
 
-__all__ = ["Model", "effect_tangent", "nominal_calibration", "nominal_model"]
+__all__ = []
 
 _ROUNDS, _MORE = 3, 3
-# directions in which a size at its limit does less than this to the data, in units of the
-# noise, are not looked at; nor those of which the model takes up all but this share
-_VISIBLE = 1.0
-_ABSORBED = 1e-6
 # a size so near to its limit, in units of that, is at it; the share of the wavelengths at
 # which the data may leave a size there
 _AT_LIMIT = 1e-6
 _MOST_PRESSED = 0.1
 # share by which optics may seem to measure more polarization than there is
 _MORE_LIGHT = 1e-3
+# alternatives are tried where double differences are off by more than this
+_WRONG_SIGN = 0.02
+# or by more than this share of the signal and so many times the noise, as those of stars are
+_WRONG_SHARE, _ABOVE_NOISE = 0.3, 3.0
+# an alternative must lower the residuals to this share, and those within a tenth are aliases
+_FAR_BETTER, _ALIKE = 0.5, 1.1
+# fits of what gives the same data end with misfits that differ by a smaller share
+_EQUAL = 1e-3
+_FEW = 5
+#: A fit whose residuals are less probable than this may sit in a wrong minimum
+NOISE = 1e-3
+# a second difference above this share of the first one is tried at finite size
+_BENT = 1.0
+# wavelengths with a mean square above so many medians may sit in a wrong branch; another one has to
+# leave less than this share, and is sought in so many steps
+_CONSPICUOUS, _FAR_LESS, _FEW_STEPS = 3.0, 0.7, 8
+# square of the bend (radian) that another sign has to be worth
+_OTHER_SIGN = 0.01
 
 
 @dataclass
 class Model:
-    """
-    Chains, what has been added to them, and their fit in both channels.
-
-    Parameters
-    ----------
-    problem : GapProblem
-        Residuals and derivatives.
-    fit : Fit
-        The solution.
-    added : dict of str to list of EffectParameter
-        Effects in the chains, with the parameters that they added.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> model = nominal_model([chain], [simulate(chain, charis.wavelength, frames, seed=1)])
-    >>> model.added, model.fit.converged
-    ({}, True)
-    """
+    """Chains, what has been added to them, and their fit in both channels."""
 
     problem: GapProblem
     fit: object
+    #: Effects in the chains, with the parameters that they added.
     added: dict = field(default_factory=dict)
 
     @property
@@ -81,7 +75,11 @@ class Model:
     @cached_property
     def held_chains(self):
         """Copies of the optics of the chains with every parameter fixed."""
-        return [_held(train) for train in self.trains]
+        held = [train.copy() for train in self.trains]
+        for leaf in (leaf for train in held for leaf in leaves(train)):
+            for key in leaf.param_names:
+                getattr(leaf, key).fixed = True
+        return held
 
     @property
     def observations(self):
@@ -99,27 +97,11 @@ class Model:
         return Context.of(self.problem.wavelength, self.observations)
 
     def of_dataset(self, i):
-        """
-        Return the model of one of the datasets by itself, fitted with the same noise.
-
-        Parameters
-        ----------
-        i : int
-            Number of the dataset.
-
-        Returns
-        -------
-        Model
-            Without what was added.
-        """
+        """Return the model of one of the datasets by itself, fitted with the same noise."""
         mine = self.problem
         noise = SimpleNamespace(fluxes=[mine.fluxes[i]], channels=[mine.channels[i]], waves=None)
         problem = GapProblem([self.trains[i]], [self.observations[i]], ties=mine.ties, like=noise)
         return Model(problem, problem.fit(problem.start))
-
-    def degrees_of_freedom(self, tangent):
-        """Return the number of data less that of the directions fitted."""
-        return self.problem.n_data - tangent.shape[1]
 
     @property
     def mean_square(self):
@@ -130,22 +112,14 @@ class Model:
     def p_value(self):
         """Probability of the residuals by noise alone."""
         tangent = self.problem.tangent(self.fit.coefficients)
-        return float(stats.chi2.sf(self.fit.chi2, self.degrees_of_freedom(tangent)))
+        return float(stats.chi2.sf(self.fit.chi2, self.problem.n_data - tangent.shape[1]))
 
     def edited(self, *recipes):
         """
-        Return the model with effects at zero, not fitted.
+        Return the model with effects, each with its context, at zero and not fitted.
 
-        Parameters
-        ----------
-        *recipes : tuple
-            Effect and context each, the latter None for that of the data. An effect that has no
-            place without another that is not among them is left out.
-
-        Returns
-        -------
-        Model
-            The model itself where nothing was added.
+        A context of None is that of the data. An effect that has no place without another that is
+        not among them is left out; where nothing was added it is the model itself.
         """
         mine, trains, edits = self.problem, self.trains, {}
         for effect, context in recipes:
@@ -166,22 +140,7 @@ class Model:
         return Model(problem, Fit(problem.start, np.inf, False), self.added | added)
 
     def with_effect(self, effect, context=None, **settings):
-        """
-        Return the model with an effect added and everything fitted again.
-
-        Parameters
-        ----------
-        effect : Effect
-            The effect.
-        context : Context, optional
-            By default that of the data.
-        **settings
-            Of `GapProblem.fit`.
-
-        Returns
-        -------
-        Model
-        """
+        """Return the model with an effect added and everything fitted again."""
         model = self.edited((effect, context))
         problem, added = model.problem, model.added
         starts = off_extremum(problem, problem.start, added[effect.name])
@@ -190,23 +149,10 @@ class Model:
 
     def with_effects(self, effects, like=None, **settings):
         """
-        Return the model with several effects added, and fitted once.
+        Return the model with several effects added, each with its context, and fitted once.
 
-        One that has no place without another that is not among them is left out.
-
-        Parameters
-        ----------
-        effects : sequence of tuple
-            Effect and context each, the latter None for that of the data.
-        like : Model, optional
-            A model from whose solution the fit starts, where the two share
-            parameters.
-        **settings
-            Of `GapProblem.fit`.
-
-        Returns
-        -------
-        Model
+        A context of None is that of the data. An effect that has no place without another that is
+        not among them is left out.
         """
         model = self.edited(*effects)
         # not fitted in between: one fit at the end is enough
@@ -225,18 +171,7 @@ class Model:
         return Model(self.problem, Fit(start, np.inf, False), self.added) if moved else self
 
     def without(self, names):
-        """
-        Return the model without some of its effects, to first order.
-
-        Parameters
-        ----------
-        names : collection of str
-            Names of added effects.
-
-        Returns
-        -------
-        Linear
-        """
+        """Return the model without some of its effects, to first order."""
         problem, q = self.problem, self.fit.coefficients
         kept, jacobian = np.ones(problem.size, dtype=bool), self.jacobian
         residual = self.residual
@@ -283,17 +218,7 @@ class Model:
 
     def sizes(self, name):
         """
-        Return the fitted coefficients of an added effect and their errors.
-
-        Parameters
-        ----------
-        name : str
-            Name of the effect.
-
-        Returns
-        -------
-        dict of str to tuple
-            ``"optic.parameter"`` to coefficients, errors, unit and EffectParameter.
+        Return the coefficients of an added effect by name, with errors, unit and `EffectParameter`.
         """
         errors = self.problem.errors(self.fit.coefficients)
         found = {}
@@ -343,14 +268,19 @@ class Model:
         What makes polarization larger may be a change of an optic that makes it smaller, or of one
         behind it, but all optics together never measure more than there is.
         """
-        vector, own = None, {p.name.partition(".")[0] for p in self.added[name]}
+        own = {p.name.partition(".")[0] for p in self.added[name]}
         for dataset in self.problem.datasets:
             optics = dataset.propagator.leaves
-            found = [i for i, leaf in enumerate(optics) if leaf.name in own and _depolarizes(leaf)]
+            found = [
+                i
+                for i, leaf in enumerate(optics)
+                if leaf.name in own
+                and isinstance(leaf, Perturbation)
+                and leaf.kind.startswith("depolarization")
+            ]
             if not found:
                 continue
-            vector = self.problem.vector(self.fit.coefficients) if vector is None else vector
-            sweep = dataset.forward(vector)
+            sweep = dataset.forward(self.problem.vector(self.fit.coefficients))
             # rotators, which stand between an optic and what turns with it, change no length
             front = [i for i in range(found[0]) if not isinstance(optics[i], Rotator)][-1:]
             one, none = np.ones(sweep.fluxes[0].shape), np.zeros(sweep.fluxes[0].shape)
@@ -374,35 +304,15 @@ class Model:
         slots = [self.problem.free.by_name[p.name] for p in self.added.get(name) or ()]
         return sum(int(np.sum(at[slot.slice])) for slot in slots)
 
-    def impossible(self):
-        """Return the names of the effects whose fitted values are out of their limits."""
-        return {name for name in self.added if not self.is_physical(name)}
-
 
 @dataclass
 class Linear:
-    """
-    A fitted model in which effects may be absent, to first order.
-
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    tangent : `~numpy.ndarray`
-        Orthonormal basis of what it can do without these effects, (n_rows, rank).
-    residual : `~numpy.ndarray`
-        What it leaves then, whitened, (n_rows,).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.gap.model import Linear
-    >>> Linear(None, np.zeros((2, 0)), np.array([3.0, 4.0])).chi2
-    25.0
-    """
+    """A fitted model in which effects may be absent, to first order."""
 
     model: Model
+    #: Orthonormal basis of what it can do without these effects, (n_rows, rank).
     tangent: np.ndarray
+    #: What it leaves then, whitened, (n_rows,).
     residual: np.ndarray
 
     @property
@@ -417,49 +327,8 @@ class Linear:
         return self.chi2 / max(freedom, 1)
 
 
-def _depolarizes(leaf):
-    return isinstance(leaf, Perturbation) and leaf.kind.startswith("depolarization")
-
-
 def nominal_model(chains, observations, *, calibration=None, like=None, fit=True):
-    """
-    Fit the nominal chains in both channels.
-
-    Parameters
-    ----------
-    chains : sequence
-        The chain of each dataset.
-    observations : sequence of Observations
-        The datasets.
-    calibration : Calibration, optional
-        A calibration of these data; by default it is made.
-    like : Model, optional
-        A model whose noise is taken over.
-    fit : bool
-        Whether to fit in both channels, or take the values of the calibration.
-
-    Returns
-    -------
-    Model
-
-    Raises
-    ------
-    GapError
-        If the nominal fit does not converge.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> model = nominal_model([charis.chain()], [observations])
-    >>> bool(model.fit.chi2 < 1.1 * model.problem.n_rows)
-    True
-    """
+    """Fit the nominal chains in both channels, from a calibration that is made if none is given."""
     if calibration is None:
         calibration = nominal_calibration(chains, observations)
     if calibration.converged is False and fit:
@@ -506,128 +375,273 @@ def _no_convergence():
     )
 
 
-class _AsGiven:
-    """What stands for a calibration where every parameter is held: the chains as they are."""
-
-    converged = True
-
-    def __init__(self, measurement):
-        self.measurement = measurement
-
-    @property
-    def chains(self):
-        """The chains."""
-        return self.measurement.chains
-
-
 def nominal_calibration(chains, observations):
     """
-    Calibrate chains without cross-validation, for a diagnosis.
-
-    Parameters
-    ----------
-    chains : sequence
-        The chain of each dataset.
-    observations : sequence of Observations
-        The datasets.
-
-    Returns
-    -------
-    Calibration
-        It may not have converged, see its ``converged``.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_calibration
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> nominal_calibration([chain], [simulate(chain, charis.wavelength, frames, seed=1)]).converged
-    True
+    Calibrate chains for a diagnosis, not cross-validated; see ``converged`` of what is returned.
     """
     measurement = Measurement(chains, observations)
     if not measurement.free.size:
-        return _AsGiven(measurement)
+        # every parameter is held: the chains as they are
+        return SimpleNamespace(converged=True, measurement=measurement, chains=measurement.chains)
     with warnings.catch_warnings():
         # a model that lacks something is expected to fit badly; the report says how badly
         warnings.simplefilter("ignore", AstropolcalWarning)
         return calibrate(list(chains), list(observations), cross_validate=False)
 
 
-def effect_tangent(model, effect, nominal, context=None):
+def starting_model(calibration, observations, library, say):
     """
-    Return the directions in the data that an effect adds to a model.
+    Return the nominal model, that of the discrete alternative that beats it, and which this is.
 
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    effect : Effect
-        An effect that is not in the model.
-    nominal : `~numpy.ndarray`
-        Orthonormal basis of what the model can do already, (n_rows, rank).
-    context : Context, optional
-        By default that of the data.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Orthonormal, shape (n_rows, k). Directions are left out in which even an
-        effect at its physical limit would change the data by less than their
-        noise.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.effects import get_effect
-    >>> from astropolcal.gap.model import effect_tangent, nominal_model
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> model = nominal_model([charis.chain()], [observations])
-    >>> nominal = model.problem.tangent(model.fit.coefficients)
-    >>> effect_tangent(model, get_effect("beam_gain"), nominal).shape[1]
-    3
+    Where none does, the second is the nominal model again and the third an empty list; else the
+    alternative is followed by its aliases.
     """
-    edit = effect.edit(model.held_chains, context or model.context)
-    names = {p.name for p in edit.parameters}
-    problem = GapProblem(
-        edit.chains,
-        model.observations,
-        ties={name: tie for name, tie in edit.ties.items() if tie.source in names},
-        laws=edit.laws,
-        like=model.problem,
-        copy=False,
-    )
-    if not problem.size:
-        return np.zeros((problem.n_rows, 0))
-    priors = edit.priors
-    size = np.concatenate(
-        [
-            np.full(problem.slices[n].stop - problem.slices[n].start, priors[n])
-            for n in problem.slices
-        ]
-    )
-    # each column is what a size at the brink of the possible would do
-    slopes = problem.jacobian(problem.start) * size
-    left = slopes - nominal @ (nominal.T @ slopes)
-    # twice is enough to be orthogonal to rounding
-    left -= nominal @ (nominal.T @ left)
-    basis, singular, _ = np.linalg.svd(left, full_matrices=False)
-    # a column is what half the limit does: singular values are in units of the noise
-    floor = max(_VISIBLE, _ABSORBED * np.linalg.norm(slopes, axis=0).max())
-    return basis[:, singular > floor]
+    given = calibration if isinstance(calibration, Calibration) else None
+    chains = calibration.chains if given else calibration
+    chains = list(chains) if isinstance(chains, (list, tuple)) else [chains] * len(observations)
+    if len(chains) != len(observations):
+        raise GapError(f"{len(chains)} chains for {len(observations)} datasets")
+    if given is None:
+        given = nominal_calibration(chains, observations)
+    elif given.measurement is None:
+        given = given.with_observations(observations)
+    if _may_be_wrong(given):
+        discrete = [e for e in adapted(library, chains) if e.kind == "discrete"]
+        found = _tried(chains, observations, discrete, say)
+        if found and found[0][0] < _FAR_BETTER * _misfit(given):
+            say(f"calibrating: {found[0][1].title}")
+            edited = found[0][1].edit(chains, _context(observations)).chains
+            best = nominal_calibration(edited, observations)
+            if _misfit(best) < _FAR_BETTER * _misfit(given):
+                return _with_alternative(chains, observations, given, best, found)
+    nominal = nominal_model(chains, observations, calibration=given)
+    return nominal, nominal, []
 
 
-def _held(chain):
-    """Return a copy of the chain with every parameter fixed."""
-    copy = chain.copy()
-    for leaf in leaves(copy):
-        for key in leaf.param_names:
-            getattr(leaf, key).fixed = True
-    return copy
+def _tried(chains, observations, effects, say):
+    """Return misfit and effect of every alternative at a few wavelengths, best first."""
+    if not effects:
+        return []
+    few, context = thinned(chains, observations, _FEW), _context(observations)
+    found = []
+    for effect in effects:
+        say(f"trying: {effect.title}")
+        trial = nominal_calibration(effect.edit(few[0], context).chains, few[1])
+        found.append((_misfit(trial), effect))
+    misfits = np.array([misfit for misfit, _ in found])
+    return [found[i] for i in ranked(-misfits, _EQUAL * misfits.min())]
+
+
+def _context(observations):
+    """Return what a discrete effect may know: how the plates follow the sky."""
+    return Context(common_wavelengths(observations), tracking=tracking_laws(observations))
+
+
+def _misfit(calibration):
+    """Return the root mean square residual of the double differences, in polarization."""
+    return float(np.sqrt(np.mean(np.square(calibration.measurement.residuals()))))
+
+
+def _may_be_wrong(calibration):
+    """Return whether the double differences are so far off that a sign may be wrong."""
+    misfit, datasets = _misfit(calibration), calibration.measurement.datasets
+    signal, noise = (
+        float(np.sqrt(np.mean(np.concatenate([np.square(part(d)) for d in datasets]))))
+        for part in (lambda d: d.observed, lambda d: d.sigma)
+    )
+    # what has no stated errors has no noise to compare with
+    clear = not misfit < _ABOVE_NOISE * noise
+    return misfit > _WRONG_SIGN or (misfit > _WRONG_SHARE * signal and clear)
+
+
+def _with_alternative(chains, observations, given, best, found):
+    """Return the nominal model, and the model of the alternative with its aliases."""
+    model = nominal_model(best.chains, observations, calibration=best)
+    # what fits badly need not converge to be left behind
+    nominal = nominal_model(chains, observations, calibration=given, like=model, fit=False)
+    least, effect = found[0]
+    model.added[effect.name] = []
+    return nominal, model, [effect, *(o for misfit, o in found[1:] if misfit < _ALIKE * least)]
+
+
+def thinned(chains, observations, count):
+    """Return chains and datasets at a few of the wavelengths."""
+    grid = common_wavelengths(observations)
+    if count >= len(grid):
+        return list(chains), list(observations)
+    keep = np.unique(np.linspace(0, len(grid) - 1, count).round().astype(int))
+    few = [_at(o, grid[keep]) for o in observations]
+    return [join([_picked(leaf, keep, len(grid)) for leaf in leaves(c)]) for c in chains], few
+
+
+def _at(observations, wavelength):
+    own = observations.wavelength.to_value(u.um)
+    near = np.isclose(own[:, None], wavelength, rtol=1e-4).any(axis=1)
+    return observations.select_bins(near)
+
+
+def _picked(leaf, keep, size):
+    values = {}
+    for key in leaf.param_names:
+        parameter = getattr(leaf, key)
+        if parameter.shape == (size,):
+            values[key] = parameter.value[keep] * (parameter.unit or 1)
+    return leaf.with_parameters(**values) if values else leaf.copy()
+
+
+def off_extremum(problem, start, parameters):
+    """
+    Return the start of a fit, or those of both signs where the derivative of a retardance vanishes.
+
+    At half a wave it does, and a fit from there would stay.
+    """
+    found = []
+    optics = {leaf.name: leaf for d in problem.datasets for leaf in d.propagator.leaves}
+    for parameter in parameters:
+        where = problem.slices.get(parameter.name)
+        if where is None or np.any(start[where]) or not _retards(optics, parameter.name):
+            continue
+        vector = problem.vector(start)
+        vector[problem.free.by_name[parameter.name].slice] = FINITE
+        step = problem.coefficients(vector) - start
+        ends = [start + sign * step for sign in (1, -1)]
+        there, up, down = (problem.residual(q) for q in (start, *ends))
+        bend = np.linalg.norm(up + down - 2 * there)
+        if bend > max(1.0, _BENT * np.linalg.norm(up - down)):
+            found += ends
+    return found or [start]
+
+
+def _retards(optics, name):
+    """Return whether a parameter is a constant retardance that was inserted."""
+    optic = optics.get(name.partition(".")[0])
+    if isinstance(optic, Perturbation):
+        return optic.kind.startswith("retardance") and optic.dependence == "constant"
+    return isinstance(optic, LinearRetarder) and name.endswith(".retardance")
+
+
+def in_branch(problem, found):
+    """
+    Return the fit with the wavelengths in other branches that are far better there.
+
+    A retardance of the other sign, or a turn from it, may be a minimum of its own, from which a
+    fit does not leave. Wavelengths that fit much worse than the others are started again from what
+    their neighbours say, with all signs; where those would have all others bent, everything is
+    fitted from the signs of the smoothest course.
+    """
+    slots = [s for s in problem.free.slots if s.per_wavelength and s.name not in problem.laws]
+    slots = [slot for slot in slots if slot.size == len(problem.wavelength)]
+    if not slots or stats.chi2.sf(found.chi2, max(problem.n_data - problem.size, 1)) > NOISE:
+        return found
+    for starts in (_mended(problem, slots, found.coefficients), _smoothest(problem, slots, found)):
+        for start in starts:
+            again = problem.fit(start)
+            found = again if again.converged and again.chi2 < found.chi2 else found
+    return found
+
+
+def _mended(problem, slots, coefficients):
+    """Yield the coefficients with the wavelengths that fit worst in a better branch, if any are."""
+    before = _by_wavelength(problem, coefficients)
+    bad = before > _CONSPICUOUS * np.median(before)
+    if not bad.any() or np.sum(~bad) < 2:
+        return
+    live = np.zeros(problem.size, dtype=bool)
+    for slot in slots:
+        live[problem.slices[slot.name]] = bad
+    rows = np.concatenate(
+        [np.broadcast_to(bad[d.bins][:, None], c.shape).ravel() for c, d in _datasets(problem)]
+    )
+    best, least = coefficients.copy(), before
+    for start in _branches(problem, slots, coefficients, bad):
+        trial = problem.fit(start, rows, ~live, steps=_FEW_STEPS).coefficients
+        after = _by_wavelength(problem, trial)
+        better = bad & (after < least)
+        for slot in slots:
+            where = problem.slices[slot.name]
+            best[where] = np.where(better, trial[where], best[where])
+        least = np.where(better, after, least)
+    # what a wavelength gains has to be more than what a fit may still win by itself
+    if np.any(least < _FAR_LESS * before):
+        yield best
+
+
+def _smoothest(problem, slots, found):
+    """Yield the coefficients with the signs of retardances that make their courses smoothest."""
+    start = found.coefficients.copy()
+    for slot in slots:
+        where = problem.slices[slot.name]
+        if slot.unit == u.deg and slot.size > 2:
+            start[where] = _smooth(
+                problem.wavelength, start[where], problem.low[where], problem.high[where]
+            )
+    if not np.array_equal(start, found.coefficients):
+        yield start
+
+
+def _smooth(wavelength, values, low, high):
+    """Return values with the signs and turns with which their course is least bent."""
+    turn = 2 * np.pi
+    choices = np.array([s * values + k * turn for s in (1, -1) for k in (0, -1, 1)])
+    # what is out of the bounds is no choice; its own value is always one, and preferred
+    cost = np.where((choices >= low) & (choices <= high), _OTHER_SIGN, np.inf)
+    cost[0] = 0.0
+    total, back = cost[:, :1] + cost[:, 1], []
+    for i in range(2, len(values)):
+        first, second, third = choices[:, i - 2], choices[:, i - 1], choices[:, i]
+        share = (wavelength[i] - wavelength[i - 1]) / (wavelength[i - 1] - wavelength[i - 2])
+        straight = second[None] + share * (second[None] - first[:, None])
+        bends = total[:, :, None] + (third - straight[:, :, None]) ** 2 + cost[:, i]
+        back.append(bends.argmin(axis=0))
+        total = bends.min(axis=0)
+    path = list(np.unravel_index(total.argmin(), total.shape))
+    for step in reversed(back):
+        path.insert(0, int(step[path[0], path[1]]))
+    return choices[path, np.arange(len(values))]
+
+
+def _datasets(problem):
+    return zip(problem.channels, problem.datasets, strict=True)
+
+
+def _by_wavelength(problem, coefficients):
+    """Return the mean square of the residuals at each wavelength."""
+    square = problem.residual(coefficients) ** 2
+    total, count = np.zeros((2, len(problem.wavelength)))
+    for (channel, dataset), rows in zip(_datasets(problem), problem.segments, strict=True):
+        total[dataset.bins] += square[rows].reshape(channel.shape).sum(axis=(0, 2))
+        count[dataset.bins] += 2 * channel.valid.sum(axis=1)
+    return total / np.maximum(count, 1)
+
+
+def _branches(problem, slots, coefficients, bad):
+    """Yield starts at which wavelengths are as their neighbours say, with one sign or another."""
+    smooth = {}
+    for slot in slots:
+        values = coefficients[problem.slices[slot.name]]
+        # a retardance is known up to a turn
+        good = np.unwrap(values[~bad]) if slot.unit == u.deg else values[~bad]
+        smooth[slot.name] = np.interp(problem.wavelength, problem.wavelength[~bad], good)
+    angles = [slot.name for slot in slots if slot.unit == u.deg]
+    for flipped in dict.fromkeys([(), tuple(angles), *((name,) for name in angles)]):
+        start = coefficients.copy()
+        for slot in slots:
+            where, value = problem.slices[slot.name], smooth[slot.name]
+            value = -value if slot.name in flipped else value
+            if slot.name in angles:
+                value = _within(value, problem.low[where], problem.high[where])
+            start[where] = np.where(bad, value, start[where])
+        yield np.clip(start, problem.low, problem.high)
+    own = coefficients.copy()
+    for name in angles:
+        where = problem.slices[name]
+        turned = _within(-own[where], problem.low[where], problem.high[where])
+        own[where] = np.where(bad, turned, own[where])
+    yield np.clip(own, problem.low, problem.high)
+
+
+def _within(angle, low, high):
+    """Return an angle, radian, moved by a turn where that brings it within its bounds."""
+    turn = 2 * np.pi
+    angle = np.where((angle < low) & (angle + turn <= high), angle + turn, angle)
+    return np.where((angle > high) & (angle - turn >= low), angle - turn, angle)

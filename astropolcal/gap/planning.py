@@ -11,25 +11,24 @@ that the true cause is expected to have.
 
 from dataclasses import dataclass, replace
 
+import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 from scipy import stats
+from scipy.linalg import cho_factor, cho_solve
 
-from astropolcal.chain import stages
-from astropolcal.exceptions import GapError, ParameterError
-from astropolcal.gap._forecast import (
-    LEAST_GAIN,
-    MODULATOR,
-    STATES,
-    Forecast,
-    expected,
-    odds,
-)
+from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.chain import Train, join, leaves, stages
+from astropolcal.exceptions import ParameterError
 from astropolcal.gap._words import listed
-from astropolcal.gap.effects import Roles, get_effect
+from astropolcal.gap.channels import orthonormal
+from astropolcal.gap.effects import Roles
+from astropolcal.gap.problem import OPEN, GapProblem
 from astropolcal.gap.selection import REMAINDER
 from astropolcal.optics import COORDINATES, Dependence
+from astropolcal.simulation import simulate
 
-__all__ = ["Exposure", "exposures", "plan"]
+__all__ = []
 
 # positions that are set: degree; altitudes from low to high, the range in which stars are observed
 _DEROTATOR, _ALTITUDE = np.arange(0, 180, 15.0), (25.0, 45.0, 65.0, 80.0)
@@ -50,51 +49,39 @@ _TIMED = ("time", "time2", "step", "frame")
 _APART = np.log(10)
 # a dataset is repeated so many times to know its noise
 _REPEATS = 3
+MODULATOR, STATES = "flc_state", ("A", "B")
+#: What cannot be seen to one standard deviation is not worth an exposure.
+LEAST_GAIN = 1.0
+# a change of this size (radian or relative) has to be seen
+_WANTED = 0.01
+# nearer to a bound is at it
+_AT_BOUND = 1e-9
+# keeps open directions where they are, of columns of unit length; sizes are known within this
+# factor of the usual one
+_HOLD, _WIDE = 1e-10, 3.0
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """
-    A block of frames that could be taken.
+    """A block of frames that could be taken."""
 
-    Parameters
-    ----------
-    dataset : int
-        The dataset whose set-up it repeats.
-    hwp : tuple of float
-        Half-wave-plate angles in degree, one a frame.
-    positions : tuple of (str, float or tuple of float)
-        Other stages and their angle in degree, one a frame where it changes.
-    polarizer_turned : float
-        Degrees by which the calibration polarizer is turned.
-    lamp : float
-        Brightness of the lamp, relative to that of the dataset.
-    without : tuple of str
-        Optics that are taken out.
-    states : tuple of str
-        States of a modulator, "A" and "B", in which each angle is taken, one frame each; empty
-        where there is no modulator.
-    what : str
-        The frames in words, where they are those of a run.
-    setup : str
-        Name of the dataset, where there are several.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.planning import Exposure
-    >>> Exposure(0, (0.0, 22.5, 45.0, 67.5), (("derotator", 100.0),), polarizer_turned=45.0).words
-    '4 half-wave-plate angles from 0 to 67.5 deg, derotator at 100 deg, the polarizer turned \
-by 45 deg'
-    """
-
+    #: The dataset whose set-up it repeats.
     dataset: int
+    #: Half-wave-plate angles in degree, one a frame.
     hwp: tuple
+    #: Other stages and their angle in degree, one a frame where it changes.
     positions: tuple = ()
+    #: Degrees by which the calibration polarizer is turned.
     polarizer_turned: float = 0.0
+    #: Brightness of the lamp, relative to that of the dataset.
     lamp: float = 1.0
     without: tuple = ()
+    #: States of a modulator, "A" and "B", in which each angle is taken, one frame each; empty where
+    #: there is no modulator.
     states: tuple = ()
+    #: The frames in words, where they are those of a run.
     what: str = ""
+    #: Name of the dataset, where there are several.
     setup: str = ""
 
     @property
@@ -145,32 +132,8 @@ def exposures(model, *, flux_matters=False):
     """
     Return exposures that the set-ups of the data allow.
 
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    flux_matters : bool
-        Whether other brightnesses of the lamp are among them.
-
-    Returns
-    -------
-    list of Exposure
-        New angles, a full turn of the plate, the run again, in another order and backwards, the
-        polarizer turned or taken out, and another lamp.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.gap.planning import exposures
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> model = nominal_model([chain], [simulate(chain, charis.wavelength, frames, seed=1)])
-    >>> len(exposures(model))
-    9
+    New angles, a full turn of the plate, the run again, in another order and backwards, the
+    polarizer turned or taken out, and another lamp.
     """
     found, trains = [], model.trains
     polarized = [Roles(train).polarizer is not None for train in trains]
@@ -256,65 +219,28 @@ def _in_order(run, order, what):
 # ---- the plan ----------------------------------------------------------------------------------
 
 
-def plan(found, members=(), *, candidates=None, limit=4):
+def plan(diagnosis, candidates=None, limit=4):
     """
-    Propose exposures for every question that is open.
+    Return exposures that answer the questions that a diagnosis leaves open, a list of dict.
 
-    Parameters
-    ----------
-    found : Diagnosis or Model
-        A diagnosis, with all its questions; or a fitted model.
-    members : sequence of tuple
-        For a model: an alias group, names or effects with their probabilities.
-    candidates : sequence of Exposure, optional
-        By default those of ``exposures``.
-    limit : int
-        Most lines to return.
-
-    Returns
-    -------
-    list of dict
-        ``words``; ``question``, ``"cause"``, ``"structure"`` or ``"parameters"``; ``separates``,
-        the causes, or the parameters of the open direction that is seen best; ``gain``, the
-        standard deviations at which they come apart, or at which a change of that direction by
-        0.01 (rad) shows, 0 where no exposure tells them apart; ``probability_now`` and
-        ``probability_after``, that the true one is expected to have, None for parameters. The
-        questions are in the order of the causes.
-
-    Raises
-    ------
-    GapError
-        If an effect is unknown or has no place in the chains, or an exposure is impossible.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.gap.planning import plan
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> model = nominal_model([chain], [simulate(chain, charis.wavelength, frames, seed=1)])
-    >>> plan(model)
-    []
+    Keys are ``words``; ``question``, ``"cause"``, ``"structure"`` or ``"parameters"``;
+    ``separates``, the causes, or the parameters of the open direction that is seen best; ``gain``,
+    the standard deviations at which they come apart, or at which a change of that direction by 0.01
+    (rad) shows, 0 where no exposure tells them apart; ``probability_now`` and
+    ``probability_after``, that the true one is expected to have, None for parameters. The questions
+    are in the order of the causes.
     """
-    model = getattr(found, "improved", found)
-    groups = _groups(found) if model is not found else [_given(model, members)] * bool(members)
-    lines = [] if model is found else _repetitions(found)
+    model, groups, lines = diagnosis.improved, _groups(diagnosis), _repetitions(diagnosis)
     forecast = Forecast(model, [recipe for group in groups for _, recipe, _ in group])
     # a member may have lost its place to another one
     groups = [[one for one in group if one[0] in forecast.own] for group in groups]
     groups = [group for group in groups if len(group) > 1]
     directions = forecast.open_directions()
-    asked = [*groups, None] if directions[2].shape[1] else groups
-    if not asked:
+    if not groups and not directions[2].shape[1]:
         return lines[:limit]
     if candidates is None:
         used = {s for chain in forecast.chains for s in stages(chain)}
         candidates = exposures(model, flux_matters=bool(used & {"flux", "total_flux"}))
-    _check(list(candidates), model)
     foreseen = []
     for one in candidates:
         try:
@@ -325,20 +251,10 @@ def plan(found, members=(), *, candidates=None, limit=4):
             if error.argument != "chain":
                 raise
     for group in groups:
-        lines.insert(len(lines) - (not groups), _telling_apart(forecast, group, foreseen))
+        lines.append(_telling_apart(forecast, group, foreseen))
     if directions[2].shape[1]:
         lines += _fixing(forecast, directions, foreseen)
     return _merged(lines)[:limit]
-
-
-def _given(model, members):
-    found = []
-    for one, share in members:
-        effect = get_effect(one)
-        if effect.name not in model.added and not effect.applies(model.trains):
-            raise GapError(f"effect {effect.name!r} has no place in these chains")
-        found.append((effect.name, (effect, None), float(share)))
-    return found
 
 
 def _groups(diagnosis):
@@ -362,7 +278,8 @@ def _telling_apart(forecast, group, foreseen):
     """Return the line on the exposure that tells the members of an alias group apart best."""
     names, recipes, shares = zip(*group, strict=True)
     weights = np.array(shares) / sum(shares)
-    titles = {effect.name: _titled(effect) for effect, _ in recipes}
+    # what a cell is called says no more than its title
+    titles = {e.name: e.title + f" ({e.name})" * (e.kind != "cell") for e, _ in recipes}
     hypotheses, now = forecast.foreseen(names), float(np.sum(weights**2))
     best, value = None, -np.inf
     # a short block is no run: how far a drift would come in it is not known
@@ -390,7 +307,7 @@ def _telling_apart(forecast, group, foreseen):
             words = (
                 f"Take {exposure.words}: tells {first} from {few} at {_sigmas(gain)} "
                 f"standard deviations; the probability of the true one should rise from "
-                f"{now:.0%} to {_percent(after)}"
+                f"{now:.0%} to {'over 99%' if after > 0.99 else f'{after:.0%}'}"
             )
             told = [names[0], *(names[j] for j in other)]
             more = {"separates": told, "gain": float(gain), "probability_after": after}
@@ -457,36 +374,236 @@ def _merged(lines):
     return list(found.values())
 
 
-def _titled(effect):
-    # what a cell is called says no more than its title
-    is_cell = effect.kind == "cell"
-    return effect.title if is_cell else f"{effect.title} ({effect.name})"
-
-
-def _percent(probability):
-    return "over 99%" if probability > 0.99 else f"{probability:.0%}"
-
-
 def _sigmas(gain):
     return f"{gain:.2g}" if gain < 100 else f"{gain:.0f}"
 
 
-def _check(candidates, model):
-    n = len(model.observations)
-    for one in candidates:
-        if not 0 <= one.dataset < n:
-            raise GapError(f"exposure of dataset {one.dataset}; there are {n}, from 0")
-        modulated = MODULATOR in stages(model.trains[one.dataset])
-        wrong = {
-            f"half-wave-plate angles {one.hwp}: finite ones are needed": (
-                len(one.hwp) == 0 or not np.all(np.isfinite(one.hwp))
-            ),
-            f"lamp = {one.lamp}: it must be positive": not (np.isfinite(one.lamp) and one.lamp > 0),
-            f"states {one.states}: allowed are {', '.join(STATES)}": not set(one.states)
-            <= {*STATES},
-            f"states {one.states}: they are needed where the chain has a modulator, and nowhere "
-            "else": bool(one.states) != modulated,
+# ---- what exposures would tell ------------------------------------------------------------------
+
+
+class Forecast:
+    """
+    A fitted model with all causes that are asked about, and what the data say of each of them.
+    """
+
+    def __init__(self, model, recipes):
+        self.model, base = model, model.problem
+        chains, ties, laws, added = model.trains, dict(base.ties), dict(base.laws), {}
+        for effect, context in recipes:
+            if effect.name in model.added:
+                added[effect.name] = model.added[effect.name]
+            elif effect.name not in added and effect.applies(chains):
+                edit = effect.edit(chains, context or model.context)
+                chains, ties, laws = edit.chains, ties | edit.ties, laws | edit.laws
+                added[effect.name] = edit.parameters
+        self.chains, self.ties, self.laws = chains, ties, laws
+        self.problem = GapProblem(chains, model.observations, ties=ties, laws=laws, like=base)
+        problem, q = self.problem, self.problem.start
+        every = np.arange(problem.size)
+        #: Coefficients of each cause that has a place.
+        self.own = {}
+        for name, some in added.items():
+            rows = [every[problem.slices[p.name]] for p in some if p.name in problem.slices]
+            if sum(map(len, rows)):
+                self.own[name] = np.concatenate(rows)
+        slopes, residual = problem.jacobian(q), problem.residual(q)
+        tight = np.zeros(problem.size)
+        for name, sigma in base.priors.items():
+            tight[problem.slices[name]] = 1 / sigma**2
+        absent = np.zeros(problem.free.size)
+        for one in (p for some in added.values() for p in some if p.name in problem.slices):
+            tight[problem.slices[one.name]] = 1 / (_WIDE * one.canonical_scale) ** 2
+            absent[problem.free.by_name[one.name].slice] = one.canonical_neutral
+        self.causes = np.zeros(problem.size, dtype=bool)
+        for own in self.own.values():
+            self.causes[own] = True
+        at_bound = (q <= problem.low + _AT_BOUND) | (q >= problem.high - _AT_BOUND)
+        #: Coefficients that the data may move.
+        self.live = self.causes | ~at_bound
+        norm = np.linalg.norm(slopes, axis=0)
+        self.scale = np.where(norm > 0, norm, 1.0)
+        slopes = slopes / self.scale
+        self.gram = slopes.T @ slopes + np.diag(tight / self.scale**2 + _HOLD)
+        self.slopes, self.residual = slopes, residual
+        #: By how much each coefficient is off the value at which its cause is absent.
+        self.value = (q - problem.coefficients(absent)) * self.scale
+
+    def foreseen(self, names):
+        """
+        Return what the data say of causes, one at a time.
+
+        The coefficients that are live, the normal equations, and the solution (size,).
+        """
+        inside = [name for name in names if name in self.model.added]
+        # the data, with the causes of the group that are in the model taken out
+        taken = np.concatenate([np.empty(0, dtype=int), *(self.own[n] for n in inside)])
+        wanted = self.slopes.T @ (self.residual + self.slopes[:, taken] @ self.value[taken])
+        absent = self.causes.copy()
+        for name in self.own.keys() & self.model.added.keys():
+            absent[self.own[name]] = False
+        found = []
+        for name in names:
+            live = self.live & ~absent
+            live[taken] = False
+            live[self.own[name]] = True
+            rows = np.flatnonzero(live)
+            normal = self.gram[np.ix_(rows, rows)]
+            solution = np.zeros(self.problem.size)
+            solution[rows] = cho_solve(cho_factor(normal), wanted[rows])
+            found.append((rows, normal, solution))
+        return found
+
+    def columns(self, exposure):
+        """Return the whitened derivatives of an exposure, in the same units: (rows, size)."""
+        chain = _set_up(self.chains[exposure.dataset], exposure)
+        observations = _hypothetical(self.model, exposure)
+        own = {leaf.name for leaf in leaves(chain)}
+        ties = {
+            name: tie
+            for name, tie in self.ties.items()
+            if {name.split(".")[0], tie.source.split(".")[0]} <= own
         }
-        for words, is_wrong in wrong.items():
-            if is_wrong:
-                raise GapError(f"exposure with {words}")
+        problem = GapProblem([chain], [observations], ties=ties, laws=self.laws)
+        channel = problem.channels[0]
+        slopes = problem.jacobian(problem.start, whitened=False).T.reshape(-1, *channel.shape)
+        white = _whitened(slopes, self.model.problem.channels[exposure.dataset], exposure, channel)
+        out = np.zeros((white[0].size, self.problem.size))
+        for name, where in problem.slices.items():
+            # a parameter that the set-up alone has is none of those fitted
+            if name in self.problem.slices:
+                rows = white[where].reshape(where.stop - where.start, -1)
+                out[:, self.problem.slices[name]] = rows.T
+        return out / self.scale
+
+    def open_directions(self):
+        """Return what the data determine, as few rows, and the directions that they leave open."""
+        if not self.problem.size:
+            return (np.empty((0, 0)),) * 4
+        singular, right, scale = self.model.problem.decomposed(self.model.fit.coefficients)
+        is_open = singular < OPEN * singular[0]
+        return singular[:, None] * right, right[~is_open].T, right[is_open].T, scale
+
+    def fixes(self, directions, columns):
+        """
+        Return what new rows say of the open directions.
+
+        That is the parameters of the one seen best, at how many standard deviations a
+        change of it shows, and how many directions show at all.
+        """
+        rows, known, unknown, scale = directions
+        names = self.model.problem.slices
+        order = np.concatenate(
+            [np.arange(self.problem.size)[self.problem.slices[n]] for n in names]
+        )
+        table = np.concatenate([rows, columns[:, order] * self.scale[order] / scale])
+        basis = orthonormal(table @ known)
+        left = table @ unknown
+        # twice is enough to be orthogonal to rounding
+        left -= basis @ (basis.T @ left)
+        left -= basis @ (basis.T @ left)
+        _, singular, right = np.linalg.svd(left, full_matrices=False)
+        steps = np.abs(unknown @ right.T) / scale[:, None]
+        sigmas = _WANTED * singular / steps.max(axis=0)
+        best = int(ranked(sigmas)[0])
+        step = steps[:, best]
+        main = [i for i in ranked(step)[:3] if step[i] > 0.3 * step.max()]
+        found = [self.model.problem.names[i] for i in main]
+        return found, float(sigmas[best]), int(np.sum(sigmas > LEAST_GAIN))
+
+
+def odds(hypotheses, gram):
+    """
+    Return the expected logarithms of Bayes factors, and what tells two causes apart.
+
+    Of the truth (first axis) against another cause (second axis), and by how many standard
+    deviations this one fails.
+    """
+    n = len(hypotheses)
+    chi2, freedom = np.zeros((n, n)), np.zeros(n)
+    for j, (rows, normal, mine) in enumerate(hypotheses):
+        inner = gram[np.ix_(rows, rows)]
+        both = cho_factor(normal + inner)
+        for i, (_, _, theirs) in enumerate(hypotheses):
+            change = gram @ (theirs - mine)
+            seen = change[rows] @ cho_solve(both, change[rows])
+            chi2[i, j] = max(float((theirs - mine) @ change - seen), 0.0)
+        grown = _log_det(both) - _log_det(cho_factor(normal))
+        freedom[j] = grown - np.trace(cho_solve(both, inner))
+    return (chi2 + freedom[None] - freedom[:, None]) / 2, np.sqrt(chi2)
+
+
+def _log_det(factor):
+    return 2 * np.sum(np.log(np.diag(factor[0])))
+
+
+def expected(weights, factors):
+    """Return the probability that the true one of several causes is expected to have."""
+    against = np.exp(np.clip(-factors, -700, 50)) @ weights
+    return float(np.sum(weights**2 / against))
+
+
+# ---- exposures ---------------------------------------------------------------------------------
+
+
+def _set_up(chain, exposure):
+    """Return copies of the optics of a chain as the exposure needs them."""
+    train = Train(leaf.copy() for leaf in leaves(chain) if leaf.name not in exposure.without)
+    if exposure.polarizer_turned:
+        theta, angle = Roles(train).polarizer.theta, exposure.polarizer_turned
+        theta.bounds = tuple(None if b is None else b + angle for b in theta.bounds)
+        theta.value = theta.value + angle
+    return train
+
+
+def _hypothetical(base, exposure):
+    """Return noiseless observations of an exposure, as bright as its dataset."""
+    i, problem = exposure.dataset, base.problem
+    chain = _set_up(base.trains[i], exposure)
+    chain = [leaf for leaf in chain if leaf.stage not in COORDINATES or leaf.stage == MODULATOR]
+    sweep = problem.datasets[i].forward(problem.vector(base.fit.coefficients))
+    usual = np.median(np.sum(sweep.fluxes, axis=0), axis=1)
+    measured = np.exp(_middle(problem.channels[i], problem.channels[i].observed[1]))
+    # of a wavelength without a datum nothing is asked: any flux will do
+    measured = np.where(np.isfinite(measured), measured, usual)
+    frames = QTable({name: angles * u.deg for name, angles in exposure.angles.items()})
+    if "derotator" not in frames.colnames:
+        # tables have it, also those of instruments without one
+        frames["derotator"] = np.zeros(len(frames)) * u.deg
+    if exposure.states:
+        frames[MODULATOR] = (exposure.modulator == STATES[1]).astype(float)
+    return simulate(
+        join(chain),
+        problem.wavelength * u.um,
+        frames,
+        flux=exposure.lamp * measured / usual,
+        noise=False,
+        name=f"next {base.observations[i].name}",
+    )
+
+
+def _middle(channel, values):
+    """Return the median of values (..., W, F) over the frames, NaN at a wavelength without data."""
+    found, some = np.full(values.shape[:-1], np.nan), channel.valid.any(axis=1)
+    known = np.where(channel.valid, values, np.nan)
+    found[..., some] = np.nanmedian(known[..., some, :], axis=-1)
+    return found
+
+
+def _whitened(array, old, exposure, new):
+    """
+    Divide by the noise of a dataset, and take out what its lamp may do.
+
+    That is the brightness at each wavelength, a drift common to them, and flicker.
+    """
+    sigma = _middle(old, old.sigma)[..., None]
+    weight = np.where(np.isfinite(sigma), np.sqrt(exposure.lamp) / sigma, 0.0)
+    out = array * weight
+    sums = out[..., 1, :, :] - out[..., 1, :, :].mean(axis=-1, keepdims=True)
+    norm = np.sqrt(np.sum(weight[1] ** 2))
+    direction = weight[1] / (norm if norm > 0 else 1.0)
+    common = np.sum(sums * direction, axis=-2)
+    kept = common / np.sqrt(1 + (old.lamp.flicker * norm) ** 2)
+    drift = orthonormal(np.vander(2 * new.sequence - 1, old.lamp.degree + 1))
+    kept = kept - (kept @ drift) @ drift.T
+    out[..., 1, :, :] = sums + direction * (kept - common)[..., None, :]
+    return out

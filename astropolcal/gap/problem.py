@@ -13,14 +13,12 @@ from scipy.linalg import null_space, qr, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
 from astropolcal.chain import Train, leaves
-from astropolcal.gap._bases import law_basis, orthonormal
-from astropolcal.gap._noise import expected_fluxes, noise, settings
-from astropolcal.gap.channels import Channels
+from astropolcal.gap.channels import Channels, expected_fluxes, noise, orthonormal, settings
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
 from astropolcal.optics import StarSource
 
-__all__ = ["Fit", "GapProblem", "law_basis", "orthonormal"]
+__all__ = []
 
 #: A direction whose singular value is below this share of the largest is open; a
 #: coefficient with more than that of its length in such a direction is open too.
@@ -69,44 +67,11 @@ class GapProblem:
     """
     Chains against all frames of their datasets, whitened by the noise.
 
-    Parameters
-    ----------
-    chains : sequence
-        The chain of each dataset.
-    observations : sequence of Observations
-        The datasets.
-    ties : dict of str to Tie, optional
-        Parameters that follow others.
-    laws : dict of str to `~numpy.ndarray`, optional
-        Basis (W, k) of parameters given per wavelength, ``"optic.parameter"``.
-    priors : dict of str to float, optional
-        Standard deviation (canonical) of a normal prior on the coefficients of
-        a parameter.
-    neutral : dict of str to float, optional
-        Value (canonical) about which a parameter's prior and limits are, by
-        default 0: that at which an effect is absent.
-    limits : dict of str to float, optional
-        The most (canonical) by which a parameter may differ from that value. A
-        parameter that follows a law is not held to it, but to the bounds of its optic.
-    like : GapProblem, optional
-        Another problem of the same data whose noise, lamp and fluxes are taken
-        over; by default `settle_noise` must be called.
-    copy : bool
-        Whether to copy the chains; without it values are put back into those given.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.problem import GapProblem
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> problem = GapProblem([charis.chain()], [observations])
-    >>> problem.settle_noise()
-    >>> bool(problem.fit().chi2 < 1.2 * problem.n_rows)
-    True
+    Parameters may have ``laws``, a basis (W, k) each; ``priors``, the standard deviation of a
+    normal prior on their coefficients; ``neutral``, the value about which prior and limits are (0
+    if none is given); and ``limits``, the most by which they may differ from it, where they follow
+    no law: those are held to the bounds of their optic. All by ``"optic.parameter"``, canonical.
+    Noise, lamp and fluxes are those of a problem ``like`` it, or `settle_noise` must be called.
     """
 
     def __init__(
@@ -257,23 +222,19 @@ class GapProblem:
         for i, weights in enumerate(channel.slopes(sweep)):
             slopes = sweep.derivatives(keys, weights)
             for key, where, factor, _ in dataset._live:
-                self._add(out[:, i], where, factor * slopes[key], dataset)
+                self._add(out[:, i], where, factor * slopes[key])
         return out * channel.valid
 
-    def _add(self, out, where, slope, dataset):
-        slot, block = self._owner(where)
+    def _add(self, out, where, slope):
+        """Add the derivative to a free value to those to its coefficients."""
+        first = int(np.min(where))
+        owners = zip(self.free.slots, self._blocks, strict=True)
+        slot, block = next(o for o in owners if o[0].start <= first < o[0].start + o[0].size)
         rows = out[self.slices[slot.name]]
         if np.ndim(where):
             rows += block[np.asarray(where) - slot.start].T[:, :, None] * slope
         else:
             rows[0] += slope
-
-    def _owner(self, where):
-        first = int(np.min(where))
-        for slot, block in zip(self.free.slots, self._blocks, strict=True):
-            if slot.start <= first < slot.start + slot.size:
-                return slot, block
-        raise AssertionError(where)
 
     # ---- noise -----------------------------------------------------------------------
 
@@ -297,22 +258,8 @@ class GapProblem:
         """
         Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
 
-        Parameters
-        ----------
-        start : `~numpy.ndarray`, optional
-            Coefficients to start from.
-        rows : `~numpy.ndarray` of bool, optional
-            Rows that take part, shape (n_rows,).
-        held : `~numpy.ndarray` of bool, optional
-            Coefficients that stay.
-        steps : int
-            The most steps.
-        share : float
-            A step that lowers chi-square by less than this share of it is the last.
-
-        Returns
-        -------
-        Fit
+        ``rows`` are those that take part, (n_rows,), ``held`` the coefficients that stay; a step
+        that lowers chi-square by less than ``share`` of it is the last.
         """
         q = self._inside(self.start if start is None else start)
         live = np.ones(self.size, dtype=bool) if held is None else ~held
@@ -490,25 +437,7 @@ def _triangle(matrix, target):
 
 
 class Fit:
-    """
-    Outcome of a fit.
-
-    Parameters
-    ----------
-    coefficients : `~numpy.ndarray`
-        The solution.
-    chi2 : float
-        Sum of squares of the whitened residuals.
-    converged : bool
-        Whether the last step changed next to nothing.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.gap.problem import Fit
-    >>> Fit(np.zeros(1), 12.0, True).chi2
-    12.0
-    """
+    """Outcome of a fit."""
 
     def __init__(self, coefficients, chi2, converged):
         self.coefficients, self.chi2, self.converged = coefficients, chi2, converged
@@ -526,3 +455,16 @@ def _positions(chain, observations, fluxes):
         "previous_flux": fluxes / before,
     }
     return found | {stage: expected[stage] for stage in expected.keys() & found.keys()}
+
+
+def law_basis(wavelength, degree):
+    """
+    Return the basis of a polynomial law in wavelength (micrometre, (W,)), shape (W, k).
+
+    Legendre polynomials over the range of the wavelengths; one value per wavelength for None.
+    """
+    n = len(wavelength)
+    if degree is None or degree >= n - 1:
+        return np.eye(n)
+    middle, half = (wavelength.max() + wavelength.min()) / 2, np.ptp(wavelength) / 2
+    return np.polynomial.legendre.legvander((wavelength - middle) / half, degree)

@@ -82,6 +82,9 @@ def to_dict(diagnosis):
         cause["words"] = _words.cause(cause, ranks)
     noisy = diagnosis.remainder_p_value > REMAINDER
     changed = runs.changes(diagnosis, causes)
+    old, new = (m.fit.chi2 - m.problem.n_data for m in (diagnosis.nominal, diagnosis.improved))
+    # the share of the excess over the noise that the improved model leaves
+    left = float(np.clip(new / old, 0, 1)) if old > 0 else 1.0
     content = {
         "verdict": diagnosis.verdict,
         "nominal": _nominal(diagnosis.nominal),
@@ -100,16 +103,19 @@ def to_dict(diagnosis):
         "nested_percent": diagnosis.nested.percent if diagnosis.nested else None,
         "unlisted_probability": diagnosis.settings.get("unlisted"),
         "frames": [fault.to_dict() for fault in diagnosis.frames],
-        "where": _where(diagnosis.nominal),
-        "where_left": [] if same or noisy else _where(diagnosis.improved),
-        "left_share": 0.0 if noisy else _left_share(diagnosis),
+        "where": locate(diagnosis.nominal),
+        "where_left": [] if same or noisy else locate(diagnosis.improved),
+        "left_share": 0.0 if noisy else left,
         "causes": causes,
         "changes": changed,
-        "scores": [_score(one) for one in diagnosis.scan.candidates[:_MOST_SCORES]],
+        "scores": [
+            _named(one) | {key: getattr(one, key) for key in ("statistic", "rank", "evidence")}
+            for one in diagnosis.scan.candidates[:_MOST_SCORES]
+        ],
         "n_effects": len(diagnosis.scan.candidates),
         "accuracy_before": before,
         "accuracy_after": after,
-        "next_observations": _next(diagnosis),
+        "next_observations": plan(diagnosis),
     }
     names = [o.name for o in diagnosis.improved.observations]
     asked = diagnosis.settings.get("changes", False)
@@ -151,16 +157,17 @@ def _cause(diagnosis, i, fitted):
     entry = {
         "rank": i + 1,
         "probability": cause.probability,
-        "name": cause.name,
-        "effect": cause.name if cause.is_named else None,
-        "title": cause.effect.title,
+        **_named(cause),
         "cell": cause.cell.to_dict() if cause.cell else None,
         "place": cause.effect.place,
         "kind": cause.effect.kind,
         "shows": cause.effect.shows,
         "reference": cause.effect.reference,
         "share": cause.share,
-        "aliases": [_alias(one, chance) for one, chance in cause.aliases],
+        "aliases": [
+            _named(one) | {"cell": one.cell.to_dict() if one.cell else None, "probability": chance}
+            for one, chance in cause.aliases
+        ],
         "p_value": cause.p_value,
         "explained": cause.explained,
         "double_difference_share": fitted.double_share(cause.name),
@@ -180,43 +187,10 @@ def _cause(diagnosis, i, fitted):
     return entry | {"trades_with": fitted.trades(cause.name) if open_size else []}
 
 
-def _alias(candidate, chance):
-    return {
-        "name": candidate.name,
-        "effect": candidate.name if candidate.is_named else None,
-        "title": candidate.effect.title,
-        "cell": candidate.cell.to_dict() if candidate.cell else None,
-        "probability": chance,
-    }
-
-
-def _score(one):
-    return {
-        "name": one.name,
-        "effect": one.name if one.is_named else None,
-        "title": one.effect.title,
-        "statistic": one.statistic,
-        "rank": one.rank,
-        "evidence": one.evidence,
-    }
-
-
-def _where(model):
-    """Return where the gap of a model lies: what it follows, then where it is large."""
-    found = locate(model)
-    kinds = map(str, found.told["kind"])
-    return [e | {"kind": kind} for e, kind in zip(found.entries, kinds, strict=True)]
-
-
-def _left_share(diagnosis):
-    """Return the share of the excess over the noise that the improved model leaves."""
-    old, new = (m.fit.chi2 - m.problem.n_data for m in (diagnosis.nominal, diagnosis.improved))
-    return float(np.clip(new / old, 0, 1)) if old > 0 else 1.0
-
-
-def _next(diagnosis):
-    """Return the exposures that answer what is open."""
-    return plan(diagnosis)
+def _named(one):
+    """Return what a cause or a candidate is called."""
+    effect = one.name if one.is_named else None
+    return {"name": one.name, "effect": effect, "title": one.effect.title}
 
 
 def _plain(value):

@@ -13,11 +13,11 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import GapError
-from astropolcal.gap._words import listed
+from astropolcal.gap._words import decimals, listed
 from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.optics.perturbations import split_run
 
-__all__ = ["changes", "distinct", "paragraph"]
+__all__ = []
 
 # so many changes are told in the summary
 _MOST = 4
@@ -25,36 +25,7 @@ _LIKELY = 0.5
 
 
 def distinct(observations, changes=False):
-    """
-    Return the datasets with names of their own.
-
-    Parameters
-    ----------
-    observations : sequence of Observations
-        The datasets.
-    changes : bool
-        Whether changes between runs are asked for.
-
-    Returns
-    -------
-    list of Observations
-        Copies with another name of those whose name is that of one before them.
-
-    Raises
-    ------
-    GapError
-        If two hold the same data, or changes are asked for and there is one run of each source.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.runs import distinct
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis, frames = instruments.get("charis"), half_wave_plate_cycles()
-    >>> pair = [simulate(charis.chain(), charis.wavelength, frames, seed=i) for i in (1, 2)]
-    >>> [one.name for one in distinct(pair)]
-    ['simulated', 'simulated (2)']
-    """
+    """Return the datasets, those whose name is taken as copies with another name."""
     observations = list(observations)
     for one, other in combinations(observations, 2):
         if one is other or (
@@ -87,28 +58,11 @@ def distinct(observations, changes=False):
 
 def changes(diagnosis, causes):
     """
-    Return the causes that are in one of several runs only.
+    Return the causes that are in one of several runs only, a list of dict.
 
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-        The diagnosis.
-    causes : list of dict
-        Its causes, as `~astropolcal.gap.report.to_dict` gives them.
-
-    Returns
-    -------
-    list of dict
-        Keys ``cell``, ``dataset``, ``size`` (parameter to values, errors, unit and limit),
-        ``probability``, ``brought_by`` (optics that only this run has, in front of the place) and
-        ``words``; the most probable first, and among these the most significant.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> from astropolcal.gap.runs import changes
-    >>> changes(SimpleNamespace(improved=None), [])
-    []
+    Keys are ``cell``, ``dataset``, ``size`` (parameter to values, errors, unit and limit),
+    ``probability``, ``brought_by`` (optics that only this run has, in front of the place) and
+    ``words``; the most probable first, and among these the most significant.
     """
     if not causes or count_runs(diagnosis.improved.problem) < 2:
         return []
@@ -153,7 +107,11 @@ def _run_of(cell, names, chains):
 
 def _brought(cell, run, names, chains):
     """Return the optics that only a run has, at or in front of the place of a cell."""
-    mine = [optic.name for optic in chains[names.index(run)] if not _is_added(optic)]
+    mine = [
+        optic.name
+        for optic in chains[names.index(run)]
+        if not (optic.name or "").startswith("gap_")
+    ]
     others = {o.name for n, c in zip(names, chains, strict=True) if n != run for o in c}
     own = [name for name in mine if name not in others]
     head, _, optic = cell.place.partition(":")
@@ -167,36 +125,11 @@ def _brought(cell, run, names, chains):
     return [name for name in own if mine.index(name) < end]
 
 
-def _is_added(optic):
-    return (optic.name or "").startswith("gap_")
-
-
 # ---- in words ----------------------------------------------------------------------------------
 
 
 def paragraph(content, names, asked=False):
-    """
-    Return what is to be said of the changes between runs, in a few sentences.
-
-    Parameters
-    ----------
-    content : dict
-        What `~astropolcal.gap.report.to_dict` collects, with its ``changes`` and ``causes``.
-    names : list of str
-        Names of the runs.
-    asked : bool
-        Whether changes were asked for; if not, nothing is said where there are none.
-
-    Returns
-    -------
-    list of str
-
-    Examples
-    --------
-    >>> from astropolcal.gap.runs import paragraph
-    >>> paragraph({"changes": [], "causes": [], "verdict": "none"}, ["July", "October"], asked=True)
-    ['Nothing changed between "July" and "October" that the data can tell.']
-    """
+    """Return what is to be said of the changes between runs, in a few sentences."""
     found = content["changes"]
     if not found:
         quoted = [f'"{name}"' for name in names]
@@ -247,8 +180,8 @@ def _sentence(cell, entry, names, wavelength):
 
 
 def _number(value, error):
-    digits = max(0, 1 - int(np.floor(np.log10(error)))) if error > 0 else 3
-    return f"{value:.{min(digits, 6)}f} +- {error:.{min(digits, 6)}f}"
+    digits = min(decimals(error), 6)
+    return f"{value:.{digits}f} +- {error:.{digits}f}"
 
 
 def _size(parameters, wavelength):

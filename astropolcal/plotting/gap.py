@@ -318,7 +318,7 @@ def _map(axes, gap, wavelength, limit):
 
 def _frame_axis(axes, observations):
     """Name the runs of frames at one derotator angle, or number the frames."""
-    from astropolcal.gap.patterns import frame_blocks
+    from astropolcal.gap.residuals import frame_blocks
 
     blocks = frame_blocks(observations)
     count = blocks.max() + 1
@@ -347,9 +347,8 @@ def plot_where(diagnosis, *, limit=12, figure=None):
 
     Parameters
     ----------
-    diagnosis : Diagnosis or Where
-        The diagnosis, whose nominal model is looked at, or what
-        `~astropolcal.gap.locate` found.
+    diagnosis : Diagnosis
+        The diagnosis, whose nominal model is looked at.
     limit : int
         Most bars of either kind.
     figure : `~matplotlib.figure.Figure`, optional
@@ -374,10 +373,9 @@ def plot_where(diagnosis, *, limit=12, figure=None):
     >>> len(plot_where(diagnosis).axes)
     2
     """
-    where = diagnosis if hasattr(diagnosis, "table") else _where(diagnosis)
-    told = where.told
+    told = locate(diagnosis.nominal)
     # two panels, for the shares of one list add up and those of the other do not
-    kinds = [told[told["kind"] == kind][:limit] for kind in ("pattern", "place")]
+    kinds = [[row for row in told if row["kind"] == k][:limit] for k in ("pattern", "place")]
     # bars of the same height in both panels
     heights = [max(len(rows), 1) + 0.4 for rows in kinds]
     titles = (
@@ -399,14 +397,9 @@ def plot_where(diagnosis, *, limit=12, figure=None):
 _NEAR_THE_EDGE = 93
 
 
-def _where(diagnosis):
-    found = getattr(diagnosis, "where", None)
-    return found if hasattr(found, "table") else locate(diagnosis.nominal)
-
-
 def _shares(axes, rows, color):
-    shares = 100 * np.array(rows["share"], dtype=float)
-    labels = [textwrap.fill(str(row["detail"]), _WIDTH) for row in rows]
+    shares = [100 * row["share"] for row in rows]
+    labels = [textwrap.fill(row["detail"], _WIDTH) for row in rows]
     axes.barh(range(len(rows)), shares, color=color, height=0.6)
     for i, share in enumerate(shares):
         inside = share > _NEAR_THE_EDGE

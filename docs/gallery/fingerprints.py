@@ -14,8 +14,9 @@ import numpy as np
 
 from astropolcal import instruments
 from astropolcal.chain import insert_optic, leaves, remove_optic
+from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import Context, get_effect
-from astropolcal.gap.problem import GapProblem, orthonormal
+from astropolcal.gap.problem import GapProblem
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.optics import LinearRetarder
 from astropolcal.simulation import half_wave_plate_cycles, simulate

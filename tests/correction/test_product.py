@@ -214,7 +214,8 @@ def test_a_column_in_a_heap_is_not_read(path):
     for name in ["WAVELENGTH", "FRAMES"]:
         for form in ["PA(999999999)", "QD(3)"]:
             with fits.open(path) as hdus:
-                old = f"TFORM{len(hdus[name].columns)}  = '{hdus[name].columns.formats[-1]:8}'".encode()
+                columns = hdus[name].columns
+                old = f"TFORM{len(columns)}  = '{columns.formats[-1]:8}'".encode()
             content = path.read_bytes()
             place = content.index(old, content.index(f"EXTNAME = '{name}".encode()) - 2880)
             card = f"{old[:10].decode()}'{form}'".ljust(80).encode()

@@ -73,13 +73,13 @@ def test_the_repr_tells_the_shape(spectrum, images):
 # ---- errors --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("components", ["IQU", "IQUV"])
-def test_covariances_are_symmetric_and_in_their_places(components):
-    found = make(components=components)
-    matrix = found.covariances()
-    for plane, (i, j) in zip(found.covariance, covariance_index(len(components)), strict=True):
-        np.testing.assert_array_equal(matrix[i, j], plane)
-        np.testing.assert_array_equal(matrix[j, i], plane)
+def test_covariances_are_symmetric_and_in_their_places():
+    for components in ["IQU", "IQUV"]:
+        found = make(components=components)
+        matrix = found.covariances()
+        for plane, (i, j) in zip(found.covariance, covariance_index(len(components)), strict=True):
+            np.testing.assert_array_equal(matrix[i, j], plane)
+            np.testing.assert_array_equal(matrix[j, i], plane)
 
 
 def test_systematic_covariances_are_those_of_each_wavelength(images):
@@ -110,17 +110,17 @@ def test_where_nothing_was_measured_there_is_no_systematic_error(images):
 # ---- images --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("centre", [None, (4.0, 2.0)])
-def test_q_phi_is_about_the_star(centre):
-    found = make((7, 9), centre=centre)
-    told = found.azimuthal()
-    expected = azimuthal(found["Q"], found["U"], (4.0, 3.0) if centre is None else centre)
-    np.testing.assert_allclose([told["q_phi"], told["u_phi"]], expected)
-    # the sum of both variances does not depend on the axes
-    for kind in ("statistical", "systematic"):
-        c = found.covariances(kind)
-        both = told[f"q_phi_{kind}"] ** 2 + told[f"u_phi_{kind}"] ** 2
-        np.testing.assert_allclose(both, c[1, 1] + c[2, 2], rtol=1e-9)
+def test_q_phi_is_about_the_star():
+    for centre in [None, (4.0, 2.0)]:
+        found = make((7, 9), centre=centre)
+        told = found.azimuthal()
+        expected = azimuthal(found["Q"], found["U"], (4.0, 3.0) if centre is None else centre)
+        np.testing.assert_allclose([told["q_phi"], told["u_phi"]], expected)
+        # the sum of both variances does not depend on the axes
+        for kind in ("statistical", "systematic"):
+            c = found.covariances(kind)
+            both = told[f"q_phi_{kind}"] ** 2 + told[f"u_phi_{kind}"] ** 2
+            np.testing.assert_allclose(both, c[1, 1] + c[2, 2], rtol=1e-9)
 
 
 def test_an_aperture_is_a_sum_over_pixels():
@@ -143,12 +143,12 @@ def test_an_aperture_without_a_centre_is_in_the_middle(images):
     np.testing.assert_array_equal(images.aperture(0.5).stokes, images.stokes[:, :, 3, 4])
 
 
-@pytest.mark.parametrize("radius", [0, -1, np.nan])
-def test_apertures_of_no_size(images, radius):
-    with pytest.raises(ParameterError, match="no pixel is inside"):
-        images.aperture(radius)
-    with pytest.raises(ParameterError, match="no pixel is inside"):
-        images.aperture(0.1, centre=(2.5, 2.5))
+def test_apertures_of_no_size(images):
+    for radius in [0, -1, np.nan]:
+        with pytest.raises(ParameterError, match="no pixel is inside"):
+            images.aperture(radius)
+        with pytest.raises(ParameterError, match="no pixel is inside"):
+            images.aperture(0.1, centre=(2.5, 2.5))
 
 
 def test_an_aperture_does_not_leave_the_images():
@@ -164,42 +164,39 @@ def test_an_aperture_without_errors(images):
     assert images.aperture(2).covariance is None
 
 
-@pytest.mark.parametrize(
-    ("ask", "words"),
-    [
+def test_what_is_asked_of_the_wrong_kind(spectrum, images):
+    for ask, words in [
         (lambda s, i: s.azimuthal(), "Q_phi and U_phi are of images; these are not"),
         (lambda s, i: s.aperture(3), "an aperture needs images; these are spectra"),
         (lambda s, i: i.table(), "a table is of a point source; take an aperture of the images"),
-    ],
-)
-def test_what_is_asked_of_the_wrong_kind(spectrum, images, ask, words):
-    with pytest.raises(ParameterError, match=words):
-        ask(spectrum, images)
+    ]:
+        with pytest.raises(ParameterError, match=words):
+            ask(spectrum, images)
 
 
 # ---- tables and spectra --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("components", ["IQU", "IQUV"])
-def test_columns_of_the_table(components):
-    found = make(components=components, mode="ip", provenance={"calibration": "a.asdf"})
-    table = found.table()
-    np.testing.assert_array_equal(table["I"].value, found["I"])
-    assert table["I"].unit == table["I_statistical"].unit == u.electron
-    np.testing.assert_allclose(table["I_systematic"].value, found.error("I", "systematic"))
-    for kind in ("statistical", "systematic"):
-        errors = found.fractional_errors(kind)
-        for name in components[1:].lower():
-            np.testing.assert_array_equal(table[name], getattr(found, name))
-            np.testing.assert_array_equal(table[f"{name}_{kind}"], errors[name])
-        np.testing.assert_array_equal(table[f"covariance_qu_{kind}"], errors["covariance_qu"])
-    for name in ("aolp", "s_chi_statistical", "s_chi_systematic"):
-        assert table[name].unit == u.deg
-    np.testing.assert_array_equal(table["leakage_q"], found.leakage[:, 1])
-    np.testing.assert_array_equal(table["leakage_u"], found.leakage[:, 2])
-    assert ("v" in table.colnames) is (components == "IQUV")
-    assert table.meta["mode"] == "ip"
-    assert table.meta["calibration"] == "a.asdf"
+def test_columns_of_the_table():
+    for components in ["IQU", "IQUV"]:
+        found = make(components=components, mode="ip", provenance={"calibration": "a.asdf"})
+        table = found.table()
+        np.testing.assert_array_equal(table["I"].value, found["I"])
+        assert table["I"].unit == table["I_statistical"].unit == u.electron, components
+        np.testing.assert_allclose(table["I_systematic"].value, found.error("I", "systematic"))
+        for kind in ("statistical", "systematic"):
+            errors = found.fractional_errors(kind)
+            for name in components[1:].lower():
+                np.testing.assert_array_equal(table[name], getattr(found, name))
+                np.testing.assert_array_equal(table[f"{name}_{kind}"], errors[name])
+            np.testing.assert_array_equal(table[f"covariance_qu_{kind}"], errors["covariance_qu"])
+        for name in ("aolp", "s_chi_statistical", "s_chi_systematic"):
+            assert table[name].unit == u.deg, components
+        np.testing.assert_array_equal(table["leakage_q"], found.leakage[:, 1])
+        np.testing.assert_array_equal(table["leakage_u"], found.leakage[:, 2])
+        assert ("v" in table.colnames) is (components == "IQUV"), components
+        assert table.meta["mode"] == "ip", components
+        assert table.meta["calibration"] == "a.asdf", components
 
 
 def test_a_wavelength_that_lacks_one_component_is_not_determined():

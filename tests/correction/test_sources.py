@@ -65,26 +65,23 @@ def test_chunks_of_dask_are_read_whole(images):
     np.testing.assert_array_equal(found, images[0][0, :2])
 
 
-@pytest.mark.parametrize("given", [(True, False), (False, True)])
-def test_variances_of_one_beam_only(images, given):
-    flux, variance = images
-    chosen = [v if there else None for v, there in zip(variance, given, strict=True)]
-    with pytest.raises(ObservationError, match="variances of one beam only; both or none"):
-        ArraySource(*flux, *chosen)
+def test_variances_of_one_beam_only(images):
+    for given in [(True, False), (False, True)]:
+        flux, variance = images
+        chosen = [v if there else None for v, there in zip(variance, given, strict=True)]
+        with pytest.raises(ObservationError, match="variances of one beam only; both or none"):
+            ArraySource(*flux, *chosen)
 
 
-@pytest.mark.parametrize(
-    ("right", "left", "variance", "shapes"),
-    [
+def test_shapes_that_do_not_fit():
+    for right, left, variance, shapes in [
         ((3, 2), (3, 1), None, r"\[\(3, 1\), \(3, 2\)\]"),
         ((3, 2), (3, 2), (2, 3), r"\[\(2, 3\), \(3, 2\)\]"),
         ((3,), (3,), None, r"\[\(3,\)\]"),
-    ],
-)
-def test_shapes_that_do_not_fit(right, left, variance, shapes):
-    variances = [None, None] if variance is None else [np.ones(variance)] * 2
-    with pytest.raises(ObservationError, match=f"have shapes {shapes}; one shape"):
-        ArraySource(np.ones(right), np.ones(left), *variances)
+    ]:
+        variances = [None, None] if variance is None else [np.ones(variance)] * 2
+        with pytest.raises(ObservationError, match=f"have shapes {shapes}; one shape"):
+            ArraySource(np.ones(right), np.ones(left), *variances)
 
 
 # ---- turned ----------------------------------------------------------------------------
@@ -105,13 +102,13 @@ def test_each_frame_is_turned_by_its_own_angle(images):
         np.testing.assert_array_equal(source.variances(1, one, ALL)[0], expected)
 
 
-@pytest.mark.parametrize(("size", "shape"), [(5, (5, 5)), ((3, 7), (3, 7)), (None, (9, 9))])
-def test_shape_of_what_is_cut_out(images, size, shape):
-    options = {} if size is None else {"size": size}
-    source = TurnedSource(ArraySource(*images[0]), [0, 0, 0] * u.deg, **options)
-    assert source.image_shape == shape
-    assert source.fluxes(0, ALL, ALL).shape == (3, 2, *shape)
-    assert source.batches() == [slice(0, 1), slice(1, 2), slice(2, 3)]
+def test_shape_of_what_is_cut_out(images):
+    for size, shape in [(5, (5, 5)), ((3, 7), (3, 7)), (None, (9, 9))]:
+        options = {} if size is None else {"size": size}
+        source = TurnedSource(ArraySource(*images[0]), [0, 0, 0] * u.deg, **options)
+        assert source.image_shape == shape, (size, shape)
+        assert source.fluxes(0, ALL, ALL).shape == (3, 2, *shape), (size, shape)
+        assert source.batches() == [slice(0, 1), slice(1, 2), slice(2, 3)], (size, shape)
 
 
 # ---- files -----------------------------------------------------------------------------
@@ -190,30 +187,27 @@ def test_weights_of_another_shape_are_none(tmp_path):
     assert not CubeFiles([path], [(3, 3), (3, 2)], 3).has_variances
 
 
-@pytest.mark.parametrize(
-    ("centre", "words"),
-    [
+def test_centres_outside_the_image(cameras):
+    for centre, words in [
         ((13.6, 6), r"right beam's centre \[13.6, 6.0\] is outside the image of 14 x 12 pixels"),
         ((-0.6, 6), r"right beam's centre \[-0.6, 6.0\] is outside"),
         ((7, 11.5), r"right beam's centre \[7.0, 11.5\] is outside"),
         ((7, np.nan), r"right beam's centre \[7.0, nan\] is outside"),
-    ],
-)
-def test_centres_outside_the_image(cameras, centre, words):
-    _, _, (right, _) = cameras
-    with pytest.raises(ObservationError, match=words):
-        CubeFiles(right, [centre, (6, 5)], 3, extension=0)
-    # up to half a pixel beyond the middle of the last one is inside
-    CubeFiles(right, [(13.4, 11.4), (-0.4, -0.4)], 3, extension=0)
+    ]:
+        _, _, (right, _) = cameras
+        with pytest.raises(ObservationError, match=words):
+            CubeFiles(right, [centre, (6, 5)], 3, extension=0)
+        # up to half a pixel beyond the middle of the last one is inside
+        CubeFiles(right, [(13.4, 11.4), (-0.4, -0.4)], 3, extension=0)
 
 
-@pytest.mark.parametrize("size", [0, 29, 4000])
-def test_sizes_that_make_no_sense(cameras, size):
-    _, _, (right, _) = cameras
-    words = rf"size = {size}; the images are 14 x 12 pixels, allowed are 1 to 28"
-    with pytest.raises(ParameterError, match=words):
-        CubeFiles(right, [(7, 6), (6, 5)], size, extension=0)
-    assert CubeFiles(right, [(7, 6), (6, 5)], 28, extension=0).image_shape == (28, 28)
+def test_sizes_that_make_no_sense(cameras):
+    for size in [0, 29, 4000]:
+        _, _, (right, _) = cameras
+        words = rf"size = {size}; the images are 14 x 12 pixels, allowed are 1 to 28"
+        with pytest.raises(ParameterError, match=words):
+            CubeFiles(right, [(7, 6), (6, 5)], size, extension=0)
+        assert CubeFiles(right, [(7, 6), (6, 5)], 28, extension=0).image_shape == (28, 28), size
 
 
 def test_a_left_file_that_is_missing_is_named(cameras):

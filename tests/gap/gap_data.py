@@ -63,3 +63,20 @@ def fitted(observations, chains=None):
 @cache
 def clean_model(seed=1):
     return fitted(observed(seed=seed))
+
+
+def effect_basis(model, effect, nominal):
+    """Return an orthonormal basis of what an effect adds to a model, where half its limit shows."""
+    edit = effect.edit(model.held_chains, model.context)
+    names = {p.name for p in edit.parameters}
+    ties = {name: tie for name, tie in edit.ties.items() if tie.source in names}
+    problem = GapProblem(
+        edit.chains, model.observations, ties=ties, laws=edit.laws, like=model.problem
+    )
+    slopes = problem.jacobian(problem.start)
+    for name, where in problem.slices.items():
+        slopes[:, where] *= edit.priors[name]
+    left = slopes - nominal @ (nominal.T @ slopes)
+    left -= nominal @ (nominal.T @ left)
+    basis, singular, _ = np.linalg.svd(left, full_matrices=False)
+    return basis[:, singular > max(1.0, 1e-6 * np.linalg.norm(slopes, axis=0).max(initial=0.0))]

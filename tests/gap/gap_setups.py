@@ -10,7 +10,7 @@ import numpy as np
 from astropolcal import instruments, optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.gap.effects import Context, get_effect
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.instruments import Instrument, SkyLaw
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

@@ -2,25 +2,25 @@
 """Bases of laws in wavelength, and of spaces of columns."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from astropolcal.gap._bases import law_basis, orthonormal
+from astropolcal.gap.channels import orthonormal
+from astropolcal.gap.problem import law_basis
 
 GRID = np.array([1.15, 1.3, 1.37, 1.6, 1.9, 2.2, 2.39])
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_law_holds_every_polynomial_of_its_degree(degree):
-    basis = law_basis(GRID, degree)
-    assert basis.shape == (len(GRID), degree + 1)
-    for power in range(degree + 1):
-        left = GRID**power - basis @ np.linalg.lstsq(basis, GRID**power, rcond=None)[0]
-        np.testing.assert_allclose(left, 0, atol=1e-12)
-    wrong = GRID ** (degree + 1)
-    left = wrong - basis @ np.linalg.lstsq(basis, wrong, rcond=None)[0]
-    assert np.abs(left).max() > 1e-3
+def test_law_holds_every_polynomial_of_its_degree():
+    for degree in [0, 1, 2, 3]:
+        basis = law_basis(GRID, degree)
+        assert basis.shape == (len(GRID), degree + 1)
+        for power in range(degree + 1):
+            left = GRID**power - basis @ np.linalg.lstsq(basis, GRID**power, rcond=None)[0]
+            np.testing.assert_allclose(left, 0, atol=1e-12)
+        wrong = GRID ** (degree + 1)
+        left = wrong - basis @ np.linalg.lstsq(basis, wrong, rcond=None)[0]
+        assert np.abs(left).max() > 1e-3
 
 
 def test_columns_are_legendre_polynomials_over_the_range():
@@ -35,9 +35,9 @@ def test_first_coefficient_is_the_value_in_the_middle_of_a_straight_law():
     np.testing.assert_allclose(coefficients, [2.0, 1.0])
 
 
-@pytest.mark.parametrize(("n", "degree"), [(1, 0), (3, None), (3, 2), (2, 5)])
-def test_as_many_coefficients_as_values_are_the_values(n, degree):
-    np.testing.assert_array_equal(law_basis(GRID[:n], degree), np.eye(n))
+def test_as_many_coefficients_as_values_are_the_values():
+    for n, degree in [(1, 0), (3, None), (3, 2), (2, 5)]:
+        np.testing.assert_array_equal(law_basis(GRID[:n], degree), np.eye(n))
 
 
 def test_order_of_the_wavelengths_does_not_matter():
@@ -62,9 +62,9 @@ def test_units_of_columns_do_not_matter():
     assert orthonormal(small).shape == (9, 2)
 
 
-@pytest.mark.parametrize("columns", [np.zeros((5, 0)), np.zeros((5, 3))])
-def test_nothing_spans_nothing(columns):
-    assert orthonormal(columns).shape == (5, 0)
+def test_nothing_spans_nothing():
+    for columns in [np.zeros((5, 0)), np.zeros((5, 3))]:
+        assert orthonormal(columns).shape == (5, 0)
 
 
 def test_directions_below_the_share_are_left_out():

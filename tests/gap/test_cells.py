@@ -11,7 +11,7 @@ import pytest
 from gap_setups import SETUPS
 
 from astropolcal.gap.cells import Cell, Probes, dependences, places
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.optics import GENERATORS

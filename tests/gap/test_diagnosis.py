@@ -13,9 +13,9 @@ from star_data import WAVELENGTH, observe_star, star_chain
 
 from astropolcal import Calibration, calibrate, instruments
 from astropolcal.exceptions import GapError
-from astropolcal.gap import EFFECTS, alternatives, diagnose
-from astropolcal.gap.alternatives import thinned
+from astropolcal.gap import EFFECTS, diagnose, model
 from astropolcal.gap.cells import Cell
+from astropolcal.gap.model import thinned
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -172,8 +172,8 @@ def test_wrong_frames_are_named_and_left_out():
     found = diagnose(data.chain(), data.observed(table=table, flux=1e7))
     assert [(fault.frame, fault.what) for fault in found.frames] == [(5, "hwp angle")]
     assert (found.verdict, found.causes) == ("none", [])
-    for model in (found.nominal, found.improved):
-        mask = model.observations[0].mask
+    for one in (found.nominal, found.improved):
+        mask = one.observations[0].mask
         assert mask[5].all()
         assert mask.sum() == 7
 
@@ -215,19 +215,19 @@ def test_bad_input_is_refused_in_one_line(monkeypatch):
         with pytest.raises(GapError, match=message) as refused:
             diagnose(chains, observations, **options)
         assert "\n" not in str(refused.value)
-    real = alternatives.nominal_calibration
+    real = model.nominal_calibration
 
     def stopped(chains, observations):
         found = real(chains, observations)
         found.fit["converged"] = False
         return found
 
-    monkeypatch.setattr(alternatives, "nominal_calibration", stopped)
+    monkeypatch.setattr(model, "nominal_calibration", stopped)
     with pytest.raises(GapError, match="the nominal fit did not converge"):
         diagnose(chain, observed)
 
 
-# ---- alternatives ------------------------------------------------------------------------------
+# ---- model ------------------------------------------------------------------------------
 
 
 def test_a_sign_may_be_wrong_where_double_differences_are_far_off():
@@ -247,7 +247,7 @@ def test_a_sign_may_be_wrong_where_double_differences_are_far_off():
         left = residual * np.resize([1.0, -1.0], 20)
         measurement = SimpleNamespace(datasets=[part], residuals=lambda left=left: left)
         given = SimpleNamespace(measurement=measurement)
-        assert alternatives._may_be_wrong(given) == wrong, (observed, residual, sigma)
+        assert model._may_be_wrong(given) == wrong, (observed, residual, sigma)
 
 
 def test_thinned_data_are_spread_over_the_wavelengths():

@@ -183,21 +183,21 @@ def found_of(chain, observations):
     return harmful(suspect_frames(data.fitted(observations, [chain])))
 
 
-@pytest.mark.parametrize("folder", ["gap-cases-2"])
-def test_cases_of_another_simulator(shared_data, folder):
-    root = shared_data / folder
-    if not root.exists():
-        pytest.skip(f"no {folder} in the shared folder")
-    expected = {
-        "case005": {(38, "exchanged"), (41, "exchanged")},
-        "case008": {(36, "one beam")},
-        "case044": {(18, "hwp angle")},
-        "case000": set(),
-        "case019": set(),
-        "case046": set(),
-    }
-    for case, named in expected.items():
-        seen = [Observations.read(root / case / f"{s}polarized.ecsv") for s in ("", "un")]
-        chains = instruments.get("charis").chains_for(seen, derotator="linear")
-        faults = harmful(suspect_frames(nominal_model(chains, seen)))
-        assert {(fault.frame, fault.what) for fault in faults} == named, case
+def test_cases_of_another_simulator(shared_data):
+    for folder in ["gap-cases-2"]:
+        root = shared_data / folder
+        if not root.exists():
+            pytest.skip(f"no {folder} in the shared folder")
+        expected = {
+            "case005": {(38, "exchanged"), (41, "exchanged")},
+            "case008": {(36, "one beam")},
+            "case044": {(18, "hwp angle")},
+            "case000": set(),
+            "case019": set(),
+            "case046": set(),
+        }
+        for case, named in expected.items():
+            seen = [Observations.read(root / case / f"{s}polarized.ecsv") for s in ("", "un")]
+            chains = instruments.get("charis").chains_for(seen, derotator="linear")
+            faults = harmful(suspect_frames(nominal_model(chains, seen)))
+            assert {(fault.frame, fault.what) for fault in faults} == named, case

@@ -16,8 +16,8 @@ from astropolcal.gap.effects import (
     adapted,
     check_effect,
     get_effect,
-    tracking_laws,
 )
+from astropolcal.gap.effects.effect import tracking_laws
 from astropolcal.simulation import simulate
 
 pytestmark = pytest.mark.usefixtures("own_instruments")

@@ -10,7 +10,7 @@ import pytest
 from astropy.table import QTable
 from scipy import stats
 
-from astropolcal.gap import _places
+from astropolcal.gap import residuals
 from astropolcal.gap.residuals import _Whitened
 from astropolcal.simulation import half_wave_plate_cycles
 
@@ -47,40 +47,40 @@ def test_unevenness_is_a_likelihood_ratio():
     freedom = np.array([30.0, 20.0, 40.0, 25.0])
     squares = rng.chisquare(freedom) * [1.0, 2.0, 0.5, 1.0]
     pairs = [(a, b) for a in range(4) for b in range(a + 1, 5) if b - a < 4]
-    found = _places._unevenness(squares[None], freedom, pairs)[0]
+    found = residuals._unevenness(squares[None], freedom, pairs)[0]
     expected = [by_hand(squares, freedom, a, b) for a, b in pairs]
     np.testing.assert_allclose(found, expected, atol=1e-9)
     assert found[pairs.index((1, 2))] == found.max()
 
 
 def test_less_than_elsewhere_is_no_place():
-    found = _places._unevenness(np.array([[1.0, 30.0]]), np.array([10.0, 10.0]), [(0, 1), (1, 2)])
+    found = residuals._unevenness(np.array([[1.0, 30.0]]), np.array([10.0, 10.0]), [(0, 1), (1, 2)])
     assert found[0, 0] == 0
     assert found[0, 1] > 0
 
 
-@pytest.mark.parametrize(("template", "expected"), [("{} nm", "20-30 nm"), (None, "20")])
-def test_the_place_is_the_run_that_stands_out(template, expected):
-    label = np.repeat(np.arange(6), 200)
-    sigma = np.array([1, 1.6, 1.6, 1, 1, 1])[label]
-    residual = sigma * np.random.default_rng(2).normal(size=label.size)
-    names = [10, 20, 30, 40, 50, 60]
-    (row,) = _places.most_uneven(whitened(residual), "wavelength", label, names, template)
-    # without a template labels have no neighbours
-    assert row["detail"].startswith(expected[:2])
-    assert row["detail"] == expected or template is None
-    assert row["kind"] == "place"
-    assert row["p_single"] < 1e-9
-    inside = (label == 1) | (label == 2) if template else label == int(row["detail"]) / 10 - 1
-    excess = np.sum(residual[inside] ** 2) - inside.sum()
-    assert row["share"] == pytest.approx(excess / (residual @ residual - residual.size))
+def test_the_place_is_the_run_that_stands_out():
+    for template, expected in [("{} nm", "20-30 nm"), (None, "20")]:
+        label = np.repeat(np.arange(6), 200)
+        sigma = np.array([1, 1.6, 1.6, 1, 1, 1])[label]
+        residual = sigma * np.random.default_rng(2).normal(size=label.size)
+        names = [10, 20, 30, 40, 50, 60]
+        (row,) = residuals.most_uneven(whitened(residual), "wavelength", label, names, template)
+        # without a template labels have no neighbours
+        assert row["detail"].startswith(expected[:2])
+        assert row["detail"] == expected or template is None
+        assert row["kind"] == "place"
+        assert row["p_single"] < 1e-9
+        inside = (label == 1) | (label == 2) if template else label == int(row["detail"]) / 10 - 1
+        excess = np.sum(residual[inside] ** 2) - inside.sum()
+        assert row["share"] == pytest.approx(excess / (residual @ residual - residual.size))
 
 
 def test_a_place_holds_half_of_the_labels_at_the_most():
     label = np.repeat(np.arange(4), 300)
     sigma = np.array([1, 2, 2, 2])[label]
     residual = sigma * np.random.default_rng(3).normal(size=label.size)
-    (row,) = _places.most_uneven(whitened(residual), "time", label, [1, 2, 3, 4], "{}")
+    (row,) = residuals.most_uneven(whitened(residual), "time", label, [1, 2, 3, 4], "{}")
     first, _, last = row["detail"].partition("-")
     assert int(last or first) - int(first) == 1
 
@@ -89,7 +89,7 @@ def test_probabilities_of_noise_are_uniform():
     label = np.repeat(np.arange(5), 40)
     rng = np.random.default_rng(4)
     p = [
-        _places.most_uneven(whitened(rng.normal(size=200)), "x", label, range(5), "{}")[0][
+        residuals.most_uneven(whitened(rng.normal(size=200)), "x", label, range(5), "{}")[0][
             "p_single"
         ]
         for _ in range(60)
@@ -104,7 +104,7 @@ def test_probability_beyond_the_draws_is_a_bound():
     """No draw reaches so far: chi-square of one number, times the looks."""
     label = np.repeat(np.arange(2), 500)
     residual = np.where(label == 1, 2.0, 1.0) * np.random.default_rng(5).normal(size=1000)
-    (row,) = _places.most_uneven(whitened(residual), "beam", label, ["a", "b"], None)
+    (row,) = residuals.most_uneven(whitened(residual), "beam", label, ["a", "b"], None)
     # one-sided, for the larger of two variances
     expected = 2 * stats.chi2.sf(2 * row["evidence"], 1) / 2
     assert row["p_single"] == pytest.approx(expected)
@@ -112,24 +112,21 @@ def test_probability_beyond_the_draws_is_a_bound():
 
 
 def test_one_label_is_no_place():
-    assert _places.most_uneven(None, "dataset", None, ["all"], None) == []
+    assert residuals.most_uneven(None, "dataset", None, ["all"], None) == []
 
 
 # ---- names ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("names", "start", "stop", "template", "words"),
-    [
+def test_names_of_places():
+    for names, start, stop, template, words in [
         (["a", "b"], 1, 2, None, "b"),
         ([1200, 1400, 1600], 0, 1, "{} nm", "1200 nm"),
         ([1200, 1400, 1600], 0, 2, "{} nm", "1200-1400 nm"),
         ([(0, 7), (8, 15), (16, 23)], 0, 1, "frames", "frames 0-7"),
         ([(0, 7), (8, 15), (16, 23)], 1, 3, "frames", "frames 8-23"),
-    ],
-)
-def test_names_of_places(names, start, stop, template, words):
-    assert _places._name(names, start, stop, template) == words
+    ]:
+        assert residuals._name(names, start, stop, template) == words
 
 
 # ---- labels --------------------------------------------------------------------------------
@@ -137,7 +134,7 @@ def test_names_of_places(names, start, stop, template, words):
 
 def looks(model):
     return {axis: (label, names, template) for axis, label, names, template in
-            _places.places(model)}  # fmt: skip
+            residuals.places(model)}  # fmt: skip
 
 
 def test_every_row_has_its_label():

@@ -9,12 +9,10 @@ import pytest
 from gap_data import WAVELENGTH, chain, fitted, frames, observed, with_effect
 
 from astropolcal import instruments
-from astropolcal.exceptions import GapError
-from astropolcal.gap._forecast import Forecast, expected
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import Context, get_effect
-from astropolcal.gap.effects.cell import CellEffect
-from astropolcal.gap.planning import Exposure, exposures, plan
+from astropolcal.gap.effects.effect import CellEffect
+from astropolcal.gap.planning import Exposure, Forecast, expected, exposures, plan
 from astropolcal.observations import Observations
 from astropolcal.reduction.cubes import both_states
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -33,12 +31,26 @@ def full(model):
     return model.with_effect(get_effect(PAIR[0]))
 
 
-def even(*names):
-    return [(name, 1 / len(names)) for name in names]
+def asked(model, *members, p=1.0):
+    """Return a diagnosis that cannot tell some causes apart: effects and their probabilities."""
+    first, *others = ((get_effect(one), share) for one, share in members)
+    alias = [(SimpleNamespace(name=e.name, cell=None, recipe=(e, None)), c) for e, c in others]
+    cause = SimpleNamespace(
+        effect=first[0], name=first[0].name, cell=None, share=first[1], aliases=alias
+    )
+    return SimpleNamespace(improved=model, causes=[cause], remainder_p_value=p)
+
+
+def even(model, *effects):
+    return asked(model, *((one, 1 / len(effects)) for one in effects))
+
+
+def open_only(model):
+    return SimpleNamespace(improved=model, causes=[], remainder_p_value=1.0)
 
 
 def test_aliases_are_told_apart(full):
-    (found,) = plan(full, even(*PAIR))
+    (found,) = plan(even(full, *PAIR))
     assert found["question"] == "cause"
     assert found["separates"] == list(PAIR)
     assert found["probability_now"] == pytest.approx(0.5)
@@ -51,7 +63,7 @@ def test_what_is_the_same_everywhere_is_said_to_be(full):
     """A gain of one beam against the other is the same whatever name it has."""
     same = get_effect("beam_gain")
     again = same.changed(name="other_gain", title="another gain")
-    (found,) = plan(full, [(same, 0.6), (again, 0.4)])
+    (found,) = plan(asked(full.with_effect(same), (same, 0.6), (again, 0.4)))
     assert found["words"].startswith("No exposure that was tried tells")
     assert found["gain"] == 0
     assert found["probability_after"] == found["probability_now"] == pytest.approx(0.52)
@@ -60,7 +72,7 @@ def test_what_is_the_same_everywhere_is_said_to_be(full):
 def test_a_brighter_lamp_tells_more(full):
     base = Exposure(0, CYCLE, (("derotator", 150.0),))
     gains = [
-        plan(full, even(*PAIR), candidates=[Exposure(0, CYCLE, base.positions, lamp=lamp)])
+        plan(even(full, *PAIR), candidates=[Exposure(0, CYCLE, base.positions, lamp=lamp)])
         for lamp in (1.0, 4.0)
     ]
     one, four = (entries[0]["gain"] for entries in gains)
@@ -89,10 +101,7 @@ def test_time_and_derotator_are_told_apart_by_another_order():
     """The derotator moves once in the run and knows it as well as time; shuffled it does not."""
     model = fitted(drifting()).with_effect(DRIFTS[0])
     runs = [one for one in exposures(model) if one.what]
-    entries = {
-        one.what: plan(model, [(effect, 0.5) for effect in DRIFTS], candidates=[one])[0]
-        for one in runs
-    }
+    entries = {one.what: plan(even(model, *DRIFTS), candidates=[one])[0] for one in runs}
     again, shuffled = (
         entries["the run of lamp again"],
         entries["the frames of lamp in shuffled order"],
@@ -123,17 +132,17 @@ def elliptical(angles):
 
 
 def test_open_directions_are_fixed_by_another_derotator_angle():
-    (found,) = plan(elliptical([60]))
+    (found,) = plan(open_only(elliptical([60])))
     assert found["question"] == "parameters"
     assert "open directions" in found["words"]
     assert all(name.startswith("derotator.") for name in found["separates"])
     same = Exposure(0, CYCLE, (("derotator", 60.0),))
-    assert plan(elliptical([60]), candidates=[same]) == []
+    assert plan(open_only(elliptical([60])), candidates=[same]) == []
 
 
 def test_what_no_exposure_fixes_is_not_promised():
     """A common rotation of what is in front of the derotator stays open whatever is taken."""
-    assert plan(elliptical([45, 70, 95, 120])) == []
+    assert plan(open_only(elliptical([45, 70, 95, 120]))) == []
 
 
 def test_exposures_are_what_can_be_changed(model):
@@ -164,29 +173,8 @@ def test_a_modulator_has_both_states():
     assert one.n_frames == 2 * len(one.hwp)
     assert one.angles["hwp"][:4].tolist() == [0, 0, 11.25, 11.25]
     assert one.modulator[:4].tolist() == ["A", "B", "A", "B"]
-    entries = plan(modulated, even(*PAIR), candidates=found)
+    entries = plan(even(modulated.with_effect(get_effect(PAIR[0])), *PAIR), candidates=found)
     assert entries[0]["question"] == "cause"
-
-
-@pytest.mark.parametrize(
-    ("exposure", "message"),
-    [
-        (Exposure(3, (0.0,)), "dataset 3"),
-        (Exposure(0, ()), "half-wave-plate angles"),
-        (Exposure(0, (np.nan,)), "half-wave-plate angles"),
-        (Exposure(0, (0.0,), lamp=0.0), "lamp = 0"),
-        (Exposure(0, (0.0,), states=("A",)), "nowhere else"),
-        (Exposure(0, (0.0,), states=("C",)), "allowed are"),
-    ],
-)
-def test_impossible_exposures(full, exposure, message):
-    with pytest.raises(GapError, match=message):
-        plan(full, even(*PAIR), candidates=[exposure])
-
-
-def test_unknown_effect(model):
-    with pytest.raises(GapError):
-        plan(model, even("no_such_effect", PAIR[0]))
 
 
 def test_structure_without_a_cause_wants_the_run_again(model):

@@ -6,9 +6,9 @@ import gap_data as data
 import numpy as np
 import pytest
 
-from astropolcal.gap.channels import Channels
+from astropolcal.gap.channels import Channels, orthonormal
 from astropolcal.gap.effects import get_effect
-from astropolcal.gap.problem import GapProblem, law_basis, orthonormal
+from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.measurement import Measurement
 
 
@@ -80,19 +80,19 @@ def test_held_coefficients_stay(problem):
     assert fit.coefficients[held] == np.clip(start, problem.low, problem.high)[held]
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_lamp_is_no_gap(seed):
+def test_lamp_is_no_gap():
     """Drift and flicker of the lamp leave chi-square what it is."""
-    rng = np.random.default_rng(seed)
-    n = len(data.frames())
-    x = np.linspace(-1, 1, n)
-    lamp = 1 + 0.02 * x - 0.01 * x**2 + 0.002 * rng.normal(size=n)
-    model = data.fitted(data.observed(seed=seed, lamp=lamp))
-    nominal = model.problem.tangent(model.fit.coefficients)
-    freedom = model.degrees_of_freedom(nominal)
-    assert abs(model.fit.chi2 - freedom) < 5 * np.sqrt(2 * freedom)
-    found = model.problem.channels[0].lamp.flicker
-    assert 0.001 < found < 0.004
+    for seed in [1, 2]:
+        rng = np.random.default_rng(seed)
+        n = len(data.frames())
+        x = np.linspace(-1, 1, n)
+        lamp = 1 + 0.02 * x - 0.01 * x**2 + 0.002 * rng.normal(size=n)
+        model = data.fitted(data.observed(seed=seed, lamp=lamp))
+        nominal = model.problem.tangent(model.fit.coefficients)
+        freedom = model.problem.n_data - nominal.shape[1]
+        assert abs(model.fit.chi2 - freedom) < 5 * np.sqrt(2 * freedom)
+        found = model.problem.channels[0].lamp.flicker
+        assert 0.001 < found < 0.004
 
 
 def test_whitened_noise_has_unit_variance():

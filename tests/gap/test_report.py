@@ -20,7 +20,7 @@ from astropolcal.gap import diagnose, get_effect
 from astropolcal.gap._numbers import Fitted
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.cells import Cell
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.report import MAP, _about_frames, causes_table, summary, to_dict, write_html
 from astropolcal.simulation import simulate

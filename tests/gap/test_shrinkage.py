@@ -74,10 +74,10 @@ def test_better_is_counted_in_standard_errors():
     assert before.better_than(after) == pytest.approx(-2 * np.sqrt(3))
 
 
-@pytest.mark.parametrize(("change", "expected"), [(-1.0, np.inf), (0.0, 0.0), (1.0, -np.inf)])
-def test_a_difference_without_scatter_is_certain(change, expected):
-    before = errors([3.0, 3.0])
-    assert errors([3.0 + change] * 2).better_than(before) == expected
+def test_a_difference_without_scatter_is_certain():
+    for change, expected in [(-1.0, np.inf), (0.0, 0.0), (1.0, -np.inf)]:
+        before = errors([3.0, 3.0])
+        assert errors([3.0 + change] * 2).better_than(before) == expected
 
 
 # ---- groups --------------------------------------------------------------------------------
@@ -97,21 +97,18 @@ def test_angles_that_are_nearly_the_same_are_one_group():
     assert numbers[0].tolist() == [0, 0, 1, 1, 1, 2, 2, 2]
 
 
-@pytest.mark.parametrize(
-    "tables",
-    [
+def test_other_frames_are_grouped_in_blocks():
+    for tables in [
         # none, two angles only, and an angle that moves from frame to frame
         [table(24)],
         [table(24, np.repeat([45.0, 60.0], 12))],
         [table(24, np.linspace(0, 90, 24))],
         # one dataset without the angle is enough
         [table(24, np.repeat([45.0, 60.0, 90.0], 8)), table(24)],
-    ],
-)
-def test_other_frames_are_grouped_in_blocks(tables):
-    labels, numbers = frame_groups(tables)
-    assert labels == [f"frames {i} of 6" for i in range(1, 7)]
-    assert numbers[0].tolist() == np.repeat(np.arange(6), 4).tolist()
+    ]:
+        labels, numbers = frame_groups(tables)
+        assert labels == [f"frames {i} of 6" for i in range(1, 7)]
+        assert numbers[0].tolist() == np.repeat(np.arange(6), 4).tolist()
 
 
 def test_there_are_at_most_eight_blocks_and_all_frames_have_one():
@@ -124,10 +121,10 @@ def test_there_are_at_most_eight_blocks_and_all_frames_have_one():
         assert np.ptp(np.bincount(number)) <= 1
 
 
-@pytest.mark.parametrize("n", [1, 11])
-def test_too_few_frames(n):
-    with pytest.raises(GapError, match=rf"{n} in the shortest dataset; .*twelve frames"):
-        frame_groups([table(100), table(n)])
+def test_too_few_frames():
+    for n in [1, 11]:
+        with pytest.raises(GapError, match=rf"{n} in the shortest dataset; .*twelve frames"):
+            frame_groups([table(100), table(n)])
 
 
 # ---- fits ----------------------------------------------------------------------------------

@@ -20,9 +20,10 @@ from test_effects import (
 from astropolcal import calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, leaves, replace_optic
 from astropolcal.gap.attribution import scan
+from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import EFFECTS, Roles, get_effect
 from astropolcal.gap.model import Model
-from astropolcal.gap.problem import GapProblem, orthonormal
+from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.selection import ENOUGH, select
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.observations import Observations
@@ -68,22 +69,24 @@ def group(model):
     return [one.name for one in near if one.evidence > ENOUGH]
 
 
-@pytest.mark.parametrize("name", NEW)
-def test_is_found_at_a_significance_of_thirty(name):
-    chains, data = clean(name)
-    model = fitted(chains, planted(name, chains, data, 30, CASES[name].size))
-    # an elliptical derotator of which only the circular part shows has the simpler name
-    simpler = {"derotator_elliptical_retardance": "derotator_circular_retardance"}
-    assert {name, simpler.get(name)} & set(group(model))
+@pytest.mark.slow
+def test_is_found_at_a_significance_of_thirty():
+    for name in NEW:
+        chains, data = clean(name)
+        model = fitted(chains, planted(name, chains, data, 30, CASES[name].size))
+        # an elliptical derotator of which only the circular part shows has the simpler name
+        simpler = {"derotator_elliptical_retardance": "derotator_circular_retardance"}
+        assert {name, simpler.get(name)} & set(group(model))
 
 
-@pytest.mark.parametrize("sky", [False, True])
-def test_nothing_is_found_where_there_is_nothing(sky):
-    name = "m3_retardance" if sky else "fringes_drift"
-    chains, data = clean(name)
-    problem = GapProblem(chains, data)
-    model = fitted(chains, noisy(problem, problem.start, data, seed=8))
-    assert group(model) == []
+@pytest.mark.slow
+def test_nothing_is_found_where_there_is_nothing():
+    for sky in [False, True]:
+        name = "m3_retardance" if sky else "fringes_drift"
+        chains, data = clean(name)
+        problem = GapProblem(chains, data)
+        model = fitted(chains, noisy(problem, problem.start, data, seed=8))
+        assert group(model) == []
 
 
 # ---- aliases ---------------------------------------------------------------------------------
@@ -103,23 +106,22 @@ def one_star(parallactic, altitude):
     return [chain], [simulate(chain, WAVELENGTH, frames, flux=1e8, noise=False)]
 
 
-@pytest.mark.parametrize(
-    ("parallactic", "altitude", "share"),
-    [((20, 24), (60, 60.5), (0.97, 1.05)), ((-60, 60), (50, 70), (0.0, 0.6))],
-)
-def test_mirror_and_polarized_star_are_alike_where_the_sky_hardly_turns(
-    parallactic, altitude, share
-):
+@pytest.mark.slow
+def test_mirror_and_polarized_star_are_alike_where_the_sky_hardly_turns():
     """What a polarized star explains of the gap that the mirror leaves."""
-    chains, data = one_star(parallactic, altitude)
-    seen = planted("m3_diattenuation", chains, data, 30, (1.0, -0.1, 0.05))
-    model = fitted(chains, seen)
-    assert group(model)[0] == "m3_diattenuation"
-    names = ("m3_diattenuation", "standard_polarization")
-    found = scan(model, list(map(get_effect, names)), cells=False).candidates
-    scores = {one.name: one for one in found}
-    mirror, star = (scores[name].statistic for name in names)
-    assert share[0] < star / mirror < share[1]
+    for parallactic, altitude, share in [
+        ((20, 24), (60, 60.5), (0.97, 1.05)),
+        ((-60, 60), (50, 70), (0.0, 0.6)),
+    ]:
+        chains, data = one_star(parallactic, altitude)
+        seen = planted("m3_diattenuation", chains, data, 30, (1.0, -0.1, 0.05))
+        model = fitted(chains, seen)
+        assert group(model)[0] == "m3_diattenuation"
+        names = ("m3_diattenuation", "standard_polarization")
+        found = scan(model, list(map(get_effect, names)), cells=False).candidates
+        scores = {one.name: one for one in found}
+        mirror, star = (scores[name].statistic for name in names)
+        assert share[0] < star / mirror < share[1]
 
 
 # ---- where effects have their place ------------------------------------------------------------
@@ -127,11 +129,11 @@ def test_mirror_and_polarized_star_are_alike_where_the_sky_hardly_turns(
 SKY_ONLY = [name for name, case in CASES.items() if case.sky]
 
 
-@pytest.mark.parametrize("name", SKY_ONLY)
-def test_effects_on_sky_have_no_place_on_the_bench(name):
-    charis = instruments.get("charis")
-    bench = [charis.chain("polarized"), charis.chain("unpolarized")]
-    assert not EFFECTS[name].applies(bench * 2)
+def test_effects_on_sky_have_no_place_on_the_bench():
+    for name in SKY_ONLY:
+        charis = instruments.get("charis")
+        bench = [charis.chain("polarized"), charis.chain("unpolarized")]
+        assert not EFFECTS[name].applies(bench * 2)
 
 
 def test_chains_of_the_bench_stay_next_to_those_of_stars():
@@ -265,32 +267,32 @@ SIGNS = {
 }
 
 
-@pytest.mark.parametrize("name", SIGNS)
-def test_alternative_is_a_plate_with_another_tracking_law(name):
+def test_alternative_is_a_plate_with_another_tracking_law():
     """Other angles in the table, or another chain: the same fluxes."""
-    chains, _ = clean("m3_retardance")
-    parallactic, altitude = SKY["parallactic"], SKY["altitude"]
-    commanded = SKY["hwp"] - 0.5 * parallactic - altitude
-    wrong = SKY.copy()
-    wrong["hwp"] = commanded + SIGNS[name](parallactic, altitude)
-    edited = EFFECTS[name].edit(chains[1:], None).chains[0]
-    settings = {"noise": False, "flux": 1e6}
-    found = simulate(edited, WAVELENGTH, SKY, **settings)
-    expected = simulate(chains[1], WAVELENGTH, wrong, **settings)
-    np.testing.assert_allclose(found.flux_right, expected.flux_right, rtol=1e-10)
-    plain = simulate(chains[1], WAVELENGTH, SKY, **settings)
-    assert np.abs(found.flux_right / plain.flux_right - 1).max() > 0.01
+    for name in SIGNS:
+        chains, _ = clean("m3_retardance")
+        parallactic, altitude = SKY["parallactic"], SKY["altitude"]
+        commanded = SKY["hwp"] - 0.5 * parallactic - altitude
+        wrong = SKY.copy()
+        wrong["hwp"] = commanded + SIGNS[name](parallactic, altitude)
+        edited = EFFECTS[name].edit(chains[1:], None).chains[0]
+        settings = {"noise": False, "flux": 1e6}
+        found = simulate(edited, WAVELENGTH, SKY, **settings)
+        expected = simulate(chains[1], WAVELENGTH, wrong, **settings)
+        np.testing.assert_allclose(found.flux_right, expected.flux_right, rtol=1e-10)
+        plain = simulate(chains[1], WAVELENGTH, SKY, **settings)
+        assert np.abs(found.flux_right / plain.flux_right - 1).max() > 0.01
 
 
-@pytest.mark.parametrize("name", ["altitude", "parallactic"])
-def test_sign_of_an_axis_turns_the_mount(name):
-    chains, _ = clean("m3_retardance")
-    effect = EFFECTS[f"{name}_sign"]
-    once = effect.edit(chains, None).chains
-    twice = effect.edit(once, None).chains
-    assert chains[0][name].mount != once[0][name].mount
-    assert chains[0][name].mount == twice[0][name].mount
-    assert Roles(once[0]).plate.name == "hwp"
+def test_sign_of_an_axis_turns_the_mount():
+    for name in ["altitude", "parallactic"]:
+        chains, _ = clean("m3_retardance")
+        effect = EFFECTS[f"{name}_sign"]
+        once = effect.edit(chains, None).chains
+        twice = effect.edit(once, None).chains
+        assert chains[0][name].mount != once[0][name].mount
+        assert chains[0][name].mount == twice[0][name].mount
+        assert Roles(once[0]).plate.name == "hwp"
 
 
 # ---- a star ------------------------------------------------------------------------------------

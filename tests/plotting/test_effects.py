@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import QTable
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
@@ -15,9 +14,8 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.gap import Cause, get_effect
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.effects import EffectParameter
-from astropolcal.gap.effects.cell import CellEffect
+from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
-from astropolcal.gap.residuals import Where
 from astropolcal.plotting import effects, gap
 from astropolcal.plotting._style import BLACK, BLUE, ORANGE
 from astropolcal.plotting.effects import cause_map, plot_cause_map, plot_effect_sizes
@@ -197,21 +195,20 @@ def test_a_cell_is_drawn_over_what_it_depends_on():
 # ---- where ---------------------------------------------------------------------------------
 
 
-def where(*rows):
-    names = ("axis", "detail", "kind", "share", "p_single", "p_value")
-    table = QTable({name: [row[i] for row in rows] for i, name in enumerate(names)})
-    return Where(table, 100.0, 500)
+@pytest.fixture
+def drawn(monkeypatch):
+    """Return what draws a gap that lies at some kinds of places, with some shares."""
+
+    def draw(*rows, **options):
+        told = [dict(zip(("detail", "kind", "share"), row, strict=True)) for row in rows]
+        monkeypatch.setattr("astropolcal.plotting.gap.locate", lambda model: told)
+        return plot_where(SimpleNamespace(nominal=None), **options).axes
+
+    return draw
 
 
-def test_patterns_and_places_have_panels_of_their_own():
-    found = where(
-        ("hwp", "harmonic 4 " * 12, "pattern", 0.6, 0.0, 1e-9),
-        ("time", "a trend", "pattern", 0.005, 0.0, 1e-9),
-        ("beam", "the sums", "place", 0.97, 0.0, 1e-9),
-        ("dataset", "lamp", "place", 0.3, 0.5, 0.5),
-    )
-    top, bottom = plot_where(found).axes
-    # what is minute or not significant is left out
+def test_patterns_and_places_have_panels_of_their_own(drawn):
+    top, bottom = drawn(("harmonic 4 " * 12, "pattern", 0.6), ("the sums", "place", 0.97))
     assert [bar.get_width() for bar in top.patches] == pytest.approx([60])
     assert [bar.get_width() for bar in bottom.patches] == pytest.approx([97])
     assert [bar.get_facecolor() for bar in (*top.patches, *bottom.patches)] == [
@@ -227,11 +224,12 @@ def test_patterns_and_places_have_panels_of_their_own():
     assert bottom.texts[0].get_ha() == "right"
 
 
-def test_no_more_places_than_asked_for():
-    found = where(*(("x", f"at {i}", "place", 0.5 - 0.01 * i, 0.0, 1e-9) for i in range(20)))
-    assert len(plot_where(found).axes[1].patches) == 12
-    assert len(plot_where(found, limit=3).axes[1].patches) == 3
-    assert [t.get_text() for t in plot_where(found).axes[0].texts] == ["nothing beyond the noise"]
+def test_no_more_places_than_asked_for(drawn):
+    rows = [(f"at {i}", "place", 0.5 - 0.01 * i) for i in range(20)]
+    patterns, found = drawn(*rows)
+    assert len(found.patches) == 12
+    assert [text.get_text() for text in patterns.texts] == ["nothing beyond the noise"]
+    assert len(drawn(*rows, limit=3)[1].patches) == 3
 
 
 # ---- axes of the other figures -------------------------------------------------------------

@@ -29,26 +29,25 @@ def opened(path, layout):
 # ---- files that cannot be opened -------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
+def test_other_files_are_called_that(tmp_path, small):
+    for content, words in [
         (b"hello world\n", "is not a FITS file"),
         (b"# %ECSV 1.0\n" * 400, "is not a FITS file"),
         (b"", "not a readable FITS file: Empty or corrupt FITS file"),
-    ],
-)
-def test_other_files_are_called_that(tmp_path, small, content, words):
-    path = tmp_path / "night.fits"
-    path.write_bytes(content)
-    with (
-        pytest.raises(ObservationError, match=f"night.fits: {words}$"),
-        open_cube(path, small.files),
-    ):
-        pass
-    # what astropy would have tried does not help anybody here
-    with pytest.raises(ObservationError, match=f"^the file cannot be used: .*{words}$") as caught:
-        reduce_run([path], small)
-    assert "ignore_missing" not in str(caught.value)
+    ]:
+        path = tmp_path / "night.fits"
+        path.write_bytes(content)
+        with (
+            pytest.raises(ObservationError, match=f"night.fits: {words}$"),
+            open_cube(path, small.files),
+        ):
+            pass
+        # what astropy would have tried does not help anybody here
+        with pytest.raises(
+            ObservationError, match=f"^the file cannot be used: .*{words}$"
+        ) as caught:
+            reduce_run([path], small)
+        assert "ignore_missing" not in str(caught.value), (content, words)
 
 
 def test_many_bad_files_are_counted(tmp_path, small):
@@ -57,12 +56,12 @@ def test_many_bad_files_are_counted(tmp_path, small):
         reduce_run([tmp_path / "a.fits", tmp_path / "b.fits"], small)
 
 
-@pytest.mark.parametrize("size", [4000, 40_000])
-def test_truncated_files_are_refused_without_a_warning(flat, small, size):
-    flat.write_bytes(flat.read_bytes()[:size])
-    with pytest.raises(ObservationError, match="the file cannot be used: ") as caught:
-        reduce_run([flat], small)
-    assert "Warning" not in str(caught.value)
+def test_truncated_files_are_refused_without_a_warning(flat, small):
+    for size in [4000, 40_000]:
+        flat.write_bytes(flat.read_bytes()[:size])
+        with pytest.raises(ObservationError, match="the file cannot be used: ") as caught:
+            reduce_run([flat], small)
+        assert "Warning" not in str(caught.value), size
 
 
 def test_what_fails_in_the_block_is_not_the_file(flat, small):
@@ -163,39 +162,33 @@ def test_time_is_completed_from_date_or_mjd(small, tmp_path, flat_cube):
         assert values["date"] == "2025-11-03"
 
 
-@pytest.mark.parametrize(
-    ("values", "mjd"),
-    [
+def test_observation_time():
+    for values, mjd in [
         ({"mjd": 60982.25}, 60982.25),
         ({"date": "2025-11-03", "time": "06:00:00"}, 60982.25),
         ({"date": "2025-11-03T06:00:00"}, 60982.25),
         ({"date": "20251103", "time": "06:00:00"}, 60982.25),
         # the number goes before the words
         ({"mjd": 1.0, "date": "2025-11-03T06:00:00"}, 1.0),
-    ],
-)
-def test_observation_time(values, mjd):
-    assert observation_time(values).mjd == pytest.approx(mjd)
+    ]:
+        assert observation_time(values).mjd == pytest.approx(mjd), (values, mjd)
 
 
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
+def test_impossible_times():
+    for values, words in [
         ({}, "no date to compute the time from"),
         ({"date": "2025-11-03"}, "no time to compute the time from"),
         ({"date": "yesterday", "time": "noon"}, "time: "),
         ({"date": "2025-13-03", "time": "06:00:00"}, "time: "),
-    ],
-)
-def test_impossible_times(values, words):
-    with pytest.raises(ObservationError, match=words):
-        observation_time(values)
+    ]:
+        with pytest.raises(ObservationError, match=words):
+            observation_time(values)
 
 
-@pytest.mark.parametrize("own", ["CHARIS", None])
-def test_own_and_silent_headers_belong_to_the_instrument(own):
-    values = {} if own is None else {"instrument": own}
-    assert not_of_instrument(values, LAYOUT) == ""
+def test_own_and_silent_headers_belong_to_the_instrument():
+    for own in ["CHARIS", None]:
+        values = {} if own is None else {"instrument": own}
+        assert not_of_instrument(values, LAYOUT) == "", own
 
 
 # ---- frames as plain numbers -----------------------------------------------------------
@@ -247,20 +240,25 @@ def test_plate_that_follows_the_sky_is_fine():
     assert (frame.errors, frame.doubts) == ([], [])
 
 
-@pytest.mark.parametrize(("hwp_true", "off"), [(80.9, None), (81.5, "+1.50"), (78.0, "-2.00")])
-def test_plate_off_the_tracking_law(hwp_true, off):
-    errors = starred(hwp_true=hwp_true).errors
-    words = f"RET-POS1 = {hwp_true:g} deg is {off} deg off the tracking law; up to 1 deg is allowed"
-    assert errors == ([] if off is None else [words])
+def test_plate_off_the_tracking_law():
+    for hwp_true, off in [(80.9, None), (81.5, "+1.50"), (78.0, "-2.00")]:
+        errors = starred(hwp_true=hwp_true).errors
+        words = (
+            f"RET-POS1 = {hwp_true:g} deg is {off} deg off the tracking law; up to 1 deg is allowed"
+        )
+        assert errors == ([] if off is None else [words]), (hwp_true, off)
 
 
-@pytest.mark.parametrize(("hwp_true", "same"), [(0.9, True), (179.5, True), (80.0, False)])
-def test_plate_of_an_internal_source_stands_where_it_was_sent(hwp_true, same):
-    frame = Frame("CRSA00000001.fits", 1, SKY | {"hwp_true": hwp_true})
-    _check_header(frame, LAYOUT, "internal")
-    assert frame.errors == []
-    words = "RET-POS1 and RET-ANG1 differ by more than 1 deg, though the plate does not follow"
-    assert [doubt.startswith(words) for doubt in frame.doubts] == [True] * (not same)
+def test_plate_of_an_internal_source_stands_where_it_was_sent():
+    for hwp_true, same in [(0.9, True), (179.5, True), (80.0, False)]:
+        frame = Frame("CRSA00000001.fits", 1, SKY | {"hwp_true": hwp_true})
+        _check_header(frame, LAYOUT, "internal")
+        assert frame.errors == [], (hwp_true, same)
+        words = "RET-POS1 and RET-ANG1 differ by more than 1 deg, though the plate does not follow"
+        assert [doubt.startswith(words) for doubt in frame.doubts] == [True] * (not same), (
+            hwp_true,
+            same,
+        )
 
 
 def test_unknown_plate_angle_is_a_doubt():
@@ -271,14 +269,16 @@ def test_unknown_plate_angle_is_a_doubt():
     ]
 
 
-@pytest.mark.parametrize("missing", [["parallactic"], ["parallactic", "altitude"]])
-def test_pointing_follows_from_place_and_time_but_what_is_known_stays(missing):
-    frame = starred(without=[*missing, "hwp_true"], **TARGET)
-    assert frame.values["parallactic"] == pytest.approx(-44.9, abs=0.1)
-    assert frame.values["altitude"] == pytest.approx(75.9 if "altitude" in missing else 70, abs=0.1)
-    assert frame.doubts[0] == (
-        f"{' and '.join(missing)} computed from the coordinates and the time"
-    )
+def test_pointing_follows_from_place_and_time_but_what_is_known_stays():
+    for missing in [["parallactic"], ["parallactic", "altitude"]]:
+        frame = starred(without=[*missing, "hwp_true"], **TARGET)
+        assert frame.values["parallactic"] == pytest.approx(-44.9, abs=0.1), missing
+        assert frame.values["altitude"] == pytest.approx(
+            75.9 if "altitude" in missing else 70, abs=0.1
+        ), missing
+        assert frame.doubts[0] == (
+            f"{' and '.join(missing)} computed from the coordinates and the time"
+        ), missing
 
 
 def test_star_without_pointing_is_an_error_that_says_both():

@@ -77,27 +77,26 @@ def test_unusable_frame_is_no_original():
     assert why == {"CRSA00000001.fits": "truncated"}
 
 
-@pytest.mark.parametrize(
-    ("source", "name", "usual", "other"),
-    [
+def test_frame_of_another_kind_than_most_is_left_out():
+    for source, name, usual, other in [
         ("internal", "filter", "Broadband", "J"),
         ("internal", "pickoff", "in", "out"),
         ("internal", "light", "even", "uneven"),
         ("star", "filter", "Broadband", "J"),
         ("star", "object", "HD 1", "HD 2"),
-    ],
-)
-def test_frame_of_another_kind_than_most_is_left_out(source, name, usual, other):
-    frames = [frame(i, **{name: usual}) for i in range(3)] + [frame(9, **{name: other})]
-    kept, why = aside(*frames, source=source)
-    assert len(kept) == 3
-    assert why == {"CRSA00000009.fits": f"{name} {other!r}, the others of the run have {usual!r}"}
+    ]:
+        frames = [frame(i, **{name: usual}) for i in range(3)] + [frame(9, **{name: other})]
+        kept, why = aside(*frames, source=source)
+        assert len(kept) == 3, (source, name, usual, other)
+        assert why == {
+            "CRSA00000009.fits": f"{name} {other!r}, the others of the run have {usual!r}"
+        }, (source, name, usual, other)
 
 
-@pytest.mark.parametrize(("source", "name"), [("internal", "object"), ("star", "light")])
-def test_what_does_not_matter_for_a_source_is_not_compared(source, name):
-    kept, why = aside(frame(1, **{name: "a"}), frame(2, **{name: "b"}), source=source)
-    assert (len(kept), why) == (2, {})
+def test_what_does_not_matter_for_a_source_is_not_compared():
+    for source, name in [("internal", "object"), ("star", "light")]:
+        kept, why = aside(frame(1, **{name: "a"}), frame(2, **{name: "b"}), source=source)
+        assert (len(kept), why) == (2, {}), (source, name)
 
 
 def test_other_units_are_another_kind():
@@ -105,10 +104,10 @@ def test_other_units_are_another_kind():
     assert why == {"CRSA00000003.fits": "unit 'electron', the others of the run have 'adu'"}
 
 
-@pytest.mark.parametrize("other", ["hd1", "HD  1", "HD_1", "Hd.1", None])
-def test_spelling_and_silence_do_not_tell_objects_apart(other):
-    kept, _ = aside(frame(1, object="HD 1"), frame(2, object=other), source="star")
-    assert len(kept) == 2
+def test_spelling_and_silence_do_not_tell_objects_apart():
+    for other in ["hd1", "HD  1", "HD_1", "Hd.1", None]:
+        kept, _ = aside(frame(1, object="HD 1"), frame(2, object=other), source="star")
+        assert len(kept) == 2, other
 
 
 def test_silent_frame_stays_beside_one_that_contradicts():
@@ -118,10 +117,10 @@ def test_silent_frame_stays_beside_one_that_contradicts():
     assert list(why) == ["CRSA00000009.fits"]
 
 
-@pytest.mark.parametrize(("one", "other"), [("HD 1-2", "HD 12"), ("BD+12", "BD-12")])
-def test_signs_in_names_tell_objects_apart(one, other):
-    kept, _ = aside(frame(1, object=one), frame(2, object=other), source="star")
-    assert kept == ["CRSA00000001.fits"]
+def test_signs_in_names_tell_objects_apart():
+    for one, other in [("HD 1-2", "HD 12"), ("BD+12", "BD-12")]:
+        kept, _ = aside(frame(1, object=one), frame(2, object=other), source="star")
+        assert kept == ["CRSA00000001.fits"], (one, other)
 
 
 # ---- commanded angles ----------------------------------------------------------------
@@ -142,11 +141,13 @@ def test_without_a_sequence_angles_stay():
     assert frames[0].values["hwp"] == 30.0
 
 
-@pytest.mark.parametrize("sequence", [[], [0, 45], [0, 45, 22.5, 67.5]])
-def test_sequence_that_does_not_divide_the_frames_is_refused(sequence):
-    words = f"3 frames cannot be cut into sequences of {len(sequence)} angles; frames are missing"
-    with pytest.raises(ObservationError, match=words):
-        replace_angles([frame(i) for i in range(3)], sequence)
+def test_sequence_that_does_not_divide_the_frames_is_refused():
+    for sequence in [[], [0, 45], [0, 45, 22.5, 67.5]]:
+        words = (
+            f"3 frames cannot be cut into sequences of {len(sequence)} angles; frames are missing"
+        )
+        with pytest.raises(ObservationError, match=words):
+            replace_angles([frame(i) for i in range(3)], sequence)
 
 
 def test_angles_that_do_not_fit_are_left_out_unless_they_were_replaced():
@@ -160,17 +161,21 @@ def test_angles_that_do_not_fit_are_left_out_unless_they_were_replaced():
     assert consistent([], reduction, LAYOUT, check=True) == []
 
 
-@pytest.mark.parametrize(
-    ("hwp", "derotator", "repeats"),
-    [(90.0, 45.0, True), (90.2, 45.4, True), (-90.0, 45.0, True), (90.4, 45.0, False),
-     (90.0, 45.6, False), (45.0, 45.0, False), (180.0, 45.0, False)],
-)  # fmt: skip
-def test_frames_at_90_degrees_measure_the_same(hwp, derotator, repeats):
-    reduction = Reduction(None, "internal")
-    kept = without_repeats([frame(1), frame(2, hwp, derotator)], reduction)
-    assert len(kept) == 2 - repeats
-    words = [f"half-wave plate at {hwp:g} deg repeats that of CRSA00000001.fits"]
-    assert list(reduction.problems.values()) == [words] * repeats
+def test_frames_at_90_degrees_measure_the_same():
+    for hwp, derotator, repeats in [
+        (90.0, 45.0, True),
+        (90.2, 45.4, True),
+        (-90.0, 45.0, True),
+        (90.4, 45.0, False),
+        (90.0, 45.6, False),
+        (45.0, 45.0, False),
+        (180.0, 45.0, False),
+    ]:
+        reduction = Reduction(None, "internal")
+        kept = without_repeats([frame(1), frame(2, hwp, derotator)], reduction)
+        assert len(kept) == 2 - repeats, (hwp, derotator, repeats)
+        words = [f"half-wave plate at {hwp:g} deg repeats that of CRSA00000001.fits"]
+        assert list(reduction.problems.values()) == [words] * repeats, (hwp, derotator, repeats)
 
 
 def test_a_repeat_of_a_repeat_is_an_original():
@@ -194,22 +199,19 @@ def modulated(amplitude, n=8, offset=0.1):
     return frames
 
 
-@pytest.mark.parametrize(
-    ("amplitude", "seen"),
-    [
+def test_modulation_tells_a_polarized_lamp():
+    for amplitude, seen in [
         (0.9, "polarized"),
         (0.42, "polarized"),
         (0.3, None),
         (0.14, "unpolarized"),
         (0.0, "unpolarized"),
-    ],
-)
-def test_modulation_tells_a_polarized_lamp(amplitude, seen):
-    from astropolcal.reduction.run import _seen_source
+    ]:
+        from astropolcal.reduction.run import _seen_source
 
-    assert _seen_source(modulated(amplitude)) == seen
-    # an offset that no plate changes is no modulation
-    assert _seen_source(modulated(amplitude, offset=0.0)) == seen
+        assert _seen_source(modulated(amplitude)) == seen, (amplitude, seen)
+        # an offset that no plate changes is no modulation
+        assert _seen_source(modulated(amplitude, offset=0.0)) == seen, (amplitude, seen)
 
 
 def test_few_angles_tell_nothing():

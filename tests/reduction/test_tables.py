@@ -67,19 +67,22 @@ def test_failed_cells_are_masked_with_their_reason(small):
     assert obs.mask_reasons == {"saturated": 1}
 
 
-@pytest.mark.parametrize(
-    ("name", "column", "unit"),
-    [
-        ("hwp_true", "hwp_true", u.deg), ("parallactic", "parallactic", u.deg),
-        ("altitude", "altitude", u.deg), ("exposure_time", "exposure_time", u.s),
+def test_column_that_all_frames_know_is_in_the_table(small):
+    for name, column, unit in [
+        ("hwp_true", "hwp_true", u.deg),
+        ("parallactic", "parallactic", u.deg),
+        ("altitude", "altitude", u.deg),
+        ("exposure_time", "exposure_time", u.s),
         ("mjd", "time", u.day),
-    ],
-)  # fmt: skip
-def test_column_that_all_frames_know_is_in_the_table(small, name, column, unit):
-    both = reduced_table([frame(1, **{name: 2.0}), frame(2, **{name: 3.0})], small, {})
-    assert both[column].quantity.to_value(unit).tolist() == [2.0] * N + [3.0] * N
-    one = reduced_table([frame(1, **{name: 2.0}), frame(2)], small, {})
-    assert column not in one.colnames
+    ]:
+        both = reduced_table([frame(1, **{name: 2.0}), frame(2, **{name: 3.0})], small, {})
+        assert both[column].quantity.to_value(unit).tolist() == [2.0] * N + [3.0] * N, (
+            name,
+            column,
+            unit,
+        )
+        one = reduced_table([frame(1, **{name: 2.0}), frame(2)], small, {})
+        assert column not in one.colnames, (name, column, unit)
 
 
 def test_numbers_and_states_too_need_all_frames(small):
@@ -124,9 +127,7 @@ def test_file_is_not_replaced_unasked(small, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["run.ecsv"]
 
 
-@pytest.mark.parametrize(
-    ("place", "words"), [(".", "is a folder; name a file in it"), ("no/run.ecsv", "no folder")]
-)
-def test_impossible_places_are_named(tmp_path, place, words):
-    with pytest.raises(ObservationError, match=words):
-        write_table(Table({"bin": [0]}), tmp_path / place)
+def test_impossible_places_are_named(tmp_path):
+    for place, words in [(".", "is a folder; name a file in it"), ("no/run.ecsv", "no folder")]:
+        with pytest.raises(ObservationError, match=words):
+            write_table(Table({"bin": [0]}), tmp_path / place)

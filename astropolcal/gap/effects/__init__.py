@@ -5,32 +5,15 @@ The library of effects that a model of a polarimeter may lack.
 One row each of ``astropolcal.gap.effects.library``, in `EFFECTS`; `register_effect` adds your own.
 """
 
-from astropolcal.exceptions import GapError
-from astropolcal.gap.effects._check import check_against, check_declared
-from astropolcal.gap.effects.base import (
-    KINDS,
-    Context,
-    Edit,
-    EffectParameter,
-    tracking_laws,
-)
-from astropolcal.gap.effects.effect import Effect
+import numpy as np
+
+from astropolcal.chain import leaves
+from astropolcal.exceptions import AstropolcalError, GapError
+from astropolcal.gap.effects.effect import KINDS, Context, Edit, Effect, EffectParameter
 from astropolcal.gap.effects.library import LIBRARY
-from astropolcal.gap.effects.roles import Roles, adapted
-from astropolcal.gap.effects.where import (
-    Where,
-    after,
-    before,
-    detector,
-    direction,
-    harmonic,
-    inside,
-    move,
-    source,
-    step,
-    telescope,
-    time,
-)
+from astropolcal.gap.effects.where import Roles, adapted
+from astropolcal.gap.problem import GapProblem
+from astropolcal.units import canonical_factor, to_unit
 from astropolcal.words import did_you_mean
 
 __all__ = [
@@ -41,27 +24,22 @@ __all__ = [
     "Effect",
     "EffectParameter",
     "Roles",
-    "Where",
     "adapted",
-    "after",
-    "before",
     "check_effect",
-    "detector",
-    "direction",
     "get_effect",
-    "harmonic",
-    "inside",
-    "move",
     "register_effect",
-    "source",
-    "step",
-    "telescope",
-    "time",
-    "tracking_laws",
 ]
 
 #: Every effect by name.
 EFFECTS = {}
+_NEEDED = ("name", "title", "kind", "place", "shows", "reference")
+_TAKEN = "an effect {!r} is registered already; give yours another name"
+# of the largest flux: far above rounding, far below any noise
+_SAME = 1e-10
+# step of the differences, in units of the size to expect, and error that they may have
+_STEP, _ERROR = 1e-3, 1e-4
+# derivatives are compared at zero and at this share of the size to expect
+_PLACES = (0.0, 0.5)
 
 
 def register_effect(effect):
@@ -96,15 +74,11 @@ def register_effect(effect):
     >>> removed = EFFECTS.pop("fringes_15_um")
     """
     one = effect() if isinstance(effect, type) else effect
-    check_declared(one)
+    _check_declared(one)
     if one.name in EFFECTS:
-        raise _taken(one.name)
+        raise GapError(_TAKEN.format(one.name))
     EFFECTS[one.name] = one
     return effect
-
-
-def _taken(name):
-    return GapError(f"an effect {name!r} is registered already; give yours another name")
 
 
 def check_effect(effect, chains, observations):
@@ -142,11 +116,11 @@ def check_effect(effect, chains, observations):
     >>> check_effect("hwp_tilt", [charis.chain()], [observations])
     """
     one = effect() if isinstance(effect, type) else get_effect(effect)
-    check_declared(one)
+    _check_declared(one)
     # the registered effect itself may be checked, a namesake may not
     if one.name in EFFECTS and type(EFFECTS[one.name]) is not type(one):
-        raise _taken(one.name)
-    check_against(one, chains, observations)
+        raise GapError(_TAKEN.format(one.name))
+    _check_against(one, chains, observations)
 
 
 def get_effect(name):
@@ -187,6 +161,147 @@ def get_effect(name):
         f"no effect {name!r}{f'{near} All' if near else '; all'} {len(EFFECTS)} are listed by "
         "'astropolcal diagnose --effects help'"
     )
+
+
+def _check_declared(effect):
+    """Check that an effect has its attributes and is of a known kind."""
+    if not isinstance(effect, Effect):
+        raise GapError(f"{effect!r} is no Effect")
+    lacking = [key for key in _NEEDED if not getattr(effect, key)]
+    if lacking:
+        raise GapError(f"effect {effect.name or type(effect).__name__} lacks {', '.join(lacking)}")
+    if effect.kind not in KINDS:
+        raise GapError(
+            f"effect {effect.name}: kind {effect.kind!r}; allowed are {', '.join(KINDS)}"
+        )
+
+
+def _check_against(effect, chains, observations):
+    """Check identity at zero, names and derivatives of an effect on chains and data."""
+    chains, observations = list(chains), list(observations)
+    if not effect.applies(chains):
+        raise _failed(effect, "has no place in these chains")
+    # a diagnosis edits the same chains for a hundred effects: they must stay as they are
+    before = [_state(chain) for chain in chains]
+    nominal = GapProblem(chains, observations)
+    nominal.settle_noise()
+    try:
+        edit = effect.edit(chains, Context.of(nominal.wavelength, observations))
+    except AstropolcalError as error:
+        raise _failed(effect, f"cannot edit the chains: {error}") from error
+    names = [parameter.name for parameter in edit.parameters]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    discrete = effect.kind == "discrete"
+    wrong = {
+        f"gives {len(edit.chains)} chains for {len(chains)}": len(edit.chains) != len(chains),
+        "changes the chains that it is given; edit copies of the optics": (
+            [_state(chain) for chain in chains] != before
+        ),
+        "is discrete and has parameters; make it another kind": discrete and names,
+        "adds no parameter": not discrete and not names,
+        f"names the parameter {next(iter(twice), None)} twice": twice,
+    }
+    for words, is_wrong in wrong.items():
+        if is_wrong:
+            raise _failed(effect, words)
+    like = None if discrete else nominal
+    try:
+        problem = GapProblem(edit.chains, observations, ties=edit.ties, laws=edit.laws, like=like)
+    except AstropolcalError as error:
+        raise _failed(effect, f"gives chains that cannot be fitted: {error}") from error
+    if not discrete:
+        _check_names(effect, edit, problem, nominal)
+        _check_identity(effect, problem, nominal)
+    for parameter in edit.parameters:
+        _check_derivative(effect, problem, parameter)
+
+
+def _failed(effect, words):
+    return GapError(f"effect {effect.name}: {words}")
+
+
+def _state(chain):
+    """Return all that an edit could change in a chain."""
+    found = []
+    for leaf in leaves(chain):
+        found += [leaf.name, leaf.mount]
+        for one in (getattr(leaf, key) for key in leaf.param_names):
+            found.append((np.array(one.value).tolist(), bool(one.fixed), tuple(one.bounds)))
+    return found
+
+
+def _check_names(effect, edit, problem, nominal):
+    """Check that parameters are new, and in the chains."""
+    for parameter in edit.parameters:
+        name = parameter.name
+        if name not in problem.free.by_name:
+            known = ", ".join(sorted(set(problem.free.by_name) - set(nominal.free.by_name)))
+            raise _failed(effect, f"{name} is not free in its chains; new and free: {known or '-'}")
+        # a lifted bound, or prior, frees nothing that was not free: it gives room
+        known = name in nominal.free.by_name and name not in nominal.priors
+        if known and effect.kind != "bound":
+            raise _failed(effect, f"{name} is free in the chains without it already")
+        slot = problem.free.by_name[name]
+        if parameter.basis is not None and len(parameter.basis) != slot.size:
+            raise _failed(effect, f"{name}: a law for {len(parameter.basis)} of {slot.size} values")
+        for what in ("scale", "limit"):
+            if not _canonical(getattr(parameter, what), slot, effect) > 0:
+                raise _failed(effect, f"{name}: {what} = {getattr(parameter, what)} not positive")
+
+
+def _canonical(value, slot, effect):
+    try:
+        return float(to_unit(value, slot.unit, slot.name)) * canonical_factor(slot.unit)
+    except AstropolcalError as error:
+        raise _failed(effect, str(error)) from error
+
+
+def _check_identity(effect, problem, nominal):
+    pairs = zip(problem.datasets, nominal.datasets, strict=True)
+    for number, (edited, plain) in enumerate(pairs):
+        new = np.stack(edited.forward(problem.vector(problem.start)).fluxes)
+        old = np.stack(plain.forward(nominal.vector(nominal.start)).fluxes)
+        change = np.max(np.abs(new - old)) / np.max(np.abs(old))
+        if not change < _SAME:
+            raise _failed(
+                effect,
+                f"changes the fluxes of dataset {number} by {change:.2g} at zero parameters; "
+                "it must be the identity there",
+            )
+
+
+def _check_derivative(effect, problem, parameter):
+    """Compare the derivative of both channels with central differences."""
+    slot, where = problem.free.by_name[parameter.name], problem.slices[parameter.name]
+    scale = _canonical(parameter.scale, slot, effect)
+    for place in _PLACES:
+        middle = problem.start.copy()
+        middle[where] += place * scale
+        slopes = problem.jacobian(middle, whitened=False)
+        for column in range(where.start, where.stop):
+            found, expected = slopes[:, column], _difference(problem, middle, column, scale)
+            # a derivative that is zero has no relative error
+            size = max(np.abs(expected).max(), 1e-9 / scale)
+            worst = np.abs(found - expected).max() / size
+            if not worst < _ERROR:
+                raise _failed(
+                    effect,
+                    f"derivative to {problem.names[column]} differs from central differences by "
+                    f"{100 * worst:.3g} % of its largest value",
+                )
+
+
+def _difference(problem, middle, column, scale):
+    """Return the derivative of the predicted rows by differences of fourth order."""
+    step, total = _STEP * scale, 0.0
+    # f' = (8 [f(h) - f(-h)] - [f(2h) - f(-2h)]) / 12 h, with an error of h^4
+    for factor, weight in ((1, 8), (-1, -8), (2, -1), (-2, 1)):
+        q = middle.copy()
+        q[column] += factor * step
+        # differences are observed minus predicted
+        rows = np.concatenate([d.ravel() for d in problem.differences(q)])
+        total = total - weight * rows
+    return total / (12 * step)
 
 
 for _effect in LIBRARY:

@@ -7,10 +7,8 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import insert_optic, leaves, remove_optic, replace_optic
-from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
-from astropolcal.gap.effects.effect import Effect
-from astropolcal.gap.effects.roles import is_held
-from astropolcal.gap.effects.where import Where
+from astropolcal.gap.effects.effect import Edit, Effect, EffectParameter, label_of
+from astropolcal.gap.effects.where import Where, is_held
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
 
@@ -93,7 +91,7 @@ class Fringes(Effect):
     Etalon: retardance that oscillates with the wavenumber.
 
     The difference of path between the two reflections, in micrometre, decides on the period, and
-    no derivative at zero tells it: `variants` gives one effect for each that the wavelengths tell.
+    no derivative at zero tells it: `of` gives one effect for each.
     The phase of a fringe that drifts linearly turns a cosine in the wavenumber into a sine: to
     first order both have amplitudes that change linearly with time.
     """
@@ -119,16 +117,6 @@ class Fringes(Effect):
         # two reflections interfere with the phase of their difference of path
         phase = 2 * np.pi * self.thickness / context.wavelength
         return np.stack([np.cos(phase), np.sin(phase)], axis=1)
-
-    def variants(self, context):
-        """Return fringes of all periods that the wavelengths resolve."""
-        wavenumber = np.sort(1 / np.asarray(context.wavelength))
-        if len(wavenumber) < 5:
-            return [self]
-        # one fringe more over the band for each step; the largest has two bins a fringe (Nyquist)
-        step = 1 / np.ptp(wavenumber)
-        largest = 1 / (2 * np.diff(wavenumber).max())
-        return [self.of(step * (i + 1)) for i in range(int(largest / step))]
 
 
 # ---- optics that are exchanged -----------------------------------------------------------------
@@ -193,7 +181,7 @@ class BandAverage(Effect):
 
     def retarder(self, roles):
         """Return the derotator, or the steepest retarder behind it that stands still."""
-        if self.where.relation == "inside" or roles.derotator is None:
+        if self.where.relation == "in" or roles.derotator is None:
             return roles.derotator
         names = [leaf.name for leaf in roles.leaves]
         behind = roles.leaves[names.index(roles.derotator.name) + 1 :]
@@ -415,7 +403,7 @@ class Alternative(Effect):
     change = None
 
     def __init__(self, name, title, words, role, change, **settings):
-        where = Where("inside", role, True) if isinstance(role, str) else role
+        where = Where("in", role, True) if isinstance(role, str) else role
         super().__init__(name, title, where, words=words, change=change, **settings)
 
     def cells(self, chains):

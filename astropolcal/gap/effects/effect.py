@@ -7,24 +7,30 @@ effect would do to the data; fitted, the edited chains are ordinary chains again
 """
 
 import copy
+import re
+from dataclasses import dataclass, field
 
 import astropy.units as u
 import numpy as np
+from scipy.linalg import helmert
 
-from astropolcal import optics
-from astropolcal.chain import insert_optic
-from astropolcal.exceptions import GapError, ParameterError
+from astropolcal import instruments, optics
+from astropolcal.chain import insert_optic, leaves
+from astropolcal.exceptions import GapError, InstrumentError, ParameterError
 from astropolcal.gap.cells import Cell
-from astropolcal.gap.effects.base import Edit, EffectParameter, label_of
-from astropolcal.gap.effects.roles import SEVERAL, Roles
-from astropolcal.gap.effects.where import Where
+from astropolcal.gap.effects.where import SEVERAL, Roles, Where
+from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
+from astropolcal.observations.pointings import TRACKING
 from astropolcal.optics import GENERATORS, Dependence
 from astropolcal.optics.perturbations import split_run
+from astropolcal.units import canonical_factor
 from astropolcal.words import did_you_mean
 
-__all__ = ["Effect"]
+__all__ = []
 
+#: What an effect may be.
+KINDS = ("optic", "parameter", "bound", "detector", "source", "discrete")
 # the most that a kind may be: beyond it is no perturbation
 _LIMITS = {"retardance": np.pi, "rotation": np.pi / 4, "diattenuation": 3.0, "depolarization": 3.0}
 _LIMIT = 0.5
@@ -38,6 +44,198 @@ _SEVERAL = {
 NUMBER = "number"
 # largest change of an optic's Mueller matrix from the identity that is none
 _SAME = 1e-9
+_SETTINGS = (
+    *("name", "title", "where", "dependence", "scale", "limit", "shows", "reference", "words"),
+    *("category", "inserted", "free", "equal", "when", "near", "absorbed_by", "flux"),
+    *("components", "change"),
+)
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """
+    A parameter that an effect adds.
+
+    Parameters
+    ----------
+    name : str
+        ``"optic.parameter"``.
+    scale : `~astropy.units.Quantity` or float
+        Size to expect: the standard deviation of its prior.
+    limit : `~astropy.units.Quantity` or float
+        Largest size that is physical.
+    basis : `~numpy.ndarray` or None
+        Law in wavelength, shape (W, k); None for a single number.
+    neutral : `~astropy.units.Quantity` or float, optional
+        Value from which the size counts; by default 1 for a share that is
+        retained and 0 for everything else.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.gap.effects import EffectParameter
+    >>> EffectParameter("static_retarder.circular", 1 * u.deg, 30 * u.deg, None).name
+    'static_retarder.circular'
+    """
+
+    name: str
+    scale: object
+    limit: object
+    basis: np.ndarray | None = None
+    neutral: object = None
+
+    @property
+    def canonical_scale(self):
+        """Size to expect in canonical units."""
+        return _canonical(self.scale)
+
+    @property
+    def canonical_limit(self):
+        """Largest size that is physical in canonical units."""
+        return _canonical(self.limit)
+
+    @property
+    def canonical_neutral(self):
+        """Value at which the effect is absent, canonical; scalar or one a wavelength."""
+        if self.neutral is not None:
+            value = u.Quantity(self.neutral)
+            return value.value * canonical_factor(value.unit)
+        # an optic that keeps all of the polarization is none
+        return 1.0 if self.is_retained else 0.0
+
+    @property
+    def is_retained(self):
+        """Whether it is a share of polarization that an optic retains, 1 where it does nothing."""
+        return self.name.split(".")[1].startswith("retained")
+
+
+def _canonical(value):
+    value = u.Quantity(value)
+    return float(value.value * canonical_factor(value.unit))
+
+
+@dataclass(frozen=True)
+class Edit:
+    """
+    Chains with an effect in them.
+
+    Parameters
+    ----------
+    chains : list
+        One a dataset.
+    parameters : list of EffectParameter
+        What the effect adds.
+    ties : dict of str to Tie
+        Parameters that follow others.
+
+    Examples
+    --------
+    >>> from astropolcal.gap.effects import Edit
+    >>> Edit([], []).ties
+    {}
+    """
+
+    chains: list
+    parameters: list
+    ties: dict = field(default_factory=dict)
+
+    @property
+    def laws(self):
+        """Law in wavelength of the parameters that follow one, by name."""
+        return {p.name: p.basis for p in self.parameters if p.basis is not None}
+
+    @property
+    def limits(self):
+        """Largest physical size of every parameter, canonical, by name."""
+        return {p.name: p.canonical_limit for p in self.parameters}
+
+    @property
+    def priors(self):
+        """Standard deviation of the prior of every parameter, canonical, by name."""
+        # two standard deviations reach the limit: sizes are held where the data are silent only
+        return {name: limit / 2 for name, limit in self.limits.items()}
+
+
+@dataclass(frozen=True)
+class Context:
+    """
+    What an effect may know of the data.
+
+    Parameters
+    ----------
+    wavelength : `~numpy.ndarray`
+        Common grid in micrometre, shape (W,).
+    flux : float
+        Median flux of a beam, in the tables' unit.
+    degree : int or None
+        Degree of the laws in wavelength, None for one value a wavelength, or
+        "default" for that of each effect.
+    tracking : tuple of (float, float)
+        Law by which the half-wave plate of each dataset follows the sky, see
+        `tracking_laws`.
+    datasets : tuple of str
+        Names of the datasets.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.gap.effects import Context
+    >>> Context(np.array([1.2, 1.6])).basis(1).shape
+    (2, 2)
+    """
+
+    wavelength: np.ndarray
+    flux: float = 1.0
+    degree: object = "default"
+    tracking: tuple = ()
+    datasets: tuple = ()
+
+    @classmethod
+    def of(cls, wavelength, observations):
+        """Return what the datasets tell, on their common grid of wavelengths."""
+        fluxes = [np.nanmedian(o.flux_right + o.flux_left) / 2 for o in observations]
+        return cls(
+            wavelength,
+            float(np.median(fluxes)),
+            tracking=tracking_laws(observations),
+            datasets=tuple(o.name for o in observations),
+        )
+
+    def basis(self, degree, constant=True):
+        """Return the law's basis; without its constant where that is known already."""
+        wanted = degree if self.degree == "default" else self.degree
+        found = law_basis(self.wavelength, wanted)
+        if constant:
+            return found
+        # a constant over the wavelengths is the orientation of the optic, which is known by itself
+        if wanted is None:
+            # one value a wavelength, less their mean; singular vectors would be any basis of these
+            return helmert(len(found)).T
+        return found[:, 1:]
+
+
+def tracking_laws(observations):
+    """Return the law of the half-wave plate of every dataset, as its instrument tells it.
+
+    Factors of parallactic angle and altitude; those of `~astropolcal.observations.tracked` for
+    tables of no known instrument.
+    """
+    found = []
+    for one in observations:
+        try:
+            law = one.instrument and instruments.get(one.instrument).plate_law(one)
+        except InstrumentError:
+            law = None
+        found.append(law or TRACKING)
+    return tuple(found)
+
+
+def label_of(name):
+    """Return the name of an optic that an effect adds."""
+    head, sign, run = name.partition("dataset:")
+    # datasets whose names differ in a space only have optics of their own
+    run = re.sub(r"\W", lambda m: "_" if m.group() == "-" else f"_{ord(m.group()):x}_", run)
+    return "gap_" + re.sub(r"\W", "_", head + sign) + run
 
 
 class Effect:
@@ -50,13 +248,15 @@ class Effect:
         Identifier.
     title : str
         What it is, for a reader.
-    place : Where
-        Such as ``after("hwp")``.
+    place : str
+        ``"after:OPTIC"``, ``"before:OPTIC"``, ``"in:OPTIC"`` (the frame that turns with it),
+        ``"source"``, ``"telescope"`` (in front of the half-wave plate) or ``"detector"``; an optic
+        by its name or its role.
     kind : str or tuple of str
         Key of `~astropolcal.optics.GENERATORS`; ``"diattenuation"`` and ``"retardance"`` are of
         any axis; ``"orientation"`` is an error of the orientation of the optic inside which it is.
     dependence : str
-        On the frame, such as ``harmonic("derotator", 1)``.
+        On the frame, such as ``"harmonic:derotator:1"``.
     degree : int, "number" or None
         Degree of the law in wavelength; "number" is one number for all wavelengths, and None one
         for each.
@@ -97,10 +297,10 @@ class Effect:
     Examples
     --------
     >>> from astropolcal import instruments
-    >>> from astropolcal.gap.effects import Effect, after, harmonic
+    >>> from astropolcal.gap.effects import Effect
     >>> flexure = Effect("flexure", "mirror that bends as the derotator turns",
-    ...                  place=after("hwp"), kind="diattenuation",
-    ...                  dependence=harmonic("derotator", 1), limit=0.05)
+    ...                  place="after:hwp", kind="diattenuation",
+    ...                  dependence="harmonic:derotator:1", limit=0.05)
     >>> flexure.cell([instruments.get("charis").chain()]).title
     'diattenuation along the axes behind the half-wave plate that changes once in a turn of the derotator'
     """  # noqa: E501
@@ -136,7 +336,12 @@ class Effect:
 
     def _check(self):
         if self.where is not None and not isinstance(self.where, Where):
-            raise GapError(f"effect {self.name}: place = {self.where!r} is none; say after(optic)")
+            given, self.where = self.where, Where.of(str(self.where))
+            if self.where is None:
+                raise GapError(
+                    f"effect {self.name}: place = {given!r}; allowed are 'after:OPTIC', "
+                    "'before:OPTIC', 'in:OPTIC', 'source', 'telescope' and 'detector'"
+                )
         known = (*GENERATORS, *_SEVERAL)
         for one in self.kinds if self.inserted is None else ():
             if one not in known:
@@ -180,7 +385,7 @@ class Effect:
         >>> Effect.insert(film, before="wollaston", limit=0.1, degree=1)
         <Effect film: Diattenuator in front of the wollaston>
         """
-        given = {"after": after, "before": before, "inside": inside}
+        given = {"after": after, "before": before, "in": inside}
         told = [Where(key, value) for key, value in given.items() if value is not None]
         name = settings.pop("name", optic.name)
         if len(told) != 1:
@@ -275,7 +480,11 @@ class Effect:
         """
         every = [self.roles(chain) for chain in chains]
         # what is in the chains already applies to them no more, and is still what it is
-        there = [one for one in every if self._is_there(one) or self.where.otherwise]
+        there = [
+            r
+            for r in every
+            if self.where.optic is None or self.where.anchor(r) is not None or self.where.otherwise
+        ]
         roles = next((one for one in there if self.applies_to(one)), next(iter(there), None))
         if roles is None or not (self.kinds or self.near):
             return ()
@@ -287,9 +496,6 @@ class Effect:
         texts = (text,) if isinstance(text, str) else text
         cells = [Cell(place, one, text) for text in texts for place in at for one in kinds]
         return tuple(dict.fromkeys(cells))
-
-    def _is_there(self, roles):
-        return self.where.optic is None or self.where.anchor(roles) is not None
 
     def cell(self, chains):
         """Return the main one of `cells`, None where there is none."""
@@ -404,7 +610,7 @@ class Effect:
         if self.flux is not None:
             one.reference = self.flux * context.flux
         where = self.where
-        inside = where.relation == "inside" and _has_axes(one)
+        inside = where.relation == "in" and _has_axes(one)
         if anchor is not None and (inside or where.turned is not None):
             one.theta = (anchor.theta.value + (where.turned or 0.0)) * u.deg
         for key in one.param_names:
@@ -430,24 +636,8 @@ class Effect:
             found.append(one)
         return found
 
-    def variants(self, context):
-        """
-        Return the effect in all the settings among which the data may choose.
-
-        Only itself, unless a setting enters the law in a way that is not linear, as the thickness
-        of a window does.
-        """
-        return [self]
-
     def __repr__(self):
         return f"<Effect {self.name}: {self.title}>"
-
-
-_SETTINGS = (
-    *("name", "title", "where", "dependence", "scale", "limit", "shows", "reference", "words"),
-    *("category", "inserted", "free", "equal", "when", "near", "absorbed_by", "flux"),
-    *("components", "change"),
-)
 
 
 def _plain(size):
@@ -468,3 +658,67 @@ def _in_frame(place, parts, label):
     for one in ends:
         one.theta.fixed = True
     return [ends[0], *parts, ends[1]]
+
+
+class CellEffect(Effect):
+    """An effect that is one cell: a perturbation of some kind at some place."""
+
+    def __init__(self, cell, degree=2):
+        everywhere = "constant" if cell.run is None else f"dataset:{cell.run}"
+        super().__init__(
+            cell.name,
+            cell.title,
+            cell.place,
+            # what only a detector has is put in by itself, see `edit`
+            *((cell.kind, cell.dependence) if cell.kind in GENERATORS else ("gain", everywhere)),
+            degree,
+            category="cell",
+            words=cell.place,
+            shows="what the cell does to the data",
+            reference="a perturbation of no name",
+        )
+        self._cell = cell
+
+    def cells(self, chains):
+        """Return the cell."""
+        return (self._cell,)
+
+    def edit(self, chains, context):
+        """Return the chains with the perturbation at zero; see `Effect.edit`."""
+        if self._cell.kind in GENERATORS:
+            return super().edit(chains, context)
+        optic, side, *free = _of_detector(self._cell.kind, self.label, context)
+        for name in optic.param_names:
+            getattr(optic, name).fixed = name not in free
+        edited, ties = [], {}
+        for i, chain in enumerate(chains):
+            if self._in_dataset(context, i):
+                split = next(o.name for o in leaves(chain) if o.splits_light)
+                chain = insert_optic(chain, optic.copy(), **{side: split})
+                # one detector: the same law for both beams
+                ties = {f"{self.label}.{key}": Tie(f"{self.label}.{free[0]}") for key in free[1:]}
+            edited.append(chain)
+        basis = None if self.degree is None else context.basis(self.degree)
+        size = EffectParameter(f"{self.label}.{free[0]}", self._cell.scale, _LIMIT, basis)
+        return Edit(edited, [size], ties)
+
+
+def _of_detector(kind, name, context):
+    """Return the optic of a kind that only a detector has, its side of the splitter, what is free.
+
+    Of the free parameters all follow the first.
+    """
+    size, flux = np.zeros(len(context.wavelength)), context.flux
+    if kind == "background":
+        settings = {"reference": 2 * flux, "mount": "total_flux"}
+        return optics.StrayLight(amount=size, name=name, **settings), "before", "amount"
+    if kind == "crosstalk":
+        loss = optics.Perturbation(amplitude=size, kind="depolarization_linear", name=name)
+        return loss, "before", "amplitude"
+    power, reference, mount, *free = {
+        "background_of_one_beam": (-1, flux, "flux", "right"),
+        "nonlinearity": (1, flux, "flux", "right", "left"),
+        "persistence": (-1, 1.0, "previous_flux", "right", "left"),
+    }[kind]
+    settings = {"power": power, "reference": reference, "mount": mount, "name": name}
+    return optics.FluxGain(right=size, left=size, **settings), "after", *free

@@ -31,9 +31,9 @@ from astropolcal.gap.effects._laws import (
     without_constant,
 )
 from astropolcal.gap.effects.effect import NUMBER, Effect
-from astropolcal.gap.effects.where import Where, before, harmonic, telescope, time
+from astropolcal.gap.effects.where import Where
 
-__all__ = ["LIBRARY"]
+__all__ = []
 
 _BRYAN = "Bryan et al. 2010, doi:10.1364/AO.49.006313"
 _HARRINGTON_2019 = "Harrington et al. 2019, doi:10.1117/1.JATIS.5.3.038001"
@@ -44,8 +44,8 @@ _PATAT = "Patat & Romaniello 2006, doi:10.1086/497581"
 _SIGNS = "McIntosh et al. 2026, Sec. 6.1; van Holstein et al. 2020, doi:10.1051/0004-6361/201834996"
 _THART = "'t Hart et al. 2021, doi:10.1117/12.2594962"
 
-_PLATE = Where("inside", "plate", True, in_front=True)
-_DEROTATOR = Where("inside", "derotator", True)
+_PLATE = Where("in", "plate", True, in_front=True)
+_DEROTATOR = Where("in", "derotator", True)
 _RELAY = Where("after", "relay", True)
 _POLARIZER = Where("after", "polarizer", True)
 _MIRROR = Where("after", "mirror", True)
@@ -54,15 +54,13 @@ _DETECTOR = Where("detector")
 _ENTRANCE = Where("before", "entrance", True)
 _SKY = Where("before", "parallactic", True)
 # behind the mirror: small diattenuations of one plane add up in any order
-_M3 = Where(
-    "inside", "telescope_mirror", True, turned=0.0, otherwise=Where("before", "altitude", True)
-)
+_M3 = Where("in", "telescope_mirror", True, turned=0.0, otherwise=Where("before", "altitude", True))
 
 _ON_PLATE = {"words": "half-wave plate"}
 _AT_DETECTOR = {"words": "detector", "category": "detector"}
 _BEHIND = {"words": "relay behind the derotator"}
 _IN_TELESCOPE = {
-    kind: {"words": "tertiary mirror", "near": (telescope(), (f"{kind}_h", f"{kind}_d"))}
+    kind: {"words": "tertiary mirror", "near": (Where("telescope"), (f"{kind}_h", f"{kind}_d"))}
     for kind in ("diattenuation", "retardance")
 }
 
@@ -92,7 +90,7 @@ def _encoder(name, n, place, optic, like, shows):
         name, f"angle of the {optic} wrong {how}", place, "orientation",
         optics.HarmonicRotator(harmonic=n), _WAVES, _size(0.1, 5, u.deg), shows,
         f"geometry of an eccentric scale; compare {like}", degree=NUMBER,
-        dependence=harmonic("own", n), words=f"stage of the {optic}", category="parameter",
+        dependence=f"harmonic:own:{n}", words=f"stage of the {optic}", category="parameter",
     )  # fmt: skip
 
 
@@ -102,7 +100,7 @@ def _transmission(name, n, title):
         name, title, _PLATE, (), optics.HarmonicGain(harmonic=n), _WAVES, _size(0.003, 0.1),
         f"harmonic {n} of the plate angle in sums, none in differences",
         "Essinger-Hileman et al. 2016, doi:10.1063/1.4962023", degree=NUMBER,
-        dependence=harmonic("own", n), near=(Where("source"), ("diattenuation_h",)), **_ON_PLATE,
+        dependence=f"harmonic:own:{n}", near=(Where("source"), ("diattenuation_h",)), **_ON_PLATE,
     )  # fmt: skip
 
 
@@ -155,7 +153,7 @@ _PLATE_EFFECTS = [
         _DETECTOR, "gain", optics.HarmonicGain(differential=True, mount="hwp"), _WAVES,
         _size(0.003, 0.1), "harmonic 1 of the plate angle in differences of all sources",
         "Tinyanont et al. 2019, doi:10.1088/1538-3873/aaef0f",
-        degree=NUMBER, dependence=harmonic("hwp", 1), when=lambda roles: roles.plate is not None,
+        degree=NUMBER, dependence="harmonic:hwp:1", when=lambda roles: roles.plate is not None,
         **_AT_DETECTOR,
     ),
     # its retardance depends on whether the fast axis lies along the tilt or across: twice a turn
@@ -164,7 +162,7 @@ _PLATE_EFFECTS = [
         _PLATE, "retardance_h", optics.HarmonicRetarder(harmonic=2), _WAVES,
         _size(0.5, 20, u.deg), "harmonics 2, 4, 6 and 8 of the plate angle",
         "Patanchon et al. 2024, doi:10.1088/1475-7516/2024/01/074",
-        degree=NUMBER, dependence=harmonic("own", 2), **_ON_PLATE,
+        degree=NUMBER, dependence="harmonic:own:2", **_ON_PLATE,
     ),
     _encoder(
         "hwp_encoder_eccentricity", 1, _PLATE, "half-wave plate", "Millar-Blanchaer et al. 2016",
@@ -342,7 +340,7 @@ _SOURCE_EFFECTS = [
         _POLARIZER, "rotation", optics.DriftRotator(mount="sequence"), "rate",
         _size(0.1, 10, u.deg), "phase of harmonic 4 of the plate angle, with time",
         "Harrington et al. 2023, drift terms of DKIST",
-        degree=NUMBER, dependence=time(), words="source", category="source",
+        degree=NUMBER, dependence="time", words="source", category="source",
     ),
     # behind a polarizer a leak is an equal loss of all, whatever the axes
     _effect(
@@ -520,7 +518,7 @@ _ALTERNATIVES = [
     Alternative(
         "mirror_flip_before_plate",
         "odd number of reflections in front of the half-wave plate that the model lacks",
-        "in front of the half-wave plate", before("plate"), flipped_before, shows=_TURNED,
+        "in front of the half-wave plate", Where("before", "plate"), flipped_before, shows=_TURNED,
     ),
     Alternative("hwp_sign", _SIGN.format("half-wave plate"), _PLATE_WORDS, "plate", other_sign,
                 shows=_TURNED),

@@ -1,66 +1,47 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Places in a chain, and dependences on the frame, of which effects are declared."""
+"""Places of effects in a chain, told by its optics and by what these are for."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from astropolcal.chain import Train
+from astropolcal import optics
+from astropolcal.chain import Train, leaves
 from astropolcal.gap.cells import Place, places
+from astropolcal.optics import COORDINATES
 
-__all__ = [
-    "Where",
-    "after",
-    "before",
-    "detector",
-    "direction",
-    "harmonic",
-    "inside",
-    "move",
-    "source",
-    "step",
-    "telescope",
-    "time",
-]
+__all__ = []
+
+#: Roles of which a chain may have several optics.
+SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
+# positions that are not those of a stage which carries a retarder
+_NO_STAGES = ("parallactic", "altitude", *COORDINATES)
+_BEHIND, _BEHIND_PLATE = "behind the derotator", "behind the half-wave plate"
 
 
 @dataclass(frozen=True)
 class Where:
-    """
-    A place in chains, told by an optic.
+    """A place in chains, told by an optic."""
 
-    Parameters
-    ----------
-    relation : {"after", "before", "inside", "source", "telescope", "detector"}
-        Inside is the frame that turns with the optic.
-    optic : str or None
-        Its name, or its role.
-    is_role : bool
-        Whether only the role counts, see `Roles`.
-    in_front : bool
-        Whether what is inside an optic stands in front of it.
-    turned : float
-        Orientation to that of the optic, degree.
-    otherwise : Where or None
-        The place of chains that lack the optic.
-
-    See Also
-    --------
-    after, before, inside, source, telescope, detector : make one.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import Where
-    >>> Where("inside", "hwp").words
-    'hwp'
-    """
-
+    #: ``"after"``, ``"before"`` or ``"in"`` an optic, the latter in the frame that turns with it;
+    #: ``"source"``, ``"telescope"`` or ``"detector"``.
     relation: str
     optic: str | None = None
+    #: Whether only the role counts, see `Roles`.
     is_role: bool = False
+    #: Whether what is inside an optic stands in front of it.
     in_front: bool = False
+    #: Orientation to that of the optic, degree.
     turned: float | None = None
+    #: The place of chains that lack the optic.
     otherwise: object = None
+
+    @classmethod
+    def of(cls, place):
+        """Return the place of a text such as ``"after:hwp"``, None where it is no place."""
+        relation, _, optic = place.partition(":")
+        known = ("after", "before", "in") if optic else ("source", "telescope", "detector")
+        return cls(relation, optic or None) if relation in known else None
 
     @property
     def words(self):
@@ -71,7 +52,7 @@ class Where:
     @property
     def follows(self):
         """Whether the orientation is that of the optic, whatever that is."""
-        return self.relation == "inside" and self.turned is None
+        return self.relation == "in" and self.turned is None
 
     def anchor(self, roles):
         """Return the optic by which the place is told, None where there is none."""
@@ -93,7 +74,7 @@ class Where:
         in_front = self.in_front or self.relation == "before"
         side = {"before" if in_front else "after": optic.name}
         theta, mount = 0.0, None
-        if self.relation == "inside" or self.turned is not None:
+        if self.relation == "in" or self.turned is not None:
             theta = np.deg2rad(np.mean(optic.theta.value) + (self.turned or 0.0))
             mount = optic.mount
         return Place(self.cell_place(roles, optic), mount=mount, theta=float(theta), **side)
@@ -103,7 +84,7 @@ class Where:
         optic = self.anchor(roles) if optic is None else optic
         if optic is None:
             return self.relation if self.optic is None else "source"
-        if self.relation == "inside" and optic.stage is not None:
+        if self.relation == "in" and optic.stage is not None:
             return f"in:{optic.name}"
         index = {o.name: i for i, o in enumerate(roles.leaves)}
         mine = index[optic.name] + (not (self.in_front or self.relation == "before"))
@@ -119,158 +100,161 @@ class Where:
         return Where("before", self.optic, self.is_role).cell_place(roles)
 
 
-def after(optic):
+def is_held(parameter):
+    """Return whether a parameter is fixed, or as good as that: known beforehand."""
+    return bool(parameter.fixed or parameter.prior is not None)
+
+
+class Roles:
     """
-    Return the place behind an optic, by its name or role, in the frame that stands still.
+    The optics of a chain by what they are for.
 
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import after
-    >>> after("hwp").words
-    'behind the hwp'
-    """
-    return Where("after", optic)
-
-
-def before(optic):
-    """
-    Return the place in front of an optic, in the frame that stands still.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import before
-    >>> before("wollaston").words
-    'in front of the wollaston'
-    """
-    return Where("before", optic)
-
-
-def inside(optic):
-    """
-    Return the place of an optic, in the frame that turns with it.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import inside
-    >>> inside("derotator").words
-    'derotator'
-    """
-    return Where("inside", optic)
-
-
-def source():
-    """
-    Return the place behind the source.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import source
-    >>> source().words
-    'source'
-    """
-    return Where("source")
-
-
-def telescope():
-    """
-    Return the place behind the telescope, in front of the half-wave plate.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import telescope
-    >>> telescope().words
-    'telescope'
-    """
-    return Where("telescope")
-
-
-def detector():
-    """
-    Return the place behind the beam splitter.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import detector
-    >>> detector().words
-    'detector'
-    """
-    return Where("detector")
-
-
-# ---- dependences -------------------------------------------------------------------------------
-
-
-def harmonic(stage, n):
-    """
-    Return the dependence on cosine and sine of n times the angle of a stage.
+    There may be several of a kind. The plates are the retarders on the stage ``hwp``, and those
+    on a stage in front of it; the derotators are retarders on a stage behind the plate, whatever
+    it is called; the telescope's mirrors stand between the rotation by the parallactic angle and
+    the plate.
 
     Parameters
     ----------
-    stage : str
-        Its name.
-    n : int
-        Periods in a turn.
+    chain : Optic or `~astropy.modeling.CompoundModel`
+        The chain.
+    **chosen
+        Role to the name of the optic that has it, where that is not the first of its kind.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import Roles
+    >>> roles = Roles(instruments.get("charis").chain())
+    >>> roles.plate.name, roles.derotator.name, roles.splitter.name
+    ('hwp', 'derotator', 'wollaston')
+    >>> irdis = Roles(instruments.get("irdis").chain("star"))
+    >>> [mirror.name for mirror in irdis.all("telescope_mirror")]
+    ['ut', 'm4']
+    """
+
+    def __init__(self, chain, **chosen):
+        self.leaves = leaves(chain)
+        # what an effect has added stands for nothing else
+        self._own = [o for o in self.leaves if o.name and not o.name.startswith("gap_")]
+        self._kinds = {
+            "polarizer": [o for o in self._own if isinstance(o, optics.LinearPolarizer)],
+            "mirror": self._source_mirrors(),
+            **self._turning(),
+        }
+        front = self._in_front()
+        self._kinds["telescope_mirror"] = [o for o in front if hasattr(o, "diattenuation")]
+        for role, found in self._kinds.items():
+            name = chosen.get(role)
+            own = (o for o in found if name in (None, o.name))
+            setattr(self, role, next(own, None))
+        #: Rotations by the parallactic angle and the altitude, and the star in front of them.
+        self.parallactic = self.altitude = self.star = None
+        self._look_at_the_sky()
+        self.splitter = next((o for o in self._own if isinstance(o, optics.WollastonPrism)), None)
+        #: What static optics of the relay stand behind.
+        self.relay = self.derotator or self.plate
+        #: The plate, where the model has nothing in front of it that could polarize.
+        self.entrance = self.plate if self._is_entrance() else None
+
+    def _look_at_the_sky(self):
+        turns = [o if isinstance(o, optics.Rotator) else None for o in self.leaves]
+        first = next((i for i, o in enumerate(turns) if o and o.stage == "parallactic"), None)
+        # without a rotation by the parallactic angle the light is that of an internal source
+        if first is None:
+            return
+        self.parallactic = turns[first]
+        self.altitude = next((o for o in turns[first:] if o and o.stage == "altitude"), None)
+        stars = (o for o in self.leaves[:first] if isinstance(o, optics.PolarizedSource))
+        self.star = next(stars, None)
+
+    def all(self, role):
+        """Return all optics of a role, in the order in which light meets them."""
+        return self._kinds.get(role, [])
+
+    def _source_mirrors(self):
+        """Return what stands in the place of the polarizer for unpolarized light."""
+        first = self.leaves[0]
+        kinds = (optics.Diattenuator, optics.DiattenuatorRetarder)
+        return [first] if isinstance(first, kinds) and first.stage is None else []
+
+    def _turning(self):
+        """Return plates and derotators."""
+        found = [o for o in self._own if _retards(o) and o.stage not in (None, *_NO_STAGES)]
+        names = [o.stage for o in found]
+        middle = names.index("hwp") if "hwp" in names else -1
+        plates = [o for o in found if o.stage == "hwp"]
+        plates += found[: max(middle, 0)]
+        behind = [o for o in found if not any(o is plate for plate in plates)]
+        return {"plate": plates, "derotator": sorted(behind, key=lambda o: o.stage != "derotator")}
+
+    def _in_front(self):
+        """Return what stands between the rotation by the parallactic angle and the plate."""
+        names = [o.stage for o in self._own]
+        start = names.index("parallactic") + 1 if "parallactic" in names else len(names)
+        plate = self._kinds["plate"]
+        end = next((i for i, o in enumerate(self._own) if plate and o is plate[0]), start)
+        return [o for o in self._own[start:end] if not isinstance(o, optics.Rotator)]
+
+    def _is_entrance(self):
+        if self.plate is None:
+            return False
+        if self._own[0] is self.plate:
+            return True
+        on = {o.stage for o in self._own}
+        if "parallactic" not in on or "altitude" in on:
+            return False
+        # the sky turns, and the instrument with the telescope
+        return all(is_held(getattr(o, key)) for o in self._in_front() for key in o.param_names)
+
+
+def _retards(optic):
+    kinds = (
+        optics.LinearRetarder,
+        optics.EllipticalRetarder,
+        optics.TwoLayerWaveplate,
+        optics.DiattenuatorRetarder,
+        optics.KMirror,
+    )
+    return isinstance(optic, kinds)
+
+
+def adapted(effects, chains):
+    """
+    Return the effects of a library that chains have a place for, one for each optic of a kind.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        The library.
+    chains : sequence
+        One a dataset.
 
     Returns
     -------
-    str
+    list of Effect
+        An effect that acts on one kind of optic comes once for each such optic: under its own name
+        for the first, as ``"name:optic"`` for the others. Where there is no derotator, the words
+        of what stands behind it name the half-wave plate.
 
     Examples
     --------
-    >>> from astropolcal.gap.effects import harmonic
-    >>> harmonic("derotator", 1)
-    'harmonic:derotator:1'
+    >>> from astropolcal import instruments
+    >>> from astropolcal.gap.effects import EFFECTS, adapted
+    >>> chain = instruments.get("irdis").chain("star")
+    >>> chain["ut"].diattenuation.fixed = chain["m4"].diattenuation.fixed = True
+    >>> [effect.name for effect in adapted([EFFECTS["m3_diattenuation"]], [chain])]
+    ['m3_diattenuation', 'm3_diattenuation:m4']
     """
-    return f"harmonic:{stage}:{n}"
+    chains = list(chains)
+    found = [one for effect in effects for one in effect.per_optic(chains)]
+    found = [one for one in found if one.applies(chains)]
+    if any(Roles(chain).derotator is not None for chain in chains):
+        return found
+    return [_reworded(one) for one in found]
 
 
-def time():
-    """
-    Return the dependence on time, a trend through the run.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import time
-    >>> time()
-    'time'
-    """
-    return "time"
-
-
-def step(frame):
-    """
-    Return the dependence of what is there from a frame on.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import step
-    >>> step(24)
-    'step:24'
-    """
-    return f"step:{frame}"
-
-
-def direction(stage):
-    """
-    Return the dependence on whether the last move of a stage was backwards.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import direction
-    >>> direction("hwp")
-    'direction:hwp'
-    """
-    return f"direction:{stage}"
-
-
-def move(stage):
-    """
-    Return the dependence on how far a stage was moved last.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.effects import move
-    >>> move("derotator")
-    'move:derotator'
-    """
-    return f"move:{stage}"
+def _reworded(effect):
+    words = {"title": effect.title, "place": effect.place}
+    new = {key: text.replace(_BEHIND, _BEHIND_PLATE) for key, text in words.items()}
+    return effect if new == words else effect.changed(**new)
