@@ -69,7 +69,7 @@ class Entry:
     validity : Validity
         For what it holds.
     content_hash : str
-        See `content_hash`.
+        SHA-256 of all that the file keeps.
 
     Examples
     --------

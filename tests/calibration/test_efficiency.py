@@ -11,7 +11,6 @@ from star_data import CHARIS
 from astropolcal import instruments, optics
 from astropolcal.chain import join, leaves, replace_optic
 from astropolcal.efficiency import (
-    DEROTATOR_LAWS,
     best_derotator,
     has_derotator,
     polarimetric_efficiency,
@@ -253,7 +252,7 @@ def test_laws_of_the_derotator(sky):
     pointing = [40, 60] * u.deg, [-60, 60] * u.deg
     found = [
         best_derotator(sky, CHARIS.wavelength, *pointing, law=law, **kwargs).table["least"]
-        for law in DEROTATOR_LAWS
+        for law in SkyLaw().derotator
     ]
     assert np.abs(found[0] - found[1]).max() > 0.05
     with pytest.raises(ParameterError, match=r"law = 'sky'.*allowed are pupil, field"):
