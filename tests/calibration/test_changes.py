@@ -65,13 +65,14 @@ def test_nothing_compared_is_no_sigma():
     assert "nothing that is determined in all of them to compare, from a to b" in str(_change(0, 0))
 
 
-@pytest.mark.parametrize(
-    ("chi2", "words"), [(2.0, "no change seen from a to b"), (30.0, "changed from a to b")]
-)
-def test_a_change_in_words(chi2, words):
-    text = str(_change(chi2, 2))
-    assert text.startswith("m3.diattenuation: " + words)
-    assert f"(chi-square {chi2:.1f} of 2, p = {stats.chi2.sf(chi2, 2):.1g})" in text
+def test_a_change_in_words():
+    for chi2, words in [(2.0, "no change seen from a to b"), (30.0, "changed from a to b")]:
+        text = str(_change(chi2, 2))
+        assert text.startswith("m3.diattenuation: " + words), (chi2, words)
+        assert f"(chi-square {chi2:.1f} of 2, p = {stats.chi2.sf(chi2, 2):.1g})" in text, (
+            chi2,
+            words,
+        )
 
 
 # --- chi-square of one common value ------------------------------------------------------

@@ -169,21 +169,19 @@ def test_the_limits_themselves_are_allowed():
     assert _made([10000 / ENOUGH], **edge).complaints(["a"]) == []
 
 
-@pytest.mark.parametrize("kind", ["bulk", "tail"])
-def test_too_few_samples_name_the_worst_parameter(kind):
-    found = _made([10.0, 10.0, 10.0], **{f"ess_{kind}": np.array([500.0, 399.0, 450.0])})
-    assert found.complaints("abc") == [
-        f"b has an effective sample size ({kind}) of 399, but {FEWEST_SAMPLES} are needed"
-    ]
+def test_too_few_samples_name_the_worst_parameter():
+    for kind in ["bulk", "tail"]:
+        found = _made([10.0, 10.0, 10.0], **{f"ess_{kind}": np.array([500.0, 399.0, 450.0])})
+        assert found.complaints("abc") == [
+            f"b has an effective sample size ({kind}) of 399, but {FEWEST_SAMPLES} are needed"
+        ], kind
 
 
-@pytest.mark.parametrize(
-    ("key", "words"), [("r_hat", "R-hat of b is nan"), ("ess_bulk", "b has an")]
-)
-def test_what_is_no_number_is_the_worst(key, words):
-    values = np.array([1.2, np.nan]) if key == "r_hat" else np.array([10.0, np.nan])
-    (found,) = _made([10.0, 10.0], **{key: values}).complaints("ab")
-    assert found.startswith(words)
+def test_what_is_no_number_is_the_worst():
+    for key, words in [("r_hat", "R-hat of b is nan"), ("ess_bulk", "b has an")]:
+        values = np.array([1.2, np.nan]) if key == "r_hat" else np.array([10.0, np.nan])
+        (found,) = _made([10.0, 10.0], **{key: values}).complaints("ab")
+        assert found.startswith(words), (key, words)
 
 
 def test_without_arviz_only_the_length_counts():
@@ -193,7 +191,7 @@ def test_without_arviz_only_the_length_counts():
     assert not _made([10.0], n_steps=100, **none).converged
 
 
-@pytest.mark.parametrize("changes", [{"std": np.zeros(3)}, {"r_hat": np.zeros((2, 1))}])
-def test_shapes_must_agree(changes):
-    with pytest.raises(ParameterError, match="one value a parameter is allowed"):
-        _made([1.0, 2.0], **changes)
+def test_shapes_must_agree():
+    for changes in [{"std": np.zeros(3)}, {"r_hat": np.zeros((2, 1))}]:
+        with pytest.raises(ParameterError, match="one value a parameter is allowed"):
+            _made([1.0, 2.0], **changes)

@@ -148,12 +148,10 @@ def test_name_of_a_parameter_stands_for_all_its_values(small):
     assert found == ["wollaston.efficiency[0]", "wollaston.efficiency[1]"]
 
 
-@pytest.mark.parametrize(
-    ("noise", "expected"), [(1 * u.percent, [0.01, 0.01]), ([0.01, 0.02], [0.01, 0.02])]
-)
-def test_noise_given(small, noise, expected):
-    posterior = LogPosterior(small.measurement, noise=noise)
-    assert posterior.sigma == pytest.approx(np.array(expected)[small.measurement.bins])
+def test_noise_given(small):
+    for noise, expected in [(1 * u.percent, [0.01, 0.01]), ([0.01, 0.02], [0.01, 0.02])]:
+        posterior = LogPosterior(small.measurement, noise=noise)
+        assert posterior.sigma == pytest.approx(np.array(expected)[small.measurement.bins])
 
 
 def test_noise_from_the_table(small):
@@ -446,14 +444,14 @@ def test_other_last_digits_do_not_matter(small, tmp_path):
     assert len(quiet_sample(other, **RUN, checkpoint=path).chain) == 60
 
 
-@pytest.mark.parametrize("content", [b"", b"no HDF5 at all" * 100])
-def test_other_files_are_not_touched(small, tmp_path, content):
-    path = tmp_path / "chain.h5"
-    path.write_bytes(content)
-    for resume in (True, False):
-        with pytest.raises(FitError, match=r"chain\.h5: is no checkpoint"):
-            quiet_sample(small, **RUN, checkpoint=path, resume=resume)
-    assert path.read_bytes() == content
+def test_other_files_are_not_touched(small, tmp_path):
+    for content in [b"", b"no HDF5 at all" * 100]:
+        path = tmp_path / "chain.h5"
+        path.write_bytes(content)
+        for resume in (True, False):
+            with pytest.raises(FitError, match=r"chain\.h5: is no checkpoint"):
+                quiet_sample(small, **RUN, checkpoint=path, resume=resume)
+        assert path.read_bytes() == content
 
 
 def test_other_hdf5_files_are_not_touched(small, tmp_path):

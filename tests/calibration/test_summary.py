@@ -81,17 +81,17 @@ def test_long_lines_are_broken_behind_their_bullet():
     assert " ".join(" ".join(lines).split()) == " ".join((long + " short").split())
 
 
-@pytest.mark.parametrize(
-    ("converged", "instrument", "words"),
-    [
+def test_heading():
+    for converged, instrument, words in [
         (True, "lab", ["Calibration of lab from night", "F, 1.23 s, converged"]),
         (False, None, ["Calibration of an instrument from night", "F, 1.23 s, NOT CONVERGED"]),
-    ],
-)
-def test_heading(converged, instrument, words):
-    lines = _heading(_calibration(converged=converged, instrument=instrument))
-    assert [lines[0], lines[2]] == words
-    assert lines[1] == "joint fit of 7 parameters to 48 normalized differences,"
+    ]:
+        lines = _heading(_calibration(converged=converged, instrument=instrument))
+        assert [lines[0], lines[2]] == words, (converged, instrument)
+        assert lines[1] == "joint fit of 7 parameters to 48 normalized differences,", (
+            converged,
+            instrument,
+        )
 
 
 def test_a_parameter_for_all_wavelengths():

@@ -52,18 +52,18 @@ def test_a_copy_of_a_column_is_one_direction_less():
     assert found.determined.tolist() == [False, False, True, True]
 
 
-@pytest.mark.parametrize(("share", "rank"), [(1e-8, 2), (1e-10, 1)])
-def test_what_is_a_billion_times_weaker_is_open(share, rank):
-    assert decompose(np.diag([1.0, share])).rank == rank
+def test_what_is_a_billion_times_weaker_is_open():
+    for share, rank in [(1e-8, 2), (1e-10, 1)]:
+        assert decompose(np.diag([1.0, share])).rank == rank, (share, rank)
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-13])
-def test_data_that_nothing_moves_determine_nothing(size):
+def test_data_that_nothing_moves_determine_nothing():
     """A rounding error is no slope, even where it is the largest there is."""
-    found = decompose(np.full((3, 2), size))
-    assert found.rank == 0
-    assert not found.determined.any()
-    assert found.half.shape == (0, 2)
+    for size in [0.0, 1e-13]:
+        found = decompose(np.full((3, 2), size))
+        assert found.rank == 0, size
+        assert not found.determined.any(), size
+        assert found.half.shape == (0, 2), size
 
 
 def test_without_rows_all_is_open():

@@ -273,12 +273,12 @@ def test_prior_is_kept_if_it_is_a_distribution():
             optic_from_node("Rotator", node)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_value_that_is_no_number_is_refused(value):
-    optic = optics.LinearRetarder(name="r")
-    optic.retardance.value = value
-    with pytest.raises(CalibrationFileError, match=r"r\.retardance = .* finite"):
-        written(optic)
+def test_value_that_is_no_number_is_refused():
+    for value in [np.nan, np.inf]:
+        optic = optics.LinearRetarder(name="r")
+        optic.retardance.value = value
+        with pytest.raises(CalibrationFileError, match=r"r\.retardance = .* finite"):
+            written(optic)
 
 
 def test_unit_changed_behind_the_optics_back_is_refused():
@@ -359,15 +359,15 @@ def test_setting_that_the_class_refuses():
             optic_from_node(type(optic).__name__, node)
 
 
-@pytest.mark.parametrize(
-    ("datatype", "shape", "data"),
-    [("int64", "[2]", "[1, 2]"), ("float64", "[1, 2]", "[[1.0, 2.0]]")],
-)
-def test_schema_refuses_arrays_of_another_kind(datatype, shape, data):
-    with asdf.config_context() as config:
-        config.array_inline_threshold = 10
-        text = written(optics.LinearRetarder(retardance=[1, 2] * u.deg)).decode()
-    assert "data: [1.0, 2.0]" in text
-    text = text.replace("datatype: float64", f"datatype: {datatype}").replace("[2]", shape)
-    with pytest.raises(ValidationError):
-        read(text.replace("[1.0, 2.0]", data).encode())
+def test_schema_refuses_arrays_of_another_kind():
+    for datatype, shape, data in [
+        ("int64", "[2]", "[1, 2]"),
+        ("float64", "[1, 2]", "[[1.0, 2.0]]"),
+    ]:
+        with asdf.config_context() as config:
+            config.array_inline_threshold = 10
+            text = written(optics.LinearRetarder(retardance=[1, 2] * u.deg)).decode()
+        assert "data: [1.0, 2.0]" in text, (datatype, shape, data)
+        text = text.replace("datatype: float64", f"datatype: {datatype}").replace("[2]", shape)
+        with pytest.raises(ValidationError):
+            read(text.replace("[1.0, 2.0]", data).encode())
