@@ -43,6 +43,7 @@ def calibrated(few):
 # --- it arrives at the truth ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_noiseless_data_give_back_the_truth(make):
     for observable in sorted(n for n, one in OBSERVABLES.items() if one.frames_per_datum < 4):
         for kind in ["linear", "elliptical"]:
@@ -344,6 +345,7 @@ def test_fitter_that_leaves_the_bounds_is_told_on(few):
     assert not cal.converged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strategy", "search", "searches"),
     [

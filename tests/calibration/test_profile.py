@@ -27,6 +27,7 @@ def cal(make):
 # --- the profile of a well-behaved parameter ----------------------------------------------
 
 
+@pytest.mark.slow
 def test_profile_is_the_parabola_of_the_error(make):
     """Wilks: where the model is nearly linear, chi-square rises by one at one sigma."""
     for weights in [None, "errors"]:

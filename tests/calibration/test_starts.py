@@ -37,6 +37,7 @@ def anywhere(make, kind, seed):
 # --- recovery from wrong branches ------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_wavelength_finds_a_branch_that_explains_it(make):
     """Chi-square of 32 data in each bin; a wrong valley gives 1e3 to 1e7."""
     for seed in range(8):
@@ -244,6 +245,7 @@ def with_prior(make, prior, seed=3):
     return start, truth, make.observe(truth, seed=seed)
 
 
+@pytest.mark.slow
 def test_prior_decides_between_equal_branches(make):
     """A retardance of d and of d - 360 deg are the same optic; a broad prior knows which it is."""
     for weights in [None, "wavelength", "errors"]:

@@ -107,6 +107,7 @@ def test_a_node_of_a_node_is_the_same(node):
     assert again["checksum"] == node["checksum"]
 
 
+@pytest.mark.slow
 def test_through_a_file_of_asdf(original):
     """As a part of any tree, beside other things and twice."""
     buffer = io.BytesIO()
@@ -396,6 +397,7 @@ def text_of(original):
     return buffer.getvalue()
 
 
+@pytest.mark.slow
 def test_one_clear_error_for_what_is_out_of_place(original, tmp_path):
     for old, new in [
         (b"optics/linear_retarder-1.0.0", b"optics/linear_polarizer-1.0.0"),
