@@ -13,6 +13,7 @@ from astropolcal.calibration.result.validity import (
     _dates,
     _moment,
     beam_words,
+    folded,
     instrument_of,
     optics_words,
     validity_of,
@@ -325,15 +326,11 @@ def _check_mode(held, label, mode, name, way):
         raise CalibrationFileError(
             f"{label}: its mode is not known, and {name} holds for {held}; {way} states it"
         )
-    if _folded(mode) != _folded(held.mode):
+    if folded(mode) != folded(held.mode):
         raise CalibrationFileError(
             f"{label} is in mode {mode!r}, but {name} holds for {held}; if it is the same by "
             f"another name, {way} says so"
         )
-
-
-def _folded(text):
-    return " ".join(str(text).split()).casefold()
 
 
 def _changes(calibration, light):

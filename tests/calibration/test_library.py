@@ -108,9 +108,8 @@ def test_moments_compare_as_times_do(moment):
     assert held.holds(moment) == (moment >= start.datetime)
 
 
-@pytest.mark.parametrize(
-    ("stated", "message"),
-    [
+def test_statement_that_makes_no_sense(calibration):
+    for stated, message in [
         ({"valid_from": "yesterday"}, "valid_from = 'yesterday' is not a date"),
         ({"valid_from": "2025-02-30"}, "is not a date"),
         ({"valid_from": "2026", "valid_until": "2025-01-01"}, "2026|not a date"),
@@ -119,11 +118,9 @@ def test_moments_compare_as_times_do(moment):
         ({"optics_in": [3]}, "names of optics are needed"),
         ({"mode": 3}, "mode = 3; text is needed"),
         ({"until": "2025-10-02"}, "no 'until'; allowed are mode, valid_from"),
-    ],
-)
-def test_statement_that_makes_no_sense(calibration, stated, message):
-    with refused(message):
-        with_validity(calibration, **stated)
+    ]:
+        with refused(message):
+            with_validity(calibration, **stated)
 
 
 def test_validity_of_an_unknown_instrument(calibration):
