@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from astropolcal import instruments
 from astropolcal.calibration import calibrate
 from astropolcal.exceptions import InstrumentError, ObservationError
-from astropolcal.instruments.layout import FileLayout
-from astropolcal.instruments.readout import ReadOut
-from astropolcal.instruments.vampires_headers import layout_of, mode_header, slices_of
+from astropolcal.instruments.layout import FileLayout, ReadOut
+from astropolcal.instruments.vampires import layout_of, mode_header, slices_of
 from astropolcal.observations import Observations
 from astropolcal.reduction import reduce_run
 from astropolcal.reduction.cubes import both_states, simulate_cubes

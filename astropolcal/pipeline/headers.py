@@ -28,8 +28,9 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
-from astropolcal.instruments import Instrument, without_nuisance
-from astropolcal.instruments.keywords import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
+from astropolcal.instruments import Instrument
+from astropolcal.instruments.base import without_nuisance
+from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
 from astropolcal.observations.pointings import offline
 from astropolcal.observations.reading import numeric_column
 from astropolcal.units import plain_number

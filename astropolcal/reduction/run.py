@@ -537,6 +537,7 @@ def _order(frame):
 
 
 def replace_angles(frames, sequence):
+    """Give the frames the angles of a sequence that repeats, in place."""
     if sequence is None:
         return
     sequence = [float(angle) for angle in sequence]

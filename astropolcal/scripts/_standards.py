@@ -466,7 +466,7 @@ def _site(text):
     import astropy.units as u
     from astropy.coordinates import EarthLocation
 
-    from astropolcal.standards._sky import SITES, location
+    from astropolcal.standards.visibility import SITES, location
 
     if "," not in text:
         try:

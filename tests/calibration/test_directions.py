@@ -23,7 +23,9 @@ from astropolcal.calibration.identifiability.linearized import (
     plain,
     step_of,
 )
-from astropolcal.measurement import FreeParameters, Normal, Uniform
+from astropolcal.measurement import Normal
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.measurement.priors import Uniform
 
 N = 3
 NAMES = ["polarizer.theta", "hwp.w_sio2", *(f"retarder.retardance[{i}]" for i in range(N))]

@@ -21,7 +21,8 @@ from astropolcal.calibration.identifiability.analysis import finding_of as findi
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.calibration.identifiability.linearized import Whitened, near_null_directions
 from astropolcal.calibration.identifiability.sky import consequences_along, view_of_measurement
-from astropolcal.measurement import FreeParameters, Measurement, Normal
+from astropolcal.measurement import Measurement, Normal
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 FRAMES = half_wave_plate_cycles(derotator=np.linspace(45, 132.5, 8) * u.deg)

@@ -9,8 +9,8 @@ from star_data import CHARIS, WAVELENGTH
 from astropolcal import calibrate, optics
 from astropolcal.chain import leaves
 from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments import add_nuisance, without_nuisance
-from astropolcal.instruments.nuisance import NUISANCES
+from astropolcal.instruments import add_nuisance
+from astropolcal.instruments.base import NUISANCES, without_nuisance
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 

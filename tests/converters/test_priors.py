@@ -9,7 +9,8 @@ import scipy.stats
 from astropolcal import optics
 from astropolcal.converters.nodes import node_from_priors, restore_priors, without_priors
 from astropolcal.exceptions import CalibrationFileError
-from astropolcal.measurement import Normal, Uniform
+from astropolcal.measurement import Normal
+from astropolcal.measurement.priors import Uniform
 
 
 def chain(**priors):

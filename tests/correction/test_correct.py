@@ -89,6 +89,7 @@ def test_what_some_frames_do_not_show_is_found_from_the_others(sky, charis, trac
     np.testing.assert_allclose(found.stokes, stokes, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_any_turn_of_the_field(sky, charis, track, scene, seen):
     hwp, positions = track(2)
     stokes = scene(22, size=31)
@@ -412,6 +413,7 @@ def test_v_and_its_fraction(sky, charis, track, seen):
     assert list(found.stokes_axis.symbol) == ["I", "Q", "U", "V"]
 
 
+@pytest.mark.slow
 def test_too_few_angles(star, sky, charis):
     keep = [0, 1]
     positions = {k: v[keep] for k, v in star.positions.items()}

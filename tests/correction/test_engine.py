@@ -88,6 +88,7 @@ def test_an_error_in_a_block_comes_out():
             run_blocks(fail, (1, 4), workers=workers)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_frames(sky, charis, track, tmp_path):
     pytest.importorskip("dask", reason="dask is not installed")
     peaks = []

@@ -169,6 +169,7 @@ def test_pairs_that_name_no_frame():
         Channels("double", 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observable", CHANNELS)
 @given(seed=st.integers(0, 1000))
 def test_gains_of_beams_are_those_of_channels(observable, seed):

@@ -239,6 +239,7 @@ def test_halo_takes_its_share_of_the_core(tmp_path):
     assert with_halo[0, 30, 33] > 10 * plain[0, 30, 33]
 
 
+@pytest.mark.slow
 def test_motion_and_seeing_change_from_frame_to_frame(tmp_path):
     frames = sky_frames()[[0] * 40]
     moving = [image(p)[0] for p in write_star(tmp_path, frames=frames, noise=False, motion=0.5)]
