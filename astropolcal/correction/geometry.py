@@ -52,10 +52,10 @@ def derotate_variance(
     variance, position_angle, *, centre=None, size=None, mirrored=False, order=3, centre_out=None
 ):
     """
-    Return the variances of images turned by `derotate`.
+    Return the variances of images turned by `derotate`, of independent pixels.
 
-    Sums of squared spline weights times the variances. The covariance of neighbouring pixels that
-    resampling makes is not kept.
+    The sum of the squared spline weights times the variance interpolated linearly: exact where the
+    variance is the same within a few pixels. Correlations that resampling makes are not in it.
     """
     variance = np.asarray(variance, dtype=float)
     matrix, offset, shape = _grid(variance, position_angle, centre, size, mirrored, centre_out)
