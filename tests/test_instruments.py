@@ -428,7 +428,7 @@ DEFAULT = "instrument that a command takes where nothing names one"
 ALLOWED = {
     ("gap/_bench.py", "charis"): "instrument on which challenges run by default",
     ("gap/effects/library.py", "dichroic"): "place of an effect, in a chain with or without one",
-    ("reduction/pypolcal.py", "SCExAO/CHARIS"): "the software whose tables are read has only it",
+    ("reduction/tables.py", "SCExAO/CHARIS"): "the software whose tables are read has only it",
     ("scripts/_calibrate.py", "charis_example.ecsv"): "packaged data",
     ("scripts/_calibrate.py", "--m3"): "option of the command line, and of two chains",
     ("scripts/_calibrate.py", "m3"): "option of the command line, and of two chains",

@@ -562,7 +562,7 @@ class Probes:
             channel.whiten(slopes.get(i, np.zeros(channel.shape))).ravel()
             for i, channel in enumerate(self.problem.channels)
         ]
-        return np.concatenate(parts)
+        return np.concatenate([*parts, np.zeros(len(self.problem.known))])
 
     def _left(self, slopes):
         """Return how much of it the model cannot take up."""

@@ -119,7 +119,8 @@ class Measurement(FittableModel):
         self.sigma = np.concatenate([d.sigma for d in self.datasets])
         #: Wavelength (index on the common grid) of each datum.
         self.bins = np.concatenate([d.bin_of_datum for d in self.datasets])
-        #: Noise that a fit assumed of the data, a `~astropolcal.calibration.Weighting`.
+        #: Noise that a fit assumed of the data, a
+        #: `~astropolcal.calibration.noise.weighting.Weighting`.
         self.weighting = None
         # vector and sweeps of the last prediction: fitters ask for
         # data and Jacobian at the same point

@@ -38,7 +38,7 @@ def plot_polarimetric_efficiency(
     Parameters
     ----------
     chain : `~astropy.modeling.CompoundModel`
-        A calibrated chain, see `~astropolcal.calibration.polarimetric_efficiency`.
+        A calibrated chain, see `~astropolcal.efficiency.polarimetric_efficiency`.
     wavelength : `~astropy.units.Quantity`
         On the grid of the chain's parameters.
     altitude, parallactic : `~astropy.units.Quantity`
@@ -48,7 +48,7 @@ def plot_polarimetric_efficiency(
     shown : `~astropy.units.Quantity`, optional
         Wavelengths of the lines, the nearest of the grid; by default six spread over it.
     instrument, mode
-        Whose half-wave plate it is, see `~astropolcal.calibration.polarimetric_efficiency`.
+        Whose half-wave plate it is, see `~astropolcal.efficiency.polarimetric_efficiency`.
     title : str, optional
         Title of the figure.
     figure : `~matplotlib.figure.Figure`, optional
@@ -98,8 +98,8 @@ def plot_derotator_offsets(best, *, title=None, figure=None):
 
     Parameters
     ----------
-    best : `~astropolcal.calibration.BestDerotator`
-        Of `~astropolcal.calibration.best_derotator`.
+    best : `~astropolcal.efficiency.BestDerotator`
+        Of `~astropolcal.efficiency.best_derotator`.
     title : str, optional
         Title of the figure.
     figure : `~matplotlib.figure.Figure`, optional

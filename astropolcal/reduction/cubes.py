@@ -544,6 +544,7 @@ def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):
 
 
 def write_cube(cube, raw_header, image, weight, header, layout):
+    """Write a simulated cube, and leave some keywords to the header of the raw frame."""
     # as real extraction leaves it: some keywords stay behind in the raw frame
     in_raw = {layout.keywords[c] for c in layout.raw_columns if c in layout.keywords}
     in_cube = {k: v for k, v in header.items() if raw_header is None or k not in in_raw}

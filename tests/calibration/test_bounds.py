@@ -35,6 +35,7 @@ def cal(make):
 # --- errors of what is at a bound ------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [None, "errors"])
 def test_one_sided_error_is_where_the_profile_has_risen_by_one(make, weights):
     # far from the bound, near it, at the lower one, and several at bounds that correlate
@@ -126,6 +127,7 @@ def test_status_of_every_kind():
         assert status in STATUSES
 
 
+@pytest.mark.slow
 def test_file_keeps_them_and_refuses_what_is_none(cal, tmp_path):
     cal.write(tmp_path / "cal.asdf")
     again = Calibration.read(tmp_path / "cal.asdf")

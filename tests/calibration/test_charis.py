@@ -54,6 +54,7 @@ def s_mean(cal, k=None):
 # --- accuracy ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "limit"), [(1, 0.062), (3, 0.055)])
 def test_median_accuracy(calibrated, number, limit):
     """Measured: 0.058 and 0.052 %; the medians published are 0.110 and 0.081 %."""
@@ -62,6 +63,7 @@ def test_median_accuracy(calibrated, number, limit):
     assert np.median(s_mean(cal)) <= limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "worse"), [(1, {5, 19}), (3, {4})])
 def test_more_accurate_than_published_at_nearly_all_wavelengths(
     calibrated, published, number, worse
@@ -80,6 +82,7 @@ def test_more_accurate_than_published_at_nearly_all_wavelengths(
     assert found <= worse
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "worse"), [(1, set()), (3, {4})])
 def test_residuals_are_smaller_than_published(calibrated, published, number, worse):
     """With k = 5 as they count, that is compared by the sum of squares: 22 and 21 of 22."""
@@ -88,10 +91,12 @@ def test_residuals_are_smaller_than_published(calibrated, published, number, wor
     assert found <= worse
 
 
+@pytest.mark.slow
 def test_two_steps_are_as_good_in_the_median(two_step):
     assert np.median(s_mean(two_step)) <= 0.055
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "published_median"), [(1, 1.165), (3, 0.824)])
 def test_linear_derotator_needs_its_misalignments(charis_data, published, number, published_median):
     """
@@ -107,6 +112,7 @@ def test_linear_derotator_needs_its_misalignments(charis_data, published, number
     assert np.median(s_mean(cal)) < published_median / 8
 
 
+@pytest.mark.slow
 def test_frames_left_out_are_predicted(calibrated):
     """s_cv is the rms of single double differences: compare it with s_res, not s_mean."""
     for cal in calibrated.values():
@@ -118,6 +124,7 @@ def test_frames_left_out_are_predicted(calibrated):
 # --- what is determined -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 3])
 def test_rank_is_91_of_93(calibrated, number):
     finding = calibrated[number].identifiability
@@ -125,6 +132,7 @@ def test_rank_is_91_of_93(calibrated, number):
     assert len(finding.directions) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hwp.theta", "derotator.theta", "derotator.circular[9]"])
 def test_gauge_parameters_have_no_error(calibrated, name):
     assert np.isnan(calibrated[3].covariance.std(name))
@@ -144,6 +152,7 @@ def test_fixed_angles_give_full_rank(charis_data):
     assert np.median(s_mean(cal)) <= 0.06
 
 
+@pytest.mark.slow
 def test_efficiency_at_its_bound_is_flagged(calibrated):
     """The published efficiency of bin 0 is 0.9999999999 as well."""
     assert "wollaston.efficiency[0]" in calibrated[3].at_bound
@@ -152,6 +161,7 @@ def test_efficiency_at_its_bound_is_flagged(calibrated):
 # --- parameters ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_thicknesses_are_near_the_published(calibrated):
     """1.653 and 1.291 mm in the paper; the errors here are 2 um."""
     hwp = calibrated[3].chain["hwp"]
@@ -165,6 +175,7 @@ def _branch(value, reference):
     return np.where(np.abs(360 - value - reference) < np.abs(value - reference), 360 - value, value)
 
 
+@pytest.mark.slow
 def test_horizontal_retardance_in_h_and_k(calibrated, published):
     """Within 2 deg, up to mirror branches; measured: 0.4 deg."""
     theirs = np.asarray(published["derotator_horizontal"])
@@ -173,6 +184,7 @@ def test_horizontal_retardance_in_h_and_k(calibrated, published):
     assert np.abs(ours - theirs)[band].max() < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "column", "tolerance", "in_h_and_k"),
     [
@@ -200,6 +212,7 @@ def test_first_step_reproduces_the_published_retardances(
     assert difference[band].max() < in_h_and_k
 
 
+@pytest.mark.slow
 def test_published_values_are_not_the_minimum(two_step, published):
     """The first step alone, same parameters, same data: smaller residuals over all bins."""
     theirs = np.asarray(published["s_rel_elliptical_dataset3"]) / 100
@@ -210,6 +223,7 @@ def test_published_values_are_not_the_minimum(two_step, published):
 # --- unpolarized source ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_fold_mirror_of_dataset_4(charis_data, calibrated, shared_data):
     """
     Diattenuation with all else from Dataset 3, and derotator 45 deg left out as they did.
@@ -242,6 +256,7 @@ def test_fold_mirror_of_dataset_4(charis_data, calibrated, shared_data):
     assert np.median(s_mean(cal)) < np.median(s_unpol)
 
 
+@pytest.mark.slow
 def test_fold_mirror_at_one_derotator_angle_at_a_time(charis_data, shared_data):
     """In K six angles agree; the mean of the published values is that of 57.5 deg alone."""
     with warnings.catch_warnings():
@@ -275,6 +290,7 @@ def _cases(folder):
     return {name: case["base"] for name, case in key.items() if case["effect"] == "none"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(3))
 def test_simulated_calibrations_without_effect_give_back_the_truth(shared_data, index):
     """The nominal model on data of a simulator that shares no code with this package."""

@@ -170,6 +170,7 @@ def drawn(calibration, n, seed=1):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_errors_are_the_scatter_over_the_covariance(calibration):
     table = compare([calibration])
     scatter = drawn(calibration, 100).std(axis=0)
@@ -192,6 +193,7 @@ def test_error_of_a_retardance_is_that_of_its_parameter(calibration):
     np.testing.assert_allclose(table["derotator_diattenuation_std"], expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plate", [179.999, 180.0, 180.001, -180.0])
 def test_half_a_wave_is_no_kink(plate):
     """The folded retardance has a kink at 180 deg, where its error is still that of the angle."""

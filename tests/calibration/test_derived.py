@@ -79,6 +79,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("which", ["full_rank", "open_gauge"])
 def test_analytic_errors_are_the_numeric_ones(request, case, which):
@@ -141,6 +142,7 @@ def test_calibration_is_not_changed(full_rank):
     assert full_rank.chain["hwp"].w_sio2.value == before
 
 
+@pytest.mark.slow
 def test_errors_are_the_spread_of_samples(full_rank):
     """Monte Carlo from the covariance matrix, 2000 draws: 1.6 % per standard deviation."""
     rng = np.random.default_rng(1)

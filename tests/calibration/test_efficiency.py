@@ -33,6 +33,7 @@ def bench(retardance, efficiency=0.7, analyser=0.0):
     )
 
 
+@pytest.mark.slow
 @given(st.floats(-180, 180), st.floats(0, 360), st.floats(0, 180))
 def test_linear_retarder_has_a_closed_form(derotator, retardance, aolp):
     found = polarimetric_efficiency(
@@ -42,6 +43,7 @@ def test_linear_retarder_has_a_closed_form(derotator, retardance, aolp):
     assert found[0] == pytest.approx(np.hypot(np.cos(d), np.sin(d) * np.cos(delta)), abs=1e-9)
 
 
+@pytest.mark.slow
 @given(st.floats(-180, 180), st.floats(0, 360))
 def test_worst_angle_is_no_better_than_any(derotator, retardance):
     kwargs = {"derotator": derotator * u.deg}

@@ -134,6 +134,7 @@ def replaced(content, old, new, count=1):
 # ---- what comes back -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_everything_comes_back(calibration, path):
     calibration.write(path)
     assert_same(calibration, Calibration.read(path))
@@ -183,6 +184,7 @@ def test_arrays_and_tables_come_back(calibration, path):
         _ = again.residuals
 
 
+@pytest.mark.slow
 def test_predictions_come_back(calibration, path):
     calibration.write(path)
     frames = half_wave_plate_cycles(derotator=[50, 70] * u.deg)
@@ -191,6 +193,7 @@ def test_predictions_come_back(calibration, path):
     assert np.array_equal(old, again)
 
 
+@pytest.mark.slow
 def test_what_is_not_determined_comes_back(path):
     # one derotator angle, everything free: parameters at bounds, NaN in the covariance
     chain = make_chain()
@@ -253,6 +256,7 @@ def test_no_field_is_forgotten(calibration, sampled):
 # ---- the posterior -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_posterior_comes_back_thinned(sampled, path):
     sampled.write(path)
     again = Calibration.read(path)
@@ -278,6 +282,7 @@ def test_file_with_a_posterior_is_the_same_again(sampled, path):
     assert path.read_bytes() == content
 
 
+@pytest.mark.slow
 def test_file_keeps_as_many_samples_as_it_is_told(sampled, path):
     told = dataclasses.replace(sampled, posterior=sampled.posterior.thinned(draws=10**6))
     told.write(path)
@@ -334,6 +339,7 @@ def test_inconsistent_posterior_is_not_written(sampled, path, change, message):
         assert_not_written(changed, path, message)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -398,6 +404,7 @@ def with_priors(**priors):
     return calibrate(chain, make_nights()[0], cross_validate=False)
 
 
+@pytest.mark.slow
 def test_priors_come_back(path):
     from scipy.stats import truncnorm
 
@@ -443,6 +450,7 @@ def test_prior_of_something_else_is_not_written(calibration, path):
     assert_not_written(changed, path, "prior of hwp.w_sio2 is a function")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -487,6 +495,7 @@ def test_unreadable_date_of_an_older_file_is_refused(content, path, monkeypatch)
 # ---- with the observations again --------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_observations_are_brought_back(calibration, content, path):
     path.write_bytes(content)
     again = Calibration.read(path).with_observations(make_nights()[::-1])
@@ -501,6 +510,7 @@ def test_observations_are_brought_back(calibration, content, path):
     assert_same(again, Calibration.read(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [None, "wavelength", "errors", 0.003, [0.002, 0.003, 0.004]])
 def test_noise_of_the_fit_is_brought_back(path, weights):
     from astropolcal.calibration.noise.weighting import weighting_of
@@ -515,6 +525,7 @@ def test_noise_of_the_fit_is_brought_back(path, weights):
     np.testing.assert_allclose(new.sigma, old.sigma, rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_reading_again_does_not_change_what_was_read(content, path):
     path.write_bytes(content)
     alone = Calibration.read(path)
@@ -577,6 +588,7 @@ def test_file_says_for_what_it_holds(content):
     assert node["datasets"][1]["meta"]["n"] == 3
 
 
+@pytest.mark.slow
 def test_any_asdf_file_may_hold_a_calibration(calibration):
     buffer = io.BytesIO()
     asdf.AsdfFile({"mine": {"nights": [calibration]}}).write_to(buffer)
@@ -586,6 +598,7 @@ def test_any_asdf_file_may_hold_a_calibration(calibration):
     assert_same(calibration, again)
 
 
+@pytest.mark.slow
 def test_file_rewritten_with_asdf_in_another_layout_is_the_same(calibration, content, path):
     # all arrays in compressed blocks: other bytes, same content
     with asdf.open(io.BytesIO(content)) as file, asdf.config_context() as config:
@@ -595,6 +608,7 @@ def test_file_rewritten_with_asdf_in_another_layout_is_the_same(calibration, con
     assert_same(calibration, Calibration.read(path))
 
 
+@pytest.mark.slow
 def test_works_without_entry_points(calibration, path):
     with asdf.config_context() as config:
         config.remove_extension(package="astropolcal")
@@ -627,6 +641,7 @@ def assert_not_written(calibration, path, message, **options):
         assert sorted(path.parent.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_existing_file_is_kept(calibration, path):
     path.write_text("precious")
     assert_not_written(calibration, path, "exists already; overwrite=True replaces it")
@@ -791,6 +806,7 @@ def test_other_versions(path, content):
         assert_refused(path, replaced(content, old, new), message)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -43,6 +43,7 @@ def calibrated(few):
 # --- it arrives at the truth ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "observable", sorted(n for n, one in OBSERVABLES.items() if one.frames_per_datum < 4)
 )
@@ -349,6 +350,7 @@ def test_fitter_that_leaves_the_bounds_is_told_on(few):
     assert not cal.converged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strategy", "search", "searches"),
     [

@@ -66,6 +66,7 @@ def test_the_minimal_gauge_moves_the_angles_least(observations):
     assert polarizer + plate == pytest.approx(0.0, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_every_gauge_fits_the_data_as_well(observations):
     costs = [
         np.sum(_fit(chain, observations, **options).residuals ** 2)
@@ -79,6 +80,7 @@ def test_every_gauge_fits_the_data_as_well(observations):
     np.testing.assert_allclose(costs, costs[0], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_gauge_is_recorded_and_read_back(observations, tmp_path):
     minimal = _fit(_chain(), observations)
     assert minimal.settings["gauge"].startswith("minimal")
@@ -186,6 +188,7 @@ def test_describe_gauge_names_priors_and_choice(observations):
 # --- what moves no datum --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fitter", [TRFLSQFitter, LevMarLSQFitter, DogBoxLSQFitter])
 @pytest.mark.parametrize("gauge", ["minimal", None])
 def test_what_moves_no_datum_stays_at_its_start(observations, fitter, gauge):

@@ -342,6 +342,7 @@ def test_noise_of_another_measurement_is_refused(make, chain, measurement):
 # --- real measurements --------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "low", "high"), [(1, 60, 85), (3, 30, 42)])
 def test_charis_residuals_are_no_noise(charis_data, number, low, high):
     """Measured: 73 and 36 times the stated noise, and above the null channel's upper limit."""

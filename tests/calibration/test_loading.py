@@ -131,6 +131,7 @@ def test_true_angle_of_the_half_wave_plate_comes_first(loaded):
     assert found.positions["hwp"].to_value(u.deg) == pytest.approx(242.5)
 
 
+@pytest.mark.slow
 def test_pointing_is_computed_where_the_header_lacks_it(loaded):
     header = {k: v for k, v in HEADER.items() if k not in ("ALTITUDE", "PARANG")}
     header |= {"MJD": 60982.55, "RA": "05:18:00", "DEC": "-01:00:00"}
@@ -224,6 +225,7 @@ def test_calibration_in_memory(calibration, loaded):
         load(calibration, HEADER | {"MJD": 60400.0})
 
 
+@pytest.mark.slow
 def test_library_is_looked_up_by_the_header(calibration, tmp_path):
     library = Library(tmp_path)
     early = library.add(calibration, valid_from="2025-01-01", valid_until="2025-10-05")
@@ -473,6 +475,7 @@ def test_nothing_else_is_needed(tmp_path):
     assert (tmp_path / "m.fits").exists()
 
 
+@pytest.mark.slow
 def test_beam_that_the_library_lacks(calibration, tmp_path):
     """The date of the frame says that the beam switcher was not there yet."""
     Library(tmp_path).add(calibration, valid_from="2025-01-01")

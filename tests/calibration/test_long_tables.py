@@ -62,6 +62,7 @@ def test_short_measurement_is_not_thinned():
     assert fewer.n_data == whole.n_data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [None, "wavelength", "errors"])
 def test_fit_of_a_long_table_ends_where_one_without_the_short_cut_does(long, weights, monkeypatch):
     quick = calibrate(*long, cross_validate=False, weights=weights)
@@ -88,6 +89,7 @@ def test_time_is_linear_in_the_number_of_frames():
 # --- cross-validation with many groups ----------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weighted", [False, True])
 def test_groups_in_one_step_are_as_fits_without_them(weighted, monkeypatch):
     chain, data = lamp(160, seed=5)
@@ -118,6 +120,7 @@ def test_group_that_alone_determines_something_is_not_predicted(monkeypatch):
 # --- nearly degenerate parameters of stars -----------------------------------------------------
 
 
+@pytest.mark.slow
 def test_power_law_next_to_a_lamp_takes_few_steps():
     lamp_meta = {
         "source": "polarized",

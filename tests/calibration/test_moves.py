@@ -80,6 +80,7 @@ def test_default_moves_find_the_distribution_though_the_fit_is_wrong(mistaken):
     assert target.whitened(chain).std() == pytest.approx(1, abs=0.04)
 
 
+@pytest.mark.slow
 def test_default_moves_widen_a_start_that_is_too_narrow():
     target = Normal(20)
     chain = run(target, default_moves(emcee, Laplace(target)), 2000, start=0.3)
@@ -213,6 +214,7 @@ def test_default_numbers_of_walkers_and_of_steps_kept_grow(calibration, monkeypa
     assert asked == [(n, 2 * n, 5000, 1), (1, 24, 5000, 1)]
 
 
+@pytest.mark.slow
 def test_resumed_run_of_many_parameters_is_the_uninterrupted_one(calibration, tmp_path):
     """The steps around the fit draw the same random numbers."""
     pytest.importorskip("h5py")

@@ -205,6 +205,7 @@ def test_null_channel_by_hand(make):
     np.testing.assert_allclose(percent(noise.sigma), 100 * np.sqrt(squares / 24))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("null_model", "dof"), [("constant", 23), ("smooth", 11)])
 def test_null_channel_finds_the_noise_put_in(make, chain, null_model, dof):
     """Over 20 runs its variance is the true one within three standard errors."""
@@ -301,6 +302,7 @@ def test_noise_of_unpolarized_charis_data(charis_data):
     assert np.median(percent(noise_from_errors(measurement).sigma)) == pytest.approx(0.0104, 0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "low", "high"), [(1, 0.035, 0.048), (3, 0.022, 0.034)])
 def test_noise_of_polarized_charis_data(charis_data, number, low, high):
     """Datasets 1 and 3: 0.041 and 0.028 %, a tenth of the residuals; nothing was repeated."""

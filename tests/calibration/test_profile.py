@@ -27,6 +27,7 @@ def cal(make):
 # --- the profile of a well-behaved parameter ----------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [None, "errors"])
 @pytest.mark.parametrize(
     "name", ["hwp.w_sio2", "calibration_polarizer.theta", "derotator.retardance[1]"]

@@ -122,6 +122,7 @@ def test_summary_and_json_have_the_mirrors(free):
     json.dumps(entry, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_figures_of_mirrors_and_targets(free, metal, tmp_path):
     top, bottom = plot_mirrors(free[0]).axes
     lines = " ".join(str(line.get_label()) for line in top.get_lines())
@@ -145,6 +146,7 @@ def night(truth, name="HD 30675", scale=1.0, **options):
     )
 
 
+@pytest.mark.slow
 def test_a_standard_comes_out_as_the_catalogue_has_it(free):
     cal, truth = free
     table = star_check(cal, star_chain("star"), night(truth, seed=3))
@@ -163,6 +165,7 @@ def test_a_star_that_is_not_as_the_catalogue_has_it(free):
     np.testing.assert_allclose(table["dolp_error"].to_value(u.percent), known, atol=0.05)
 
 
+@pytest.mark.slow
 def test_check_is_kept_in_file_summary_and_json(free, tmp_path):
     cal, truth = free
     add_star_check(cal, star_chain("star"), night(truth, seed=3))

@@ -53,6 +53,7 @@ def test_words_name_the_angles_to_add():
     assert harmonic_words(np.deg2rad(np.arange(32) * 11.25)) == []
 
 
+@pytest.mark.slow
 @given(st.sampled_from([4, 8, 12, 16]), st.floats(0, 20))
 def test_following_the_advice_cures_it(n, start):
     angles = np.deg2rad(start + np.arange(n) * 11.25)

@@ -47,6 +47,7 @@ def shifted(make, amount=0.5 * u.deg, seed=3):
 # --- what it should give ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", ["derotator", "pair"])
 def test_white_noise_gives_the_errors_of_the_covariance(white, block):
     """150 resamples: 6 % for each; a sandwich of 24 blocks scatters by 15 % more."""
@@ -68,6 +69,7 @@ def test_errors_in_blocks_are_noticed(make):
     assert blocks > 1.2 * pairs
 
 
+@pytest.mark.slow
 def test_mean_of_the_samples_is_the_calibration(white):
     made = bootstrap(white, n=100, seed=5)
     solution = white.measurement.vector() / white.measurement.free.factors()

@@ -66,6 +66,7 @@ def mean_ratio(cal, noises, truth, **options):
 # --- the truth, by simulation -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", ["derotator", "pair"])
 def test_white_noise_gives_the_ordinary_errors_in_the_mean(few, block):
     """The correction for leverage is exact here: 120 draws, 5 % each parameter."""
@@ -96,6 +97,7 @@ def shared(cal, rng, n_draws):
     return common + rng.normal(0, np.sqrt(1e-7), common.shape), covariance
 
 
+@pytest.mark.slow
 def test_errors_shared_by_an_angle_are_found(many):
     """Within 12 % in the mean and 35 % each, where the ordinary errors are off by more."""
     noises, covariance = shared(many, np.random.default_rng(3), 100)
@@ -108,6 +110,7 @@ def test_errors_shared_by_an_angle_are_found(many):
     assert np.abs(np.log(ordinary)).max() > 2 * np.abs(np.log(ratio)).max()
 
 
+@pytest.mark.slow
 def test_one_sigma_covers_where_errors_are_shared(many):
     """Pulls of 100 draws: unit width with robust errors, twice it with ordinary ones."""
     labels = leave_out_groups(many.measurement)
@@ -143,6 +146,7 @@ def test_unequal_noise_needs_no_groups(few):
     assert ordinary.min() < 0.7
 
 
+@pytest.mark.slow
 def test_bootstrap_agrees(many):
     """Two estimates of the same from the same residuals, 24 blocks."""
     noises, _ = shared(many, np.random.default_rng(4), 1)

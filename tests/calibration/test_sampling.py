@@ -257,6 +257,7 @@ def test_uniform_prior_and_bounds_are_never_left():
     assert samples.std(axis=0) == pytest.approx(0.065 / 12**0.5, rel=0.15)
 
 
+@pytest.mark.slow
 def test_walkers_start_within_bounds_where_the_fit_is_at_one():
     chain = make_chain(retardance_free=False)
     chain["wollaston"].efficiency = [1.0, 0.85]
@@ -297,6 +298,7 @@ def test_parameters_held_have_no_share_in_the_errors(full_rank):
     assert (posterior.covariance.stds < full_rank.covariance.stds[rows]).all()
 
 
+@pytest.mark.slow
 def test_undetermined_direction_is_filled_by_its_prior():
     """Polarizer and half-wave plate turned together: only the prior keeps them apart."""
     chain = make_chain(retardance_free=False)
@@ -319,6 +321,7 @@ def test_undetermined_direction_is_filled_by_its_prior():
 RUN = {"n_walkers": 10, "n_steps": 60, "seed": 7, "progress": False}
 
 
+@pytest.mark.slow
 def test_seed_repeats_the_run(small):
     first, second = (quiet_sample(small, **RUN) for _ in range(2))
     assert first == second
@@ -346,6 +349,7 @@ def test_log_prob_belongs_to_the_chain(small):
     np.testing.assert_allclose(again, posterior.log_prob[-1], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thin", [1, 4])
 @pytest.mark.parametrize("interval", [1, 7, 100])
 def test_resumed_chain_is_the_uninterrupted_one(small, tmp_path, thin, interval):
@@ -639,6 +643,7 @@ def paper(charis_data):
     return quiet_sample(cal, parameters=names, n_steps=800, seed=1, progress=False)
 
 
+@pytest.mark.slow
 def test_thicknesses_of_dataset_3_are_degenerate(paper):
     """
     McIntosh et al. (2026, Appendix on MCMC): "perfectly degenerate with each other".

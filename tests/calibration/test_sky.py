@@ -102,6 +102,7 @@ def test_polarization_of_the_telescope_is_subtracted_at_a_wrong_angle():
         assert found["dolp_percent"] == found["targets"][0]["dolp_change_percent"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("real", [False, True])
 def test_equal_fits_a_degree_apart_differ_as_predicted(alone, real, request):
     """

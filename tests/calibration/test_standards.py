@@ -283,6 +283,7 @@ def test_summary_shows_four_accuracies_and_the_prediction(fresh, chain, standard
     assert max(len(line) for line in text.splitlines()) <= 80
 
 
+@pytest.mark.slow
 def test_charis_in_july_is_not_charis_in_october(charis_data):
     """
     Dataset 3 (October 2025) predicts Dataset 1 (July, no beam switcher) at 1.5 %.

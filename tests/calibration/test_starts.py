@@ -37,6 +37,7 @@ def anywhere(make, kind, seed):
 # --- recovery from wrong branches ------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("kind", ["linear", "elliptical"])
 def test_every_wavelength_finds_a_branch_that_explains_it(make, kind, seed):
@@ -247,6 +248,7 @@ def with_prior(make, prior, seed=3):
     return start, truth, make.observe(truth, seed=seed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [None, "wavelength", "errors"])
 @pytest.mark.parametrize("mean", [95, -265])
 def test_prior_decides_between_equal_branches(make, weights, mean):

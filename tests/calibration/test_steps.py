@@ -209,6 +209,7 @@ def spoiled(data):
     return start, [*observations[:2], Observations.from_table(table, name="star")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "bisquare"])
 def test_robust_loss_is_not_pulled(spoiled, loss):
     def error(**options):
@@ -237,6 +238,7 @@ def test_good_data_have_no_outliers(fitted):
     assert len(outlying_data(fitted["joint"])) == 0
 
 
+@pytest.mark.slow
 def test_robust_noise_is_found_again_from_the_file(spoiled, tmp_path):
     from astropolcal.calibration.noise.weighting import weighting_of
 

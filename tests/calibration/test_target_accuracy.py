@@ -484,6 +484,7 @@ def test_calibration_from_a_file_has_accuracies_but_no_data(tmp_path, make, chai
         four_accuracies(read, groups="cycle")
 
 
+@pytest.mark.slow
 def test_calibration_of_one_night_on_another_of_charis(charis_data):
     """
     Dataset 3 (October) predicts Dataset 1 (July, no beam switcher) far worse than itself.

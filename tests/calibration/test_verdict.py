@@ -64,6 +64,7 @@ def example():
     return Observations.read(path)
 
 
+@pytest.mark.slow
 def test_the_example_leaves_the_zero_of_the_angle_open(example, tmp_path):
     (chain,) = CHARIS.chains_for([example])
     cal = calibrate(chain, example, instrument="charis", cross_validate=False)
@@ -88,6 +89,7 @@ def test_the_example_leaves_the_zero_of_the_angle_open(example, tmp_path):
     assert held.verdict().words[1].endswith("deg")
 
 
+@pytest.mark.slow
 def test_a_polarized_star_alone_determines_nothing():
     options = {"target": "HD 30675", "star": "star_HD30675"}
     truth = star_chain("polarized standard star", **options)

@@ -114,6 +114,7 @@ def test_the_weighted_fit_is_a_minimum_of_the_weighted_residuals(fitted):
     assert np.abs(step / stds).max() < 0.01
 
 
+@pytest.mark.slow
 def test_levels_of_the_wavelengths_are_recovered(make, truth):
     """Ten runs of 28 degrees of freedom a wavelength: 4 % in the mean."""
     found = []
@@ -125,6 +126,7 @@ def test_levels_of_the_wavelengths_are_recovered(make, truth):
     np.testing.assert_allclose(cal.measurement.sigma, LEVELS[cal.measurement.bins], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_levels_are_unbiased(truth, data):
     """Restricted maximum likelihood, 150 draws; without leverages it were 0.92 and less."""
     live, rng = Measurement(truth, data), np.random.default_rng(5)
@@ -144,6 +146,7 @@ def test_levels_are_unbiased(truth, data):
     np.testing.assert_allclose(np.mean(squares, axis=0) / LEVELS**2, 1, atol=4 * error)
 
 
+@pytest.mark.slow
 def test_errors_are_right_where_wavelengths_are_unequally_noisy(make, truth):
     """40 runs of 11 parameters: the pulls have unit width, also where one level weighted all."""
     pulls = {None: [], "wavelength": []}
@@ -455,6 +458,7 @@ def walk(cal, n=16_000, share=0.3):
     return np.array(samples[n // 10 :]) @ half.T / stds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [None, "wavelength"])
 def test_posterior_of_dataset_3_agrees_with_its_fit(dataset_3, weights):
     """Medians within 0.3 sigma and widths within 20 %; measured: 0.1 sigma and 7 %."""

@@ -107,6 +107,7 @@ def test_a_node_of_a_node_is_the_same(node):
     assert again["checksum"] == node["checksum"]
 
 
+@pytest.mark.slow
 def test_through_a_file_of_asdf(original):
     """As a part of any tree, beside other things and twice."""
     buffer = io.BytesIO()
@@ -400,6 +401,7 @@ def text_of(original):
     return buffer.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new"),
     [

@@ -97,6 +97,7 @@ def test_table_survives():
 # ---- the checksum --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(trees, trees)
 def test_checksum_tells_trees_apart(one, other):
     # 1, 1.0 and True are equal for Python, but not the same content

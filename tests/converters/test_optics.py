@@ -117,22 +117,25 @@ def test_asdf_knows_the_optic(name):
     assert manager.handles_tag(optic_tag(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_defaults_survive(name):
     optic = OPTICS[name](name="it")
     assert_same(optic, round_trip(optic))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=10)
+@settings(max_examples=4)
 @given(data=st.data())
 def test_anything_survives(name, data):
     optic = data.draw(an_optic(name))
     assert_same(optic, round_trip(optic))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(data=st.data())
 def test_anything_survives_its_node(name, data):
     optic = data.draw(an_optic(name))
@@ -288,6 +291,7 @@ def test_unit_changed_behind_the_optics_back_is_refused():
         written(optic)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -317,6 +321,7 @@ def test_schema_refuses(old, new):
         read(content.replace(old.encode(), new.encode()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new"),
     [

@@ -42,6 +42,7 @@ def test_there_are_schemas_for_all():
     assert len(SCHEMAS) == len(OPTICS) + 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("uri", sorted(SCHEMAS))
 def test_schema_is_valid(uri):
     schema = yaml.safe_load(SCHEMAS[uri])

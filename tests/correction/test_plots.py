@@ -51,6 +51,7 @@ def test_east_is_left_where_north_is_up(images):
     assert "north (arcsec)" in axes.get_ylabel()
 
 
+@pytest.mark.slow
 def test_a_spectrum_shows_both_errors(images):
     star = images.aperture(6)
     figure = plot_spectrum(star)
@@ -74,6 +75,7 @@ def test_what_is_asked_of_the_wrong_kind(images):
         plot_images(images, wavelength=40)
 
 
+@pytest.mark.slow
 def test_files(images, tmp_path):
     save_figure(plot_spectrum(images.aperture(6)), tmp_path / "star.png")
     assert (tmp_path / "star.png").stat().st_size > 1e4

@@ -149,6 +149,7 @@ def test_jacobian_is_the_derivative_for_any_chain_and_observable(chain, observab
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(chain=chains(), observable=st.sampled_from(sorted(OBSERVABLES)))
 def test_prediction_is_what_a_simulation_without_noise_measures(chain, observable):

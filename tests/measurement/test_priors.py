@@ -87,6 +87,7 @@ def test_slope_is_the_derivative_of_the_residual():
         np.testing.assert_allclose(prior.slope(x), difference, rtol=1e-3)
 
 
+@pytest.mark.slow
 @given(st.floats(-3, 3), st.floats(0.01, 2), st.floats(-10, 10))
 def test_normal_in_any_unit(mean, std, value):
     here = bind_prior(Normal(mean * u.deg, std * u.deg), "a.theta", u.deg, (None, None))

@@ -30,6 +30,7 @@ def test_beam_of_the_paper():
         np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.slow
 @given(efficiency=FRACTION)
 def test_unpolarized_light_is_halved_and_polarized(efficiency):
     for beam in ("right", "left"):

@@ -717,6 +717,7 @@ def test_position_is_the_coordinate(label, data, theta):
         np.testing.assert_array_equal(optic.mueller(WAVELENGTH), other.mueller(WAVELENGTH))
 
 
+@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data(), theta=ANGLE)
 @settings(max_examples=10)
@@ -965,6 +966,7 @@ def state(optic):
     ]
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=5)

@@ -56,6 +56,7 @@ def none():
     return make(0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plot", ALL)
 def test_a_figure_without_traces(plot, gap, none):
     before = dict(mpl.rcParams)
@@ -116,6 +117,7 @@ def test_shares_end_at_a_hundred(gap):
         assert axes.get_xlim() == (0, 100)
 
 
+@pytest.mark.slow
 def test_titles_of_many_causes_fit(gap, monkeypatch):
     """Names of causes and of a dataset that are too long stay within the figure."""
     many = [replace(gap.causes[0], effect=get_effect("hwp_encoder_eccentricity"))] * 6

@@ -204,6 +204,7 @@ def test_angles_may_be_given(elliptical):
 # ---- what is not known ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_calibration_from_a_file(tmp_path, elliptical):
     elliptical.write(tmp_path / "cal.asdf")
     read = Calibration.read(tmp_path / "cal.asdf")
@@ -263,6 +264,7 @@ def test_impossible_requests_are_refused(elliptical):
         plot_identifiability(nothing)
 
 
+@pytest.mark.slow
 def test_words_are_below_the_panels_and_inside_the_figure(undetermined):
     figure = plot_identifiability(undetermined)
     figure.draw_without_rendering()

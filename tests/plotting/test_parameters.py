@@ -200,6 +200,7 @@ def test_chain_without_retarder_is_refused(scalar):
         plot_retardances(bare)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [plot_retardances, plot_efficiency, plot_parameters])
 def test_legend_lies_outside_the_axes(undetermined, draw):
     figure = draw(undetermined)

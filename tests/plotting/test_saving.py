@@ -46,6 +46,7 @@ def names(paths):
     return [path.name for path in paths]
 
 
+@pytest.mark.slow
 def test_writes_every_figure_as_png(elliptical, tmp_path):
     folder = tmp_path / "new" / "figures"
     paths = save_all(elliptical, folder)
@@ -67,6 +68,7 @@ def test_writes_every_figure_as_png(elliptical, tmp_path):
         assert np.ptp(image[..., 0]) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_each_dataset_has_its_double_differences(several, tmp_path):
     found = names(save_all(several, tmp_path))
@@ -83,6 +85,7 @@ def test_what_no_other_figure_shows_is_drawn(elliptical, tmp_path):
     assert other_parameters(calibration) == ["flat.imbalance"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_calibration_without_data_gets_the_other_figures(elliptical, tmp_path):
     paths = save_all(replace(elliptical, measurement=None), tmp_path)
@@ -96,6 +99,7 @@ def test_calibration_without_data_gets_the_other_figures(elliptical, tmp_path):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_dataset_without_a_datum_is_left_out(several, tmp_path):
     measurement = copy(several.measurement)
@@ -108,6 +112,7 @@ def test_dataset_without_a_datum_is_left_out(several, tmp_path):
     assert "double_differences_2.png" not in names(save_all(without, tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["masked", "undetermined", "single_angle"])
 def test_every_kind_of_calibration_is_drawn(name, request, tmp_path):
     assert len(save_all(request.getfixturevalue(name), tmp_path)) == 8
@@ -145,6 +150,7 @@ def drawn(monkeypatch, unpainted):
     return shown
 
 
+@pytest.mark.slow
 def test_posterior_is_drawn(elliptical, tmp_path):
     pytest.importorskip("corner")
     sampled = with_posterior(elliptical, ["hwp.w_sio2", "hwp.w_mgf2", "wollaston.efficiency[0]"])
@@ -153,6 +159,7 @@ def test_posterior_is_drawn(elliptical, tmp_path):
     assert imread(tmp_path / "corner.png").shape[0] > 600
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_posterior_of_a_file_is_drawn(elliptical, tmp_path):
     pytest.importorskip("corner")
@@ -161,12 +168,14 @@ def test_posterior_of_a_file_is_drawn(elliptical, tmp_path):
     assert names(save_all(stored, tmp_path))[-2:] == ["traces.png", "corner.png"]
 
 
+@pytest.mark.slow
 def test_few_parameters_are_all_drawn(elliptical, tmp_path, drawn):
     sampled = with_posterior(elliptical, elliptical.covariance.names[:12])
     save_all(sampled, tmp_path)
     assert drawn["plot_traces"] == drawn["plot_corner"] == sampled.posterior.names
 
 
+@pytest.mark.slow
 def test_of_many_parameters_the_common_and_the_slowest_are_drawn(elliptical, tmp_path, drawn):
     sampled = with_posterior(elliptical)
     posterior = sampled.posterior
@@ -183,6 +192,7 @@ def test_of_many_parameters_the_common_and_the_slowest_are_drawn(elliptical, tmp
     assert max(times[name] for name in left_out) <= times[others[-1]]
 
 
+@pytest.mark.slow
 def test_of_many_parameters_without_common_ones_the_slowest_are_drawn(elliptical, tmp_path, drawn):
     sampled = with_posterior(elliptical, [n for n in elliptical.covariance.names if "[" in n])
     save_all(sampled, tmp_path)
@@ -190,6 +200,7 @@ def test_of_many_parameters_without_common_ones_the_slowest_are_drawn(elliptical
     assert drawn["plot_corner"] == drawn["plot_traces"][:12]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_without_corner_the_other_figures_are_drawn(elliptical, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "corner", None)
@@ -201,6 +212,7 @@ def test_without_corner_the_other_figures_are_drawn(elliptical, tmp_path, monkey
     assert not (tmp_path / "corner.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_parameter_that_does_not_move_costs_the_corner_plot(elliptical, tmp_path):
     pytest.importorskip("corner")
@@ -210,6 +222,7 @@ def test_parameter_that_does_not_move_costs_the_corner_plot(elliptical, tmp_path
         assert names(save_all(stuck, tmp_path))[-1] == "traces.png"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_existing_files_are_replaced(elliptical, tmp_path):
     path = tmp_path / "accuracy.png"
@@ -218,6 +231,7 @@ def test_existing_files_are_replaced(elliptical, tmp_path):
     assert path.read_text() == "painted"
 
 
+@pytest.mark.slow
 def test_failure_leaves_the_old_file_whole(elliptical, tmp_path, monkeypatch):
     def fail(self, path, **_):
         path.write_text("half a fig")
@@ -250,6 +264,7 @@ def test_drawing_leaves_no_state_behind(draw, elliptical):
     assert dict(mpl.rcParams) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", DRAW, ids=lambda draw: draw.__name__)
 def test_text_is_readable_and_stays_on_the_page(draw, undetermined):
     figure = draw(undetermined)
@@ -269,6 +284,7 @@ def test_text_is_readable_and_stays_on_the_page(draw, undetermined):
         assert box.x0 >= page.x0 - 1
 
 
+@pytest.mark.slow
 def test_importing_the_package_does_not_import_matplotlib():
     code = "import sys, astropolcal.plotting; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -51,6 +51,7 @@ def _fails(capsys, *argv):
 # ---- calibrate ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_without_files_the_packaged_example_is_calibrated_and_it_says_so(capsys, tmp_path):
     assert main(["calibrate", "--json", str(tmp_path / "out.json")]) == 0
     text = capsys.readouterr().out
@@ -113,6 +114,7 @@ def test_priors_and_gauge(small, tmp_path):
     assert "accident" in json.loads(out.read_text())["gauge"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("option", "free"), [(("--derotator", "linear"), 3 * 2 + 5), (("--strategy", "two-step"), 17)]
 )
@@ -122,6 +124,7 @@ def test_models_and_strategies(small, tmp_path, option, free):
     assert json.loads(out.read_text())["n_free"] == free
 
 
+@pytest.mark.slow
 def test_output_and_info_tell_the_same(small, tmp_path, capsys):
     path = tmp_path / "cal.asdf"
     assert main(["calibrate", str(small), "-o", str(path), "--json", str(tmp_path / "a.json")]) == 0
@@ -140,6 +143,7 @@ def test_plots_are_saved(small, tmp_path, capsys):
     assert len(list((tmp_path / "figures").glob("*.png"))) >= 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -302,6 +306,7 @@ def _damage(path, how):
         path.write_text("hello")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["truncated", "not ours", "other version", "text"])
 def test_info_of_a_damaged_calibration(small, capsys, tmp_path, how):
     path = tmp_path / "cal.asdf"
@@ -310,6 +315,7 @@ def test_info_of_a_damaged_calibration(small, capsys, tmp_path, how):
     assert "cal.asdf" in _fails(capsys, "info", path)
 
 
+@pytest.mark.slow
 def test_a_reader_that_goes_away_is_no_error(small):
     command = f"{sys.executable} -m astropolcal.scripts.main info {small} | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)

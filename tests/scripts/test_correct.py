@@ -59,6 +59,7 @@ def night(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_cubes_to_product(night, tmp_path, capsys):
     out, summary, table = tmp_path / "out.fits", tmp_path / "s.json", tmp_path / "star.ecsv"
     command(
@@ -102,6 +103,7 @@ def test_modes_differ(night, tmp_path):
     assert np.abs(q["ip"] - Q).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_the_calibration_comes_from_a_library(night, tmp_path):
     library = pytest.importorskip("astropolcal.pipeline.library").Library
     from astropolcal import Calibration
@@ -114,6 +116,7 @@ def test_the_calibration_comes_from_a_library(night, tmp_path):
     assert str(tmp_path / "lib") in fits.getheader(tmp_path / "out.fits")["CALFILE"]
 
 
+@pytest.mark.slow
 def test_no_calibration_holds_for_the_date(night, tmp_path):
     library = pytest.importorskip("astropolcal.pipeline.library").Library
     from astropolcal import Calibration
@@ -126,6 +129,7 @@ def test_no_calibration_holds_for_the_date(night, tmp_path):
         command(night / "cubes", "--calibration", tmp_path / "lib", *words)
 
 
+@pytest.mark.slow
 def test_a_file_that_does_not_hold_is_refused(night, tmp_path):
     from astropolcal import Calibration
     from astropolcal.calibration.result.validity import with_validity
@@ -144,6 +148,7 @@ def test_a_file_that_does_not_hold_is_refused(night, tmp_path):
     assert (tmp_path / "out.fits").exists()
 
 
+@pytest.mark.slow
 def test_another_instrument_is_refused(night, tmp_path):
     path = sorted((night / "cubes").glob("*.fits"))[0]
     (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -153,6 +158,7 @@ def test_another_instrument_is_refused(night, tmp_path):
         command(tmp_path / path.name, "--calibration", night / "charis.asdf", *words)
 
 
+@pytest.mark.slow
 def test_a_frame_without_angles_is_named(night, tmp_path):
     paths = sorted((night / "cubes").glob("*.fits"))[:2]
     for path in paths:
@@ -167,6 +173,7 @@ def test_a_frame_without_angles_is_named(night, tmp_path):
     assert not (tmp_path / "out.fits").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -198,6 +205,7 @@ def test_bad_input(night, tmp_path, words, message, monkeypatch):
         command(night / "cubes", "--calibration", night / "charis.asdf", *out, *words)
 
 
+@pytest.mark.slow
 def test_too_few_angles(night, tmp_path):
     paths = sorted((night / "cubes").glob("*.fits"))[:1]
     with pytest.raises(AstropolcalError, match=r"Q and U are not determined .* 1 frame \("):
@@ -207,6 +215,7 @@ def test_too_few_angles(night, tmp_path):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_no_calibration(night, tmp_path):
     with pytest.raises(AstropolcalError, match="nowhere"):
         command(night / "cubes", "--calibration", tmp_path / "nowhere", "-o", tmp_path / "o.fits")
@@ -223,6 +232,7 @@ def changed(night, folder, *keywords):
     return paths
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [

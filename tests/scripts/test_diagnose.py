@@ -70,6 +70,7 @@ def complaint(capsys, *arguments):
     return line
 
 
+@pytest.mark.slow
 def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys):
     tables = [folder / "polarized.ecsv", folder / "unpolarized.ecsv"]
     report, saved = tmp_path / "gap.html", tmp_path / "improved.asdf"
@@ -111,6 +112,7 @@ def check_improved(saved, content):
     np.testing.assert_allclose(gain.value, entry["value"], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_model_of_a_calibration(folder, cal, tmp_path):
     content = run(tmp_path, cal, folder / "polarized.ecsv", *FEW)
     assert content["causes"][0]["effect"] == "beam_gain"
@@ -120,6 +122,7 @@ def test_model_of_a_calibration(folder, cal, tmp_path):
     assert edited["n_free"] == content["n_free"] - 1
 
 
+@pytest.mark.slow
 def test_edits_of_the_model(folder, tmp_path):
     table = folder / "polarized.ecsv"
     elliptical = run(tmp_path, table, *FEW)

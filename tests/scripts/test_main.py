@@ -203,6 +203,7 @@ def refused(capsys, words):
     return err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_output_is_an_input_or_another_output(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -222,6 +223,7 @@ def test_no_output_is_an_input_or_another_output(command, tmp_path, monkeypatch,
     assert {path: path.read_text() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_nothing_is_read_that_is_no_regular_file(command, tmp_path, monkeypatch, capsys):
@@ -238,6 +240,7 @@ def test_nothing_is_read_that_is_no_regular_file(command, tmp_path, monkeypatch,
             assert "too long" in err or "no name of a file" in err
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_names_are_shown_without_what_a_terminal_acts_on(desk, capsys):
     odd = "\x1b[31m\r\x07\u202eodd\nastropolcal: error: forged"
@@ -308,6 +311,7 @@ def call(folder, words):
         return main(words.split())
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     "words",
@@ -331,6 +335,7 @@ def test_quiet_commands_print_nothing(words, desk, capsys):
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_quiet_reduction_still_says_what_is_left_out(desk, tmp_path, capsys):
     (tmp_path / "CRSA00000099_cube.fits").write_text("no FITS")
@@ -341,6 +346,7 @@ def test_quiet_reduction_still_says_what_is_left_out(desk, tmp_path, capsys):
     assert "left out: CRSA00000099_cube.fits: is not a FITS file" in err
 
 
+@pytest.mark.slow
 def test_quiet_errors_are_printed(desk, capsys):
     assert call(desk, "calibrate nowhere.ecsv -q") == 2
     assert capsys.readouterr().err == "astropolcal: error: nowhere.ecsv: no such file\n"
@@ -349,6 +355,7 @@ def test_quiet_errors_are_printed(desk, capsys):
 # ---- numbers and their nouns ---------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_one_frame_is_no_frames(desk, capsys):
     call(desk, "simulate -o single.ecsv --derotator 45 --hwp 0 --without dichroic")
@@ -357,6 +364,7 @@ def test_one_frame_is_no_frames(desk, capsys):
     assert "one (1 cube)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_summary_has_no_negative_zero(desk, capsys):
     """Misalignments that are held at zero, and those that the data pull just below it."""
     held = "--fix hwp.theta=-1e-9 --fix derotator.theta=0"

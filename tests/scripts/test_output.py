@@ -115,6 +115,7 @@ def desk(tmp_path_factory):
 
 
 # reduction and correction take the cubes of the one before
+@pytest.mark.slow
 @pytest.mark.parametrize("what", OUTPUTS)
 def test_output_fits_a_terminal(what):
     needed = ["cubes"] if what in ("reduction", "correction") else []
@@ -160,6 +161,7 @@ def test_examples_of_the_help_are_commands(command):
         assert PARSER.parse_args(words.split()).command == command
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", ["simulate --cubes piped --derotator 45 --hwp 0,45", "effects"])
 def test_nothing_moves_the_cursor_of_a_pipe(words):
     """Progress bars and colours are for terminals; a log is plain text."""

@@ -34,6 +34,7 @@ def test_parallactic_angle_is_the_position_angle_of_the_zenith():
     assert altitude.value == pytest.approx(90 - star.separation(zenith).deg, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "name", "night"),
     [
@@ -127,6 +128,7 @@ def test_information_of_the_night():
             seen.information(bad)
 
 
+@pytest.mark.slow
 def test_no_file_is_fetched_and_an_unknown_rotation_of_the_earth_is_said_once(no_network):
     for night, covered in (("1990-11-03", True), ("2026-12-05", True), ("2041-11-03", False)):
         with warnings.catch_warnings(record=True) as caught:
@@ -233,6 +235,7 @@ def test_search_by_night_agrees_with_observability():
         assert row["transit"] == seen.transit.iso[:16]
 
 
+@pytest.mark.slow
 def test_search_leaves_out_what_does_not_rise():
     found = standards.search(site="subaru", night=NIGHT)
     assert "Cha F7" not in found["name"]

@@ -217,8 +217,7 @@ class Context:
 def tracking_laws(observations):
     """Return the law of the half-wave plate of every dataset, as its instrument tells it.
 
-    Factors of parallactic angle and altitude; those of `~astropolcal.observations.tracked` for
-    tables of no known instrument.
+    Factors of parallactic angle and altitude; 0.5 and 1 for tables of no known instrument.
     """
     found = []
     for one in observations:
