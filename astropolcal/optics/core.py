@@ -398,7 +398,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             if value.size > 1 and (lam is None or np.shape(lam)[-1:] != value.shape[-1:]):
                 count = 0 if lam is None else np.size(lam)
                 raise ParameterError(
-                    f"{self.name or type(self).__name__}.{key} has {value.size} values, one a "
+                    f"{self.name or type(self).__name__}.{key} has {value.size} values, one per "
                     f"wavelength, but {count} wavelengths were given"
                 )
 

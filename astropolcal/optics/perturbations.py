@@ -156,7 +156,7 @@ class Perturbation(_BeamOptic, FrameOptic):
     Parameters
     ----------
     amplitude : float or array_like
-        Size a: radian for retardance and rotation, else a share; scalar, or one value a
+        Size a: radian for retardance and rotation, else a share; scalar, or one value per
         wavelength.
     quadrature : float or array_like
         Size b of the second function, the sine of a harmonic; 0 for all other dependences.
