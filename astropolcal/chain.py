@@ -12,14 +12,13 @@ import numpy as np
 from astropy.modeling import CompoundModel
 
 from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.mueller._light import act, turned
+from astropolcal.mueller import act, turned
 from astropolcal.optics import Optic
-from astropolcal.optics.positions import FLUXES, finite_position
+from astropolcal.optics.core import FLUXES, finite_position
 from astropolcal.words import did_you_mean
 
 __all__ = [
     "at_positions",
-    "find_optic",
     "insert_optic",
     "join",
     "leaves",
@@ -27,7 +26,6 @@ __all__ = [
     "replace_optic",
     "stages",
     "system_mueller",
-    "system_mueller_derivatives",
     "with_beam",
 ]
 
@@ -74,13 +72,6 @@ class Train(tuple):
 
     What is tried by the hundred need not be a compound model each time: its making costs as the
     square of the number of optics.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.chain import Train, join
-    >>> join(Train([optics.LinearPolarizer(), optics.WollastonPrism()])).n_submodels
-    2
     """
 
     __slots__ = ()
@@ -154,32 +145,7 @@ def join(optics):
 
 
 def find_optic(chain, name):
-    """
-    Return the optic of that name.
-
-    Parameters
-    ----------
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        The chain.
-    name : str
-        Name of the optic.
-
-    Returns
-    -------
-    Optic
-
-    Raises
-    ------
-    ChainError
-        If there is none; the message lists near matches.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.chain import find_optic
-    >>> find_optic(optics.ParityFlip(name="nbs"), "nbs").name
-    'nbs'
-    """
+    """Return the optic of that name, or raise a ChainError that lists near matches."""
     found = leaves(chain)
     for optic in found:
         if optic.name == name:
@@ -529,32 +495,9 @@ def _check_axes(wavelength, positions):
 
 def system_mueller_derivatives(chain, wavelength=None, positions=None):
     """
-    Return the derivative of the system Mueller matrix to every parameter.
+    Return the derivatives of `system_mueller` to parameters, by ``"optic.parameter"``.
 
-    Parameters
-    ----------
-    chain, wavelength, positions
-        As in `system_mueller`.
-
-    Returns
-    -------
-    dict of str to `~astropy.units.Quantity`
-        ``"optic.parameter"`` to derivative, of the shape `system_mueller`
-        gives; for a parameter with one value a wavelength, the derivative to
-        the value at that wavelength.
-
-    Raises
-    ------
-    ChainError, ParameterError, WavelengthRangeError
-        As `system_mueller`; also if an optic has no name.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.chain import system_mueller_derivatives
-    >>> chain = optics.ParityFlip(name="nbs") | optics.WollastonPrism(name="wollaston")
-    >>> float(system_mueller_derivatives(chain)["wollaston.efficiency"][0, 1].value)
-    -0.5
+    Quantities of shape (n_frames, n_wavelengths, 4, 4) per unit of the parameter.
     """
     positions, shape = _check_axes(wavelength, positions)
     nodes = list(_oriented_leaves(chain, wavelength, positions))

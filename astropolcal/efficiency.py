@@ -24,10 +24,6 @@ from astropolcal.units import angle_to_rad
 
 __all__ = ["BestDerotator", "best_derotator", "polarimetric_efficiency"]
 
-#: Derotator angle = offset + f * parallactic angle + g * altitude, as (f, g), where no instrument
-#: is given.
-DEROTATOR_LAWS = SkyLaw().derotator
-
 # plus and minus angles of the half-wave plate, and where a modulator has exchanged the beams
 _CYCLE = [0, 45, 22.5, 67.5] * u.deg
 _EXCHANGED = [45, 0, 67.5, 22.5] * u.deg
@@ -302,7 +298,7 @@ def best_derotator(
         Whether the worst or the mean moment and wavelength decides.
     instrument : str or Instrument, optional
         Whose plate and derotator they are: its ``sky_law`` counts, without it
-        `DEROTATOR_LAWS`.
+        that of `~astropolcal.instruments.SkyLaw` at a Nasmyth focus.
 
     Returns
     -------

@@ -2,8 +2,8 @@
 """
 Files that appear complete or not at all, and files that may be anything.
 
-What is read may come from anywhere. Every reader stands in a door, `understood`,
-that lets through objects and errors of ours only; YAML is looked at by `check_yaml`
+What is read may come from anywhere. Every reader stands in a door, ``understood``,
+that lets through objects and errors of ours only; YAML is looked at by ``check_yaml``
 before any of it is loaded.
 """
 
@@ -21,7 +21,7 @@ from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError
 
-__all__ = ["atomic_path", "check_new", "check_yaml", "one_line", "understood"]
+__all__ = []
 
 # a file of ours is 12 levels deep; loaders call themselves at each and die at some thousands
 _DEEPEST = 64
@@ -52,34 +52,8 @@ def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
     """
     Return the path of a file to write, before the work of writing it is done.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    overwrite : bool
-        Whether a file that exists may be replaced.
-    error : type
-        What to raise.
-    sources : sequence of path-like
-        Files that the content comes from, which must not be replaced in any case.
-
-    Returns
-    -------
-    `~pathlib.Path`
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given, if it is a folder, exists and must not be replaced, or its own
-        folder is missing.
-
-    Examples
-    --------
-    >>> from astropolcal.files import check_new
-    >>> check_new("no/run.ecsv")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.AstropolcalError: no/run.ecsv: cannot be written: there is no folder no
+    It is no folder, does not exist unless ``overwrite``, and is none of the ``sources`` of the
+    content.
     """
     path = Path(path)
     # os.path answers where pathlib raises: the name may be one that no system takes
@@ -106,40 +80,12 @@ def _is_same(path, other):
 @contextmanager
 def atomic_path(path, error=AstropolcalError):
     """
-    Give a temporary path that takes the place of ``path`` in the end.
+    Give a temporary path that takes the place of ``path`` when the block ends well.
 
-    A file that exists keeps its permissions, and a link stays a link: what it points to is
-    replaced. Pipes and devices, such as ``/dev/null``, stay what they are; the content is
-    written to them when the block ends well.
-
-    Parameters
-    ----------
-    path : path-like
-        The file to write. It is replaced only when the block ends well.
-    error : type
-        What to raise where the operating system refuses.
-
-    Yields
-    ------
-    `~pathlib.Path`
-        Where to write, with the same suffix. Nobody else writes there. Nothing is there, or an
-        empty file that only its owner may read, where a file is to be replaced.
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given, if the folder is missing or cannot be written to.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from pathlib import Path
-    >>> from astropolcal.files import atomic_path
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with atomic_path(Path(folder) / "note.txt") as temporary:
-    ...         _ = temporary.write_text("all of it")
-    ...     (Path(folder) / "note.txt").read_text()
-    'all of it'
+    It has the same suffix, and nobody else writes there. A file that exists keeps its permissions,
+    and a link stays a link: what it points to is replaced. Pipes and devices, such as
+    ``/dev/null``, stay what they are; the content is written to them. ``error`` is raised where
+    the system refuses.
     """
     path = _named(path, error)
     try:
@@ -313,36 +259,11 @@ def check_kind(path, error=AstropolcalError):
 @contextmanager
 def understood(path, error, words, *, reads=True):
     """
-    Turn whatever goes wrong in a reader into one line that names the file.
+    Turn whatever goes wrong in a reader into one line that names the file and says what it is not.
 
-    Parsers raise errors of every kind for a damaged file. Errors of ours pass unchanged. What
-    is no regular file is refused before it is opened, see ``check_kind``.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    error : type
-        What to raise.
-    words : str
-        What the file is not, such as ``"not a readable FITS file"``.
-    reads : bool
-        Whether the file is going to be read.
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given.
-
-    Examples
-    --------
-    >>> from astropolcal.exceptions import ObservationError
-    >>> from astropolcal.files import understood
-    >>> with understood("night.json", ObservationError, "not a journal"):
-    ...     {}["frame"]
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: night.json: not a journal: KeyError: 'frame'
+    Parsers raise errors of every kind for a damaged file. Errors of ours pass unchanged. What is
+    no regular file is refused before it is opened, where it is going to be read, see
+    ``check_kind``.
     """
     if reads:
         check_kind(path, error)
@@ -362,27 +283,10 @@ def understood(path, error, words, *, reads=True):
 
 
 def one_line(problem, longest=_LONGEST_REASON):
-    r"""
-    Return what an error or a text says, in one line that is not too long.
+    """
+    Return what an error or a text says, in one line of up to ``longest`` characters (None: all).
 
-    Parameters
-    ----------
-    problem : Exception or object
-        The error, whose type is named where its words alone say little, or a text.
-    longest : int or None
-        Number of characters to keep; None for all.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> from astropolcal.files import one_line
-    >>> one_line(ValueError("could not\n   parse it"))
-    'could not parse it'
-    >>> one_line(KeyError("names"))
-    "KeyError: 'names'"
+    The type of an error is named where its words alone say little.
     """
     text = " ".join(str(problem).split())
     plain = isinstance(problem, ValueError | OSError)
@@ -406,30 +310,8 @@ def check_yaml(text, error=AstropolcalError):
     Refuse YAML that is small in a file and immense, endless or deadly when it is loaded.
 
     Links make a document of a kilobyte grow without bounds, loops never end, and a loader that
-    calls itself for each level takes the whole process with it. Nothing is loaded here.
-
-    Parameters
-    ----------
-    text : str or bytes
-        The document.
-    error : type
-        What to raise.
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given.
-    yaml.YAMLError
-        If it is no YAML.
-
-    Examples
-    --------
-    >>> from astropolcal.files import check_yaml
-    >>> check_yaml("{hwp: [0, 45]}")
-    >>> check_yaml("&loop [*loop]")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.AstropolcalError: its YAML refers to itself
+    calls itself for each level takes the whole process with it. Nothing is loaded here. What is no
+    YAML at all raises yaml.YAMLError.
     """
     import yaml
 

@@ -3,7 +3,7 @@
 What a FITS file claims to hold, looked at before astropy opens it.
 
 A header without an end, or one that claims a billion axes, keeps astropy busy for minutes, and
-what is packed may be immense. `check_fits` goes from header to header as Sec. 4.4.1 of the FITS
+what is packed may be immense. ``check_fits`` goes from header to header as Sec. 4.4.1 of the FITS
 standard 4.0 describes, and adds up what has a checksum on its way; what else is wrong is left for
 astropy to say.
 """
@@ -22,14 +22,7 @@ import numpy as np
 from astropolcal.exceptions import AstropolcalError, ObservationError
 from astropolcal.files import understood
 
-__all__ = [
-    "MOST_BLOCKS",
-    "MOST_HDUS",
-    "check_fits",
-    "open_fits",
-    "primary_header",
-    "readable_fits",
-]
+__all__ = []
 
 # bytes; all parts of a file are filled up to whole blocks (Sec. 3.1 of the standard)
 _BLOCK, _CARD = 2880, 80
@@ -54,64 +47,17 @@ _NEEDS_MEMORY = (b"\xfd7zXZ",)
 
 @contextmanager
 def readable_fits(path, error=ObservationError):
-    """
-    Turn whatever goes wrong with a FITS file into one line that names it.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    error : type
-        What to raise.
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given, if the file is missing, no FITS file or damaged.
-
-    Examples
-    --------
-    >>> from astropolcal.fitscheck import readable_fits
-    >>> with readable_fits("night.fits"):
-    ...     raise KeyError("HWP")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ObservationError: night.fits: not a readable FITS file: KeyError: 'HWP'
-    """
+    """Turn whatever goes wrong with a FITS file into one line that names it, see ``understood``."""
     with understood(path, error, "not a readable FITS file"):
         yield
 
 
 def open_fits(path, error=ObservationError, *, count=MOST_HDUS, whole=False):
     """
-    Open a FITS file for astropy, after `check_fits`.
+    Open a FITS file for astropy, at its beginning, after ``check_fits`` with the same arguments.
 
     Astropy does not close a file that it cannot read, and loses its way in a packed one whose
     headers are damaged: so it is given a file that is open, and unpacked.
-
-    Parameters
-    ----------
-    path, error, count, whole
-        As for `check_fits`.
-
-    Returns
-    -------
-    file
-        At its beginning: the file itself, or a `~io.BytesIO` of one that was packed.
-
-    Raises
-    ------
-    AstropolcalError
-        As for `check_fits`.
-
-    Examples
-    --------
-    >>> from astropy.io import fits
-    >>> from astropolcal.fitscheck import open_fits
-    >>> fits.PrimaryHDU([1, 2]).writeto("two.fits.gz")
-    >>> with open_fits("two.fits.gz") as stream, fits.open(stream) as hdus:
-    ...     hdus[0].data.tolist()
-    [1, 2]
     """
     check_fits(path, error, count=count, whole=whole)
     with readable_fits(path, error):
@@ -126,33 +72,7 @@ def open_fits(path, error=ObservationError, *, count=MOST_HDUS, whole=False):
 
 
 def primary_header(path, error=ObservationError):
-    """
-    Return the primary header of a FITS file.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    error : type
-        What to raise.
-
-    Returns
-    -------
-    `~astropy.io.fits.Header`
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given, if it cannot be read.
-
-    Examples
-    --------
-    >>> from astropy.io import fits
-    >>> from astropolcal.fitscheck import primary_header
-    >>> fits.PrimaryHDU(header=fits.Header({"RET-ANG1": 22.5})).writeto("one.fits")
-    >>> primary_header("one.fits")["RET-ANG1"]
-    22.5
-    """
+    """Return the primary header of a FITS file."""
     from astropy.io import fits
 
     with readable_fits(path, error), open_fits(path, error, count=1) as stream:
@@ -163,35 +83,11 @@ def check_fits(path, error=AstropolcalError, *, count=MOST_HDUS, whole=False):
     """
     Refuse a FITS file whose headers would take astropy minutes or all of the memory.
 
-    Parameters
-    ----------
-    path : path-like
-        The file, which may be packed by gzip, bzip2 or xz.
-    error : type
-        What to raise.
-    count : int
-        Of how many HDUs something is going to be read.
-    whole : bool
-        Whether to refuse data that are claimed and not there.
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given, if the file is missing or no FITS file, a header has no end, claims
-        negative sizes or more axes or columns than the standard allows, what is packed is
-        immense, or a ``DATASUM`` or ``CHECKSUM`` does not match.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from astropolcal.fitscheck import check_fits
-    >>> cards = [b"SIMPLE  =                    T", b"NAXIS   =              9999999", b"END"]
-    >>> _ = Path("axes.fits").write_bytes(b"".join(card.ljust(80) for card in cards).ljust(2880))
-    >>> check_fits("axes.fits")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.AstropolcalError: axes.fits: not a readable FITS file: NAXIS = 9999999 in header 0, up to 999 are allowed
-    """  # noqa: E501
+    The file may be packed by gzip, bzip2 or xz; ``count`` HDUs are going to be read, and ``whole``
+    refuses data that are claimed and not there. ``error`` is raised if a header has no end, claims
+    negative sizes or more axes or columns than the standard allows, what is packed is immense, or
+    a ``DATASUM`` or ``CHECKSUM`` does not match.
+    """
     with understood(path, error, "not a readable FITS file"), open(path, "rb") as file:
         size, packing = os.path.getsize(path), _packing(file)
         if packing is None:

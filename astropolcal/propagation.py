@@ -20,10 +20,10 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ChainError
-from astropolcal.mueller._light import act, act_back, inverse, phase_of, plane, turned
+from astropolcal.mueller import act, act_back, inverse, phase_of, plane, turned
 from astropolcal.optics import FrameOptic
 
-__all__ = ["Propagator"]
+__all__ = []
 
 
 class _Node:
@@ -101,37 +101,11 @@ class _Step:
 
 class Propagator:
     """
-    The fluxes that a chain predicts, and their derivatives.
+    The fluxes that a chain with one beam splitter predicts, and their derivatives.
 
-    Parameters
-    ----------
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        A chain with one beam splitter.
-    wavelength : `~numpy.ndarray`
-        Wavelengths in micrometre, shape (n_wavelengths,).
-    positions : dict of str to `~numpy.ndarray`
-        Position of each stage, radian or a number, shape (n_columns,). What
-        differs between the beams, such as a flux, may have shape
-        (2, n_wavelengths, n_columns), the right beam first.
-    source : sequence of float
-        Stokes vector of the light that enters.
-
-    Raises
-    ------
-    ChainError
-        If the chain has no beam splitter, a stage has no position, the stages
-        have different numbers of positions, or positions that differ between
-        the beams are given for an optic that does not.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal import optics
-    >>> from astropolcal.propagation import Propagator
-    >>> chain = optics.LinearPolarizer() | optics.WollastonPrism(efficiency=0.9)
-    >>> right, left = Propagator(chain, np.array([1.6]), {}).fluxes()
-    >>> float(right[0, 0].round(4)), float(left[0, 0].round(4))
-    (0.475, 0.025)
+    ``wavelength`` in micrometre, ``positions`` of each stage in radian or a number, shape
+    (n_columns,); what differs between the beams, such as a flux, may have shape (2, n_wavelengths,
+    n_columns), the right beam first. ``source`` is the Stokes vector of the light that enters.
     """
 
     def __init__(self, chain, wavelength, positions, source=(1.0, 0.0, 0.0, 0.0)):
@@ -160,46 +134,15 @@ class Propagator:
         self._meeting = _meeting(self._common, self._arms) if self._same_entrance else None
 
     def values(self):
-        """
-        Return the current parameter values, one list an optic.
-
-        Returns
-        -------
-        list of list of `~numpy.ndarray`
-            Canonical floats, ``theta`` first; shape () or (n_wavelengths,).
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from astropolcal import optics
-        >>> from astropolcal.propagation import Propagator
-        >>> values = Propagator(optics.WollastonPrism(), np.array([1.6]), {}).values()
-        >>> [[float(value) for value in optic] for optic in values]
-        [[0.0, 1.0]]
-        """
+        """Return the current canonical values, one list per optic, ``theta`` first."""
         return [leaf.canonical_values() for leaf in self.leaves]
 
     def fluxes(self, values=None):
         """
-        Return the fluxes of the right and the left beam.
+        Return the fluxes of the right and the left beam for a source of unit intensity.
 
-        Parameters
-        ----------
-        values : list of list, optional
-            Values as `values` gives them; by default the current ones.
-
-        Returns
-        -------
-        right, left : `~numpy.ndarray`
-            Shape (n_wavelengths, n_columns), for unit source intensity.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from astropolcal import optics
-        >>> from astropolcal.propagation import Propagator
-        >>> [float(flux[0, 0]) for flux in Propagator(optics.WollastonPrism(), [1.6], {}).fluxes()]
-        [0.5, 0.5]
+        (n_wavelengths, n_columns) each, at values as ``values`` gives them, by default the current
+        ones.
         """
         values = self._own_values() if values is None else values
         if self._meeting is None:
@@ -207,45 +150,14 @@ class Propagator:
         common, frame = _at(self._common, values, 0.0)
         arms = [_inward(_at(arm, values, frame)[0]) for arm in self._arms]
         (right, phase), (left, _) = arms
-        # what stands still meets the light of all frames as two rows a wavelength
+        # what stands still meets the light of all frames as two rows per wavelength
         rows, phase = _inward(common[self._meeting :], np.concatenate([right, left], axis=1), phase)
         light, fresh = _behind(common[: self._meeting], self.source, keep=False)
         fluxes = turned(light, phase, fresh) @ np.ascontiguousarray(rows.swapaxes(1, 2))
         return tuple(_whole(fluxes[..., beam], self.shape) for beam in (0, 1))
 
     def forward(self, values=None):
-        """
-        Carry the light through the chain and keep what derivatives need.
-
-        Parameters
-        ----------
-        values : list of list, optional
-            As for `fluxes`.
-
-        Returns
-        -------
-        Sweep
-            With ``fluxes`` and the method ``derivatives``.
-
-        Raises
-        ------
-        ParameterError
-            If the chain's own values are used and one has neither one value
-            nor one a wavelength.
-
-        Examples
-        --------
-        The derivative of the right flux to the efficiency of the Wollaston prism:
-
-        >>> import numpy as np
-        >>> from astropolcal import optics
-        >>> from astropolcal.propagation import Propagator
-        >>> chain = optics.LinearPolarizer() | optics.WollastonPrism(efficiency=0.9)
-        >>> sweep = Propagator(chain, np.array([1.6]), {}).forward()
-        >>> weights = np.ones((1, 1)), np.zeros((1, 1))
-        >>> float(sweep.derivatives([(1, 1)], weights)[1, 1][0, 0])
-        0.25
-        """
+        """Carry the light through the chain and keep what derivatives need; return a Sweep."""
         return Sweep(self, self._own_values() if values is None else values)
 
     def _own_values(self):
@@ -322,19 +234,8 @@ class Sweep:
         Return what any small change of the matrix of an optic does to a weighted sum of fluxes.
 
         A change of the matrix by E changes the sum by a . E s, with the light s that enters the
-        optic and the analyser row a behind it.
-
-        Parameters
-        ----------
-        wanted : sequence of int
-            Index of the optic in the chain; it has to stand in front of the beam splitter.
-        weights : pair of `~numpy.ndarray`
-            Weights of the right and the left flux, (n_wavelengths, n_columns).
-
-        Returns
-        -------
-        dict of int to tuple
-            a and s, (n_wavelengths, n_columns, 4) each, in the frame of the optic.
+        optic and the analyser row a behind it. Of each ``wanted`` index of an optic in front of
+        the beam splitter: a and s, (n_wavelengths, n_columns, 4) each, in the frame of the optic.
         """
         found = {}
         self.derivatives([(index, _CROSSING) for index in wanted], weights, found)
@@ -343,21 +244,11 @@ class Sweep:
 
     def derivatives(self, wanted, weights, crossings=None):
         """
-        Return derivatives of a weighted sum of the two fluxes of each column.
+        Return derivatives of a weighted sum of the two fluxes of each column, per canonical unit.
 
-        Parameters
-        ----------
-        wanted : sequence of (int, int)
-            Index of the optic in the chain and of its parameter.
-        weights : pair of `~numpy.ndarray`
-            Weights of the right and the left flux, (n_wavelengths, n_columns).
-        crossings : dict, optional
-            Takes up what `crossings` returns.
-
-        Returns
-        -------
-        dict of (int, int) to `~numpy.ndarray`
-            Derivative per canonical unit, (n_wavelengths, n_columns).
+        ``wanted`` are pairs, index of the optic and of its parameter, the keys of what is
+        returned; ``weights`` those of the right and the left flux, all (n_wavelengths, n_columns).
+        A dictionary ``crossings`` takes up what the method of that name returns.
         """
         result = {}
         by_optic = {}
@@ -464,9 +355,9 @@ def _back(steps, adjoint, behind, by_optic, result, crossings=None):
     """
     Carry the adjoint back through ``steps``, adding derivatives to ``result``.
 
-    Returns the adjoint, and adjoint and light as they enter the first optic. ``behind`` has
-    such pairs for the optics behind the steps. The product a . G s of a pair is the same on
-    either side of a rotation, so that each is needed at one optic only.
+    Returns the adjoint, and adjoint and light as they enter the first optic. ``behind`` has such
+    pairs for the optics behind the steps. The product a . G s of a pair is the same on either side
+    of a rotation, so that each is needed at one optic only.
     """
     for step in reversed(steps):
         wanted = by_optic.get(step.node.index, ())

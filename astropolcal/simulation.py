@@ -10,11 +10,11 @@ from astropy.table import QTable
 from astropolcal.chain import stages
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
-from astropolcal.optics.positions import finite_position
+from astropolcal.optics.core import finite_position
 from astropolcal.propagation import Propagator
 from astropolcal.units import length_to_um
 
-__all__ = ["check_seed", "entering_flux", "expected_fluxes", "half_wave_plate_cycles", "simulate"]
+__all__ = ["half_wave_plate_cycles", "simulate"]
 
 #: The angles of a calibration run of CHARIS (paper, Sec. 5.1).
 _CYCLE = np.array([0, 45, 11.25, 56.25, 22.5, 67.5, 33.75, 78.75])
@@ -39,7 +39,7 @@ def half_wave_plate_cycles(hwp=_CYCLE * u.deg, derotator=45 * u.deg):
     Returns
     -------
     `~astropy.table.QTable`
-        Columns ``hwp`` and ``derotator``, one row a frame.
+        Columns ``hwp`` and ``derotator``, one row per frame.
 
     Examples
     --------
@@ -79,10 +79,10 @@ def simulate(
     wavelength : `~astropy.units.Quantity`
         Shape (n_wavelengths,).
     frames : `~astropy.table.QTable`
-        One row a frame: the position of every stage (``hwp``, ``derotator``,
+        One row per frame: the position of every stage (``hwp``, ``derotator``,
         ...) and whatever else is to stand in the table.
     flux : float or array_like
-        Flux that enters the chain, in adu; scalar or one value a wavelength.
+        Flux that enters the chain, in adu; scalar or one value per wavelength.
     lamp : array_like, optional
         Relative brightness of the source in each frame.
     gain : float
@@ -144,30 +144,7 @@ def simulate(
 
 
 def check_seed(seed):
-    """
-    Return the seed of random numbers if it is one.
-
-    Parameters
-    ----------
-    seed : int, None or `~numpy.random.Generator`
-        What `numpy.random.default_rng` takes.
-
-    Returns
-    -------
-    int, None or `~numpy.random.Generator`
-        The same.
-
-    Raises
-    ------
-    ParameterError
-        If it is negative, or no whole number.
-
-    Examples
-    --------
-    >>> from astropolcal.simulation import check_seed
-    >>> check_seed(7)
-    7
-    """
+    """Return the seed of random numbers if `numpy.random.default_rng` takes it, else raise."""
     try:
         # draws nothing, so that a generator stays as it is
         np.random.default_rng(seed)
@@ -178,44 +155,10 @@ def check_seed(seed):
 
 def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
     """
-    Return the noiseless fluxes of both beams for a source of unit flux.
+    Return the noiseless fluxes of both beams, (n_wavelengths, n_frames) each, not negative.
 
-    Parameters
-    ----------
-    chain : `~astropy.modeling.CompoundModel`
-        With a beam splitter.
-    wavelength : `~astropy.units.Quantity`
-        Shape (n_wavelengths,).
-    frames : `~astropy.table.QTable`
-        One row a frame: the position of every stage. A column such as ``hwp_true`` goes
-        before ``hwp``.
-    source : sequence of float
-        Stokes vector of the light that enters.
-
-    Returns
-    -------
-    right, left : `~numpy.ndarray`
-        Each of shape (n_wavelengths, n_frames), not negative.
-
-    Raises
-    ------
-    ParameterError
-        If a flux is negative, which no physical chain gives.
-    ChainError
-        If the position of a stage is missing.
-
-    Examples
-    --------
-    A half-wave plate at 0 and 45 deg turns light that is polarized along +Q into -Q:
-
-    >>> import astropy.units as u
-    >>> from astropolcal import optics
-    >>> from astropolcal.simulation import expected_fluxes, half_wave_plate_cycles
-    >>> chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp") | optics.WollastonPrism()
-    >>> frames = half_wave_plate_cycles(hwp=[0, 45] * u.deg)
-    >>> right, left = expected_fluxes(chain, [1.6] * u.um, frames, source=(1, 1, 0, 0))
-    >>> (right - left).round(12).tolist()
-    [[1.0, -1.0]]
+    ``frames`` has the position of every stage, one row per frame; a column such as ``hwp_true``
+    goes before ``hwp``. ``source`` is the Stokes vector of the light that enters.
     """
     # where the true angle of a stage is known, it is that at which it stands
     known = {stage: f"{stage}_true" for stage in stages(chain)}
@@ -259,32 +202,10 @@ def check_electrons(electrons):
 
 def entering_flux(flux, lamp, n_frames, n_wavelengths):
     """
-    Return the flux that enters a chain in every frame.
+    Return the flux that enters a chain in every frame, shape (n_frames, n_wavelengths).
 
-    Parameters
-    ----------
-    flux : float or array_like
-        Scalar or one value a wavelength.
-    lamp : array_like or None
-        Relative brightness in each frame; None if it is constant.
-    n_frames, n_wavelengths : int
-        Numbers of them.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Shape (n_frames, n_wavelengths).
-
-    Raises
-    ------
-    ParameterError
-        If one is not positive, or of another shape.
-
-    Examples
-    --------
-    >>> from astropolcal.simulation import entering_flux
-    >>> entering_flux([10, 20], [1.0, 0.5], 2, 2).tolist()
-    [[10.0, 20.0], [5.0, 10.0]]
+    The flux is a scalar or one value per wavelength, the brightness of the lamp is relative, one
+    per frame or None.
     """
     flux = _positive("flux", flux)
     lamp = _positive("lamp", np.ones(n_frames) if lamp is None else lamp)

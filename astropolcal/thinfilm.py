@@ -20,7 +20,7 @@ from astropolcal.materials import get_material
 from astropolcal.mueller import diattenuator_retarder
 from astropolcal.units import angle_to_rad, length_to_um
 
-__all__ = ["Reflection", "fresnel", "reflect"]
+__all__ = ["reflect"]
 
 # keeps the admittance of p finite exactly at the critical angle
 _GRAZING = 1e-12
@@ -198,22 +198,9 @@ class Reflection:
     """
     What a surface does to the light that it reflects, made by `reflect`.
 
-    Parameters
-    ----------
-    r_s, r_p : `~numpy.ndarray`
-        Complex amplitudes of the field across and in the plane of incidence.
-    transmittance_s, transmittance_p : `~numpy.ndarray`
-        Shares of the power that enter the substrate.
-    slopes : tuple
-        Derivatives of ln(r_p / r_s), see `derivatives`.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.thinfilm import reflect
-    >>> gold = reflect(1.6 * u.um, 45 * u.deg, "gold")
-    >>> round(float(gold.diattenuation), 5), gold.retardance.round(2)
-    (0.0082, <Quantity 187.89 deg>)
+    ``r_s`` and ``r_p`` are complex amplitudes of the field across and in the plane of incidence,
+    ``transmittance_s`` and ``transmittance_p`` shares of the power that enter the substrate,
+    ``slopes`` derivatives of ln(r_p / r_s), see ``derivatives``.
     """
 
     r_s: np.ndarray
@@ -253,23 +240,11 @@ class Reflection:
 
     def derivatives(self):
         """
-        Return the derivatives of diattenuation and retardance.
+        Return the derivatives of diattenuation and retardance (radian), two in a tuple.
 
-        Returns
-        -------
-        dict of str to tuple
-            Of the diattenuation (per radian, per micrometre, or per unit of n and k) and of
-            the retardance in radian, to ``incidence``, ``n``, ``k`` of the substrate and
-            ``n_1``, ``k_1``, ``thickness_1`` and so on of the films, the first being
-            where the light arrives.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.thinfilm import reflect
-        >>> bare = reflect(1.6 * u.um, 45 * u.deg, "silver").derivatives()
-        >>> bare["n"][0].round(4), bare["k"][1].round(4)
-        (np.float64(0.0129), np.float64(-0.0129))
+        Keys are ``incidence`` (per radian), ``n`` and ``k`` of the substrate, and ``n_1``,
+        ``k_1``, ``thickness_1`` (per micrometre) and so on of the films, the first being where the
+        light arrives.
         """
         incidence, indices, thicknesses = self.slopes
         labels = [f"_{i + 1}" for i in range(len(thicknesses))]
@@ -280,52 +255,6 @@ class Reflection:
             found[f"thickness{label}"] = slope
         steepness = (1 - self.diattenuation) * (1 + self.diattenuation)
         return {key: (-steepness * slope.real, slope.imag) for key, slope in found.items()}
-
-
-def fresnel(index, incidence, ambient=1.0):
-    r"""
-    Return the Fresnel reflection amplitudes of a surface.
-
-    .. math:: r_s = \frac{n_0\cos\theta - q}{n_0\cos\theta + q}, \qquad
-              r_p = \frac{n^2\cos\theta - n_0 q}{n^2\cos\theta + n_0 q}, \qquad
-              q = \sqrt{n^2 - n_0^2\sin^2\theta}
-
-    Parameters
-    ----------
-    index : complex or array_like
-        n + ik behind the surface, k not negative.
-    incidence : `~astropy.units.Quantity`
-        Angle of incidence, 0 deg to less than 90 deg; broadcast with the index.
-    ambient : float
-        Real index in front of the surface.
-
-    Returns
-    -------
-    r_s, r_p : `~numpy.ndarray`
-        Complex amplitudes; :math:`r_p = -r_s` at normal incidence.
-
-    Raises
-    ------
-    ParameterError
-        If an index or an angle is not allowed.
-
-    References
-    ----------
-    Born & Wolf 1999, Principles of Optics, Sec. 1.5 and 14.2.
-
-    Examples
-    --------
-    Glass reflects no p at the Brewster angle:
-
-    >>> import astropy.units as u
-    >>> import numpy as np
-    >>> from astropolcal.thinfilm import fresnel
-    >>> r_s, r_p = fresnel(1.5, np.arctan(1.5) * u.rad)
-    >>> float(r_s.real.round(4)), float(abs(r_p).round(12))
-    (-0.3846, 0.0)
-    """
-    stack = _checked_stack(1.0, incidence, [_ambient(ambient), _plain_index(index)], [])
-    return stack.amplitudes
 
 
 def reflect(wavelength, incidence, substrate, films=(), ambient=1.0):

@@ -19,15 +19,7 @@ from erfa import ErfaWarning
 from astropolcal.exceptions import ParameterError
 from astropolcal.files import one_line
 
-__all__ = [
-    "angle_to_rad",
-    "canonical_factor",
-    "canonical_unit",
-    "iso_date",
-    "length_to_um",
-    "plain_number",
-    "to_unit",
-]
+__all__ = []
 
 # radian for numpy, micrometre because dispersion laws are written in it
 _CANONICAL = (u.rad, u.um, u.dimensionless_unscaled)
@@ -44,31 +36,7 @@ _MJD = re.compile(r"[4-9]\d{4}(\.\d*)?", re.ASCII)
 
 
 def canonical_unit(unit):
-    """
-    Return the internal unit for quantities of the same kind as ``unit``.
-
-    Parameters
-    ----------
-    unit : unit-like or None
-        Any unit of angle or length, a dimensionless one, or None.
-
-    Returns
-    -------
-    `~astropy.units.Unit`
-        Radian, micrometre or dimensionless.
-
-    Raises
-    ------
-    ParameterError
-        If the unit is of another kind.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.units import canonical_unit
-    >>> canonical_unit(u.deg), canonical_unit(u.mm)
-    (Unit("rad"), Unit("um"))
-    """
+    """Return the internal unit of a unit: radian, micrometre or dimensionless (also for None)."""
     unit = u.dimensionless_unscaled if unit is None else u.Unit(unit)
     for candidate in _CANONICAL:
         # angles count as dimensionless for astropy only under an equivalency
@@ -81,31 +49,7 @@ def canonical_unit(unit):
 
 
 def canonical_factor(unit):
-    """
-    Return the number by which a value in ``unit`` becomes canonical.
-
-    Parameters
-    ----------
-    unit : unit-like or None
-        Any unit of angle or length, a dimensionless one, or None.
-
-    Returns
-    -------
-    float
-        Radian, micrometre or 1 a unit.
-
-    Raises
-    ------
-    ParameterError
-        If the unit is of another kind.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.units import canonical_factor
-    >>> float(canonical_factor(u.mm))
-    1000.0
-    """
+    """Return the number by which a value in a unit, or without one (None), becomes canonical."""
     return 1.0 if unit is None else _factor(u.Unit(unit))
 
 
@@ -117,33 +61,9 @@ def _factor(unit):
 
 def to_unit(value, unit, name="value"):
     """
-    Return ``value`` as floats in ``unit``; refuse numbers without a unit.
+    Return a value as floats in a unit; ``name`` is what messages call it.
 
-    Parameters
-    ----------
-    value : `~astropy.units.Quantity` or float or array_like
-        Plain numbers are accepted only where ``unit`` is None or dimensionless.
-    unit : unit-like or None
-        The unit wanted.
-    name : str
-        What the value is called in the error message.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Floats in ``unit``, of the shape of ``value``.
-
-    Raises
-    ------
-    ParameterError
-        If the unit is missing or cannot be converted.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.units import to_unit
-    >>> float(to_unit(1.2 * u.mm, u.um))
-    1200.0
+    Plain numbers are accepted only where the unit is None or dimensionless.
     """
     unit = u.dimensionless_unscaled if unit is None else u.Unit(unit)
     # numpy would drop the imaginary part with no more than a warning
@@ -171,64 +91,12 @@ def to_unit(value, unit, name="value"):
 
 
 def angle_to_rad(value, name="angle"):
-    """
-    Return an angle with unit as floats in radian.
-
-    Parameters
-    ----------
-    value : `~astropy.units.Quantity`
-        Any angle, of any shape.
-    name : str
-        What the angle is called in the error message.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Floats in radian, of the shape of ``value``.
-
-    Raises
-    ------
-    ParameterError
-        If the unit is missing or is not one of angle.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.units import angle_to_rad
-    >>> round(float(angle_to_rad(180 * u.deg)), 6)
-    3.141593
-    """
+    """Return an angle with unit as floats in radian."""
     return to_unit(value, u.rad, name)
 
 
 def length_to_um(value, name="wavelength"):
-    """
-    Return a length with unit as floats in micrometre.
-
-    Parameters
-    ----------
-    value : `~astropy.units.Quantity`
-        Any length, of any shape.
-    name : str
-        What the length is called in the error message.
-
-    Returns
-    -------
-    `~numpy.ndarray`
-        Floats in micrometre, of the shape of ``value``.
-
-    Raises
-    ------
-    ParameterError
-        If the unit is missing or is not one of length.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.units import length_to_um
-    >>> float(length_to_um(1600 * u.nm))
-    1.6
-    """
+    """Return a length with unit as floats in micrometre."""
     return to_unit(value, u.um, name)
 
 
@@ -237,32 +105,8 @@ def plain_number(value, kind=float):
     Return a number, or the one that a text writes in ASCII digits without separators.
 
     Python reads ``1_000`` and digits of all scripts as numbers; no file of data means them so.
-
-    Parameters
-    ----------
-    value : str or number
-        The value.
-    kind : callable
-        What makes the number of it: `float`, `int` or `~astropy.units.Quantity`.
-
-    Returns
-    -------
-    float, int or `~astropy.units.Quantity`
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is not a number, or written in another way.
-
-    Examples
-    --------
-    >>> from astropolcal.units import plain_number
-    >>> plain_number(" 1e3")
-    1000.0
-    >>> plain_number("1_000")
-    Traceback (most recent call last):
-    ...
-    ValueError: '1_000' is not written as a plain number
+    What makes the number of a text is ``kind``: float, int or Quantity. Raises ValueError or
+    TypeError.
     """
     if isinstance(value, str) and _doubtful(value):
         raise ValueError(f"{value!r} is not written as a plain number")
@@ -277,37 +121,10 @@ def iso_date(value, name="date", error=ParameterError, *, months=False):
     """
     Return a date in the one form in which dates are kept and compared.
 
-    Parameters
-    ----------
-    value : str, number, ``datetime.date``, ``datetime.datetime`` or `~astropy.time.Time`
-        In UTC: ``YYYY-MM-DD``, perhaps with a time of day, ``YYYYMMDD``, or a Modified Julian
-        Date of five digits and perhaps a fraction.
-    name : str
-        What the date is called in the error message.
-    error : type
-        What to raise.
-    months : bool
-        Whether ``YYYY-MM`` is enough.
-
-    Returns
-    -------
-    str
-        ``YYYY-MM-DD``, followed by ``T`` and the time of day where it is known; or ``YYYY-MM``.
-
-    Raises
-    ------
-    AstropolcalError
-        Of the type given, if it is not a date, or not one of the calendar.
-
-    Examples
-    --------
-    >>> from astropolcal.units import iso_date
-    >>> iso_date("20251005"), iso_date(60953), iso_date("2025-10-05 09:30")
-    ('2025-10-05', '2025-10-05', '2025-10-05T09:30:00.000')
-    >>> iso_date("5 Oct 2025")
-    Traceback (most recent call last):
-    ...
-    astropolcal.exceptions.ParameterError: date = '5 Oct 2025' is not a date; allowed are ...
+    It is ``YYYY-MM-DD``, followed by ``T`` and the time of day where it is known, or ``YYYY-MM``
+    where ``months`` are enough; in UTC. Taken are texts such as these, ``YYYYMMDD``, Modified
+    Julian Dates of five digits, dates of Python and `~astropy.time.Time`. What is none raises
+    ``error``.
     """
     if _is_iso(value):
         return value

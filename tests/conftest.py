@@ -10,8 +10,6 @@ from hypothesis import HealthCheck, is_hypothesis_test, settings
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FEW_EXAMPLES = 5
-# tests that took long when they were measured last; tests/slow_tests.py writes the list
-SLOW_TESTS = Path(__file__).with_name("slow_tests.txt")
 
 # no window system is needed to test a figure
 os.environ.setdefault("MPLBACKEND", "agg")
@@ -50,9 +48,8 @@ def pytest_configure(config):
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
     """Examples of docstrings and pages are slow; without slow tests each law has few examples."""
-    listed = set(SLOW_TESTS.read_text(encoding="utf-8").split())
     for item in items:
-        if isinstance(item, pytest.DoctestItem) or item.nodeid.partition("[")[0] in listed:
+        if isinstance(item, pytest.DoctestItem):
             item.add_marker(pytest.mark.slow)
     if config.option.markexpr == "not slow":
         for item in items:

@@ -149,6 +149,7 @@ def test_metadata_of_the_software_agree(repository):
 # ---- the gallery of models -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_optic_has_a_page(gallery):
     for name in OPTICS:
         page = gallery["pages"].optic_page(name, "wavelength", "somewhere")
@@ -161,6 +162,7 @@ def test_every_optic_has_a_page(gallery):
         assert f"import {name}" in page, name
 
 
+@pytest.mark.slow
 def test_every_effect_has_a_page_and_a_scene(gallery):
     for name in EFFECTS:
         effect, make = EFFECTS[name], gallery["fingerprints"].scene_of(name)
@@ -252,6 +254,7 @@ def test_figures_are_drawn_once(gallery, tmp_path):
     assert drawn == ["a", "b", "a", "b"]
 
 
+@pytest.mark.slow
 def test_figures_of_an_optic(gallery, tmp_path):
     for name in ["KMirror", "FluxGain", "PolarizedSource"]:
         words = gallery["build"].draw_optic(name, tmp_path)

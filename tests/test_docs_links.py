@@ -164,10 +164,14 @@ def _exists(name):
 
 def test_names_of_the_package_exist():
     """What a page or a docstring calls by its full name."""
-    for path in [*PAGES, *MODULES]:
-        names = re.findall(r"`~?(astropolcal(?:\.\w+)+)(?:\(\))?`", _text(path))
-        missing = sorted({name for name in names if not _exists(name)})
-        assert not missing, path
+    pattern = r"`~?(astropolcal(?:\.\w+)+)(?:\(\))?`"
+    named = {
+        (_id(path), name)
+        for path in [*PAGES, *MODULES]
+        for name in re.findall(pattern, _text(path))
+    }
+    missing = sorted((page, name) for page, name in named if not _exists(name))
+    assert not missing
 
 
 def test_existence_is_told():

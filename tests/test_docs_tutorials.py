@@ -112,6 +112,7 @@ FINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path", [pytest.param(path, marks=_slow(path), id=path.stem) for path in TUTORIALS]
 )
@@ -139,6 +140,7 @@ def test_there_are_tutorials():
     assert {path.stem for path in TUTORIALS} == set(FINDS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
 def test_tutorial_becomes_a_notebook(path):
     parser = pytest.importorskip("sphinx_gallery.py_source_parser")

@@ -420,6 +420,7 @@ def ended(desk):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", REASONS)
 def test_commands_that_cannot_write(kind, ended):
     if kind not in ended:
@@ -465,6 +466,7 @@ def write_for_ever(path):
                 stream.write(content[i % 2][start : start + 3000])
 
 
+@pytest.mark.slow
 def test_killed_writer_leaves_a_whole_file(tmp_path):
     path = tmp_path / "out.bin"
     path.write_bytes(b"a" * 300_000)
@@ -499,6 +501,7 @@ def write_calibrations(path):
         cal.write(path, overwrite=True)
 
 
+@pytest.mark.slow
 def test_killed_calibrate_leaves_a_calibration_or_nothing(tmp_path):
     path, digest = tmp_path / "cal.asdf", None
     rng = np.random.default_rng(5)
@@ -518,6 +521,7 @@ def append_challenges(path):
         _append(path, {"index": i, "words": "x" * 500} | RECORD)
 
 
+@pytest.mark.slow
 def test_killed_challenges_go_on(tmp_path):
     path, before = tmp_path / "run.jsonl", 0
     rng = np.random.default_rng(6)
@@ -537,6 +541,7 @@ def add_frames(path, folder):
         journal.add(Frame(str(folder / f"{i % 5}.fits"), number=i, errors=["x" * 300]))
 
 
+@pytest.mark.slow
 def test_killed_reduction_goes_on(tmp_path):
     for i in range(5):
         (tmp_path / f"{i}.fits").write_bytes(b"x")
@@ -559,6 +564,7 @@ def sample_for_ever(path):
         path.unlink()
 
 
+@pytest.mark.slow
 @needs_h5py
 def test_killed_sampler_goes_on(tmp_path, monkeypatch):
     path, rng = tmp_path / "chain.h5", np.random.default_rng(8)
@@ -587,6 +593,7 @@ def add_to_library(folder, number, same, out):
         out.put((number, repr(error)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("same", [False, True])
 def test_several_processes_add_to_one_library(tmp_path, same):
     calibration()
@@ -609,6 +616,7 @@ def test_several_processes_add_to_one_library(tmp_path, same):
     assert left - {".astropolcal-index.json"} == {".lock"}
 
 
+@pytest.mark.slow
 def test_killed_writer_does_not_lock_a_library(tmp_path):
     killed(add_to_library, tmp_path, 0, False, FORK.Queue(), after=0.3)
     Library(tmp_path).add(calibration(), valid_from="1999-01-01", valid_until="1999-06-01")
@@ -621,6 +629,7 @@ def write_tables(path, number):
         data.write(path, overwrite=True)
 
 
+@pytest.mark.slow
 def test_several_processes_write_one_file(tmp_path):
     path, digest = tmp_path / "night.ecsv", lab()[1].content_hash
     processes = [FORK.Process(target=write_tables, args=(path, i)) for i in range(3)]

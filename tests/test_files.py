@@ -52,13 +52,13 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("error", [AstropolcalError, CalibrationFileError])
-def test_what_the_system_refuses_is_one_of_our_errors(tmp_path, error):
-    with (
-        pytest.raises(error, match="cannot be written"),
-        atomic_path(tmp_path / "no" / "x.txt", error) as temporary,
-    ):
-        temporary.write_text("x")
+def test_what_the_system_refuses_is_one_of_our_errors(tmp_path):
+    for error in [AstropolcalError, CalibrationFileError]:
+        with (
+            pytest.raises(error, match="cannot be written"),
+            atomic_path(tmp_path / "no" / "x.txt", error) as temporary,
+        ):
+            temporary.write_text("x")
 
 
 def test_a_block_that_writes_nothing_is_an_error(tmp_path):
@@ -91,9 +91,9 @@ def test_two_writers_of_one_file_do_not_meet(tmp_path):
     assert [other.name for other in tmp_path.iterdir()] == ["note.txt"]
 
 
-@pytest.mark.parametrize(
-    ("name", "age", "goes"),
-    [
+def test_what_killed_runs_left_goes_after_a_day(tmp_path):
+    """Only remains of the same file: nothing else in a folder is ours to remove."""
+    for name, age, goes in [
         (".note.123-0123abcd.tmp.txt", 25, True),
         (".note.123.tmp.txt", 25, True),
         (".note.123-0123abcd.tmp.txt", 23, False),
@@ -102,17 +102,14 @@ def test_two_writers_of_one_file_do_not_meet(tmp_path):
         (".note.abc.tmp.txt", 25, False),
         (".note.123-0123ABCD.tmp.txt", 25, False),
         ("note.txt.bak", 25, False),
-    ],
-)
-def test_what_killed_runs_left_goes_after_a_day(tmp_path, name, age, goes):
-    """Only remains of the same file: nothing else in a folder is ours to remove."""
-    other = tmp_path / name
-    other.write_text("left")
-    then = time.time() - age * 3600
-    os.utime(other, (then, then))
-    with atomic_path(tmp_path / "note.txt") as temporary:
-        temporary.write_text("x")
-    assert other.exists() is not goes
+    ]:
+        other = tmp_path / name
+        other.write_text("left")
+        then = time.time() - age * 3600
+        os.utime(other, (then, then))
+        with atomic_path(tmp_path / "note.txt") as temporary:
+            temporary.write_text("x")
+        assert other.exists() is not goes, (name, age, goes)
 
 
 def test_remains_of_a_file_without_suffix(tmp_path):
@@ -124,20 +121,17 @@ def test_remains_of_a_file_without_suffix(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["note"]
 
 
-@pytest.mark.parametrize(
-    ("number", "words"),
-    [
+def test_refusals_say_what_to_do(tmp_path):
+    for number, words in [
         (errno.ENOSPC, "No space left on device; free some space or name another folder"),
         (errno.EROFS, "Read-only file system; name a folder that you may write to"),
         (errno.EIO, "Input/output error"),
         (None, "out of luck"),
-    ],
-)
-def test_refusals_say_what_to_do(tmp_path, number, words):
-    path = tmp_path / "note.txt"
-    with pytest.raises(AstropolcalError) as caught, atomic_path(path):
-        raise OSError("out of luck") if number is None else OSError(number, os.strerror(number))
-    assert str(caught.value) == f"{path}: cannot be written: {words}"
+    ]:
+        path = tmp_path / "note.txt"
+        with pytest.raises(AstropolcalError) as caught, atomic_path(path):
+            raise OSError("out of luck") if number is None else OSError(number, os.strerror(number))
+        assert str(caught.value) == f"{path}: cannot be written: {words}", (number, words)
 
 
 # ---- what is there already -------------------------------------------------------------
@@ -249,17 +243,14 @@ def test_the_standard_output_gets_both_what_is_written_and_what_is_printed(tmp_p
     assert link.is_symlink()
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["é" * 120 + ".txt", "💥" * 63, "a." + "b" * 253, "x" * 255],
-    ids=["two bytes", "four bytes", "suffix", "plain"],
-)
-def test_names_as_long_as_the_system_takes(tmp_path, name):
-    path = tmp_path / name
-    for text in ("first", "second"):
-        write(path, text)
-        assert path.read_text() == text
-    assert list(tmp_path.iterdir()) == [path]
+def test_names_as_long_as_the_system_takes(tmp_path):
+    for name in ["é" * 120 + ".txt", "💥" * 63, "a." + "b" * 253, "x" * 255]:
+        path = tmp_path / name
+        for text in ("first", "second"):
+            write(path, text)
+            assert path.read_text() == text, name
+        assert list(tmp_path.iterdir()) == [path], name
+        path.unlink()
 
 
 def test_names_that_no_system_takes(tmp_path):
@@ -301,19 +292,16 @@ def test_lines_are_appended_as_a_whole(tmp_path, monkeypatch):
 # ---- a new file ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "overwrite", "words"),
-    [
+def test_a_file_that_cannot_be_new(tmp_path):
+    for name, overwrite, words in [
         ("there.txt", False, "exists already; overwrite=True replaces it"),
         (".", True, "is a folder; name a file in it"),
         ("nowhere/new.txt", True, "cannot be written: there is no folder"),
-    ],
-)
-def test_a_file_that_cannot_be_new(tmp_path, name, overwrite, words):
-    (tmp_path / "there.txt").write_text("x")
-    with pytest.raises(CalibrationFileError, match=words) as caught:
-        check_new(tmp_path / name, overwrite, CalibrationFileError)
-    assert str(caught.value).startswith(str(tmp_path / name))
+    ]:
+        (tmp_path / "there.txt").write_text("x")
+        with pytest.raises(CalibrationFileError, match=words) as caught:
+            check_new(tmp_path / name, overwrite, CalibrationFileError)
+        assert str(caught.value).startswith(str(tmp_path / name)), (name, overwrite, words)
 
 
 def test_a_file_that_the_content_comes_from(tmp_path):
@@ -326,18 +314,17 @@ def test_a_file_that_the_content_comes_from(tmp_path):
     assert check_new(tmp_path / "other.txt", True, sources=sources) == tmp_path / "other.txt"
 
 
-@pytest.mark.parametrize(("name", "overwrite"), [("there.txt", True), ("new.txt", False)])
-def test_a_file_that_can(tmp_path, name, overwrite):
-    (tmp_path / "there.txt").write_text("x")
-    assert check_new(str(tmp_path / name), overwrite) == tmp_path / name
+def test_a_file_that_can(tmp_path):
+    for name, overwrite in [("there.txt", True), ("new.txt", False)]:
+        (tmp_path / "there.txt").write_text("x")
+        assert check_new(str(tmp_path / name), overwrite) == tmp_path / name, (name, overwrite)
 
 
 # ---- the door of readers ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("problem", "words"),
-    [
+def test_whatever_goes_wrong_is_one_line():
+    for problem, words in [
         (FileNotFoundError(2, "No such file or directory"), "no such file"),
         (IsADirectoryError(21, "Is a directory"), "is a folder, not a file"),
         (PermissionError(13, "Permission denied"), "cannot be read: Permission denied"),
@@ -347,15 +334,13 @@ def test_a_file_that_can(tmp_path, name, overwrite):
         (KeyError("frame"), "no journal: KeyError: 'frame'"),
         (RecursionError(), "no journal: RecursionError"),
         (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "bad"), "no journal: 'utf-8' codec can't"),
-    ],
-)
-def test_whatever_goes_wrong_is_one_line(problem, words):
-    with (
-        pytest.raises(ObservationError) as caught,
-        understood("a.json", ObservationError, "no journal"),
-    ):
-        raise problem
-    assert str(caught.value).startswith(f"a.json: {words}")
+    ]:
+        with (
+            pytest.raises(ObservationError) as caught,
+            understood("a.json", ObservationError, "no journal"),
+        ):
+            raise problem
+        assert str(caught.value).startswith(f"a.json: {words}"), (problem, words)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
@@ -391,9 +376,8 @@ def test_the_cause_is_kept_where_it_may_be_needed():
     assert isinstance(caught.value.__cause__, KeyError)
 
 
-@pytest.mark.parametrize(
-    ("said", "longest", "line"),
-    [
+def test_one_line():
+    for said, longest, line in [
         ("  two\n\n words\t", 240, "two words"),
         (ValueError(""), 240, "ValueError"),
         (TypeError("of no\nuse"), 240, "TypeError: of no use"),
@@ -405,10 +389,8 @@ def test_the_cause_is_kept_where_it_may_be_needed():
         ("abcdefg", 6, "abcdef..."),
         ("a\nb", None, "a b"),
         ("", 240, ""),
-    ],
-)
-def test_one_line(said, longest, line):
-    assert one_line(said, longest) == line
+    ]:
+        assert one_line(said, longest) == line, (said, longest, line)
 
 
 def test_lines_stay_and_what_moves_the_cursor_does_not():
@@ -426,9 +408,8 @@ def laughs(levels, width=9):
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
+def test_yaml_that_must_not_be_loaded():
+    for text, words in [
         ("&a [*a]", "refers to itself"),
         ("a: &a\n  b: {c: *a}", "refers to itself"),
         ("- *unknown", "undefined alias|refers to itself"),
@@ -438,16 +419,13 @@ def laughs(levels, width=9):
         ("a: &a {x: 1}\nb: {<<: *a}", "merge keys"),
         ("a: &a {x: 1}\nb: {!!merge <<: *a}", "merge keys"),
         ("a: &a {x: 1}\nb: {? !<tag:yaml.org,2002:merge> z : *a}", "merge keys"),
-    ],
-)
-def test_yaml_that_must_not_be_loaded(text, words):
-    with pytest.raises(AstropolcalError, match=words):
-        check_yaml(text)
+    ]:
+        with pytest.raises(AstropolcalError, match=words):
+            check_yaml(text)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
+def test_yaml_that_may_be_loaded():
+    for text in [
         "",
         "[" * 62 + "]" * 62,
         "a: &a [1, 2]\nb: *a\nc: *a",
@@ -455,12 +433,9 @@ def test_yaml_that_must_not_be_loaded(text, words):
         laughs(3),
         "--- {a: 1}\n...\n--- {b: 2}\n",
         "\n".join(f"- {i}" for i in range(3000)),
-    ],
-    ids=lambda text: str(len(text)),
-)
-def test_yaml_that_may_be_loaded(text):
-    check_yaml(text)
-    check_yaml(text.encode())
+    ]:
+        check_yaml(text)
+        check_yaml(text.encode())
 
 
 def test_an_anchor_may_be_given_anew():

@@ -96,66 +96,68 @@ GOOD = {
 # ---- checksums ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("packer", PACKERS)
-def test_checksums_that_do_not_match_are_refused(tmp_path, packer):
+def test_checksums_that_do_not_match_are_refused(tmp_path):
     """Each bit counts, in all kinds of HDUs; without the keywords, or a value, nothing does."""
-    buffer = io.BytesIO()
-    image = np.arange(2000, dtype="i2").reshape(40, 50)
-    hdus = [fits.ImageHDU(image), fits.CompImageHDU(image), fits.ImageHDU(image.astype("u2"))]
-    hdus = [fits.PrimaryHDU(), *hdus, fits.BinTableHDU(np.array([(1, 2.0)], dtype="i4,f8"))]
-    fits.HDUList(hdus).writeto(buffer, checksum=True)
-    good = buffer.getvalue()
-    path = stored(tmp_path, PACKERS[packer](good))
-    check_fits(path, ObservationError, whole=True)
-    with fits.open(io.BytesIO(good)) as opened:
-        places = [(i, h.fileinfo()) for i, h in enumerate(opened)]
-    for number, info in places:
-        for place, keyword, read in (
-            (info["datLoc"] + 1, "DATASUM = '.*' does not match the data", None),
-            (info["datLoc"] - 1, "CHECKSUM = '.*' does not match", number + 1),
-        ):
-            # the primary HDU has no data
-            if read is None and not info["datSpan"]:
-                continue
-            spoiled = bytearray(good)
-            spoiled[place] ^= 2
-            stored(tmp_path, PACKERS[packer](bytes(spoiled)))
-            refused(path, f"{keyword} in HDU {number}: it was changed")
-            if read is not None:
-                refused(path, f"{keyword} in HDU {number}", count=read)
-    blank = re.sub(rb"(?<=M= ')[^']{16}|(?<=M = ')\d*", lambda m: b" " * len(m[0]), good)
-    absent = good.replace(b"CHECKSUM=", b"CHECKSUN=").replace(b"DATASUM =", b"DATASUN =")
-    for content in (blank, absent):
-        assert content != good
-        check_fits(stored(tmp_path, PACKERS[packer](content)), ObservationError, whole=True)
+    for packer in PACKERS:
+        buffer = io.BytesIO()
+        image = np.arange(2000, dtype="i2").reshape(40, 50)
+        hdus = [fits.ImageHDU(image), fits.CompImageHDU(image), fits.ImageHDU(image.astype("u2"))]
+        hdus = [fits.PrimaryHDU(), *hdus, fits.BinTableHDU(np.array([(1, 2.0)], dtype="i4,f8"))]
+        fits.HDUList(hdus).writeto(buffer, checksum=True)
+        good = buffer.getvalue()
+        path = stored(tmp_path, PACKERS[packer](good))
+        check_fits(path, ObservationError, whole=True)
+        with fits.open(io.BytesIO(good)) as opened:
+            places = [(i, h.fileinfo()) for i, h in enumerate(opened)]
+        for number, info in places:
+            for place, keyword, read in (
+                (info["datLoc"] + 1, "DATASUM = '.*' does not match the data", None),
+                (info["datLoc"] - 1, "CHECKSUM = '.*' does not match", number + 1),
+            ):
+                # the primary HDU has no data
+                if read is None and not info["datSpan"]:
+                    continue
+                spoiled = bytearray(good)
+                spoiled[place] ^= 2
+                stored(tmp_path, PACKERS[packer](bytes(spoiled)))
+                refused(path, f"{keyword} in HDU {number}: it was changed")
+                if read is not None:
+                    refused(path, f"{keyword} in HDU {number}", count=read)
+        blank = re.sub(rb"(?<=M= ')[^']{16}|(?<=M = ')\d*", lambda m: b" " * len(m[0]), good)
+        absent = good.replace(b"CHECKSUM=", b"CHECKSUN=").replace(b"DATASUM =", b"DATASUN =")
+        for content in (blank, absent):
+            assert content != good, packer
+            check_fits(stored(tmp_path, PACKERS[packer](content)), ObservationError, whole=True)
 
 
 # ---- files that are good ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("packer", PACKERS)
-@pytest.mark.parametrize("name", GOOD)
-def test_good_files_pass(tmp_path, name, packer):
-    check_fits(stored(tmp_path, PACKERS[packer](GOOD[name])), ObservationError, whole=True)
+def test_good_files_pass(tmp_path):
+    for packer in PACKERS:
+        for name in GOOD:
+            check_fits(stored(tmp_path, PACKERS[packer](GOOD[name])), ObservationError, whole=True)
 
 
-@pytest.mark.parametrize("packer", PACKERS)
-@pytest.mark.parametrize("name", GOOD)
-def test_each_header_is_found(tmp_path, name, packer):
+def test_each_header_is_found(tmp_path):
     """Sizes of data are those of astropy: else what follows them would be missed."""
-    with fits.open(io.BytesIO(GOOD[name])) as hdus:
-        n = len(hdus)
-    content = GOOD[name] + block("XTENSION= 'IMAGE   '", "NAXIS   = 5000", "END")
-    refused(stored(tmp_path, PACKERS[packer](content)), f"NAXIS = 5000 in header {n}, up to 999")
+    for packer in PACKERS:
+        for name in GOOD:
+            with fits.open(io.BytesIO(GOOD[name])) as hdus:
+                n = len(hdus)
+            content = GOOD[name] + block("XTENSION= 'IMAGE   '", "NAXIS   = 5000", "END")
+            refused(
+                stored(tmp_path, PACKERS[packer](content)), f"NAXIS = 5000 in header {n}, up to 999"
+            )
 
 
-@pytest.mark.parametrize("packer", PACKERS)
-@pytest.mark.parametrize("name", sorted(set(GOOD) - {"nothing"}))
-def test_data_that_are_cut_off(tmp_path, name, packer):
+def test_data_that_are_cut_off(tmp_path):
     """The last block of data is missing: only who needs all of them minds."""
-    path = stored(tmp_path, PACKERS[packer](GOOD[name][:-2880]))
-    check_fits(path, ObservationError)
-    refused(path, r"truncated: the data of HDU \d are not whole", whole=True)
+    for packer in PACKERS:
+        for name in sorted(set(GOOD) - {"nothing"}):
+            path = stored(tmp_path, PACKERS[packer](GOOD[name][:-2880]))
+            check_fits(path, ObservationError)
+            refused(path, r"truncated: the data of HDU \d are not whole", whole=True)
 
 
 def test_which_data_are_cut_off(tmp_path):
@@ -171,10 +173,10 @@ def test_only_headers_that_are_wanted_are_looked_at(tmp_path):
     refused(path, "NAXIS = 5000 in header 2, up to 999 are allowed", count=3)
 
 
-@pytest.mark.parametrize("packer", PACKERS)
-@pytest.mark.parametrize("content", [b"no FITS file", b"x" * 100_000, block("XTENSION= 'A'")])
-def test_files_of_another_kind(tmp_path, packer, content):
-    refused(stored(tmp_path, PACKERS[packer](content)), r"some.fits: is not a FITS file$")
+def test_files_of_another_kind(tmp_path):
+    for packer in PACKERS:
+        for content in [b"no FITS file", b"x" * 100_000, block("XTENSION= 'A'")]:
+            refused(stored(tmp_path, PACKERS[packer](content)), r"some.fits: is not a FITS file$")
 
 
 def test_remains_behind_the_last_part_do_no_harm(tmp_path):
@@ -185,12 +187,12 @@ def test_remains_behind_the_last_part_do_no_harm(tmp_path):
         assert len(file) == 3
 
 
-@pytest.mark.parametrize(("first", "later", "blocks"), [(0, 7000, 0), (3, 0, 1), (2881, 1, 2)])
-def test_the_first_of_two_cards_of_one_keyword_counts(tmp_path, first, later, blocks):
-    axes = "NAXIS   = 1", f"NAXIS1  = {first}", f"NAXIS1  = {later}"
-    content = block(SIMPLE, "BITPIX  = 8", *axes, "END") + b"\0" * 2880 * blocks
-    content += block("XTENSION= 'IMAGE   '", "NAXIS   = 5000", "END")
-    refused(stored(tmp_path, content), "NAXIS = 5000 in header 1")
+def test_the_first_of_two_cards_of_one_keyword_counts(tmp_path):
+    for first, later, blocks in [(0, 7000, 0), (3, 0, 1), (2881, 1, 2)]:
+        axes = "NAXIS   = 1", f"NAXIS1  = {first}", f"NAXIS1  = {later}"
+        content = block(SIMPLE, "BITPIX  = 8", *axes, "END") + b"\0" * 2880 * blocks
+        content += block("XTENSION= 'IMAGE   '", "NAXIS   = 5000", "END")
+        refused(stored(tmp_path, content), "NAXIS = 5000 in header 1")
 
 
 def test_a_card_that_only_begins_like_the_end(tmp_path):
@@ -208,16 +210,16 @@ def test_without_axes_there_are_no_data(tmp_path):
 # ---- files that are not -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("packer", PACKERS)
-@pytest.mark.parametrize("key", ["NAXIS", "TFIELDS"])
-@pytest.mark.parametrize("value", ["1000", "9" * 19, "9" * 70, "+5000", "1000 / of axes"])
-def test_more_axes_or_columns_than_there_can_be(tmp_path, packer, key, value):
-    content = block(SIMPLE, f"{key:8}= {value:>20}", "END")
-    number = value.split()[0].lstrip("+")
-    refused(
-        stored(tmp_path, PACKERS[packer](content)),
-        rf"not a readable FITS file: {key} = {number} in header 0, up to 999 are allowed",
-    )
+def test_more_axes_or_columns_than_there_can_be(tmp_path):
+    for packer in PACKERS:
+        for key in ["NAXIS", "TFIELDS"]:
+            for value in ["1000", "9" * 19, "9" * 70, "+5000", "1000 / of axes"]:
+                content = block(SIMPLE, f"{key:8}= {value:>20}", "END")
+                number = value.split()[0].lstrip("+")
+                refused(
+                    stored(tmp_path, PACKERS[packer](content)),
+                    rf"not a readable FITS file: {key} = {number} in header 0, up to 999 are",
+                )
 
 
 def test_as_many_axes_as_the_standard_allows(tmp_path):
@@ -251,14 +253,14 @@ def test_too_many_parts(tmp_path):
     refused(path, f"more than {MOST_HDUS} HDUs")
 
 
-@pytest.mark.parametrize("packer", ["gzip", "bzip2", "xz"])
-def test_packed_data_that_would_be_immense(tmp_path, packer):
-    axes = [f"NAXIS{i}  =           1000000" for i in (1, 2)]
-    content = block(SIMPLE, "BITPIX  = 64", "NAXIS   = 2", *axes, "END")
-    refused(
-        stored(tmp_path, PACKERS[packer](content)),
-        r"it would unpack to 80000000\d+ bytes, up to 268435456 are allowed",
-    )
+def test_packed_data_that_would_be_immense(tmp_path):
+    for packer in ["gzip", "bzip2", "xz"]:
+        axes = [f"NAXIS{i}  =           1000000" for i in (1, 2)]
+        content = block(SIMPLE, "BITPIX  = 64", "NAXIS   = 2", *axes, "END")
+        refused(
+            stored(tmp_path, PACKERS[packer](content)),
+            r"it would unpack to 80000000\d+ bytes, up to 268435456 are allowed",
+        )
 
 
 def test_plain_data_that_would_be_immense_are_only_cut_off(tmp_path):
@@ -269,16 +271,18 @@ def test_plain_data_that_would_be_immense_are_only_cut_off(tmp_path):
     refused(path, "the data of HDU 0 are not whole", whole=True)
 
 
-@pytest.mark.parametrize("key", ["NAXIS", "NAXIS1", "NAXIS17", "PCOUNT", "GCOUNT", "TFIELDS"])
-def test_negative_sizes_would_lead_back_for_ever(tmp_path, key):
-    content = block(SIMPLE, "BITPIX  = -32", "NAXIS   = 1", "NAXIS1  = 3", f"{key:8}= -1", "END")
-    refused(stored(tmp_path, content), f"{key} = -1 in header 0, which must not be negative")
+def test_negative_sizes_would_lead_back_for_ever(tmp_path):
+    for key in ["NAXIS", "NAXIS1", "NAXIS17", "PCOUNT", "GCOUNT", "TFIELDS"]:
+        content = block(
+            SIMPLE, "BITPIX  = -32", "NAXIS   = 1", "NAXIS1  = 3", f"{key:8}= -1", "END"
+        )
+        refused(stored(tmp_path, content), f"{key} = -1 in header 0, which must not be negative")
 
 
-@pytest.mark.parametrize("value", ["T", "'3'", "4.5"])
-def test_strange_sizes_do_not_stop_the_walk(tmp_path, value):
-    content = block(SIMPLE, "BITPIX  = 8", "NAXIS   = 1", f"NAXIS1  = {value}", "END")
-    check_fits(stored(tmp_path, content + b"\0" * 2880), ObservationError)
+def test_strange_sizes_do_not_stop_the_walk(tmp_path):
+    for value in ["T", "'3'", "4.5"]:
+        content = block(SIMPLE, "BITPIX  = 8", "NAXIS   = 1", f"NAXIS1  = {value}", "END")
+        check_fits(stored(tmp_path, content + b"\0" * 2880), ObservationError)
 
 
 def test_a_packed_file_whose_unpacking_takes_all_memory(tmp_path):
@@ -293,10 +297,10 @@ def test_a_packed_file_whose_unpacking_takes_all_memory(tmp_path):
     refused(stored(tmp_path, bytes(packed)), "not a readable FITS file: .*[Mm]emory")
 
 
-@pytest.mark.parametrize("packer", ["gzip", "bzip2", "xz"])
-def test_packed_files_that_are_damaged(tmp_path, packer):
-    packed = PACKERS[packer](GOOD["images"])
-    refused(stored(tmp_path, packed[:60]), "not a readable FITS file")
+def test_packed_files_that_are_damaged(tmp_path):
+    for packer in ["gzip", "bzip2", "xz"]:
+        packed = PACKERS[packer](GOOD["images"])
+        refused(stored(tmp_path, packed[:60]), "not a readable FITS file")
 
 
 def test_archives_are_not_unpacked_to_the_disk(tmp_path):
@@ -309,38 +313,37 @@ def test_archives_are_not_unpacked_to_the_disk(tmp_path):
 # ---- the door ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
+def test_what_is_no_file_of_this_kind(tmp_path):
+    for make, words in [
         (lambda path: None, "no such file"),
         (lambda path: path.mkdir(), "is a folder, not a file"),
         (lambda path: path.write_text("a text"), "is not a FITS file"),
         (lambda path: path.write_bytes(b""), "Empty or corrupt FITS file"),
-    ],
-)
-def test_what_is_no_file_of_this_kind(tmp_path, make, words):
-    path = tmp_path / "some.fits"
-    make(path)
-    for opened in (check_fits, open_fits, primary_header):
-        with pytest.raises(ObservationError, match=words):
-            opened(path, ObservationError)
+    ]:
+        path = tmp_path / f"{len(words)}.fits"
+        make(path)
+        for opened in (check_fits, open_fits, primary_header):
+            with pytest.raises(ObservationError, match=words):
+                opened(path, ObservationError)
 
 
-@pytest.mark.parametrize("packer", PACKERS)
-@pytest.mark.parametrize("name", GOOD)
-def test_astropy_reads_what_is_opened(tmp_path, name, packer):
-    path = stored(tmp_path, PACKERS[packer](GOOD[name]))
-    with open_fits(path) as stream:
-        assert stream.read() == GOOD[name]
-        stream.seek(0)
-        with fits.open(stream) as hdus, fits.open(io.BytesIO(GOOD[name])) as expected:
-            assert len(hdus) == len(expected)
-            # astropy adds cards of its own to some
-            known = dict(expected[0].header)
-            assert {key: known[key] for key in primary_header(path)} == dict(primary_header(path))
-    # a file is mapped, what was packed is in memory
-    assert isinstance(stream, io.BytesIO) is (packer != "plain")
-    assert stream.closed
+def test_astropy_reads_what_is_opened(tmp_path):
+    for packer in PACKERS:
+        for name in GOOD:
+            path = stored(tmp_path, PACKERS[packer](GOOD[name]))
+            with open_fits(path) as stream:
+                assert stream.read() == GOOD[name], (packer, name)
+                stream.seek(0)
+                with fits.open(stream) as hdus, fits.open(io.BytesIO(GOOD[name])) as expected:
+                    assert len(hdus) == len(expected), (packer, name)
+                    # astropy adds cards of its own to some
+                    known = dict(expected[0].header)
+                    assert {key: known[key] for key in primary_header(path)} == dict(
+                        primary_header(path)
+                    ), (packer, name)
+            # a file is mapped, what was packed is in memory
+            assert isinstance(stream, io.BytesIO) is (packer != "plain"), (packer, name)
+            assert stream.closed, (packer, name)
 
 
 def test_a_header_alone_of_an_immense_packed_file(tmp_path):
@@ -353,17 +356,17 @@ def test_a_header_alone_of_an_immense_packed_file(tmp_path):
     refused(path, "it would unpack to")
 
 
-@pytest.mark.parametrize("card", ["GROUPS  = 'x", "XTENSION= IMAGE", "SIMPLE  = ="])
-def test_a_damaged_card_in_a_packed_file_does_not_lead_back(tmp_path, card):
+def test_a_damaged_card_in_a_packed_file_does_not_lead_back(tmp_path):
     """Astropy takes the size of the packed file for that of what is in it."""
-    part = block("XTENSION= 'IMAGE   '", card, "BITPIX  = 8", "NAXIS   = 0", "END")
-    path = stored(tmp_path, gzip.compress(block(*NOTHING, "END") + part))
-    start = time.process_time()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with readable_fits(path), open_fits(path) as stream, fits.open(stream) as hdus:
-            assert len(hdus) <= 3
-    assert time.process_time() - start < 2
+    for card in ["GROUPS  = 'x", "XTENSION= IMAGE", "SIMPLE  = ="]:
+        part = block("XTENSION= 'IMAGE   '", card, "BITPIX  = 8", "NAXIS   = 0", "END")
+        path = stored(tmp_path, gzip.compress(block(*NOTHING, "END") + part))
+        start = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with readable_fits(path), open_fits(path) as stream, fits.open(stream) as hdus:
+                assert len(hdus) <= 3, card
+        assert time.process_time() - start < 2, card
 
 
 def test_other_errors_of_the_block(tmp_path):

@@ -16,7 +16,8 @@ from astropolcal import calibrate, diagnose, instruments, optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError
 from astropolcal.instruments import CHARIS, Instrument, SkyLaw
-from astropolcal.measurement import FreeParameters, Measurement
+from astropolcal.measurement import Measurement
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import Observations
 from astropolcal.observations.quality import is_star
 from astropolcal.simulation import half_wave_plate_cycles, simulate
@@ -65,11 +66,9 @@ def _setup(**meta):
 # --- registry -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name", ["charis", "CHARIS", "SCExAO/CHARIS", "scexao/charis", "Subaru/SCExAO/CHARIS"]
-)
-def test_get_knows_name_and_aliases_in_any_case(name):
-    assert isinstance(instruments.get(name), CHARIS)
+def test_get_knows_name_and_aliases_in_any_case():
+    for name in ["charis", "CHARIS", "SCExAO/CHARIS", "scexao/charis", "Subaru/SCExAO/CHARIS"]:
+        assert isinstance(instruments.get(name), CHARIS), name
 
 
 def test_get_suggests_a_near_match():
@@ -100,12 +99,10 @@ def test_name_that_is_taken_is_refused(registry):
         instruments.register(other)
 
 
-@pytest.mark.parametrize(
-    "thing", [CHARIS(), int, "charis", type("Nameless", (Plugin,), {"name": ""})]
-)
-def test_only_named_instrument_classes_are_registered(registry, thing):
-    with pytest.raises(InstrumentError, match="not an Instrument with a name"):
-        instruments.register(thing)
+def test_only_named_instrument_classes_are_registered(registry):
+    for thing in [CHARIS(), int, "charis", type("Nameless", (Plugin,), {"name": ""})]:
+        with pytest.raises(InstrumentError, match="not an Instrument with a name"):
+            instruments.register(thing)
 
 
 def test_entry_point_is_listed_without_being_loaded(entry_point):
@@ -144,19 +141,19 @@ def test_base_class_cannot_be_used_itself():
         Instrument()
 
 
-@pytest.mark.parametrize("name", instruments.names())
-def test_every_instrument_gives_a_chain_that_predicts(name):
-    instrument = instruments.get(name)
-    chain = instrument.chain()
-    assert all(leaf.name for leaf in leaves(chain))
-    assert instrument.references
-    assert instrument.name in repr(instrument)
-    for leaf in leaves(chain):
-        for key in leaf.param_names:
-            low, high = getattr(leaf, key).bounds
-            value = getattr(leaf, key).value
-            assert np.all(value >= (-np.inf if low is None else low)), f"{leaf.name}.{key}"
-            assert np.all(value <= (np.inf if high is None else high)), f"{leaf.name}.{key}"
+def test_every_instrument_gives_a_chain_that_predicts():
+    for name in instruments.names():
+        instrument = instruments.get(name)
+        chain = instrument.chain()
+        assert all(leaf.name for leaf in leaves(chain)), name
+        assert instrument.references, name
+        assert instrument.name in repr(instrument), name
+        for leaf in leaves(chain):
+            for key in leaf.param_names:
+                low, high = getattr(leaf, key).bounds
+                value = getattr(leaf, key).value
+                assert np.all(value >= (-np.inf if low is None else low)), f"{leaf.name}.{key}"
+                assert np.all(value <= (np.inf if high is None else high)), f"{leaf.name}.{key}"
 
 
 # --- the chain of CHARIS ----------------------------------------------------------
@@ -176,13 +173,10 @@ def test_unpolarized_chain_begins_with_the_fold_mirror():
     assert not chain["fold_mirror"].diattenuation.fixed
 
 
-@pytest.mark.parametrize(
-    ("derotator", "count"),
-    [("elliptical", 5 + 4 * N_BINS), ("linear", 5 + 2 * N_BINS)],  # 93 as in the paper, and 49
-)
-def test_number_of_free_parameters(derotator, count):
-    chain = CHARIS().chain(derotator=derotator)
-    assert FreeParameters([chain], N_BINS).size == count
+def test_number_of_free_parameters():
+    for derotator, count in [("elliptical", 5 + 4 * N_BINS), ("linear", 5 + 2 * N_BINS)]:
+        chain = CHARIS().chain(derotator=derotator)
+        assert FreeParameters([chain], N_BINS).size == count, (derotator, count)
 
 
 def test_dichroic_adds_no_free_parameter_and_no_change():
@@ -193,16 +187,16 @@ def test_dichroic_adds_no_free_parameter_and_no_change():
     np.testing.assert_allclose(with_it(wavelength, *light)[1], without(wavelength, *light)[1])
 
 
-@pytest.mark.parametrize(
-    ("bounds", "expected"),
-    [
+def test_bounds_of_the_derotator():
+    for bounds, expected in [
         ("physical", {"horizontal": (-360, 360), "diagonal": (-360, 360), "circular": (-360, 360)}),
         ("paper", {"horizontal": (-360, 0), "diagonal": (-360, 0), "circular": (0, 360)}),
-    ],
-)
-def test_bounds_of_the_derotator(bounds, expected):
-    derotator = CHARIS().chain(bounds=bounds)["derotator"]
-    assert {key: getattr(derotator, key).bounds for key in expected} == expected
+    ]:
+        derotator = CHARIS().chain(bounds=bounds)["derotator"]
+        assert {key: getattr(derotator, key).bounds for key in expected} == expected, (
+            bounds,
+            expected,
+        )
 
 
 def test_bounds_of_the_paper():
@@ -227,27 +221,23 @@ def test_chain_follows_the_wavelength_grid():
     assert chain["wollaston"].efficiency.shape == (3,)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_unknown_choice_is_refused():
+    for options, words in [
         ({"source": "moon"}, r"source = 'moon'; allowed are polarized, unpolarized"),
         ({"source": "star", "m3": "glass"}, r"m3 = 'glass'; allowed are free, power law, metal"),
         ({"derotator": "round"}, r"derotator = 'round'; allowed are elliptical, linear"),
         ({"bounds": "none"}, r"bounds = 'none'; allowed are physical, paper"),
         ({"optics_in": ["lens"]}, r"charis: optics_in = 'lens'; allowed are nbs, dichroic"),
-    ],
-)
-def test_unknown_choice_is_refused(options, words):
-    with pytest.raises(InstrumentError, match=words):
-        CHARIS().chain(**options)
+    ]:
+        with pytest.raises(InstrumentError, match=words):
+            CHARIS().chain(**options)
 
 
 # --- setup from a table -------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("meta", "expected"),
-    [
+def test_setup_reads_what_is_in_the_beam():
+    for meta, expected in [
         ({"nasmyth_beam_switcher": "installed"}, ("nbs",)),
         ({"nasmyth_beam_switcher": " Not Installed "}, ()),
         ({"nasmyth_beam_switcher": "not installed", "date": "2025-11-01"}, ()),
@@ -257,24 +247,22 @@ def test_unknown_choice_is_refused(options, words):
         ({"date": date(2025, 7, 31)}, ()),
         ({"date": "2025-10-05", "yjh50_dichroic": "in"}, ("dichroic", "nbs")),
         ({"date": "2025-07-15", "yjh50_dichroic": "out"}, ()),
-    ],
-)
-def test_setup_reads_what_is_in_the_beam(meta, expected):
-    assert _setup(source="polarized", **meta) == ("polarized", expected)
+    ]:
+        assert _setup(source="polarized", **meta) == ("polarized", expected), (meta, expected)
 
 
-@pytest.mark.parametrize("day", [None, "2025-09-01", "2025-10", " "])
-def test_inconclusive_date_is_an_error(day):
-    meta = {} if day is None else {"date": day}
-    with pytest.raises(InstrumentError, match="neither nasmyth_beam_switcher nor a conclusive"):
-        _setup(source="polarized", **meta)
+def test_inconclusive_date_is_an_error():
+    for day in [None, "2025-09-01", "2025-10", " "]:
+        meta = {} if day is None else {"date": day}
+        with pytest.raises(InstrumentError, match="neither nasmyth_beam_switcher nor a conclusive"):
+            _setup(source="polarized", **meta)
 
 
-@pytest.mark.parametrize("key", ["nasmyth_beam_switcher", "yjh50_dichroic"])
-def test_word_that_is_not_understood_is_an_error(key):
-    meta = {"date": "2025-10-05", key: "perhaps"}
-    with pytest.raises(InstrumentError, match=f"night: {key} is 'perhaps'; allowed are"):
-        _setup(source="polarized", **meta)
+def test_word_that_is_not_understood_is_an_error():
+    for key in ["nasmyth_beam_switcher", "yjh50_dichroic"]:
+        meta = {"date": "2025-10-05", key: "perhaps"}
+        with pytest.raises(InstrumentError, match=f"night: {key} is 'perhaps'; allowed are"):
+            _setup(source="polarized", **meta)
 
 
 def test_spelling_of_a_source_does_not_matter():
@@ -290,11 +278,11 @@ def test_spelling_of_a_source_does_not_matter():
         assert is_star(spelling) == ("star" in source)
 
 
-@pytest.mark.parametrize("source", ["moon", "unpolarized_standard", None])
-def test_source_that_is_not_supported_is_an_error(source):
-    meta = {"date": "2025-10-05"} | ({} if source is None else {"source": source})
-    with pytest.raises(InstrumentError, match=r"night: source .*allowed are polarized"):
-        _setup(**meta)
+def test_source_that_is_not_supported_is_an_error():
+    for source in ["moon", "unpolarized_standard", None]:
+        meta = {"date": "2025-10-05"} | ({} if source is None else {"source": source})
+        with pytest.raises(InstrumentError, match=r"night: source .*allowed are polarized"):
+            _setup(**meta)
 
 
 # --- chains for several datasets ------------------------------------------------------
@@ -418,11 +406,13 @@ def test_published_chain_of_the_instrument_agrees_with_the_table(published):
     assert chain["calibration_polarizer"].theta.value == pytest.approx(90 + given["offset_cal_deg"])
 
 
-@pytest.mark.parametrize("name", ["charis", "irdis", "vampires"])
-def test_on_sky_needs_a_half_wave_plate(name):
-    chain = optics.LinearPolarizer(name="polarizer") | optics.WollastonPrism(name="wollaston")
-    with pytest.raises(ChainError, match=f"{name}: the chain has no optic 'hwp' to put the tel"):
-        instruments.get(name).on_sky(chain)
+def test_on_sky_needs_a_half_wave_plate():
+    for name in ["charis", "irdis", "vampires"]:
+        chain = optics.LinearPolarizer(name="polarizer") | optics.WollastonPrism(name="wollaston")
+        with pytest.raises(
+            ChainError, match=f"{name}: the chain has no optic 'hwp' to put the tel"
+        ):
+            instruments.get(name).on_sky(chain)
 
 
 # --- nothing outside of this folder knows an instrument -------------------------------------
@@ -438,7 +428,7 @@ DEFAULT = "instrument that a command takes where nothing names one"
 ALLOWED = {
     ("gap/_bench.py", "charis"): "instrument on which challenges run by default",
     ("gap/effects/library.py", "dichroic"): "place of an effect, in a chain with or without one",
-    ("reduction/pypolcal.py", "SCExAO/CHARIS"): "the software whose tables are read has only it",
+    ("reduction/tables.py", "SCExAO/CHARIS"): "the software whose tables are read has only it",
     ("scripts/_calibrate.py", "charis_example.ecsv"): "packaged data",
     ("scripts/_calibrate.py", "--m3"): "option of the command line, and of two chains",
     ("scripts/_calibrate.py", "m3"): "option of the command line, and of two chains",
@@ -502,6 +492,7 @@ vampires_only = chain["nbs"]
     assert set(_named(code, {"nbs"})) == {"SCExAO/CHARIS", "vampires_only", "nbs"}
 
 
+@pytest.mark.slow
 def test_no_code_outside_of_the_folder_names_an_instrument():
     """What a new instrument needs is in its file: nothing else may tell one from another."""
     private, found = _private_names(), {}

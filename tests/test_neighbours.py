@@ -120,9 +120,10 @@ def test_what_a_matrix_is_made_of(katsu, py_pol, strength, angle, retardance):
     """Diattenuation and retardance of a retarder behind a diattenuator."""
     first = mueller.rotate(mueller.diattenuator(strength), angle * u.rad)
     matrix = mueller.linear_retarder(retardance * u.rad) @ first
-    assert mueller.diattenuation(matrix) == pytest.approx(katsu.diattenuation_from_mueller(matrix))
+    found = np.linalg.norm(mueller.diattenuation_vector(matrix))
+    assert found == pytest.approx(katsu.diattenuation_from_mueller(matrix))
     theirs = py_pol.Mueller().from_matrix(matrix).parameters
-    assert mueller.diattenuation(matrix) == pytest.approx(theirs.diattenuation())
+    assert found == pytest.approx(theirs.diattenuation())
     vector = mueller.retardance_vector(matrix).to_value(u.rad)
     assert np.linalg.norm(vector) == pytest.approx(retardance, abs=1e-6)
 

@@ -167,9 +167,8 @@ def test_generator_goes_on_where_it_stands(chain, frames):
 # --- bad input ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_bad_numbers_are_refused(chain, frames):
+    for options, words in [
         ({"flux": 0.0}, "flux = 0.0 must be finite and positive"),
         ({"flux": -1.0}, "flux"),
         ({"flux": np.nan}, "flux"),
@@ -182,11 +181,9 @@ def test_generator_goes_on_where_it_stands(chain, frames):
         ({"read_noise": 1e300}, r"read_noise = 1e\+300: allowed is up to 1e\+18"),
         ({"flux": np.ones(4)}, r"flux has shape \(4,\).*allowed are a scalar or \(3,\)"),
         ({"lamp": np.ones(5)}, r"lamp \(5,\).*\(24,\)"),
-    ],
-)
-def test_bad_numbers_are_refused(chain, frames, options, words):
-    with pytest.raises(ParameterError, match=words):
-        simulate(chain, WAVELENGTH, frames, **options)
+    ]:
+        with pytest.raises(ParameterError, match=words):
+            simulate(chain, WAVELENGTH, frames, **options)
 
 
 def test_unphysical_chain_is_refused(frames):
@@ -239,42 +236,38 @@ def test_true_angle_goes_before_the_commanded_one():
     assert right.min() >= 0.0
 
 
-@pytest.mark.parametrize(
-    ("flux", "lamp", "expected"),
-    [
+def test_flux_that_enters_is_lamp_times_flux():
+    for flux, lamp, expected in [
         (10.0, None, [[10, 10], [10, 10], [10, 10]]),
         ([10.0, 20.0], None, [[10, 20], [10, 20], [10, 20]]),
         (10.0, [1.0, 0.5, 2.0], [[10, 10], [5, 5], [20, 20]]),
         ([10.0, 20.0], [1.0, 0.5, 2.0], [[10, 20], [5, 10], [20, 40]]),
-    ],
-)
-def test_flux_that_enters_is_lamp_times_flux(flux, lamp, expected):
-    assert entering_flux(flux, lamp, 3, 2).tolist() == expected
+    ]:
+        assert entering_flux(flux, lamp, 3, 2).tolist() == expected, (flux, lamp, expected)
 
 
-@pytest.mark.parametrize(
-    ("flux", "lamp", "words"),
-    [
+def test_flux_of_another_shape_or_sign_is_refused():
+    for flux, lamp, words in [
         ([1.0, 2.0, 3.0], None, r"flux has shape \(3,\) and lamp \(3,\); allowed are a scalar or"),
         (1.0, [1.0, 2.0], r"lamp \(2,\)"),
         (0.0, None, "flux = 0.0 must be finite and positive"),
         (np.inf, None, "flux = inf must be finite"),
         (1.0, [1.0, -1.0, 1.0], "lamp = .* must be finite and positive"),
-    ],
-)
-def test_flux_of_another_shape_or_sign_is_refused(flux, lamp, words):
-    with pytest.raises(ParameterError, match=words):
-        entering_flux(flux, lamp, 3, 2)
+    ]:
+        with pytest.raises(ParameterError, match=words):
+            entering_flux(flux, lamp, 3, 2)
 
 
 # --- seeds ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [-1, 1.5, "a"])
-@pytest.mark.parametrize("noise", [True, False])
-def test_seed_that_is_none_is_refused(chain, frames, seed, noise):
-    with pytest.raises(ParameterError, match=f"seed = {seed!r}; allowed are whole numbers from 0"):
-        simulate(chain, WAVELENGTH, frames, seed=seed, noise=noise)
+def test_seed_that_is_none_is_refused(chain, frames):
+    for seed in [-1, 1.5, "a"]:
+        for noise in [True, False]:
+            with pytest.raises(
+                ParameterError, match=f"seed = {seed!r}; allowed are whole numbers from 0"
+            ):
+                simulate(chain, WAVELENGTH, frames, seed=seed, noise=noise)
 
 
 def test_seed_is_returned_and_a_generator_left_as_it_is():

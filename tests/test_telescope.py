@@ -23,7 +23,7 @@ from astropolcal.instruments.telescope import (
     telescope,
     tertiary_mirror,
 )
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations import Observations
 from astropolcal.optics import PolarizedSource
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from astropolcal import mueller
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.materials import FUSED_SILICA, GOLD, get_material
-from astropolcal.thinfilm import Reflection, fresnel, reflect
+from astropolcal.thinfilm import Reflection, reflect
 
 REAL = st.floats(1.05, 4.0)
 DEGREES = st.floats(0.0, 88.0)
@@ -24,6 +24,11 @@ def stacks(draw, indices=REAL | METAL, substrate=REAL | METAL):
     """Incidence, films and substrate."""
     films = draw(st.lists(st.tuples(indices, MICRON), max_size=4))
     return draw(DEGREES) * u.deg, [(n, d * u.um) for n, d in films], draw(substrate)
+
+
+def fresnel(index, incidence, ambient=1.0):
+    bare = reflect(LIGHT, incidence, index, ambient=ambient)
+    return bare.r_s, bare.r_p
 
 
 # --- closed forms -----------------------------------------------------------------
@@ -273,30 +278,28 @@ def test_names_materials_and_numbers_are_the_same():
     assert by_name.r_p == pytest.approx(by_number.r_p, abs=1e-14)
 
 
-@pytest.mark.parametrize("degrees", [-1, 90, 100, np.nan, np.inf])
-def test_an_impossible_incidence_is_refused(degrees):
-    with pytest.raises(ParameterError, match=r"incidence = .* less than 90 deg"):
-        reflect(LIGHT, degrees * u.deg, "gold")
-    with pytest.raises(ParameterError, match="incidence"):
-        fresnel(1.5, degrees * u.deg)
+def test_an_impossible_incidence_is_refused():
+    for degrees in [-1, 90, 100, np.nan, np.inf]:
+        with pytest.raises(ParameterError, match=r"incidence = .* less than 90 deg"):
+            reflect(LIGHT, degrees * u.deg, "gold")
 
 
-@pytest.mark.parametrize("index", [np.nan, -1.0, 1 - 0.1j, 0, np.inf, [1.5, np.nan]])
-def test_an_impossible_index_is_refused(index):
-    with pytest.raises(ParameterError, match=r"index = .*; allowed are"):
-        reflect(LIGHT, 0 * u.deg, index)
+def test_an_impossible_index_is_refused():
+    for index in [np.nan, -1.0, 1 - 0.1j, 0, np.inf, [1.5, np.nan]]:
+        with pytest.raises(ParameterError, match=r"index = .*; allowed are"):
+            reflect(LIGHT, 0 * u.deg, index)
 
 
-@pytest.mark.parametrize("ambient", [0.0, 1 + 0.1j, -1.0])
-def test_an_absorbing_ambient_is_refused(ambient):
-    with pytest.raises(ParameterError, match=r"ambient = .* real, positive|index = "):
-        fresnel(1.5, 0 * u.deg, ambient=ambient)
+def test_an_absorbing_ambient_is_refused():
+    for ambient in [0.0, 1 + 0.1j, -1.0]:
+        with pytest.raises(ParameterError, match=r"ambient = .* real, positive|index = "):
+            fresnel(1.5, 0 * u.deg, ambient=ambient)
 
 
-@pytest.mark.parametrize("thickness", [-1 * u.nm, np.nan * u.nm, 3, 1 * u.s])
-def test_an_impossible_thickness_is_refused(thickness):
-    with pytest.raises(ParameterError, match="thickness"):
-        reflect(LIGHT, 0 * u.deg, "gold", [(1.5, thickness)])
+def test_an_impossible_thickness_is_refused():
+    for thickness in [-1 * u.nm, np.nan * u.nm, 3, 1 * u.s]:
+        with pytest.raises(ParameterError, match="thickness"):
+            reflect(LIGHT, 0 * u.deg, "gold", [(1.5, thickness)])
 
 
 def test_other_nonsense_is_refused():

@@ -31,9 +31,8 @@ LENGTHS = (u.nm, u.um, u.mm, u.m, u.AA)
 # --- internal units -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("unit", "expected"),
-    [
+def test_internal_unit_of_a_kind():
+    for unit, expected in [
         (u.deg, u.rad),
         ("arcsec", u.rad),
         (u.AA, u.um),
@@ -41,25 +40,29 @@ LENGTHS = (u.nm, u.um, u.mm, u.m, u.AA)
         (u.percent, u.one),
         (None, u.one),
         ("", u.one),
-    ],
-)
-def test_internal_unit_of_a_kind(unit, expected):
-    assert canonical_unit(unit) == expected
+    ]:
+        assert canonical_unit(unit) == expected, (unit, expected)
 
 
-@pytest.mark.parametrize("unit", [u.s, "Hz", u.adu, u.deg / u.um, u.rad**2])
-def test_kind_without_an_internal_unit(unit):
-    for function in (canonical_unit, canonical_factor):
-        with pytest.raises(ParameterError, match="neither an angle, a length nor dimensionless"):
-            function(unit)
+def test_kind_without_an_internal_unit():
+    for unit in [u.s, "Hz", u.adu, u.deg / u.um, u.rad**2]:
+        for function in (canonical_unit, canonical_factor):
+            with pytest.raises(
+                ParameterError, match="neither an angle, a length nor dimensionless"
+            ):
+                function(unit)
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [(u.deg, np.pi / 180), (u.mm, 1e3), (u.nm, 1e-3), (u.percent, 0.01), (None, 1.0), (u.um, 1.0)],
-)
-def test_factor_to_the_internal_unit(unit, factor):
-    assert canonical_factor(unit) == pytest.approx(factor, rel=1e-15)
+def test_factor_to_the_internal_unit():
+    for unit, factor in [
+        (u.deg, np.pi / 180),
+        (u.mm, 1e3),
+        (u.nm, 1e-3),
+        (u.percent, 0.01),
+        (None, 1.0),
+        (u.um, 1.0),
+    ]:
+        assert canonical_factor(unit) == pytest.approx(factor, rel=1e-15), (unit, factor)
 
 
 @given(value=FINITE, unit=st.sampled_from([*ANGLES, *LENGTHS, u.percent]))
@@ -83,32 +86,28 @@ def test_length_survives_the_way_in_and_out(value, unit):
     assert back == pytest.approx(value, rel=1e-12, abs=1e-300)
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (3,), (2, 3), (0,)])
-def test_shape_is_kept_and_the_result_is_plain(shape):
-    found = angle_to_rad(np.full(shape, 180.0) * u.deg)
-    assert type(found) is np.ndarray
-    assert found.shape == shape
-    assert found.dtype == float
-    np.testing.assert_allclose(found, np.pi)
+def test_shape_is_kept_and_the_result_is_plain():
+    for shape in [(), (1,), (3,), (2, 3), (0,)]:
+        found = angle_to_rad(np.full(shape, 180.0) * u.deg)
+        assert type(found) is np.ndarray, shape
+        assert found.shape == shape, shape
+        assert found.dtype == float, shape
+        np.testing.assert_allclose(found, np.pi)
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
+def test_whatever_carries_a_unit():
+    for value in [
         Parameter("x", default=90.0, unit=u.deg),
         QTable({"x": [90.0] * u.deg})["x"],
         Column([90.0], unit=u.deg),
         u.Quantity(np.float32(90), u.deg),
-    ],
-    ids=["parameter", "quantity column", "column", "single precision"],
-)
-def test_whatever_carries_a_unit(value):
-    np.testing.assert_allclose(angle_to_rad(value), np.pi / 2, rtol=1e-7)
+    ]:
+        np.testing.assert_allclose(angle_to_rad(value), np.pi / 2, rtol=1e-7)
 
 
-@pytest.mark.parametrize("value", [3, True, [1, 2], np.float32(0.5), "2.5", (1.0,)])
-def test_plain_numbers_where_there_is_no_unit(value):
-    np.testing.assert_array_equal(to_unit(value, None), np.asarray(value, dtype=float))
+def test_plain_numbers_where_there_is_no_unit():
+    for value in [3, True, [1, 2], np.float32(0.5), "2.5", (1.0,)]:
+        np.testing.assert_array_equal(to_unit(value, None), np.asarray(value, dtype=float))
 
 
 def test_percent_is_a_number_and_a_number_is_percent():
@@ -131,9 +130,8 @@ def test_not_a_number_and_infinity_pass():
 # --- what is refused ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
+def test_what_is_refused_is_named():
+    for call, words in [
         (lambda: angle_to_rad(3.0), r"^angle = 3.0 needs a unit such as rad$"),
         (lambda: angle_to_rad([1, 2], "theta"), r"theta = \[1, 2\] needs a unit such as rad"),
         (lambda: length_to_um(1.6), r"^wavelength = 1.6 needs a unit such as um$"),
@@ -146,11 +144,9 @@ def test_not_a_number_and_infinity_pass():
         (lambda: to_unit([1.0, None], None, "q"), r"q = \[1.0, None\] is not a number"),
         (lambda: to_unit(1j, None, "q"), "q = 1j is complex; allowed are real numbers"),
         (lambda: to_unit([1j] * u.deg, u.deg, "q"), "is complex"),
-    ],
-)
-def test_what_is_refused_is_named(call, words):
-    with pytest.raises(ParameterError, match=words):
-        call()
+    ]:
+        with pytest.raises(ParameterError, match=words):
+            call()
 
 
 # --- numbers and dates as text --------------------------------------------------------------------

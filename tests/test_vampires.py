@@ -249,6 +249,7 @@ def test_lamp_need_not_be_steady_where_states_alternate():
     assert VAMPIRES.prepare(night).mask.sum() == 0
 
 
+@pytest.mark.slow
 def test_calibration_recovers_the_retardances():
     chain, night = run()
     start = VAMPIRES.chains_for([night], derotator="linear")[0]
@@ -262,6 +263,7 @@ def test_calibration_recovers_the_retardances():
     assert np.sqrt(np.mean(found.residuals**2)) < 2e-3
 
 
+@pytest.mark.slow
 def test_one_model_for_all_filters_of_the_real_data(shared_data):
     files = sorted((shared_data / "data" / "vampires").glob("*.ecsv"))
     if not files:

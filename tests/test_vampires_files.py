@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from astropolcal import instruments
 from astropolcal.calibration import calibrate
 from astropolcal.exceptions import InstrumentError, ObservationError
-from astropolcal.instruments.layout import FileLayout
-from astropolcal.instruments.readout import ReadOut
-from astropolcal.instruments.vampires_headers import layout_of, mode_header, slices_of
+from astropolcal.instruments.layout import FileLayout, ReadOut
+from astropolcal.instruments.vampires import layout_of, mode_header, slices_of
 from astropolcal.observations import Observations
 from astropolcal.reduction import reduce_run
 from astropolcal.reduction.cubes import both_states, simulate_cubes
@@ -319,6 +318,7 @@ def test_images_without_an_axis_of_wavelengths(copied):
 # --- from cubes to the truth ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_cubes_give_back_the_truth(tmp_path):
     table = frames(hwp=np.arange(0, 180, 22.5), derotator=[45, 65, 85, 105, 125])
     write(tmp_path, table, flux=1e8)
@@ -334,6 +334,7 @@ def test_cubes_give_back_the_truth(tmp_path):
     assert np.sqrt(np.mean(found.residuals**2)) < 1e-3
 
 
+@pytest.mark.slow
 def test_commands_from_simulation_to_a_corrected_star(tmp_path, capsys):
     cubes, star, table = tmp_path / "cubes", tmp_path / "star", tmp_path / "obs.ecsv"
     cal, summary = tmp_path / "cal.asdf", tmp_path / "star.json"

@@ -88,6 +88,7 @@ def test_triple_differences_are_blind_to_the_relay_and_to_the_cameras():
     assert predicted[TRIPLE] < 0.02
 
 
+@pytest.mark.slow
 def test_errors_of_triple_differences_are_their_scatter():
     clean = Measurement(internal(), lamp(noise=False, flux=1e5), observable=TRIPLE)
     pulls = []
@@ -98,6 +99,7 @@ def test_errors_of_triple_differences_are_their_scatter():
     assert np.std(pulls) == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_fit_of_triple_differences_gives_back_the_truth():
     night, start = lamp(noise=False), internal()
     # triple differences do not see these
@@ -177,6 +179,7 @@ def test_names_of_the_targets():
     assert leaves(chain)[0].name == "star_HD293396"
 
 
+@pytest.mark.slow
 def test_unpolarized_star_calibrates_the_tertiary_mirror():
     truth = VAMPIRES.on_sky(internal())
     meta = META | {"source": "unpolarized standard star", "object": "HD 293396"}

@@ -6,7 +6,7 @@ import numpy as np
 
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 from astropolcal.units import canonical_factor

@@ -16,11 +16,10 @@ import numpy as np
 from astropy.table import QTable
 from astropy.time import Time
 
-from astropolcal import measurement
 from astropolcal.calibration.posterior.samples import Posterior
 from astropolcal.exceptions import AstropolcalError, CalibrationFileError
 from astropolcal.files import one_line
-from astropolcal.measurement import parameter_table
+from astropolcal.measurement import parameter_table, priors
 
 __all__ = []
 
@@ -250,7 +249,7 @@ def _prior(node, name):
     values = [value_from_node(node[key]) for key in _OURS[node["kind"]]]
     # a number of its own type, as it was given
     values = [v if hasattr(v, "unit") else v.item() for v in values]
-    return getattr(measurement, node["kind"].capitalize())(*values)
+    return getattr(priors, node["kind"].capitalize())(*values)
 
 
 # ---- samples of a posterior in a calibration file ----

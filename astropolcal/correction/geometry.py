@@ -52,10 +52,10 @@ def derotate_variance(
     variance, position_angle, *, centre=None, size=None, mirrored=False, order=3, centre_out=None
 ):
     """
-    Return the variances of images turned by `derotate`.
+    Return the variances of images turned by `derotate`, of independent pixels.
 
-    Sums of squared spline weights times the variances. The covariance of neighbouring pixels that
-    resampling makes is not kept.
+    The sum of the squared spline weights times the variance interpolated linearly: exact where the
+    variance is the same within a few pixels. Correlations that resampling makes are not in it.
     """
     variance = np.asarray(variance, dtype=float)
     matrix, offset, shape = _grid(variance, position_angle, centre, size, mirrored, centre_out)
@@ -100,7 +100,7 @@ def _point(name, point):
 
 def _resampled(image, matrix, offset, shape, order):
     # then nothing is interpolated, and quarter turns give back each number bit by bit
-    if _on_pixels(matrix, offset):
+    if np.isin(matrix, (-1.0, 0.0, 1.0)).all() and np.all(np.abs(offset - np.rint(offset)) < 1e-9):
         order = 0
     image, offset = _cropped(image, matrix, offset, shape)
     flat = image.reshape(-1, *image.shape[-2:])
@@ -142,12 +142,6 @@ def _cropped(image, matrix, offset, shape):
         # nothing of the image is there
         return image, offset
     return image[..., low[0] : high[0], low[1] : high[1]], offset - low
-
-
-def _on_pixels(matrix, offset):
-    """Return whether pixels fall on pixels."""
-    whole = np.abs(offset - np.rint(offset)) < 1e-9
-    return bool(np.isin(matrix, (-1.0, 0.0, 1.0)).all() and whole.all())
 
 
 def _outside(matrix, offset, shape, image_shape):

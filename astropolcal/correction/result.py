@@ -372,10 +372,10 @@ class Corrected:
 
 def fractions(stokes, covariances, components="IQU"):
     """
-    Return standard deviations ``q``, ``u``, ``v`` of Q / I, ...
+    Return standard deviations ``q``, ``u``, ``v`` of Q / I and so on, and ``covariance_qu``.
 
-    And ``covariance_qu``, from Stokes parameters (n, ...), I first, and covariances (n, n, ...);
-    infinite where a covariance is, NaN where it is not known or there is no light.
+    From Stokes parameters (n, ...), I first, and covariances (n, n, ...); infinite where a
+    covariance is, NaN where it is not known or there is no light.
     """
     bright = stokes[0] > 0
     light = np.where(bright, stokes[0], 1.0)

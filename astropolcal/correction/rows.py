@@ -20,10 +20,10 @@ from astropolcal.exceptions import (
     ChainError,
     WavelengthRangeError,
 )
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.positions import finite_position
+from astropolcal.optics.core import finite_position
 from astropolcal.pipeline.headers import inner_optics, telescope_optics
 from astropolcal.units import length_to_um
 

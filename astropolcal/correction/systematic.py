@@ -195,7 +195,10 @@ def _draws(model, count, rng):
     start, factors = model.start, model.free.factors()
     posterior = model.calibration.posterior
     if posterior is not None and set(model.free.names) <= set(posterior.names):
-        yield from _of_posterior(model, posterior, count, rng)
+        samples = posterior.samples()
+        columns = [posterior.index(name) for name in model.free.names]
+        for row in samples[rng.integers(len(samples), size=count)]:
+            yield row[columns] * factors
         return
     covariance = full_covariance(model.calibration)
     axes = covariance._axes()
@@ -203,13 +206,6 @@ def _draws(model, count, rng):
     known = axes.known * axes.sigmas[:, None] * axes.steps
     for _ in range(count):
         yield start + rng.standard_normal(len(known)) @ known * factors
-
-
-def _of_posterior(model, posterior, count, rng):
-    samples = posterior.samples()
-    columns = [posterior.index(name) for name in model.free.names]
-    for row in samples[rng.integers(len(samples), size=count)]:
-        yield row[columns] * model.free.factors()
 
 
 def _choice(open_directions):

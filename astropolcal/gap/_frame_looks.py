@@ -50,7 +50,7 @@ class Look:
         self.model, self.problem, self.chains = model, model.problem, model.chains
         self.coefficients, self.out = coefficients, out
         self.vector = self.problem.vector(coefficients)
-        rows = kept_rows(self.problem, out)
+        rows = self.problem.rows([~o for o in out])
         columns = np.concatenate([self.problem.open_slopes(coefficients), self._of_flux()], axis=1)
         #: What the model takes up of a frame that takes part, (n_rows, rank); of one that does
         #: not, how its prediction hangs on the others.
@@ -234,16 +234,6 @@ def _basis(columns, rows):
     full = columns[:, seen] / norm[seen] @ (right[good].T / singular[good])
     # what was in the basis need not be worked out again, and is more exact
     return np.where(rows[:, None], left[:, good], full), left[:, good]
-
-
-def kept_rows(problem, out):
-    """Return which rows belong to frames that take part, (n_rows,) of bool."""
-    return np.concatenate(
-        [
-            np.broadcast_to(~o, channel.shape).ravel()
-            for channel, o in zip(problem.channels, out, strict=True)
-        ]
-    )
 
 
 @dataclass

@@ -76,7 +76,7 @@ class Fitted:
             return None
         problem, full = self.problem, self.model.fit.coefficients
         rows, without = self._rows(name), full.copy()
-        without[rows] = np.concatenate([self._absent(p) for p in self.model.added[name]])
+        without[rows] = self._absent[rows]
         others = np.setdiff1d(np.arange(problem.size), rows)
         lost = problem.residual(without) - problem.residual(full)
         slopes = problem.jacobian(full)[:, others]
@@ -102,27 +102,18 @@ class Fitted:
         rows = self._rows(name)
         rows = rows[~self.is_open[rows]]
         # the centre of the prior is where the last fit began, not where the effect is absent
-        absent = np.concatenate([self._absent(p) for p in self.model.added[name]])
-        moved = self.model.fit.coefficients[self._rows(name)] - absent
-        moved = moved[~self.is_open[self._rows(name)]]
+        moved = self.model.fit.coefficients[rows] - self._absent[rows]
         block = self.covariance[np.ix_(rows, rows)]
         error = np.sqrt(np.diag(block))
         # of unit diagonal, so that units do not matter
-        left, inverse = (
-            moved / error,
-            np.linalg.pinv(block / np.outer(error, error), hermitian=True),
-        )
+        left = moved / error
+        inverse = np.linalg.pinv(block / np.outer(error, error), hermitian=True)
         return float(np.sqrt(max(left @ inverse @ left, 0.0)))
 
-    def _absent(self, parameter):
-        """Return the coefficients at which an effect is absent."""
-        where = self.problem.slices[parameter.name]
-        neutral, size = parameter.canonical_neutral, where.stop - where.start
-        if not self.problem.free.by_name[parameter.name].per_wavelength:
-            return np.broadcast_to(neutral, size)
-        basis = np.eye(size) if parameter.basis is None else parameter.basis
-        neutral = np.broadcast_to(neutral, len(basis))
-        return np.linalg.lstsq(basis, neutral, rcond=None)[0]
+    @property
+    def _absent(self):
+        """Coefficients at which every effect is absent."""
+        return self.problem.coefficients(self.problem._absent())
 
     def trades(self, name):
         """

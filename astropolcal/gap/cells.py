@@ -20,9 +20,9 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap.problem import GapProblem
-from astropolcal.optics import GENERATORS, Dependence
-from astropolcal.optics.perturbations import split_run
-from astropolcal.optics.positions import COORDINATES
+from astropolcal.optics import GENERATORS
+from astropolcal.optics.core import COORDINATES
+from astropolcal.optics.perturbations import Dependence, split_run
 
 __all__ = ["Cell", "Place", "Probes", "dependences", "places"]
 
@@ -70,7 +70,7 @@ class Cell:
         Key of `~astropolcal.optics.GENERATORS`, or ``"background"``,
         ``"background_of_one_beam"``, ``"nonlinearity"``, ``"persistence"``, ``"crosstalk"``.
     dependence : str
-        As `~astropolcal.optics.Dependence` takes it, or ``"flux"`` and ``"previous"``; in one of
+        As `~astropolcal.optics.Perturbation` takes it, or ``"flux"`` and ``"previous"``; in one of
         several runs only with ``"/dataset:NAME"`` behind it.
 
     Examples
@@ -562,7 +562,7 @@ class Probes:
             channel.whiten(slopes.get(i, np.zeros(channel.shape))).ravel()
             for i, channel in enumerate(self.problem.channels)
         ]
-        return np.concatenate(parts)
+        return np.concatenate([*parts, np.zeros(len(self.problem.known))])
 
     def _left(self, slopes):
         """Return how much of it the model cannot take up."""

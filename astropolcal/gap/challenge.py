@@ -106,8 +106,13 @@ def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
         raise GapError(f"{setup.instrument}: has no source on the bench")
     bench = Bench(setup, np.random.default_rng(seed))
     kinds = {"none": [], "pair": [bench.rng.choice(("cell", "listed")) for _ in range(2)]}
-    faults = [Fault(bench, {"type": str(k), **(fault or {})}) for k in kinds.get(kind, [kind])]
-    told = []
+    known, faults, told = fault or {}, [], []
+    for one in kinds.get(kind, [kind]):
+        drawn = Fault(bench, {"type": str(one), **known})
+        # an effect that is there already would be no other fault
+        while "effect" not in known and drawn.told.get("effect") in _effects(faults):
+            drawn = Fault(bench, {"type": str(one), **known})
+        faults.append(drawn)
     for one in faults:
         residual, fit = bench.scale(one, 1.0 if kind == "absorbed" else snr)
         absorbed = one.snr < _INVISIBLE
@@ -125,6 +130,10 @@ def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
         "faults": told,
     }
     return bench.record(bench.expose(faults)), setup.chains(), case
+
+
+def _effects(faults):
+    return {one.told["effect"] for one in faults if one.told.get("effect")}
 
 
 # ---- an answer is scored ----------------------------------------------------------------------

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from astropolcal.gap._frame_looks import Frame, Look, Trial, angle_stages, kept_rows
+from astropolcal.gap._frame_looks import Frame, Look, Trial, angle_stages
 from astropolcal.gap.channels import noise, settings
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
@@ -365,7 +365,7 @@ class Search:
 
     def _look(self, places, coefficients):
         out = _marked(self.problem, places)
-        rows = kept_rows(self.problem, out)
+        rows = self.problem.rows([~o for o in out])
         fit = self.problem.fit(coefficients, rows=rows, steps=_STEPS, share=_SHARE)
         look = Look(self.model, fit.coefficients, out)
         if look.chance > _NOISE:
@@ -382,15 +382,9 @@ class Search:
             seen = zip(self.model.observations, out, strict=True)
             left = [o.with_mask(mask, "accused") if mask.any() else o for o, mask in seen]
             chains = nominal_calibration(chains, left).chains
-        problem = GapProblem(
-            chains,
-            self.model.observations,
-            ties=old.ties,
-            laws=old.laws,
-            priors=old.priors,
-            neutral=old.neutral,
-            limits=old.limits,
-        )
+        keys = ("ties", "laws", "priors", "neutral", "limits")
+        known = {key: getattr(old, key) for key in keys}
+        problem = GapProblem(chains, self.model.observations, **known)
         q = problem.start if look.chance < _NOISE else look.coefficients
         for channel, dataset, residual, without in zip(
             problem.channels, problem.datasets, problem.differences(q), out, strict=True

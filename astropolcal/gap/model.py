@@ -99,7 +99,9 @@ class Model:
     def of_dataset(self, i):
         """Return the model of one of the datasets by itself, fitted with the same noise."""
         mine = self.problem
-        noise = SimpleNamespace(fluxes=[mine.fluxes[i]], channels=[mine.channels[i]], waves=None)
+        noise = SimpleNamespace(
+            fluxes=[mine.fluxes[i]], channels=[mine.channels[i]], waves=None, known=mine.known
+        )
         problem = GapProblem([self.trains[i]], [self.observations[i]], ties=mine.ties, like=noise)
         return Model(problem, problem.fit(problem.start))
 
@@ -331,8 +333,6 @@ def nominal_model(chains, observations, *, calibration=None, like=None, fit=True
     """Fit the nominal chains in both channels, from a calibration that is made if none is given."""
     if calibration is None:
         calibration = nominal_calibration(chains, observations)
-    if calibration.converged is False and fit:
-        raise _no_convergence()
     problem = GapProblem(
         calibration.chains, observations, like=None if like is None else like.problem
     )
@@ -549,9 +549,7 @@ def _mended(problem, slots, coefficients):
     live = np.zeros(problem.size, dtype=bool)
     for slot in slots:
         live[problem.slices[slot.name]] = bad
-    rows = np.concatenate(
-        [np.broadcast_to(bad[d.bins][:, None], c.shape).ravel() for c, d in _datasets(problem)]
-    )
+    rows = problem.rows([bad[d.bins][:, None] for d in problem.datasets])
     best, least = coefficients.copy(), before
     for start in _branches(problem, slots, coefficients, bad):
         trial = problem.fit(start, rows, ~live, steps=_FEW_STEPS).coefficients

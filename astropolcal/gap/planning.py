@@ -25,7 +25,8 @@ from astropolcal.gap.channels import orthonormal
 from astropolcal.gap.effects import Roles
 from astropolcal.gap.problem import OPEN, GapProblem
 from astropolcal.gap.selection import REMAINDER
-from astropolcal.optics import COORDINATES, Dependence
+from astropolcal.optics import COORDINATES
+from astropolcal.optics.perturbations import Dependence
 from astropolcal.simulation import simulate
 
 __all__ = []

@@ -91,9 +91,10 @@ class GapProblem:
         self.neutral, self.limits = dict(neutral or {}), dict(limits or {})
         # what the model holds is held; an effect is what frees it
         chains, observations = [_exact(chain) for chain in chains], list(observations)
-        for name, (middle, spread) in _mounted(chains).items():
-            self.neutral.setdefault(name, middle)
-            self.priors.setdefault(name, spread)
+        mounted = _mounted(chains)
+        #: Angles of what is mounted with care, mean and standard deviation (radian): one datum
+        #: each, also where an effect lets go of them.
+        self.known = mounted if like is None else like.known
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
         #: Functions of the frame on which a cause may depend, once they are known.
         self.waves = None if like is None else like.waves
@@ -116,12 +117,23 @@ class GapProblem:
         edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
         #: Slice of the rows that belongs to each dataset.
         self.segments = [slice(a, b) for a, b in pairwise(edges)]
-        self.n_rows = int(edges[-1])
+        self.n_rows = int(edges[-1]) + len(self.known)
+        self._hold(mounted)
         self.start = self.coefficients(self.free.start())
         self.tight = np.zeros(self.size)
         for name, sigma in self.priors.items():
             self.tight[self.slices[name]] = 1 / sigma
         self.centre = np.where(self.tight > 0, self.coefficients(self._absent()), 0.0)
+
+    def _hold(self, mounted):
+        """Note the rows of what is known of mountings: targets and derivatives."""
+        self._targets = np.zeros(len(self.known))
+        self._holds = np.zeros((len(self.known), self.size))
+        for i, (name, (middle, spread)) in enumerate(self.known.items()):
+            if name in mounted and name in self.slices:
+                self._holds[i, self.slices[name]] = 1 / spread
+                self._targets[i] = middle / spread
+                self.neutral.setdefault(name, middle)
 
     def _absent(self):
         """Return the vector of values about which the priors are."""
@@ -202,7 +214,8 @@ class GapProblem:
     def residual(self, coefficients):
         """Return the whitened residuals, shape (n_rows,)."""
         parts = zip(self.channels, self.differences(coefficients), strict=True)
-        return np.concatenate([channel.whiten(r).ravel() for channel, r in parts])
+        known = self._targets - self._holds @ coefficients
+        return np.concatenate([*(channel.whiten(r).ravel() for channel, r in parts), known])
 
     def jacobian(self, coefficients, whitened=True):
         """Return the derivative of the predicted rows, shape (n_rows, n_coefficients)."""
@@ -212,7 +225,14 @@ class GapProblem:
             slopes = self._slopes(channel, dataset, vector)
             slopes = channel.whiten(slopes) if whitened else slopes
             out[:, rows] = slopes.reshape(self.size, rows.stop - rows.start)
+        out[:, self.n_rows - len(self.known) :] = self._holds.T
         return out.T
+
+    def rows(self, masks):
+        """Return which rows masks (of each dataset, broadcast) keep; what is known is kept."""
+        parts = zip(masks, self.channels, strict=True)
+        kept = [np.broadcast_to(mask, channel.shape).ravel() for mask, channel in parts]
+        return np.concatenate([*kept, np.ones(len(self.known), dtype=bool)])
 
     def _slopes(self, channel, dataset, vector):
         """Return the derivative of a dataset's channels, shape (n_coefficients, 2, W, F)."""
@@ -354,7 +374,8 @@ class GapProblem:
     @property
     def n_data(self):
         """Number of rows that hold data, less the numbers that describe the lamps."""
-        return sum(2 * int(c.valid.sum()) - c.n_nuisance for c in self.channels)
+        known = int(np.count_nonzero(self._holds.any(axis=1)))
+        return known + sum(2 * int(c.valid.sum()) - c.n_nuisance for c in self.channels)
 
     def decomposed(self, coefficients):
         """

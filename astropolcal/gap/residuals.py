@@ -85,9 +85,11 @@ class _Whitened:
     def __init__(self, model):
         problem = model.problem
         self.problem, self.segments = problem, problem.segments
-        self.tangent = problem.tangent(model.fit.coefficients)
-        residual = model.residual
-        self.residual = residual - self.tangent @ (self.tangent.T @ residual)
+        tangent, residual = problem.tangent(model.fit.coefficients), model.residual
+        # what is known of a mounting has no place among the frames
+        seen = slice(0, self.segments[-1].stop)
+        self.tangent = tangent[seen]
+        self.residual = (residual - tangent @ (tangent.T @ residual))[seen]
         self.n_freedom = problem.n_data - self.tangent.shape[1]
         if self.n_freedom < 1:
             raise GapError(

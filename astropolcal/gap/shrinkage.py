@@ -354,21 +354,16 @@ def _normal(jacobian, residual, rows, scale):
 
 def _parts(problem, groups):
     """Yield rows, and whether the part is these or all but these."""
-
-    def rows(rule):
-        parts = zip(problem.datasets, problem.channels, strict=True)
-        return np.concatenate(
-            [np.broadcast_to(rule(i, d), c.shape).ravel() for i, (d, c) in enumerate(parts)]
-        )
-
     if len(problem.wavelength) > 3:
         for half in (0, 1):
-            yield True, rows(lambda i, d, half=half: (d.bins % 2 == half)[:, None])
+            yield True, problem.rows([(d.bins % 2 == half)[:, None] for d in problem.datasets])
     labels, numbers = groups or ((), ())
     # neighbours together where there are many
     bundle = np.arange(len(labels)) * min(len(labels), _MOST_PARTS) // max(len(labels), 1)
     for k in np.unique(bundle):
-        yield False, rows(lambda i, d, k=k: bundle[numbers[i]] == k)
+        out = problem.rows([bundle[number] == k for number in numbers])
+        # what is known is no part of the frames
+        yield False, out & (np.arange(len(out)) < len(out) - len(problem.known))
 
 
 def left_out_fits(model, labels, numbers):
@@ -393,9 +388,5 @@ def left_out_fits(model, labels, numbers):
     []
     """
     for i in range(len(labels)):
-        kept = [
-            np.broadcast_to(number != i, channel.shape).ravel()
-            for number, channel in zip(numbers, model.problem.channels, strict=True)
-        ]
-        rows = np.concatenate(kept)
+        rows = model.problem.rows([number != i for number in numbers])
         yield model.problem.fit(model.fit.coefficients, rows=rows, steps=_STEPS, share=_SHARE)

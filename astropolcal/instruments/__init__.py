@@ -10,11 +10,10 @@ from importlib.metadata import entry_points
 
 from astropolcal.exceptions import InstrumentError
 from astropolcal.files import one_line
-from astropolcal.instruments.base import Instrument
+from astropolcal.instruments.base import Instrument, SkyLaw, add_nuisance
 from astropolcal.instruments.charis import CHARIS
-from astropolcal.instruments.following import SkyLaw
 from astropolcal.instruments.irdis import IRDIS
-from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
+from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.instruments.vampires import VAMPIRES
 from astropolcal.words import did_you_mean
 
@@ -22,13 +21,14 @@ __all__ = [
     "CHARIS",
     "IRDIS",
     "VAMPIRES",
+    "FileLayout",
     "Instrument",
+    "ReadOut",
     "SkyLaw",
     "add_nuisance",
     "get",
     "names",
     "register",
-    "without_nuisance",
 ]
 
 _REGISTRY = {}

@@ -1,19 +1,34 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What an instrument is to astropolcal: its chain, its stages, its tables."""
+"""
+What an instrument is to astropolcal: its chain, its stages, its tables.
+
+With how its stages follow the sky, and the nuisance of a dataset: background in the apertures,
+unequal gains of the beams and the polarization of a lamp that is called unpolarized are optics
+of one dataset, with its name, and with a prior that keeps them small where the data cannot tell
+them from what the datasets share.
+"""
 
 import inspect
+import math
+import re
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import astropy.units as u
 import numpy as np
 
-from astropolcal.chain import join, stages
+from astropolcal import optics
+from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments._choices import check_choice
-from astropolcal.instruments.following import SkyLaw
-from astropolcal.instruments.nuisance import add_nuisance, without_nuisance
-from astropolcal.instruments.telescope import as_exact, behind_telescope, star_options
-from astropolcal.observations.pointings import angle_change, location_of, sky_angles, sky_positions
+from astropolcal.instruments.telescope import _normal, as_exact, behind_telescope, star_options
+from astropolcal.observations.pointings import (
+    TRACKING,
+    angle_change,
+    location_of,
+    sky_angles,
+    sky_positions,
+)
 from astropolcal.observations.quality import (
     is_star,
     mask_incomplete_cycles,
@@ -23,7 +38,231 @@ from astropolcal.observations.quality import (
 )
 from astropolcal.observations.reading import common_wavelengths
 
-__all__ = ["Instrument"]
+__all__ = ["Instrument", "SkyLaw", "add_nuisance"]
+
+
+def check_choice(what, value, allowed):
+    """Raise an InstrumentError if a value is not one of those allowed."""
+    if value not in allowed:
+        words = ", ".join(map(str, allowed)) or "none"
+        raise InstrumentError(f"{what} = {value!r}; allowed are {words}")
+
+
+# what keeps the pupil, or the image, still at a Nasmyth focus
+_NASMYTH = MappingProxyType({"pupil": (0.0, 0.5), "field": (0.5, 0.5)})
+
+
+@dataclass(frozen=True)
+class SkyLaw:
+    r"""
+    How half-wave plate and derotator follow parallactic angle *p* and altitude *a*.
+
+    .. math:: \theta = \theta_0 + f\,p + g\,a
+
+    with the commanded angle, or an offset, :math:`\theta_0`.
+
+    Parameters
+    ----------
+    plate : (float, float) or dict of str to (float, float)
+        (f, g) of the half-wave plate; (0, 0) for one that stays where it is put. Where it depends
+        on what the derotator keeps still, one for each mode, such as ``"field"`` and ``"pupil"``.
+        Without it that of Subaru, (0.5, 1).
+    derotator : dict of str to (float, float)
+        (f, g) of the derotator for each mode; empty where there is none. Without it that of a
+        Nasmyth focus: (0, 0.5) for ``"pupil"``, (0.5, 0.5) for ``"field"``.
+
+    Raises
+    ------
+    InstrumentError
+        If a law is not two finite numbers, or plate and derotator have other modes.
+
+    Examples
+    --------
+    A polarimeter at a Cassegrain focus, which turns with the telescope:
+
+    >>> from astropolcal.instruments import SkyLaw
+    >>> SkyLaw(plate=(0, 0), derotator={}).plate_law()
+    (0.0, 0.0)
+
+    One whose plate has a law of its own for each mode:
+
+    >>> law = SkyLaw(plate={"field": (-1, 1), "pupil": (-0.5, 1)})
+    >>> law.plate_law("pupil"), law.derotator_law("pupil")
+    ((-0.5, 1.0), (0.0, 0.5))
+    """
+
+    plate: object = TRACKING
+    derotator: dict = field(default_factory=lambda: dict(_NASMYTH))
+
+    def __post_init__(self):
+        # one law for all modes has the name ""
+        given = self.plate if isinstance(self.plate, dict) else {"": self.plate}
+        plate = {mode: _pair(f"plate {mode}".strip(), law) for mode, law in given.items()}
+        turns = {mode: _pair(f"derotator {mode}", law) for mode, law in self.derotator.items()}
+        if not plate:
+            raise InstrumentError("plate = {}: at least one law is needed, (0, 0) if it stands")
+        # a frozen instance is set once, here
+        object.__setattr__(self, "plate", plate)
+        object.__setattr__(self, "derotator", turns)
+        # a mode of the plate that the derotator lacks could never be asked for
+        lost = sorted(set(plate) - {""} - set(turns)) if turns else []
+        if lost:
+            raise InstrumentError(
+                f"the plate has a law for {', '.join(lost)}, the derotator for {', '.join(turns)}"
+            )
+
+    @property
+    def modes(self):
+        """What the derotator may keep still, or what the law of the plate depends on."""
+        return tuple(self.derotator) or tuple(mode for mode in self.plate if mode)
+
+    @property
+    def plate_depends_on_mode(self):
+        """Whether the law of the plate is another one in another mode."""
+        # two modes with the same law need not be told apart
+        return len(set(self.plate.values())) > 1
+
+    def plate_law(self, mode=None):
+        """
+        Return the factors of parallactic angle and altitude in the plate's true angle.
+
+        The ``mode``, what the derotator keeps still, is needed where the law depends on it.
+        """
+        if mode is not None and self.modes:
+            check_choice("mode", mode, self.modes)
+        if mode in self.plate:
+            return self.plate[mode]
+        if self.plate_depends_on_mode:
+            check_choice("mode", mode, tuple(self.plate))
+        return next(iter(self.plate.values()))
+
+    def derotator_law(self, mode):
+        """Return the factors of parallactic angle and altitude in the derotator's angle."""
+        if not self.derotator:
+            raise InstrumentError("there is no derotator that follows the sky")
+        check_choice("law", mode, tuple(self.derotator))
+        return self.derotator[mode]
+
+
+def _pair(what, law):
+    try:
+        f, g = (float(number) for number in law)
+    except (TypeError, ValueError):
+        f = g = float("nan")
+    if not (math.isfinite(f) and math.isfinite(g)):
+        raise InstrumentError(
+            f"{what}: {law!r} must be two numbers, factors of parallactic angle and altitude"
+        )
+    return f, g
+
+
+#: What may be added, and the standard deviation of its prior, a normal around zero.
+NUISANCES = {"background": 0.01, "beam_gain": 0.02, "lamp": 0.002}
+
+
+def add_nuisance(chains, datasets, nuisance):
+    """
+    Return the chains with nuisance optics, one of each kind for each dataset.
+
+    ``"background"``, light that is added at a constant flux: the share of it in a frame of median
+    flux, one value per wavelength. ``"beam_gain"``, half the relative difference of the gains
+    of the two beams, one value per wavelength; normalized double differences see it in second
+    order only, single differences in first. ``"lamp"``, q and u of an internal source without
+    polarizer, for all wavelengths; q cannot be told from the diattenuation of a mirror that
+    stands straight, except by the prior.
+
+    Parameters
+    ----------
+    chains : sequence of `~astropy.modeling.CompoundModel`
+        The chain of each dataset.
+    datasets : sequence of Observations
+        The datasets.
+    nuisance : sequence of str
+        Kinds, or ``"KIND:DATASET"`` for one dataset only.
+
+    Returns
+    -------
+    list of `~astropy.modeling.CompoundModel`
+
+    Raises
+    ------
+    InstrumentError
+        If a kind or dataset is unknown, or ``"lamp"`` is asked for where there is no such source.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import instruments
+    >>> from astropolcal.instruments import add_nuisance
+    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
+    >>> charis = instruments.get("charis")
+    >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
+    >>> lamp = simulate(charis.chain(), charis.wavelength, frames, name="night 1")
+    >>> chain, = add_nuisance([charis.chain()], [lamp], ["background"])
+    >>> [optic.name for optic in chain][-2:]
+    ['background_night_1', 'wollaston']
+    """
+    chains, names = list(chains), [observations.name for observations in datasets]
+    # names of optics must do as optic.parameter
+    labels = [re.sub(r"\W+", "_", name) for name in names]
+    # two tables may have one name
+    labels = [f"{t}_{i + 1}" if labels.count(t) > 1 else t for i, t in enumerate(labels)]
+    size = len(common_wavelengths(datasets))
+    for text in nuisance:
+        kind, _, wanted = str(text).partition(":")
+        _check(kind, wanted, names)
+        chosen = [i for i, name in enumerate(names) if wanted in ("", name)]
+        if kind == "lamp":
+            chosen = _lamps(chains, chosen, text)
+        for i in chosen:
+            chains[i] = _added(chains[i], datasets[i], kind, f"{kind}_{labels[i]}", size)
+    return chains
+
+
+def without_nuisance(chain):
+    """Return a chain without the nuisance optics of its dataset."""
+    prefixes = tuple(f"{kind}_" for kind in NUISANCES)
+    found = leaves(chain)
+    kept = [leaf for leaf in found if not str(leaf.name).startswith(prefixes)]
+    return chain if len(kept) == len(found) else join(kept)
+
+
+def _check(kind, wanted, names):
+    if kind not in NUISANCES:
+        raise InstrumentError(f"nuisance {kind!r}; allowed are {', '.join(NUISANCES)}")
+    if wanted and wanted not in names:
+        raise InstrumentError(f"nuisance {kind}: no dataset {wanted!r}; there are {names}")
+
+
+def _lamps(chains, chosen, text):
+    """Return the chains of internal sources without polarizer."""
+    polarized = (optics.LinearPolarizer, optics.PolarizedSource)
+    lamps = [i for i in chosen if not isinstance(leaves(chains[i])[0], polarized)]
+    if not lamps:
+        raise InstrumentError(f"nuisance {text}: no dataset is of an unpolarized internal source")
+    return lamps
+
+
+def _added(chain, observations, kind, name, size):
+    found, prior, zero = leaves(chain), _normal(0.0, NUISANCES[kind]), np.zeros(size)
+    split = next(i for i, leaf in enumerate(found) if leaf.splits_light)
+    if kind == "lamp":
+        source = optics.PolarizedSource(name=name)
+        source.q.prior = source.u.prior = prior
+        return join([source, *found])
+    if kind == "beam_gain":
+        # behind the splitter, where there are two beams
+        gain = optics.BeamGain(imbalance=zero, name=name)
+        gain.imbalance.prior = prior
+        return join([*found[: split + 1], gain, *found[split + 1 :]])
+    # the sum of both beams is 0 where it is masked
+    flux = observations.position("total_flux")
+    # in front of the splitter: background falls on both beams alike
+    light = optics.StrayLight(
+        amount=zero, reference=float(np.median(flux[flux > 0])), mount="total_flux", name=name
+    )
+    light.amount.prior = prior
+    return join([*found[:split], light, *found[split:]])
 
 
 class Instrument(ABC):
@@ -125,27 +364,8 @@ class Instrument(ABC):
         """
         Raise if what `chain` is asked for is not known, the first thing that it does.
 
-        Parameters
-        ----------
-        source : str
-            One of ``sources``.
-        optics_in : sequence of str
-            Each one of ``optional_optics``.
-        **choices : (str, sequence of str)
-            Name of another choice to its value and what is allowed.
-
-        Raises
-        ------
-        InstrumentError
-            Naming the instrument, the value and what is allowed.
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("irdis").check_choices("moon")
-        Traceback (most recent call last):
-        ...
-        astropolcal.exceptions.InstrumentError: irdis: source = 'moon'; allowed are polarized, ...
+        ``choices`` are other choices by name, each with its value and what is allowed; the message
+        names the instrument, the value and what is allowed.
         """
         check_choice(f"{self.name}: source", source, self.sources)
         for name in optics_in:
@@ -154,51 +374,15 @@ class Instrument(ABC):
             check_choice(f"{self.name}: {what}", value, allowed)
 
     def grid(self, wavelength=None):
-        """
-        Return the wavelengths of the parameters of a chain, a Quantity of shape (n_wavelengths,).
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`, optional
-            As given to `chain`; without it the usual ones.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal import instruments
-        >>> instruments.get("charis").grid(1.6 * u.um)
-        <Quantity [1.6] um>
-        """
+        """Return the wavelengths of the parameters of a chain, by default the usual ones."""
         return self.wavelength if wavelength is None else np.atleast_1d(u.Quantity(wavelength))
 
     def source_of(self, observations, spellings=None):
         """
         Return the source that a table's meta state, for `setup`.
 
-        Parameters
-        ----------
-        observations : Observations
-            The dataset.
-        spellings : dict of str to str, optional
-            What tables may call the sources; by default as in ``sources``. Case, hyphens and
-            underscores do not matter, and a ``"standard star"`` is a ``"star"``.
-
-        Returns
-        -------
-        str
-
-        Raises
-        ------
-        InstrumentError
-            If it is none of them.
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> from astropolcal.observations import Observations, example_table
-        >>> table = Observations.from_table(example_table())
-        >>> instruments.get("charis").source_of(table)
-        'polarized'
+        ``spellings`` lead from what tables may call the sources to the names; case, hyphens and
+        underscores do not matter, and a ``"standard star"`` is a ``"star"``.
         """
         allowed = {name: name for name in self.sources} if spellings is None else spellings
         known = {plain_source(word): name for word, name in allowed.items()}
@@ -211,93 +395,27 @@ class Instrument(ABC):
         return known[word]
 
     def meta_without(self, names):
-        """
-        Return what the meta of a table say when optional optics are out of the beam.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Optics that are taken out; others than the optional ones change nothing.
-
-        Returns
-        -------
-        dict
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("charis").meta_without(["nbs"])
-        {'nasmyth_beam_switcher': 'not installed'}
-        """
+        """Return what the meta of a table say when these optional optics are out of the beam."""
         return {}
 
     def optics_of(self, header):
-        """
-        Return what a frame's header tells of the optional optics.
-
-        Parameters
-        ----------
-        header : `~astropy.io.fits.Header` or mapping
-            Primary header.
-
-        Returns
-        -------
-        dict of str to bool
-            Name of an optic to whether it was in the beam; what the header does not tell is
-            absent.
-        """
+        """Return what a header tells of optional optics: name to whether it is in the beam."""
         return {}
 
     def configured(self, header):
         """
-        Return the instrument as a frame's mode has it, with the wavelengths and shape of its files.
+        Return the instrument as a frame's mode has it, with wavelengths and shape of its files.
 
-        Parameters
-        ----------
-        header : `~astropy.io.fits.Header` or mapping
-            Primary header.
-
-        Returns
-        -------
-        Instrument
-            Here the same: files of one kind only.
-
-        Raises
-        ------
-        InstrumentError
-            If the mode is not known.
+        Here the same: files of one kind only; an unknown mode raises an InstrumentError.
         """
         return self
 
     def mode_header(self, wavelength):
-        """
-        Return the keywords by which `configured` knows cubes of some wavelengths.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Of the slices.
-
-        Returns
-        -------
-        dict of str to str
-
-        Raises
-        ------
-        InstrumentError
-            If no mode of the instrument has these wavelengths.
-        """
+        """Return the keywords by which `configured` knows cubes of some wavelengths."""
         return {}
 
     def published(self):
-        """
-        Return the chain with published values, for simulations and examples.
-
-        Raises
-        ------
-        InstrumentError
-            If the instrument has none.
-        """
+        """Return the chain with published values, for simulations and examples."""
         raise InstrumentError(f"{self.name}: no published values; give a calibration file")
 
     def published_meta(self):

@@ -18,26 +18,23 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments._subaru_optics import (
-    CHANGES,
-    SITE,
-    fold_mirror,
-    misaligned,
-    polarizer,
-    two_layer_plate,
-)
 from astropolcal.instruments.base import Instrument
-from astropolcal.instruments.keywords import frame_time
-from astropolcal.instruments.layout import FileLayout
+from astropolcal.instruments.layout import FileLayout, frame_time
 from astropolcal.instruments.telescope import (
+    CHANGES,
     INTERNAL,
     M3_MODELS,
+    SITE,
     STARS,
+    fold_mirror,
     k_mirror,
+    misaligned,
+    polarizer,
     published_mirror,
     star_source,
     telescope,
     tertiary_mirror,
+    two_layer_plate,
 )
 from astropolcal.observations.reading import stated_date
 
@@ -186,7 +183,7 @@ class CHARIS(Instrument):
             thicknesses are within 0.6 to 1.4 of 't Hart's, misalignments
             within 5 deg, efficiencies between 0 and 1.
         m3 : {"free", "power law", "metal"}
-            Tertiary mirror of a star's chain: a diattenuation a wavelength, the paper's
+            Tertiary mirror of a star's chain: a diattenuation per wavelength, the paper's
             permittivity, or silver with a film.
         star : str
             Name of the source optic in a star's chain.

@@ -11,34 +11,340 @@ Beams have the names of the halves of the detector. The left one passes +Q, so s
 differences here, right minus left, have the opposite sign of the published ones.
 """
 
+import warnings
+from pathlib import Path
+
+import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from astropy.time import Time
 
 from astropolcal import optics
 from astropolcal.chain import join
-from astropolcal.exceptions import InstrumentError
-from astropolcal.instruments._irdis_headers import frame_table
-from astropolcal.instruments._irdis_optics import (
-    CENTRES,
-    FILTERS,
-    RECOATING,
-    calibration_polarizer,
-    check_all_filters,
-    coating_of,
-    coating_on,
-    derotator,
-    filters_at,
-    half_wave_plate,
-    polarizers,
-    stated_coating,
-    telescope,
-)
-from astropolcal.instruments.base import Instrument
-from astropolcal.instruments.following import SkyLaw
+from astropolcal.exceptions import AstropolcalWarning, ChainError, InstrumentError, ObservationError
+from astropolcal.instruments.base import Instrument, SkyLaw, check_choice
 from astropolcal.instruments.telescope import INTERNAL, STARS, star_source
-from astropolcal.observations.pointings import location_of
+from astropolcal.observations.pointings import location_of, offline, pointing
 from astropolcal.observations.quality import is_star
+from astropolcal.observations.reading import stated_date
+from astropolcal.units import iso_date, plain_number
+from astropolcal.words import counted
 
 __all__ = ["IRDIS"]
+
+# degrees: reading of the plate where theta = 0, and offset between pupil and derotator
+_PLATE_ZERO, _PUPIL_OFFSET = 152.15, 135.99
+# seconds: of the read-out of every DIT, and of the start of an exposure
+_READ_OUT, _START = 0.938, 2.4
+_COMMANDED = {"Qplus": 0.0, "Qminus": 45.0, "Uplus": 22.5, "Uminus": 67.5}
+_STAGES = {"hwp_true": "ESO INS4 DROT3", "derotator": "ESO INS4 DROT2"}
+_ROTATION, _STOKES = "ESO INS4 COMB ROT", "ESO OCS DPI H2RT STOKES"
+_FILTER, _PARALLACTIC = "ESO INS1 FILT ID", "ESO TEL PARANG START"
+
+
+class _Header:
+    """The keywords of a frame, with an error that names both where one is missing."""
+
+    def __init__(self, number, header):
+        self.number, self.header = number, header
+
+    def __contains__(self, key):
+        return key in self.header
+
+    def text(self, key, allowed=None):
+        if key not in self.header:
+            raise ObservationError(f"frame {self.number}: no keyword {key} in its header")
+        value = str(self.header[key]).strip()
+        if allowed is not None and value not in allowed:
+            raise ObservationError(
+                f"frame {self.number}: {key} = {value!r}; allowed are {', '.join(allowed)}"
+            )
+        return value
+
+    def number_of(self, key, low=-np.inf):
+        text = self.text(key)
+        try:
+            value = plain_number(text)
+        except ValueError:
+            value = np.nan
+        if not (np.isfinite(value) and value >= low):
+            limit = "" if np.isinf(low) else f" of at least {low:g}"
+            raise ObservationError(
+                f"frame {self.number}: {key} = {text!r}; a number{limit} is needed"
+            )
+        return value
+
+    def mean_angle(self, first, last):
+        # on the circle: 359 and 3 deg have the mean 1, not 181
+        ends = np.deg2rad([self.number_of(first), self.number_of(last)])
+        return float(np.rad2deg(np.angle(np.exp(1j * ends).sum())))
+
+
+def frame_table(headers, location, filters, law):
+    """
+    Return the table of frames from their headers, see `astropolcal.instruments.IRDIS.frame_table`.
+
+    ``filters`` are the central wavelengths of those with coefficients, ``law`` says how plate and
+    derotator follow the sky.
+    """
+    if not headers:
+        raise ObservationError("no headers were given, at least one is needed")
+    frames = [_Header(number, header) for number, header in enumerate(headers)]
+    stars = [_PARALLACTIC in frame for frame in frames]
+    if len(set(stars)) > 1:
+        raise ObservationError(f"frame {stars.index(False)}: no keyword {_PARALLACTIC}")
+    shared = (
+        {_filter(frame, filters) for frame in frames},
+        {_tracking(frame, stars[0]) for frame in frames},
+    )
+    for what, found in zip(("filters", "kinds of tracking"), shared, strict=True):
+        if len(found) > 1:
+            raise ObservationError(
+                f"frames of several {what}: {', '.join(sorted(map(str, found)))}"
+            )
+    (band,), (tracking,) = shared
+    rows = [_row(frame, tracking, location if stars[0] else None) for frame in frames]
+    _warn_of_starts(frames, [row.pop("motion") for row in rows], tracking, law)
+    table = QTable({key: [row[key] for row in rows] for key in rows[0]})
+    table["wavelength"] = np.full(len(rows), 1.0) * filters[band]
+    table.meta = {"filter": band, "date": str(table["time"][0])[:10]}
+    table.meta |= {"tracking": tracking} if tracking else {}
+    return table
+
+
+def _filter(frame, filters):
+    name = frame.text(_FILTER)
+    band = name.removeprefix("FILT_BBF_")
+    if band == name or band not in filters:
+        raise InstrumentError(
+            f"frame {frame.number}: {_FILTER} = {name!r} has no coefficients; allowed are "
+            f"{', '.join(f'FILT_BBF_{known}' for known in filters)}"
+        )
+    return band
+
+
+def _tracking(frame, star):
+    return frame.text(_ROTATION, ("FIELD", "PUPIL")).lower() if star else None
+
+
+def _row(frame, tracking, location):
+    angles = {column: _stage(frame, keyword) for column, keyword in _STAGES.items()}
+    angles["hwp_true"] = (angles["hwp_true"] - _PLATE_ZERO) % 360
+    # the image turns by twice the derotator
+    angles["derotator"] += 0.5 * _PUPIL_OFFSET if tracking == "pupil" else 0.0
+    dit, ndit = frame.number_of("EXPTIME", 0.0), frame.number_of("ESO DET NDIT", 1.0)
+    # EXPTIME is the light of one DIT, without its read-out
+    seconds = ndit * (dit + _READ_OUT) + _START
+    with offline():
+        start = Time(frame.number_of("MJD-OBS", 0.0), format="mjd", scale="utc")
+        middle, motion = start + 0.5 * seconds * u.s, (0.0, 0.0)
+        moment = middle.isot
+    if location is not None:
+        angles["parallactic"] = frame.mean_angle(_PARALLACTIC, "ESO TEL PARANG END")
+        motion = _motion(frame, Time([start, middle]), location)
+        # of the start: an offset of what is computed cancels in the change
+        angles["altitude"] = frame.number_of("ESO TEL ALT", 0.0) + motion[1]
+    commanded = _COMMANDED[frame.text(_STOKES, _COMMANDED)] if _STOKES in frame else None
+    angles["hwp"] = angles["hwp_true"] if commanded is None else commanded
+    row = {"frame": frame.number, "motion": motion} | {
+        key: value * u.deg for key, value in angles.items()
+    }
+    return row | {"exposure_time": dit * ndit * u.s, "time": moment}
+
+
+def _motion(frame, times, location):
+    """Return by how much parallactic angle and altitude change from one time to the other."""
+    target = SkyCoord(frame.number_of("RA"), frame.number_of("DEC", -90.0), unit=u.deg)
+    altitude, parallactic = (
+        np.diff(angle.to_value(u.deg))[0] for angle in pointing(target, times, location)
+    )
+    return float((parallactic + 180) % 360 - 180), float(altitude)
+
+
+def _stage(frame, keyword):
+    """Return the mean angle of a stage, or that of the start where there is no other."""
+    first, last = f"{keyword} BEGIN", f"{keyword} END"
+    if first not in frame and f"{keyword} START" in frame:
+        first = f"{keyword} START"
+    return frame.mean_angle(first, last if last in frame else first)
+
+
+def _warn_of_starts(frames, motions, tracking, law):
+    """Say which angles are those of the start, and by how much the middle differs."""
+    for column, keyword in _STAGES.items():
+        few = [i for i, frame in enumerate(frames) if f"{keyword} END" not in frame]
+        if not few:
+            continue
+        on_sky = (0.0, 0.0)
+        if tracking is not None:
+            on_sky = (law.plate_law if column == "hwp_true" else law.derotator_law)(tracking)
+        lost = max(abs(np.dot(on_sky, motions[i])) for i in few)
+        warnings.warn(
+            f"no keyword {keyword} END in {counted(len(few), 'frame')} of {len(frames)}, the first "
+            f"is frame {few[0]}: {column} is that of the start; until the middle of the exposure "
+            f"it turns by up to {lost:.2g} deg",
+            AstropolcalWarning,
+            # _warn_of_starts, frame_table of this module, that of the instrument: who called it
+            stacklevel=4,
+        )
+
+
+# van Holstein et al. 2020, as distributed with their pipeline; one row per filter
+_DATA = QTable.read(Path(__file__).parents[1] / "data" / "irdis.ecsv", format="ascii.ecsv")
+
+#: Filters with coefficients, and the wavelengths that stand for them.
+FILTERS = tuple(str(name) for name in _DATA["filter"])
+CENTRES = _DATA["wavelength"]
+#: Day from which the telescope's mirrors have their new coating, and the names of both.
+RECOATING = _DATA.meta["recoating"]
+COATINGS = ("before", "after")
+
+# a wavelength within this share of a filter's centre stands for the filter
+_SAME_FILTER = 0.01
+
+
+def filters_at(wavelength):
+    """Return the index of the filter of every wavelength."""
+    centres, lam = CENTRES.to_value(u.um), u.Quantity(wavelength).to_value(u.um)
+    index = np.abs(lam[:, None] / centres - 1).argmin(axis=1)
+    # written so that NaN is off, too
+    off = ~(np.abs(lam / centres[index] - 1) <= _SAME_FILTER)
+    if off.any():
+        known = ", ".join(f"{n} ({c:g} um)" for n, c in zip(FILTERS, centres, strict=True))
+        raise InstrumentError(
+            f"wavelength = {lam[off][0]:.6g} um is that of no filter with coefficients; "
+            f"allowed are {known}"
+        )
+    return index
+
+
+def check_all_filters(found):
+    """Raise if the optics have another number of values than there are filters."""
+    sizes = {getattr(leaf, key).size for leaf in found for key in leaf.param_names}
+    if max(sizes) != len(FILTERS):
+        raise ChainError(
+            f"irdis: the chain has {max(sizes)} values per parameter, and it is not known for "
+            f"which of the filters {', '.join(FILTERS)}; give on_sky(chain, wavelength=...)"
+        )
+
+
+def coating_on(date):
+    """Return "before" or "after", the coating on a date."""
+    return "before" if iso_date(date, error=InstrumentError)[:10] < RECOATING else "after"
+
+
+def stated_coating(observations):
+    """Return the coating that the meta of a table tell."""
+    stated = observations.meta.get("coating")
+    if stated is not None:
+        check_choice(f"{observations.name}: coating", stated, COATINGS)
+        return stated
+    date = stated_date(observations.meta, observations.name, InstrumentError)
+    if date is None:
+        raise InstrumentError(
+            f"{observations.name}: neither date nor coating in the table's meta; were the "
+            f"telescope's mirrors those 'before' or 'after' {RECOATING}?"
+        )
+    return coating_on(date)
+
+
+def coating_of(coating, date):
+    """Return the coating of a telescope that is put before a chain, by name or date."""
+    if coating is not None:
+        check_choice("coating", coating, COATINGS)
+    if date is None:
+        if coating is None:
+            warnings.warn(
+                "irdis: neither date nor coating of the telescope was given; it is the one from "
+                f"{RECOATING} on; give the date of the frames (date, or --date of a command), or "
+                "coating='before' for older ones",
+                AstropolcalWarning,
+                # coating_of, telescope_optics, on_sky: the line that asked for a chain from the sky
+                stacklevel=4,
+            )
+        return coating or "after"
+    several = np.ndim(date) > 0
+    found = sorted({coating_on(day) for day in (date if several else [date])})
+    if len(found) != 1:
+        words = f"of before and of after the recoating of {RECOATING}" if found else "none"
+        raise InstrumentError(f"the dates are {words}; those of one coating are needed")
+    if coating not in (None, *found):
+        raise InstrumentError(
+            f"coating = {coating!r}, but the date {date} is {found[0]} {RECOATING}"
+        )
+    return found[0]
+
+
+def _column(name, index):
+    return _DATA[name][index]
+
+
+def _near(about):
+    return {"fixed": {"theta": False}, "bounds": {"theta": (about - 5, about + 5)}}
+
+
+def half_wave_plate(index):
+    """Return the half-wave plate."""
+    return _retarder(index, "hwp")
+
+
+def _retarder(index, name):
+    theta = _DATA.meta[f"{name}_theta_deg"]
+    held = _near(theta)
+    held["bounds"] |= {"diattenuation": (-0.1, 0.1), "retardance": (0, 360)}
+    return optics.DiattenuatorRetarder(
+        diattenuation=_column(f"{name}_diattenuation", index),
+        retardance=_column(f"{name}_retardance", index),
+        theta=theta * u.deg,
+        mount=name,
+        name=name,
+        **held,
+    )
+
+
+def derotator(index):
+    """Return the derotator."""
+    turning = _retarder(index, "derotator")
+    # double differences see it in second order only
+    turning.diattenuation.fixed = True
+    return turning
+
+
+def polarizers(index):
+    """Return the pair of polarizers before the halves of the detector."""
+    # the left beam passes +Q
+    return optics.WollastonPrism(
+        efficiency=_column("polarizer_efficiency", index), theta=90 * u.deg, name="wollaston"
+    )
+
+
+def calibration_polarizer():
+    """Return the polarizer of the internal source."""
+    return optics.LinearPolarizer(name="calibration_polarizer", **_near(0))
+
+
+def telescope(index, coating):
+    """Return the optics from the sky to the half-wave plate."""
+    check_choice("coating", coating, COATINGS)
+    return [
+        optics.Rotator(mount="parallactic", name="parallactic"),
+        _mirror("ut", coating, index),
+        optics.Rotator(mount="altitude", name="altitude"),
+        _mirror("m4", coating, index),
+    ]
+
+
+def _mirror(name, coating, index):
+    return optics.DiattenuatorRetarder(
+        diattenuation=_column(f"{name}_diattenuation_{coating}", index),
+        retardance=_column("mirror_retardance", index),
+        name=name,
+        # an unpolarized star shows the diattenuation of a mirror, never its retardance
+        fixed={"retardance": True},
+        bounds={"diattenuation": (-0.1, 0.1)},
+    )
+
 
 # longitude, latitude (deg) and height (m) of the telescope in the headers
 _SITE = (-70.4045, -24.6268, 2648.0)
@@ -100,7 +406,7 @@ class IRDIS(Instrument):
         Return the chain of an internal source or a star, with the published values.
 
         Free are the retardances of half-wave plate and derotator and the diattenuations of plate
-        and polarizers, one a filter, and the angles of plate and derotator; of stars also the
+        and polarizers, one per filter, and the angles of plate and derotator; of stars also the
         diattenuations of telescope and M4, whose retardances are held. The diattenuation of the
         derotator, to which double differences are blind, is held.
 
@@ -109,7 +415,7 @@ class IRDIS(Instrument):
         source : str
             ``"polarized"``: internal source with its polarizer, whose angle is free.
             ``"unpolarized"``: without it; q and u of the light that reaches the half-wave plate
-            are free, one a filter. ``"unpolarized standard star"``,
+            are free, one per filter. ``"unpolarized standard star"``,
             ``"polarized standard star"`` or ``"star"``: behind telescope and M4.
         optics_in : sequence of str
             Nothing is optional here.
@@ -154,19 +460,7 @@ class IRDIS(Instrument):
         return join([light, *telescope(index, coating), *common])
 
     def published(self):
-        """
-        Return the chain of the polarized internal source with the published values.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("irdis").published()["wollaston"].efficiency.value.round(3).tolist()
-        [0.98, 0.989, 0.996, 0.984]
-        """
+        """Return the chain of the polarized internal source with the published values."""
         return self.chain("polarized")
 
     def published_meta(self):
@@ -217,75 +511,18 @@ class IRDIS(Instrument):
         return telescope(index, coating_of(coating, date))
 
     def setup(self, observations):
-        """
-        Return source and optics in the beam, as the table's meta states them.
-
-        Parameters
-        ----------
-        observations : Observations
-            Its meta holds ``source``.
-
-        Returns
-        -------
-        source : str
-        optics_in : tuple of str
-            Empty.
-
-        Raises
-        ------
-        InstrumentError
-            If the source is not known.
-        """
+        """Return the source from the table's meta, and no optional optics."""
         return self.source_of(observations), ()
 
     def particulars(self, observations):
-        """
-        Return the coating, and source optic and target of a star.
-
-        Parameters
-        ----------
-        observations : Observations
-            Of a star: its meta holds ``date`` (ISO), or ``coating``, which is
-            ``before`` or ``after``; and ``object``.
-
-        Returns
-        -------
-        dict
-
-        Raises
-        ------
-        InstrumentError
-            If the table of a star does not tell the coating.
-        """
+        """Return the coating, by ``date`` or ``coating`` in the meta, and names of a star."""
         if not is_star(observations.source):
             return {}
         return {"coating": stated_coating(observations)} | super().particulars(observations)
 
     @staticmethod
     def coating_on(date):
-        """
-        Return which coating the telescope's mirrors had.
-
-        Parameters
-        ----------
-        date : str, ``datetime.date`` or `~astropy.time.Time`
-            Date of the observation, a text in ISO form.
-
-        Returns
-        -------
-        {"before", "after"}
-
-        Raises
-        ------
-        InstrumentError
-            If it is no date.
-
-        Examples
-        --------
-        >>> from astropolcal.instruments import IRDIS
-        >>> coating_on("2017-04-15"), coating_on("2017-04-16T03:00")
-        ('before', 'after')
-        """
+        """Return which coating the telescope's mirrors had on a date, "before" or "after"."""
         return coating_on(date)
 
     @property
@@ -305,7 +542,7 @@ class IRDIS(Instrument):
         Returns
         -------
         `~astropy.table.QTable`
-            One row a frame: ``frame``, ``hwp`` (commanded), ``hwp_true``, ``derotator``,
+            One row per frame: ``frame``, ``hwp`` (commanded), ``hwp_true``, ``derotator``,
             ``wavelength``, ``exposure_time``, ``time``, and of stars ``parallactic`` and
             ``altitude``, all in the middle of the exposure. With the fluxes of both beams it is
             a table of observations. The meta have instrument, filter, date and tracking.

@@ -1,13 +1,79 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""How the files of an instrument look: header keywords, detector, places of the beams."""
+"""
+How the FITS files of an instrument look, and what their headers say in the units of the layout.
+"""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
-from astropolcal.exceptions import InstrumentError, ObservationError
-from astropolcal.instruments.readout import EM_EXCESS_NOISE, ReadOut
+import astropy.units as u
+from astropy.io.fits import VerifyError
+from astropy.io.fits.card import Undefined
+from astropy.time import Time
 
-__all__ = ["FileLayout"]
+from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.observations.pointings import offline
+from astropolcal.units import iso_date, plain_number
+
+__all__ = ["FileLayout", "ReadOut"]
+
+#: By what factor a long multiplication register raises the photon noise.
+EM_EXCESS_NOISE = math.sqrt(2)
+
+
+@dataclass(frozen=True)
+class ReadOut:
+    """
+    A way to read a detector out.
+
+    Parameters
+    ----------
+    gain : float
+        Electrons per adu.
+    read_noise : float
+        Of a pixel, electrons.
+    saturation : float
+        Value of a pixel, in adu, above which it is not linear.
+    excess_noise : float
+        Standard deviation of the signal over that of its photon noise; 1 without multiplication.
+
+    Raises
+    ------
+    InstrumentError
+        If a number is out of range.
+
+    Notes
+    -----
+    In an EMCCD the number of electrons that leave the register for each that enters has a wide
+    distribution, which raises the photon noise by a factor near the square root of 2 (Robbins &
+    Hadwen 2003, IEEE Trans. Electron Devices 50, 1227, doi:10.1109/TED.2003.813462).
+
+    Examples
+    --------
+    >>> from astropolcal.instruments.layout import ReadOut
+    >>> ReadOut(gain=4.5, read_noise=90.0).multiplied(300).read_noise
+    0.3
+    """
+
+    gain: float = 1.0
+    read_noise: float = 0.0
+    saturation: float = math.inf
+    excess_noise: float = 1.0
+
+    def __post_init__(self):
+        positive = self.gain > 0 and self.saturation > 0
+        if not (positive and self.read_noise >= 0 and self.excess_noise >= 1):
+            raise InstrumentError(
+                f"{self}: gain and saturation must be above zero, read_noise at least 0 and "
+                "excess_noise at least 1"
+            )
+
+    def multiplied(self, em_gain):
+        """Return gain and read noise in electrons before a multiplication by ``em_gain``."""
+        return replace(self, gain=self.gain / em_gain, read_noise=self.read_noise / em_gain)
+
 
 _WEIGHTS = ("inverse variance", "error")
 
@@ -163,27 +229,8 @@ class FileLayout:
         """
         Return how the detector was read out in a frame.
 
-        Parameters
-        ----------
-        values : dict
-            Of its header: ``em_gain``, ``read_mode`` and ``camera``, as far as they are known.
-
-        Returns
-        -------
-        ReadOut
-            With an EM gain above one, gain and read noise are those before the multiplication.
-
-        Raises
-        ------
-        ObservationError
-            If the mode is none of ``read_outs``, or the EM gain is impossible.
-
-        Examples
-        --------
-        >>> from astropolcal.instruments.layout import FileLayout
-        >>> emccd = FileLayout({"em_gain": "EMGAIN"}, (1, 512, 512), gain=4.5, read_noise=90.0)
-        >>> emccd.read_out({"em_gain": 300.0})
-        ReadOut(gain=0.015, read_noise=0.3, saturation=inf, excess_noise=1.4142135623730951)
+        ``values`` of its header are ``em_gain``, ``read_mode`` and ``camera``, as far as they are
+        known. With an EM gain above one, gain and read noise are those before the multiplication.
         """
         own = ReadOut(self.gain, self.read_noise, self.saturation)
         em_gain, mode = values.get("em_gain"), values.get("read_mode")
@@ -214,27 +261,7 @@ class FileLayout:
         """
         Return the file of the left beam that belongs to one of the right beam.
 
-        Parameters
-        ----------
-        path : path-like
-            The file of the right beam.
-
-        Returns
-        -------
-        `~pathlib.Path` or None
-            In the same folder; None where one file holds both beams.
-
-        Raises
-        ------
-        ObservationError
-            If the name does not have the mark of the right beam.
-
-        Examples
-        --------
-        >>> from astropolcal.instruments.layout import FileLayout
-        >>> layout = FileLayout({}, (1, 64, 128), beam_files=("cam1", "cam2"))
-        >>> layout.left_file("night_00000007_cam1.fits").name
-        'night_00000007_cam2.fits'
+        None where one file holds both.
         """
         if not self.beam_files:
             return None
@@ -248,25 +275,7 @@ class FileLayout:
         return path.with_name(f"{head}{left}{tail}")
 
     def frame_files(self, files):
-        """
-        Return one file a frame, without those of left beams that belong to another file.
-
-        Parameters
-        ----------
-        files : sequence of path-like
-            The files, in any order.
-
-        Returns
-        -------
-        list of str
-
-        Examples
-        --------
-        >>> from astropolcal.instruments.layout import FileLayout
-        >>> layout = FileLayout({}, (1, 64, 128), beam_files=("cam1", "cam2"))
-        >>> layout.frame_files(["a_cam1.fits", "a_cam2.fits", "b_cam2.fits"])
-        ['a_cam1.fits', 'b_cam2.fits']
-        """
+        """Return one file per frame, without those of left beams that belong to another file."""
         files = [str(path) for path in files]
         if not self.beam_files:
             return files
@@ -274,3 +283,105 @@ class FileLayout:
         rights = [path for path in files if self.beam_files[0] in Path(path).name]
         lefts = {str(self.left_file(path)) for path in rights}
         return [path for path in files if str(Path(path)) not in lefts]
+
+
+#: Columns that are angles of a stage.
+ANGLES = ("hwp", "hwp_true", "derotator", "parallactic", "altitude")
+#: Columns that are text, whatever they look like.
+TEXTS = (
+    "date",
+    "time",
+    "right_ascension",
+    "declination",
+    "object",
+    "instrument",
+    "filter",
+    "pickoff",
+    "flc",
+    "flc_state",
+    "read_mode",
+)
+#: Beyond these, in degree, an angle in a header cannot be right.
+RANGES = dict.fromkeys(ANGLES, (-720.0, 720.0)) | {"altitude": (0.0, 90.0)}
+RANGES |= {"em_gain": (0.0, 1e5)}
+# numbers without a unit
+# what a layout means that gives no unit; everything else is in degree
+_UNITS = {"camera": "", "em_gain": "", "exposure_time": "s"}
+
+_MISSING = ("", "unavailable", "none", "nan", "n/a", "#")
+
+
+def look_up(headers, column, layout):
+    """
+    Return the first keyword that holds a value for a column, and the value.
+
+    Looked through are the headers in turn, for the ``keywords`` and ``alternatives`` of the
+    layout. Without a value it is the first keyword (None if the layout knows none) and None, as
+    for what stands for no value, such as "N/A".
+    """
+    return next(stated(headers, column, layout), (layout.keywords.get(column), None))
+
+
+def stated(headers, column, layout):
+    """Yield all keywords that hold a value for a column, with the value, see ``look_up``."""
+    keywords = (layout.keywords.get(column), *layout.alternatives.get(column, ()))
+    for header, keyword in product(headers, filter(None, keywords)):
+        value = _read(header, keyword)
+        if value is None or isinstance(value, Undefined):
+            continue
+        if str(value).strip().lower() not in _MISSING:
+            yield keyword, value
+
+
+def unit_of(column, layout):
+    """
+    Return the unit of a column's keyword.
+
+    Where the layout gives none, angles are in degree and times in seconds.
+    """
+    return u.Unit(layout.units.get(column, _UNITS.get(column, "deg")))
+
+
+def _read(header, keyword):
+    try:
+        return header.get(keyword)
+    except VerifyError:
+        # no number, and no text that anything answers to
+        return "an unreadable card"
+
+
+def convert(column, value, layout, target):
+    """Return a value of a header as a float in a unit, or raise TypeError or ValueError."""
+    factor, offset = layout.transforms.get(column, (1.0, 0.0))
+    unit = unit_of(column, layout)
+    return (factor * plain_number(value) + offset) * unit.to(target)
+
+
+def frame_time(header, layout):
+    """
+    Return when a frame was taken (UTC), None if the header does not say.
+
+    A date alone is its midnight; what cannot be understood raises TypeError or ValueError.
+    """
+    mjd, date, clock = (look_up([header], key, layout)[1] for key in ("mjd", "date", "time"))
+    if mjd is not None:
+        return in_calendar(Time(plain_number(mjd), format="mjd", scale="utc"))
+    if date is None:
+        return None
+    day = iso_date(date)
+    if "T" not in day and clock is not None:
+        day = iso_date(f"{day}T{str(clock).strip()}")
+    with offline():
+        return in_calendar(Time(day, scale="utc"))
+
+
+def in_calendar(time):
+    """
+    Return a time as it is if a calendar has its day, else raise a ValueError (ErfaError).
+
+    Astropy takes any number as a day, and finds out in the first conversion only.
+    """
+    # years long before UTC was made are doubtful, but are years
+    with offline():
+        time.tai, time.isot  # noqa: B018
+    return time

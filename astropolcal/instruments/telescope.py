@@ -1,5 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What stands before the half-wave plate on sky: a star, and the telescope's tertiary mirror."""
+"""
+What the chains of instruments share: stars, tertiary mirrors, and the polarimeters at Subaru.
+
+On sky a star and the mirrors of the telescope stand before the half-wave plate.
+"""
 
 import re
 import warnings
@@ -18,20 +22,7 @@ from astropolcal.exceptions import (
 from astropolcal.observations.quality import is_star
 from astropolcal.units import to_unit
 
-__all__ = [
-    "INTERNAL",
-    "M3_MODELS",
-    "STARS",
-    "as_exact",
-    "behind_telescope",
-    "k_mirror",
-    "mounted",
-    "published_mirror",
-    "star_options",
-    "star_source",
-    "telescope",
-    "tertiary_mirror",
-]
+__all__ = []
 
 #: Sources of an internal calibration unit, and kinds of stars.
 INTERNAL = ("polarized", "unpolarized")
@@ -67,31 +58,11 @@ def tertiary_mirror(model, wavelength, name="m3"):
     """
     Return the tertiary mirror of an alt-azimuth telescope, ready to be calibrated.
 
-    Parameters
-    ----------
-    model : {"free", "power law", "metal"}
-        ``"free"``: one free diattenuation a wavelength; the retardance, of which an
-        unpolarized star tells nothing, is fixed at that of the published law.
-        ``"power law"``: the paper's permittivity, four free numbers for all wavelengths.
-        ``"metal"``: silver with a film of silica; its thickness and factors on n and k are
-        free, the factors with normal priors of 0.5 and 0.1 around 1.
-    wavelength : `~astropy.units.Quantity`
-        Grid of the parameters given per wavelength.
-    name : str
-        Name of the optic.
-
-    Returns
-    -------
-    Optic
-        Its orientation has a normal prior, see `mounted`.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.instruments.telescope import tertiary_mirror
-    >>> m3 = tertiary_mirror("free", [1.2, 2.2] * u.um)
-    >>> m3.retardance.fixed, m3.diattenuation.fixed
-    (True, False)
+    ``"free"``: one free diattenuation per wavelength; the retardance, of which an unpolarized star
+    tells nothing, is fixed at that of the published law. ``"power law"``: the paper's
+    permittivity, four free numbers for all wavelengths. ``"metal"``: silver with a film of silica;
+    its thickness and factors on n and k are free, the factors with normal priors of 0.5 and 0.1
+    around 1. All are ``mounted``.
     """
     if model == "power law":
         bounds = {key: (0.5 * start, 2 * start) for key, start in _START.items()}
@@ -117,26 +88,8 @@ def k_mirror(*, fixed, bounds, **settings):
     """
     Return a derotator of three silver mirrors with films of silica, ready to be calibrated.
 
-    Free are the thickness of the films and factors on n and k of silver, with normal
-    priors of 0.5 and 0.1 around 1.
-
-    Parameters
-    ----------
-    fixed, bounds : dict
-        What else is free, as `astropy.modeling` takes it.
-    **settings
-        Of the optic, such as ``name`` and ``mount``.
-
-    Returns
-    -------
-    KMirror
-
-    Examples
-    --------
-    >>> from astropolcal.instruments.telescope import k_mirror
-    >>> derotator = k_mirror(fixed={}, bounds={}, name="derotator", mount="derotator")
-    >>> derotator.film_thickness.quantity
-    <Quantity 262.56 nm>
+    Free are the thickness of the films and factors on n and k of silver, with normal priors of 0.5
+    and 0.1 around 1, and what else ``fixed`` and ``bounds`` say; ``settings`` are of the optic.
     """
     free = dict.fromkeys(("film_thickness", "n_scale", "k_scale"), False)
     limits = {"film_thickness": (0, 600), "n_scale": (0.05, 20), "k_scale": (0.5, 2)}
@@ -152,47 +105,12 @@ def _with_metal_priors(mirror):
 
 
 def published_mirror(name="m3"):
-    """
-    Return Subaru's tertiary mirror with the published permittivity.
-
-    Parameters
-    ----------
-    name : str
-        Name of the optic.
-
-    Returns
-    -------
-    PowerLawMirror
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.instruments.telescope import published_mirror
-    >>> published_mirror().diattenuation(1.6 * u.um).round(4)
-    np.float64(0.0147)
-    """
+    """Return Subaru's tertiary mirror with the published permittivity."""
     return optics.PowerLawMirror(name=name, **_PUBLISHED)
 
 
 def telescope(mirror):
-    """
-    Return the optics from the sky to the half-wave plate of an alt-azimuth telescope.
-
-    Parameters
-    ----------
-    mirror : Optic
-        The tertiary mirror.
-
-    Returns
-    -------
-    list of Optic
-
-    Examples
-    --------
-    >>> from astropolcal.instruments.telescope import published_mirror, telescope
-    >>> [optic.name for optic in telescope(published_mirror())]
-    ['parallactic', 'm3', 'altitude']
-    """
+    """Return the optics from the sky to the half-wave plate of an alt-azimuth telescope."""
     return [
         optics.Rotator(mount="parallactic", name="parallactic"),
         mirror,
@@ -208,29 +126,10 @@ def _normal(mean, std):
 
 def mounted(optic, tolerance=_MOUNTING):
     """
-    Return an optic whose orientation is known as well as its mounting.
+    Return the optic, whose orientation is now known as well as its mounting.
 
     A calibration then finds ``theta`` with a normal prior around its present value, in place of
-    taking it as exact.
-
-    Parameters
-    ----------
-    optic : Optic
-        The optic; it is changed.
-    tolerance : `~astropy.units.Quantity`
-        Standard deviation of the prior.
-
-    Returns
-    -------
-    Optic
-        The same.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.instruments.telescope import mounted
-    >>> float(mounted(optics.Diattenuator(name="fold_mirror")).theta.prior.std())
-    0.3
+    taking it as exact; ``tolerance`` is the standard deviation.
     """
     spread = tolerance.to_value(optic.theta.unit)
     optic.theta.fixed, optic.theta.prior = False, _normal(float(optic.theta.value), spread)
@@ -238,26 +137,7 @@ def mounted(optic, tolerance=_MOUNTING):
 
 
 def as_exact(chain):
-    """
-    Return a chain in which standard stars and mountings are held at what is known of them.
-
-    Parameters
-    ----------
-    chain : `~astropy.modeling.CompoundModel`
-        The chain; its optics are changed.
-
-    Returns
-    -------
-    `~astropy.modeling.CompoundModel`
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.instruments.telescope import as_exact
-    >>> chain = as_exact(instruments.get("charis").chain("unpolarized standard star"))
-    >>> chain["star"].q.fixed, chain["m3"].theta.fixed, chain["m3"].diattenuation.fixed
-    (True, True, False)
-    """
+    """Hold standard stars and mountings of a chain at what is known of them, and return it."""
     for leaf in leaves(chain):
         keys = leaf.param_names if isinstance(leaf, optics.StarSource) else ["theta"]
         # the orientation of what stands on a stage is for the data to find
@@ -271,43 +151,11 @@ def star_source(source, wavelength, name="star", target=None):
     """
     Return the source optic of a star.
 
-    Parameters
-    ----------
-    source : str
-        ``"unpolarized standard star"``: q and u are zero with the error of the catalogue, or
-        0.1 % where no source states one; they may change smoothly with the wavelength.
-        ``"polarized standard star"``: a Serkowski law with the errors of the catalogue. Both are
-        normal priors of free parameters. Of any other star q and u are free at each wavelength.
-    wavelength : `~astropy.units.Quantity`
-        Grid.
-    name : str
-        Name of the optic.
-    target : str, optional
-        Name of the star in the catalogue of standards.
-
-    Returns
-    -------
-    StarSource or PolarizedSource
-
-    Raises
-    ------
-    InstrumentError
-        If the catalogue does not have a polarized standard star, or has it as unpolarized, or
-        the other way round.
-
-    Warns
-    -----
-    AstropolcalWarning
-        If the catalogue does not have an unpolarized standard star.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.instruments.telescope import star_source
-    >>> star = star_source("polarized standard star", [1.25, 1.65] * u.um, target="HD 30675")
-    >>> q, stokes_u = star.stokes([1.25, 1.65] * u.um)
-    >>> stokes_u.round(3).tolist()
-    [0.016, 0.009]
+    ``"unpolarized standard star"``: q and u are zero with the error of the catalogue, or 0.1 %
+    where no source states one; they may change smoothly with the wavelength. ``"polarized standard
+    star"``: a Serkowski law with the errors of the catalogue. Both are normal priors of free
+    parameters. Of any other star q and u are free at each wavelength. ``target`` is its name in
+    the catalogue of standards.
     """
     if target and source.endswith("standard star"):
         _check_standard(source, target)
@@ -400,31 +248,9 @@ def _check_standard(source, target):
 
 def behind_telescope(chain, name):
     """
-    Return the optics of an instrument's chain from the half-wave plate on.
+    Return the optics of a chain from ``hwp`` on.
 
-    Parameters
-    ----------
-    chain : `~astropy.modeling.CompoundModel`
-        The chain of an internal source.
-    name : str
-        Of the instrument, for the message.
-
-    Returns
-    -------
-    list of Optic
-
-    Raises
-    ------
-    ChainError
-        If there is no optic ``hwp``.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.instruments.telescope import behind_telescope
-    >>> charis = instruments.get("charis")
-    >>> [optic.name for optic in behind_telescope(charis.chain(), "charis")]
-    ['hwp', 'derotator', 'wollaston']
+    The name of the instrument is for the message.
     """
     found = leaves(chain)
     start = next((i for i, leaf in enumerate(found) if leaf.name == "hwp"), None)
@@ -435,25 +261,10 @@ def behind_telescope(chain, name):
 
 def star_options(observations):
     """
-    Return the options of a chain that name its star.
+    Return the options of a chain that name its star, empty for other sources.
 
-    Parameters
-    ----------
-    observations : Observations
-        A dataset, whose meta may have ``object``.
-
-    Returns
-    -------
-    dict
-        ``star``, the name of the source optic, which is the object's without blanks behind
-        ``star_``, and ``target``; empty for other sources, and for a star without a name.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> from astropolcal.instruments.telescope import star_options
-    >>> star_options(SimpleNamespace(source="star", meta={"object": "HD 30675"}))
-    {'star': 'star_HD30675', 'target': 'HD 30675'}
+    They are ``star``, the name of the source optic, and ``target``, from ``object`` in the meta of
+    the observations.
     """
     target = str(observations.meta.get("object") or "")
     words = re.sub(r"\W+", "", target)
@@ -461,3 +272,42 @@ def star_options(observations):
     if not words or not is_star(observations.source):
         return {}
     return {"star": f"star_{words}", "target": target}
+
+
+#: Longitude, latitude (deg) and height (m) of the Subaru Telescope.
+SITE = (-155.4761, 19.8255, 4139.0)
+
+# 't Hart et al. 2021, thicknesses of the half-wave plate in mm
+_THART_SIO2, _THART_MGF2 = 1.63398, 1.27711
+
+#: What has changed; both days are known to the month only (McIntosh et al. 2026, Sec. 2 and 7).
+CHANGES = (
+    (None, "2025-08-01", "2025-10-01", "the Nasmyth beam switcher was installed"),
+    ("m3", "2025-12-01", "2026-01-01", "the tertiary mirror M3 was coated anew"),
+)
+
+
+def misaligned(about, most=5):
+    """Return what frees an angle within some degrees of where the optic should stand."""
+    return {"fixed": {"theta": False}, "bounds": {"theta": (about - most, about + most)}}
+
+
+def two_layer_plate(**settings):
+    """Return the half-wave plate of both instruments, its thicknesses near the published ones."""
+    settings["bounds"] |= {
+        "w_sio2": (0.6 * _THART_SIO2, 1.4 * _THART_SIO2),
+        "w_mgf2": (0.6 * _THART_MGF2, 1.4 * _THART_MGF2),
+    }
+    return optics.TwoLayerWaveplate(
+        w_sio2=_THART_SIO2 * u.mm, w_mgf2=_THART_MGF2 * u.mm, mount="hwp", name="hwp", **settings
+    )
+
+
+def polarizer():
+    """Return the polarizer of the calibration unit, which passes -Q."""
+    return optics.LinearPolarizer(theta=90 * u.deg, name="calibration_polarizer", **misaligned(90))
+
+
+def fold_mirror(size):
+    """Return the mirror that polarizes the lamp where the polarizer is out."""
+    return mounted(optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror"))

@@ -14,25 +14,270 @@ All retardances with the other sign, (H, 45, R) to (-H, -45, R), give the same d
 the half-wave plate exclude them, and those of the derotator exclude a further turn.
 """
 
+from dataclasses import replace
+
 import astropy.units as u
+import numpy as np
 
 from astropolcal import optics
 from astropolcal.chain import join
-from astropolcal.instruments import _vampires_optics as _optics
-from astropolcal.instruments._choices import check_choice
-from astropolcal.instruments._subaru_optics import CHANGES, fold_mirror, polarizer
-from astropolcal.instruments.base import Instrument
-from astropolcal.instruments.telescope import INTERNAL, M3_MODELS, STARS, star_source, telescope
-from astropolcal.instruments.vampires_headers import (
-    KEYWORDS,
-    LAYOUT,
-    layout_of,
-    mode_header,
-    slices_of,
+from astropolcal.exceptions import InstrumentError, ObservationError
+from astropolcal.instruments.base import Instrument, check_choice
+from astropolcal.instruments.layout import EM_EXCESS_NOISE, FileLayout, ReadOut
+from astropolcal.instruments.telescope import (
+    CHANGES,
+    INTERNAL,
+    M3_MODELS,
+    SITE,
+    STARS,
+    _normal,
+    fold_mirror,
+    k_mirror,
+    misaligned,
+    polarizer,
+    star_source,
+    telescope,
+    tertiary_mirror,
+    two_layer_plate,
 )
 from astropolcal.observations.quality import is_star, mask_saturated
+from astropolcal.observations.reading import SAME_WAVELENGTH, filter_wavelength
 
 __all__ = ["VAMPIRES"]
+
+#: Fields of the multiband imager, in the order of the slices.
+FIELDS = ("MBI 610", "MBI 670", "MBI 720", "MBI 760")
+_BANDS = ("625-50", "Open", "675-50", "725-50", "750-50", "775-50")
+_MODE, _FILTER = "OBS-MOD", "FILTER01"
+_MULTIBAND, _REDUCED, _SINGLE = "IPOL_MBI", "IPOL_MBIR", "IPOL"
+# pixels of a field of 1.1 arcsec, and of the usual window of 3 arcsec
+_FIELD_SIDE, _WINDOW_SIDE = 184, 536
+# part of a side that the rectangles of the internal source have
+_LIT = 0.8
+
+#: Column of the observation table to keyword.
+KEYWORDS = {
+    "hwp": "RET-ANG1",
+    "hwp_true": "RET-POS1",
+    "derotator": "D_IMRANG",
+    "flc_state": "U_FLC",
+    "flc": "U_FLCST",
+    "camera": "U_CAMERA",
+    "em_gain": "U_EMGAIN",
+    "read_mode": "U_DETMOD",
+    "filter": _FILTER,
+    "altitude": "ALTITUDE",
+    "parallactic": "PA",
+}
+
+# two ORCA-Quest since 2023, by read mode; before that two EMCCDs iXon Ultra 897
+_FULL = 65535.0
+_READ_OUTS = {
+    "slow 1": ReadOut(0.105, 0.245, _FULL),
+    "slow 2": ReadOut(0.105, 0.220, _FULL),
+    "fast 1": ReadOut(0.103, 0.403, _FULL),
+    "fast 2": ReadOut(0.103, 0.399, _FULL),
+    "slow": ReadOut(0.105, 0.245, _FULL),
+    "fast": ReadOut(0.103, 0.403, _FULL),
+    "em": ReadOut(4.5, 89.0, _FULL, EM_EXCESS_NOISE),
+    "conventional": ReadOut(4.5, 9.6, 40000.0),
+}
+
+
+def _places(side):
+    """Return what depends on the size of an image."""
+    middle, lit = (side - 1) / 2, _LIT * side
+    return {
+        "internal_apertures": ((middle, middle), (middle + side, middle), lit, lit, 0.0),
+        "star_offset": (float(side), 0.0),
+    }
+
+
+#: The multiband imager; ``layout_of`` has the other modes.
+LAYOUT = FileLayout(
+    keywords=KEYWORDS
+    | {
+        "exposure_time": "EXPTIME",
+        "mjd": "MJD",
+        "date": "DATE-OBS",
+        "time": "UT",
+        "right_ascension": "RA",
+        "declination": "DEC",
+        "object": "OBJECT",
+        "instrument": "INSTRUME",
+        "pickoff": _MODE,
+    },
+    shape=(len(FIELDS), _FIELD_SIDE, 2 * _FIELD_SIDE),
+    cube_extension=0,
+    weights="error",
+    alternatives={"flc_state": ("U_FLCSTT",), "hwp": ("U_HWPANG",), "filter": ("U_FILTER",)},
+    units={"exposure_time": "s", "mjd": "d"},
+    identities=("VAMPIRES",),
+    prefix="VMPA",
+    frame_pattern=r"(?<!\d)\d{8}(?!\d)",
+    gain=0.105,
+    read_noise=0.25,
+    saturation=_FULL,
+    pixel_scale=5.9,
+    fwhm=3.5,
+    site=SITE,
+    beam_files=("cam1", "cam2"),
+    states={"1": "A", "2": "B", "NA": ""},
+    read_outs=_READ_OUTS,
+    optics={"flc": ("flc", {r"(?i)^\s*in": "in", r"(?i)^\s*out": "out"})},
+    **_places(_FIELD_SIDE),
+)
+
+
+def slices_of(header):
+    """Return the wavelengths of the slices in a file, by mode and filter in its header."""
+    mode = str(header.get(_MODE, "")).upper()
+    if "MBI" in mode:
+        # the reduced multiband imager leaves the first field out
+        return _wavelengths(FIELDS[1:] if "MBIR" in mode else FIELDS)
+    name = header.get(_FILTER, header.get("U_FILTER"))
+    if name is None:
+        raise InstrumentError(f"vampires: no keyword {_FILTER} in the header")
+    try:
+        return u.Quantity([filter_wavelength("vampires", str(name).strip())])
+    except ObservationError as error:
+        raise InstrumentError(f"{_FILTER} = {name!r}: {error}") from None
+
+
+def layout_of(header):
+    """
+    Return how files of a mode look.
+
+    A header without ``NAXIS1`` and ``NAXIS2`` is of images as large as usual.
+    """
+    multiband = "MBI" in str(header.get(_MODE, "")).upper()
+    # headers that are asked before any file is read have no size
+    usual = _FIELD_SIDE if multiband else _WINDOW_SIDE
+    side, rows = (int(header.get(key, usual)) for key in ("NAXIS1", "NAXIS2"))
+    if side != rows or side < 16:
+        raise InstrumentError(
+            f"vampires: images of {side} x {rows} pixels; square ones of 16 and more are needed"
+        )
+    keywords = LAYOUT.keywords | ({"filter": _MODE} if multiband else {})
+    shape = (len(slices_of(header)), side, 2 * side)
+    return replace(LAYOUT, keywords=keywords, shape=shape, **_places(side))
+
+
+def mode_header(wavelength):
+    """Return the keywords of the mode that has slices of these wavelengths."""
+    known = [({_MODE: _MULTIBAND, _FILTER: "Open"}, FIELDS)]
+    known.append(({_MODE: _REDUCED, _FILTER: "Open"}, FIELDS[1:]))
+    known += [({_MODE: _SINGLE, _FILTER: name}, (name,)) for name in _BANDS]
+    wavelength = np.atleast_1d(u.Quantity(wavelength)).to_value(u.nm)
+    for header, names in known:
+        own = _wavelengths(names).value
+        if own.shape == wavelength.shape and np.allclose(own, wavelength, SAME_WAVELENGTH, 0):
+            return header
+    raise InstrumentError(
+        f"vampires: no file has slices of {', '.join(f'{w:g}' for w in wavelength)} nm; allowed "
+        f"are one of {', '.join(_BANDS)}, or the fields {', '.join(FIELDS)} with or without the "
+        "first"
+    )
+
+
+def _wavelengths(names):
+    return u.Quantity([filter_wavelength("vampires", name) for name in names])
+
+
+# where fits start: wavelength in nm, and retardances in deg
+_START_AT = (610.0, 670.0, 725.0, 775.0)
+_HALF_WAVE_PLATE = (-158.0, -165.0, -171.0, -173.0)
+_DEROTATOR = (281.0, 245.0, 204.0, 176.0)
+
+
+def _silver(name):
+    return optics.MetalMirror(material="silver", incidence=45 * u.deg, name=name)
+
+
+def _mirror(model, grid):
+    """Return the tertiary mirror, ready to be calibrated."""
+    mirror = tertiary_mirror(model, grid)
+    if model == "free":
+        mirror.diattenuation = _silver("m3").diattenuation(grid)
+        mirror.retardance = _silver("m3").retardance(grid)
+    return mirror
+
+
+def _starts(grid, values):
+    return np.interp(grid.to_value(u.nm), _START_AT, values) * u.deg
+
+
+def _half_wave_plate(grid, kind):
+    settings = misaligned(0)
+    if kind == "two-layer":
+        return two_layer_plate(**settings)
+    # the branch of our sign: without it (H, 45, R) and (-H, -45, R) fit alike
+    settings["bounds"] |= {"retardance": (-180, -90)}
+    start = _starts(grid, _HALF_WAVE_PLATE)
+    return optics.LinearRetarder(retardance=start, mount="hwp", name="hwp", **settings)
+
+
+def _derotator(grid, kind):
+    settings, start = misaligned(0), _starts(grid, _DEROTATOR)
+    main = "retardance" if kind == "linear" else "horizontal"
+    settings["bounds"] |= {main: (0, 360)}
+    settings |= {"mount": "derotator", "name": "derotator"}
+    if kind == "kmirror":
+        return k_mirror(**misaligned(0), mount="derotator", name="derotator")
+    if kind == "linear":
+        return optics.LinearRetarder(retardance=start, **settings)
+    settings["bounds"] |= {"diagonal": (-90, 90), "circular": (-90, 90)}
+    # off the point where the two small ones vanish
+    small = np.full(grid.size, 1.0) * u.deg
+    derotator = optics.EllipticalRetarder(
+        horizontal=start, diagonal=-small, circular=small, **settings
+    )
+    derotator.diagonal.prior = derotator.circular.prior = _normal(0, 10)
+    return derotator
+
+
+def _relay(size):
+    """Return what stands between derotator and liquid crystal, the dichroics included."""
+    relay = optics.DiattenuatorRetarder(
+        diattenuation=np.full(size, 0.01),
+        retardance=np.full(size, -30.0) * u.deg,
+        name="relay",
+        bounds={"diattenuation": (-0.6, 0.6), "retardance": (-180, 180)},
+    )
+    # wide: a retarder here looks like one in the derotator, unless that turns far
+    relay.retardance.prior = _normal(0, 45)
+    return relay
+
+
+def _liquid_crystal(size):
+    settings = misaligned(0, most=20)
+    settings["bounds"] |= {"retardance": (90, 270), "switching_angle": (30, 60)}
+    crystal = optics.FerroelectricLiquidCrystal(
+        retardance=np.full(size, 180.0) * u.deg,
+        switching_angle=43 * u.deg,
+        mount="flc_state",
+        name="flc",
+        **settings,
+    )
+    crystal.retardance.prior, crystal.theta.prior = _normal(180, 15), _normal(0, 2)
+    # a smaller switching angle looks like a lower efficiency of the splitter, hence the prior
+    crystal.switching_angle.prior = _normal(43, 2)
+    return crystal
+
+
+def _cameras(size):
+    cameras = optics.BeamGain(imbalance=np.zeros(size), name="cameras")
+    # pairs of both states see it in second order only, hence the prior
+    cameras.imbalance.prior = _normal(0, 0.1)
+    return cameras
+
+
+def _splitter(size):
+    """Return the polarizing beam splitter; an efficiency above one is none."""
+    wollaston = optics.WollastonPrism(efficiency=np.full(size, 0.95), name="wollaston")
+    wollaston.efficiency.prior = _normal(0.95, 0.03)
+    return wollaston
+
 
 # as tables may call them
 _SOURCES = {name: name for name in (*INTERNAL, *STARS)}
@@ -106,12 +351,11 @@ class VAMPIRES(Instrument):
             Grid, by default the fields of the multiband imager.
         derotator : {"elliptical", "linear", "kmirror"}
             Kind of retarder, with values of its own in each band; or three silver mirrors with
-            films of silica, one law for all bands, see
-            `~astropolcal.instruments.telescope.k_mirror`.
+            films of silica, one law for all bands, free in their thickness.
         bounds : {"physical"}
             Half-wave plate from -180 to -90 deg, derotator within the turn from 0 deg on.
         m3 : {"free", "power law", "metal"}
-            Tertiary mirror of a star's chain: a diattenuation a wavelength with the retardance of
+            Tertiary mirror of a star's chain: a diattenuation per wavelength with the retardance of
             silver, a law of the permittivity, or silver with a film.
         plate : {"free", "two-layer"}
             Half-wave plate with a retardance of its own in each band, or with the law of its two
@@ -149,21 +393,21 @@ class VAMPIRES(Instrument):
         train = [polarizer() if source == "polarized" else fold_mirror(grid.size)]
         if source in STARS:
             light = star_source(source, grid, star, target)
-            train = [light, *telescope(_optics.mirror(m3, grid))]
+            train = [light, *telescope(_mirror(m3, grid))]
         train += [
-            _optics.half_wave_plate(grid, plate),
-            _optics.derotator(grid, derotator),
-            _optics.relay(grid.size),
+            _half_wave_plate(grid, plate),
+            _derotator(grid, derotator),
+            _relay(grid.size),
         ]
         if "flc" in optics_in:
-            train.append(_optics.liquid_crystal(grid.size))
-        train.append(_optics.splitter(grid.size))
-        train.append(_optics.cameras(grid.size))
+            train.append(_liquid_crystal(grid.size))
+        train.append(_splitter(grid.size))
+        train.append(_cameras(grid.size))
         return join(train)
 
     def telescope_optics(self, behind):
         """Return the telescope with a tertiary mirror of bare silver."""
-        return telescope(_optics.silver("m3"))
+        return telescope(_silver("m3"))
 
     def published(self):
         """
@@ -171,16 +415,6 @@ class VAMPIRES(Instrument):
 
         No values of all optics are published; these are where fits start, rounded from a fit to
         the internal source in September 2023.
-
-        Returns
-        -------
-        `~astropy.modeling.CompoundModel`
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("vampires").published()["flc"].switching_angle.quantity
-        <Quantity 43. deg>
         """
         return self.chain("polarized")
 
@@ -195,29 +429,7 @@ class VAMPIRES(Instrument):
         }
 
     def configured(self, header):
-        """
-        Return the instrument with the wavelengths and the shape of a file.
-
-        Parameters
-        ----------
-        header : `~astropy.io.fits.Header` or mapping
-            Primary header, with mode, filter and size of the image.
-
-        Returns
-        -------
-        VAMPIRES
-
-        Raises
-        ------
-        InstrumentError
-            If the filter is not known, or the image not square.
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> instruments.get("vampires").configured({"FILTER01": "750-50"}).wavelength
-        <Quantity [750.] nm>
-        """
+        """Return the instrument with the wavelengths and the shape of a file."""
         # a new one: the registry hands out instances that others may hold
         one = type(self)()
         one.wavelength, one.files = slices_of(header), layout_of(header)
@@ -239,21 +451,8 @@ class VAMPIRES(Instrument):
         """
         Return the source from the table's meta, and whether the liquid crystal is in the beam.
 
-        Parameters
-        ----------
-        observations : Observations
-            Its meta holds ``source``, and ``flc`` (``in`` or ``out``); where it does not, the
-            liquid crystal is in if there is a column ``flc_state``.
-
-        Returns
-        -------
-        source : str
-        optics_in : tuple of str
-
-        Raises
-        ------
-        InstrumentError
-            If the source is unknown, or ``flc`` is neither.
+        Where the meta have no ``flc`` (``in`` or ``out``), it is in if there is a column
+        ``flc_state``.
         """
         source = self.source_of(observations, _SOURCES)
         return source, ("flc",) if _is_modulated(observations) else ()
@@ -266,18 +465,9 @@ class VAMPIRES(Instrument):
         """
         Return the observations with saturated frames masked.
 
-        Where frames are paired by the state of the liquid crystal, a drift of the lamp is
-        the same in both and no frame is masked for it. Elsewhere as
+        Where frames are paired by the state of the liquid crystal, a drift of the lamp is the same
+        in both and no frame is masked for it. Elsewhere as
         `~astropolcal.instruments.Instrument.prepare`.
-
-        Parameters
-        ----------
-        observations : Observations
-            The dataset.
-
-        Returns
-        -------
-        Observations
         """
         if observations.pairing == "flc_state" and not is_star(observations.source):
             return mask_saturated(observations)

@@ -4,17 +4,12 @@ Chains and observations as one fittable model with an analytic Jacobian.
 """
 
 from astropolcal.measurement.model import Measurement
-from astropolcal.measurement.parameters import FreeParameters, Slot, Tie, parameter_table
-from astropolcal.measurement.priors import BoundPrior, Normal, Uniform, bind_prior
+from astropolcal.measurement.parameters import Tie, parameter_table
+from astropolcal.measurement.priors import Normal
 
 __all__ = [
-    "BoundPrior",
-    "FreeParameters",
     "Measurement",
     "Normal",
-    "Slot",
     "Tie",
-    "Uniform",
-    "bind_prior",
     "parameter_table",
 ]

@@ -14,41 +14,11 @@ from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 
-__all__ = ["Dataset", "as_pairs"]
+__all__ = []
 
 
 def as_pairs(chain, observations, positions):
-    """
-    Return chain, observations and positions of every dataset, from one or several of each.
-
-    Parameters
-    ----------
-    chain : Optic, `~astropy.modeling.CompoundModel` or sequence of them
-        One for all datasets, or one each.
-    observations : Observations or sequence of Observations
-        The datasets.
-    positions : sequence of dict or None
-        Position of every stage for each dataset.
-
-    Returns
-    -------
-    list of tuple
-        ``(chain, observations, positions)``, one a dataset.
-
-    Raises
-    ------
-    ObservationError
-        If there is no dataset, or the numbers differ.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.measurement.datasets import as_pairs
-    >>> from astropolcal.observations import Observations, example_table
-    >>> night = Observations.from_table(example_table())
-    >>> len(as_pairs(optics.WollastonPrism(), [night, night], None))
-    2
-    """
+    """Return ``(chain, observations, positions)`` of every dataset, from one or several of each."""
     observations = list(observations) if isinstance(observations, (list, tuple)) else [observations]
     chains = [chain] * len(observations) if isinstance(chain, Model) else list(chain)
     positions = [None] * len(observations) if positions is None else list(positions)
@@ -62,42 +32,11 @@ def as_pairs(chain, observations, positions):
 
 class Dataset:
     """
-    A chain with its observations, on the common grid and the flat vector.
+    A chain with its observations, on the common grid (micrometre) and the flat vector.
 
-    Parameters
-    ----------
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        The chain.
-    observations : Observations
-        The data.
-    observable : Observable
-        What is compared.
-    free : FreeParameters
-        The flat vector of free parameters.
-    wavelength : `~numpy.ndarray`
-        Common grid in micrometre.
-    positions : dict of str to `~numpy.ndarray`, optional
-        Position of every stage in radian, shape (n_frames,), or (nodes, n_frames) at the
-        Gauss-Legendre nodes of each exposure, whose fluxes are averaged; by default as the
-        instrument that the table names reads it, or the columns of the table.
-
-    Raises
-    ------
-    ObservationError
-        If a wavelength of the data is not on the grid, or nodes differ in number.
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.measurement import Measurement
-    >>> from astropolcal.observations import Observations, example_table
-    >>> chain = (optics.LinearPolarizer(name="polarizer")
-    ...          | optics.LinearRetarder(mount="hwp", name="hwp")
-    ...          | optics.WollastonPrism(name="wollaston"))
-    >>> night = Observations.from_table(example_table())
-    >>> dataset = Measurement(chain, night).datasets[0]
-    >>> dataset.n_data, dataset.n_parameters_per_wavelength
-    (6, 2)
+    ``positions`` of every stage are in radian, shape (n_frames,), or (nodes, n_frames) at the
+    Gauss-Legendre nodes of each exposure, whose fluxes are averaged; by default as the instrument
+    that the table names reads it, or the columns of the table.
     """
 
     def __init__(self, chain, observations, observable, free, wavelength, positions=None):
@@ -135,20 +74,7 @@ class Dataset:
             raise WavelengthRangeError(f"{obs.name}: {error}") from None
 
     def thinned(self, chain, groups):
-        """
-        Return the dataset with some of its groups of frames, for a quick first look.
-
-        Parameters
-        ----------
-        chain : Optic or `~astropy.modeling.CompoundModel`
-            The dataset's chain.
-        groups : `~numpy.ndarray` of int
-            Numbers of the groups, ascending.
-
-        Returns
-        -------
-        Dataset
-        """
+        """Return the dataset with some of its groups of frames, by ascending numbers."""
         new = copy.copy(self)
         new.frames = self.frames[groups]
         new.positions = {stage: angle[:, groups] for stage, angle in self.positions.items()}
@@ -228,7 +154,7 @@ class Dataset:
                 if slot is not None:
                     where = slot.start + self.bins if slot.per_wavelength else slot.start
                     self._live.append(((i, j), where, factor, offset))
-                # a fixed value a wavelength is cut down to this dataset's wavelengths
+                # a fixed value per wavelength is cut down to this dataset's wavelengths
                 elif np.size(self._constants[i][j]) > 1:
                     self._constants[i][j] = self._constants[i][j][self.bins]
 
@@ -269,7 +195,7 @@ class Dataset:
         each = np.arange(n_bins)
         for key, where, factor, _ in self._live:
             slope = factor * self._grouped(self._over_nodes(slopes[key])).sum(axis=0)
-            # a value a wavelength moves the data of its own wavelength
+            # a value per wavelength moves the data of its own wavelength
             # only, one for all moves all of them
             if np.ndim(where):
                 out[where, each] += slope

@@ -18,6 +18,7 @@ from astropolcal.measurement.datasets import Dataset, as_pairs
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.observables import get_observable
 from astropolcal.observations.reading import common_wavelengths
+from astropolcal.optics._modelling import with_own_scalars
 
 __all__ = ["Measurement"]
 
@@ -118,7 +119,8 @@ class Measurement(FittableModel):
         self.sigma = np.concatenate([d.sigma for d in self.datasets])
         #: Wavelength (index on the common grid) of each datum.
         self.bins = np.concatenate([d.bin_of_datum for d in self.datasets])
-        #: Noise that a fit assumed of the data, a `~astropolcal.calibration.Weighting`.
+        #: Noise that a fit assumed of the data, a
+        #: `~astropolcal.calibration.noise.weighting.Weighting`.
         self.weighting = None
         # vector and sweeps of the last prediction: fitters ask for
         # data and Jacobian at the same point
@@ -187,50 +189,17 @@ class Measurement(FittableModel):
     def __deepcopy__(self, memo):
         # every fitter copies the model: what does not change is shared, and the chains are
         # copied when somebody looks at them
-        new = self.__class__.__new__(self.__class__)
-        memo[id(self)] = new
-        new.__dict__.update(self.__dict__, _chains_are_shared=True)
-        new.__dict__["_parameters"] = self._parameters.copy()
-        for key in ("_mconstraints", "_constraints_cache", "_user_inverse", "_meta"):
-            if key in self.__dict__:
-                new.__dict__[key] = copy_module.copy(self.__dict__[key])
-        for label in self._param_names:
-            parameter = copy_module.copy(self.__dict__[label])
-            parameter.model = new
-            new.__dict__[label] = parameter
-            parameter.value = float(self.__dict__[label].value)
+        memo[id(self)] = new = with_own_scalars(self, self._param_names)
+        new._chains_are_shared = True
         self._chains_are_shared = True
         return new
 
     def thinned(self, most):
         """
-        Return the measurement with fewer frames, for searches that need not see them all.
+        Return the measurement with fewer frames, and which data it keeps, bool of shape (n_data,).
 
-        Parameters
-        ----------
-        most : int
-            Number of groups of frames that a dataset keeps at most; they are drawn at random,
-            always the same ones.
-
-        Returns
-        -------
-        measurement : Measurement
-            With the same free parameters and current values.
-        kept : `~numpy.ndarray` of bool
-            The data that it keeps, shape (n_data,).
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> from astropolcal.measurement import Measurement
-        >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-        >>> import astropy.units as u
-        >>> charis = instruments.get("charis")
-        >>> frames = half_wave_plate_cycles(derotator=[45, 80] * u.deg)
-        >>> whole = Measurement(charis.chain(), simulate(charis.chain(), charis.wavelength, frames))
-        >>> fewer, kept = whole.thinned(5)
-        >>> fewer.n_data, int(kept.sum()), whole.n_data
-        (110, 110, 176)
+        For searches that need not see them all: up to ``most`` groups of frames of each dataset,
+        drawn at random, always the same ones. Free parameters and current values are the same.
         """
         chosen = [_drawn(dataset.frames.shape[0], most) for dataset in self.datasets]
         new = copy_module.deepcopy(self)
@@ -266,37 +235,13 @@ class Measurement(FittableModel):
         return sweeps
 
     def predict(self, vector):
-        """
-        Return all predicted data for a vector of free parameters.
-
-        Parameters
-        ----------
-        vector : array_like
-            Canonical values, shape (n_free,).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Shape (n_data,).
-        """
+        """Return all predicted data, (n_data,), for a vector of free parameters (canonical)."""
         sweeps = self._sweeps(np.asarray(vector, dtype=float).ravel())
         parts = [d.values(s) for d, s in zip(self.datasets, sweeps, strict=True)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def jacobian(self, vector):
-        """
-        Return the derivative of all data to all free parameters.
-
-        Parameters
-        ----------
-        vector : array_like
-            Canonical values, shape (n_free,).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Shape (n_free, n_data).
-        """
+        """Return the derivative of all data to all free parameters, (n_free, n_data)."""
         sweeps = self._sweeps(np.asarray(vector, dtype=float).ravel())
         parts = [d.jacobian(s) for d, s in zip(self.datasets, sweeps, strict=True)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
@@ -327,24 +272,11 @@ class Measurement(FittableModel):
 
     def fit_arguments(self, weights=None, noise=1.0, keep=None):
         """
-        Return what a fitter takes: index, data and weights, with the priors as data.
+        Return what a fitter takes: index, data and weights, with the priors as data behind them.
 
-        Parameters
-        ----------
-        weights : `~numpy.ndarray`, optional
-            Weight of each datum, shape (n_data,); None for equal weights.
-        noise : float
-            Standard deviation of a datum of weight one; sets how much a prior
-            weighs against the data.
-        keep : `~numpy.ndarray`, optional
-            True for the data that take part, shape (n_data,).
-
-        Returns
-        -------
-        index, observed : `~numpy.ndarray`
-            Shape (n_data + n_priors,), or fewer with ``keep``.
-        weights : `~numpy.ndarray` or None
-            None where all weigh the same.
+        ``weights`` of the data may be None for equal ones, ``noise`` is the standard deviation of
+        a datum of weight one, which sets how much a prior weighs against the data, and ``keep`` is
+        True for the data that take part.
         """
         take = np.ones(self.n_data, dtype=bool) if keep is None else keep
         index, observed = self.index[take], self.observed[take]
@@ -361,18 +293,7 @@ class Measurement(FittableModel):
         )
 
     def log_prior(self, vector):
-        """
-        Return the log density of the priors, minus infinity outside the bounds.
-
-        Parameters
-        ----------
-        vector : array_like
-            Canonical values, shape (n_free,).
-
-        Returns
-        -------
-        float
-        """
+        """Return the log density of the priors, minus infinity outside the bounds."""
         return self.free.log_prior(vector)
 
     # ---- results --------------------------------------------------------------

@@ -3,8 +3,8 @@
 Free parameters of one or several chains as one flat vector.
 
 Chains name their parameters ``optic.parameter``; equal names in several
-chains are the same parameter. A parameter with one value a wavelength
-becomes one number a wavelength of the common grid. Ties are linear and are
+chains are the same parameter. A parameter with one value per wavelength
+becomes one number per wavelength of the common grid. Ties are linear and are
 applied here, so that the Jacobian stays exact.
 """
 
@@ -19,7 +19,7 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.measurement.priors import bind_prior, normal_per_wavelength
 from astropolcal.units import canonical_factor, to_unit
 
-__all__ = ["FreeParameters", "Slot", "Tie", "parameter_table"]
+__all__ = ["Tie", "parameter_table"]
 
 # a parameter closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-5
@@ -58,24 +58,8 @@ class Slot:
     """
     Where a named parameter lives in the flat vector.
 
-    Parameters
-    ----------
-    name : str
-        ``"optic.parameter"``.
-    unit : `~astropy.units.Unit` or None
-        The unit it is declared in.
-    start, size : int
-        First element and number of elements; more than one for a parameter
-        with one value a wavelength.
-    bounds : tuple
-        Lower and upper bound in ``unit``, None where open.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.measurement import Slot
-    >>> Slot("hwp.theta", u.deg, 0, 1, (-5, 5)).slice
-    slice(0, 1, None)
+    Its first element and number of elements, which is more than one for a parameter with one value
+    per wavelength; bounds in ``unit``, None where open.
     """
 
     name: str
@@ -96,7 +80,7 @@ class Slot:
 
     @property
     def per_wavelength(self):
-        """Whether there is one value a wavelength."""
+        """Whether there is one value per wavelength."""
         return self.size > 1
 
     @property
@@ -126,7 +110,7 @@ def parameter_table(chains):
     Returns
     -------
     dict of str to list of `~astropy.modeling.Parameter`
-        ``"optic.parameter"`` to its parameter objects, one a chain that has it.
+        ``"optic.parameter"`` to its parameter objects, one per chain that has it.
 
     Raises
     ------
@@ -160,31 +144,11 @@ def parameter_table(chains):
 
 class FreeParameters:
     """
-    The free parameters of chains that share optics by name.
+    The free parameters of chains that share optics by name, one chain per dataset.
 
-    Parameters
-    ----------
-    chains : sequence
-        The chains, one a dataset.
-    n_wavelengths : int
-        Size of the common wavelength grid.
-    ties : dict of str to Tie, optional
-        Parameters that follow others.
-
-    Raises
-    ------
-    ParameterError
-        If shapes do not fit the grid, a parameter is free in one chain and
-        fixed in another, a tie is circular or unknown, or astropy's callable
-        ``tied`` is used (it spoils analytic Jacobians).
-
-    Examples
-    --------
-    >>> from astropolcal import optics
-    >>> from astropolcal.measurement import FreeParameters
-    >>> free = FreeParameters([optics.WollastonPrism(name="wollaston")], 22)
-    >>> [slot.name for slot in free.slots], free.size
-    (['wollaston.efficiency'], 1)
+    Refused are shapes that do not fit the common grid of ``n_wavelengths``, parameters that are
+    free in one chain and fixed in another, ties that are circular or unknown, and astropy's
+    callable ``tied``, which spoils analytic Jacobians.
     """
 
     def __init__(self, chains, n_wavelengths, ties=None):
@@ -252,7 +216,7 @@ class FreeParameters:
         size = np.size(first.value)
         if size not in (1, n_wavelengths):
             raise ParameterError(
-                f"{name} has {size} values; allowed are 1 or {n_wavelengths}, one a wavelength"
+                f"{name} has {size} values; allowed are 1 or {n_wavelengths}, one per wavelength"
             )
         if any(np.size(p.value) != size or p.fixed != first.fixed for p in parameters[1:]):
             raise ParameterError(f"{name} differs between datasets in shape or in being fixed")
@@ -330,18 +294,7 @@ class FreeParameters:
         return np.repeat([slot.factor for slot in self.slots], [slot.size for slot in self.slots])
 
     def log_prior(self, vector):
-        """
-        Return the log density of the priors, minus infinity outside the bounds.
-
-        Parameters
-        ----------
-        vector : array_like
-            Canonical values, shape (n_free,).
-
-        Returns
-        -------
-        float
-        """
+        """Return the log density of the priors, minus infinity outside the bounds."""
         vector = np.asarray(vector, dtype=float)
         low, high = self._bounds
         if np.any(vector < low) or np.any(vector > high):
@@ -367,14 +320,9 @@ class FreeParameters:
 
     def lookup(self, name):
         """
-        Return where the value of a parameter comes from.
+        Return slot, factor and offset of a parameter, ``value = factor * vector[slot] + offset``.
 
-        Returns
-        -------
-        slot : Slot or None
-            None for a parameter that is fixed.
-        factor, offset : float
-            ``value = factor * vector[slot] + offset``.
+        The slot of a fixed parameter is None.
         """
         # free itself: the value is the element of the vector
         if name in self.by_name:

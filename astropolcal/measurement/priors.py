@@ -3,7 +3,7 @@
 Prior knowledge of parameters, used by fits and samplers alike.
 
 A prior sits in astropy's place for it, ``parameter.prior``: `Normal` or
-`Uniform` with units, or any frozen scipy distribution of the value in the
+``Uniform`` with units, or any frozen scipy distribution of the value in the
 parameter's unit. For a fit a prior is one more datum, whose residual r obeys
 ``r**2 / 2 = -log density`` up to a constant; where the density is zero there
 is a bound.
@@ -18,7 +18,7 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import canonical_factor, to_unit
 
-__all__ = ["BoundPrior", "Normal", "Uniform", "bind_prior", "normal_per_wavelength"]
+__all__ = ["Normal"]
 
 # step of the numerical derivative of a general prior's residual, in its standard deviations
 _STEP = 1e-5
@@ -32,7 +32,7 @@ class Normal:
     Parameters
     ----------
     mean, std : `~astropy.units.Quantity` or float
-        In any unit that converts to the parameter's; one value a wavelength for a
+        In any unit that converts to the parameter's; one value per wavelength for a
         parameter that has one.
 
     Examples
@@ -59,21 +59,7 @@ class Normal:
 
 @dataclass(frozen=True)
 class Uniform:
-    """
-    Uniform prior: tighter bounds.
-
-    Parameters
-    ----------
-    low, high : `~astropy.units.Quantity` or float
-        In any unit that converts to the parameter's.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.measurement import Uniform
-    >>> Uniform(-1 * u.deg, 1 * u.deg).high
-    <Quantity 1. deg>
-    """
+    """Uniform prior: tighter bounds, in any unit that converts to that of the parameter."""
 
     low: object
     high: object
@@ -94,24 +80,8 @@ class BoundPrior:
     """
     A prior bound to a parameter, on canonical values.
 
-    Parameters
-    ----------
-    name : str
-        ``"optic.parameter"``.
-    distribution : object
-        Frozen scipy distribution of the value in the declared unit.
-    factor : float
-        From declared to canonical unit.
-    mode : float
-        Where the density is largest, in the declared unit.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal.measurement import Normal, bind_prior
-    >>> prior = bind_prior(Normal(0 * u.deg, 1 * u.deg), "hwp.theta", u.deg, (-5, 5))
-    >>> float(prior.residual(2 * u.deg.to(u.rad)).round(9))
-    2.0
+    ``distribution`` is a frozen scipy distribution of the value in the declared unit, ``mode``
+    where its density is largest, ``factor`` leads from the declared to the canonical unit.
     """
 
     name: str
@@ -191,36 +161,7 @@ class BoundPrior:
 
 
 def bind_prior(prior, name, unit, bounds):
-    """
-    Check a prior against its parameter and bind it.
-
-    Parameters
-    ----------
-    prior : Normal, Uniform or frozen scipy distribution
-        The prior.
-    name : str
-        ``"optic.parameter"``.
-    unit : `~astropy.units.Unit` or None
-        Unit of the parameter.
-    bounds : tuple
-        Bounds of the parameter in that unit, None where open.
-
-    Returns
-    -------
-    BoundPrior
-
-    Raises
-    ------
-    ParameterError
-        If it is no distribution, has the wrong unit, or lies outside the bounds.
-
-    Examples
-    --------
-    >>> from scipy.stats import truncnorm
-    >>> from astropolcal.measurement import bind_prior
-    >>> bind_prior(truncnorm(-5, 0, 1, 0.01), "wollaston.efficiency", None, (0, 1)).mode
-    1.0
-    """
+    """Check a prior against name, unit and bounds of its parameter; return a BoundPrior."""
     distribution = prior.frozen(unit, name) if hasattr(prior, "frozen") else prior
     if not (hasattr(distribution, "logpdf") and hasattr(distribution, "support")):
         raise ParameterError(
@@ -249,24 +190,7 @@ def normal_per_wavelength(prior, unit):
     """
     Return a frozen normal distribution of several values as `Normal`, which files can hold.
 
-    Parameters
-    ----------
-    prior : object
-        Any prior.
-    unit : `~astropy.units.Unit` or None
-        Unit of its values.
-
-    Returns
-    -------
-    object
-        The prior itself, if it is another one.
-
-    Examples
-    --------
-    >>> from scipy.stats import norm
-    >>> from astropolcal.measurement.priors import normal_per_wavelength
-    >>> normal_per_wavelength(norm([0.01, 0.02], 0.001), None).mean
-    <Quantity [0.01, 0.02]>
+    Any other prior comes back as it is.
     """
     name = getattr(getattr(prior, "dist", None), "name", None)
     if name != "norm" or np.ndim(prior.mean()) == 0:
@@ -277,7 +201,7 @@ def normal_per_wavelength(prior, unit):
 
 
 def _plain(value):
-    """Return a float, or an array where there is one value a wavelength."""
+    """Return a float, or an array where there is one value per wavelength."""
     value = np.asarray(value, dtype=float)
     return value if value.ndim else float(value)
 

@@ -281,73 +281,31 @@ def _warn_left_over(left, hwp, labels, name):
 # ---- data of a table -----------------------------------------------------------------------------
 
 
-class FrameGroups:
+def frame_groups(observations, kind, rows, label, **limits):
     """
-    The groups of frames of a table, found once for each choice of limits; the arrays are read only.
+    Return the frames of each datum of a table, an array that is read only.
+
+    By ``kind``: pairs by ``"hwp"`` or by ``"flc_state"``, (P, 2); ``"both"``, pairs in both states
+    of a modulator, (Q, 4): A and B at the plus angle, then at the minus. The limits are those
+    of `pair_frames`, rows and label are for messages.
     """
-
-    def __init__(self, observations, rows=None, label="table"):
-        self._observations = observations
-        self._names = {"rows": rows, "name": label}
-        self._found = {}
-
-    def pairs(self, tolerance=0.3 * u.deg, derotator_tolerance=0.5 * u.deg, share=False):
-        """Return frame indices of pairs, shape (P, 2)."""
-        states = self._observations.pairing == "flc_state"
-        find = self._find_states if states else self._find_pairs
-        return self._kept(find, tolerance, derotator_tolerance, share)
-
-    def quadruples(self, tolerance=0.3 * u.deg, derotator_tolerance=0.5 * u.deg, share=False):
-        """
-        Return frame indices of pairs in both states of a modulator, shape (Q, 4).
-
-        A and B at the plus angle, then at the minus angle.
-        """
-        return self._kept(self._find_quadruples, tolerance, derotator_tolerance, share)
-
-    def _kept(self, find, tolerance, derotator_tolerance, share):
-        angles = (tolerance, derotator_tolerance)
-        # in radian, so that 30 arcmin and 0.5 deg are one entry
-        key = (find.__name__, *(float(angle_to_rad(a, "tolerance")) for a in angles), bool(share))
-        if key not in self._found:
-            limits = dict(zip(("tolerance", "derotator_tolerance"), key[1:3] * u.rad, strict=True))
-            found = find(share=key[3], **limits)
-            # everybody gets the same array
-            found.flags.writeable = False
-            self._found[key] = found
-        return self._found[key]
-
-    @property
-    def _angles(self):
-        return tuple(self._observations.position(name) * u.rad for name in ("hwp", "derotator"))
-
-    def _labels(self):
-        return np.asarray(self._observations.frames["frame"]).tolist()
-
-    def _find_pairs(self, **limits):
-        frames = self._observations.frames
-        # the plate cancels what stands still: both frames must be in one state
+    frames, time = observations.frames, clock(observations.frames)
+    angles = tuple(observations.position(name) * u.rad for name in ("hwp", "derotator"))
+    named = limits | {"rows": rows, "name": label}
+    labels = np.asarray(frames["frame"]).tolist()
+    if kind == "hwp":
+        # the plate cancels what is static: both frames must be in one state
         state = np.asarray(frames["flc_state"]) if "flc_state" in frames.colnames else None
-        names = self._names | {"labels": self._labels()}
-        return self._some(pair_frames(*self._angles, state, clock(frames), **names, **limits))
-
-    def _find_states(self, **limits):
-        observations = self._observations
-        state, time = observations.position("flc_state"), clock(observations.frames)
-        return pair_states(state, *self._angles, time, **self._names, **limits)
-
-    def _find_quadruples(self, **limits):
-        time = clock(self._observations.frames)
-        names = self._names | {"labels": self._labels()}
+        found = pair_frames(*angles, state, time, labels=labels, **named)
+    else:
         # states first: they alternate within an exposure and so share its atmosphere
-        states = self._find_states(**limits)
-        return self._some(quadruples(states, *self._angles, time, **names, **limits))
-
-    def _some(self, groups):
-        if not len(groups):
-            n = self._observations.n_frames
-            raise ObservationError(
-                f"{self._names['name']}: none of its {counted(n, 'frame')} can be paired; two "
-                "frames 45 deg of half-wave plate apart at the same derotator angle are needed"
-            )
-        return groups
+        found = pair_states(observations.position("flc_state"), *angles, time, **named)
+    if kind == "both":
+        found = quadruples(found, *angles, time, labels=labels, **named)
+    if not len(found) and kind != "flc_state":
+        raise ObservationError(
+            f"{label}: none of its {counted(observations.n_frames, 'frame')} can be paired; two "
+            "frames 45 deg of half-wave plate apart at the same derotator angle are needed"
+        )
+    found.flags.writeable = False
+    return found

@@ -23,7 +23,7 @@ from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, Observa
 from astropolcal.files import one_line
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.positions import MOVES
+from astropolcal.optics.core import MOVES
 from astropolcal.units import angle_to_rad
 
 __all__ = ["location_of", "pointing"]

@@ -3,8 +3,8 @@
 Frames of a run that cannot be used, found from the table and masked with a reason.
 
 Nothing is dropped: a masked frame stays in the table with its reason, and one warning a
-reason says how many there are and which. See also `astropolcal.observations.grid`, which judges
-single cells while a table is read.
+reason says how many there are and which. Single cells are
+judged while a table is read.
 """
 
 import re
@@ -147,7 +147,9 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
         raise ObservationError(f"limit = {limit}, sigma = {sigma}; both must be above zero")
     # a lamp changes by factors
     logarithm = np.log(brightness(observations))
-    off = np.abs(logarithm - _drift(logarithm))
+    degree = min(2, max(int(np.isfinite(logarithm).sum()) - 4, 0))
+    drift = robust_curve(np.linspace(-1, 1, len(logarithm)), logarithm, degree)
+    off = np.abs(logarithm - drift)
     spread = MAD_TO_SIGMA * np.nanmedian(off)
     # NaN, a frame masked already, is not far
     far = np.nan_to_num(off) > max(limit, sigma * spread)
@@ -156,12 +158,6 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
     run = np.concatenate([[0], np.cumsum(moved)])
     far |= (np.bincount(run, far) >= 0.5 * np.bincount(run))[run]
     return _masked(observations, far, "unstable lamp")
-
-
-def _drift(values):
-    """Return the parabola of least absolute deviations through values in the order of time."""
-    degree = min(2, max(int(np.isfinite(values).sum()) - 4, 0))
-    return robust_curve(np.linspace(-1, 1, len(values)), values, degree)
 
 
 def robust_curve(x, values, degree):

@@ -102,10 +102,10 @@ def _check_numbers(path, text):
 
 def check_table(table, label, required):
     """
-    Return a table as a QTable.
+    Return a table as a QTable, or refuse it.
 
-    Refuse what is no table with rows, the required columns and plain values. All missing columns
-    are named at once.
+    It needs rows, the required columns, of which all that are missing are named at once, and plain
+    values.
     """
     if not isinstance(table, Table):
         raise ObservationError(f"{label}: a {type(table).__name__}, an astropy Table is needed")

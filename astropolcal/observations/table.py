@@ -15,7 +15,7 @@ from astropy.time import Time
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import atomic_path, check_new, one_line
 from astropolcal.observations.grid import beam_variances, build_grid
-from astropolcal.observations.pairing import PAIRINGS, FrameGroups
+from astropolcal.observations.pairing import PAIRINGS, frame_groups
 from astropolcal.observations.pointings import frame_coordinate
 from astropolcal.observations.reading import (
     complete_table,
@@ -24,7 +24,7 @@ from astropolcal.observations.reading import (
     stated_date,
 )
 from astropolcal.optics import COORDINATES
-from astropolcal.units import canonical_unit
+from astropolcal.units import angle_to_rad, canonical_unit
 from astropolcal.words import counted
 
 __all__ = ["Observations", "example_table"]
@@ -88,9 +88,8 @@ class Observations:
         self.meta |= {} if date is None else {"date": date}
         # from the grid and not from the file: a mask set later holds for them as well
         self._variances = beam_variances(grid.flux_right, grid.flux_left, grid.errors)
-        self._groups = FrameGroups(self, grid.rows.tolist(), self._label)
-        # found when it is first asked for, and kept
-        self._hash = None
+        # found when they are first asked for, and kept
+        self._groups, self._hash = {}, None
         self._mask = grid.reason > 0
         self._freeze()
 
@@ -456,7 +455,18 @@ class Observations:
         >>> obs.pairs().tolist()
         [[0, 2], [1, 3]]
         """
-        return self._groups.pairs(tolerance, derotator_tolerance, share)
+        return self._grouped(self.pairing, tolerance, derotator_tolerance, share)
+
+    def _grouped(self, kind, tolerance=0.3 * u.deg, derotator_tolerance=0.5 * u.deg, share=False):
+        limits = {"tolerance": tolerance, "derotator_tolerance": derotator_tolerance}
+        # in radian, so that 30 arcmin and 0.5 deg are one entry
+        limits = {name: float(angle_to_rad(angle, name)) for name, angle in limits.items()}
+        key = (kind, *limits.values(), bool(share))
+        if key not in self._groups:
+            limits = {name: angle * u.rad for name, angle in limits.items()}
+            rows = self._grid.rows.tolist()
+            self._groups[key] = frame_groups(self, kind, rows, self._label, share=share, **limits)
+        return self._groups[key]
 
     def groups(self, size):
         """
@@ -493,7 +503,7 @@ class Observations:
         [[0, 1, 3, 2]]
         """
         if size == 4:
-            return self._groups.quadruples()
+            return self._grouped("both")
         if size == 2:
             return self.pairs()
         if size != 1:

@@ -7,31 +7,36 @@ registered in `OPTICS`; a new optic is one class and its entry there, and the
 registry tests then hold it to the laws that all optics obey.
 """
 
-from astropolcal.optics.beamsplitters import BeamGain, WollastonPrism
-from astropolcal.optics.core import COORDINATES, Optic, rotation_generator
-from astropolcal.optics.depolarizers import Depolarizer
-from astropolcal.optics.derotators import KMirror
-from astropolcal.optics.fluxes import FluxGain, PolarizedBackground, StrayLight
-from astropolcal.optics.general import MuellerElement
-from astropolcal.optics.mirrors import MetalMirror, ParityFlip, PowerLawMirror
+from astropolcal.optics.core import COORDINATES, Optic
+from astropolcal.optics.mirrors import KMirror, MetalMirror, ParityFlip, PowerLawMirror
 from astropolcal.optics.modulated import (
     DriftRetarder,
     DriftRotator,
+    FerroelectricLiquidCrystal,
+    FluxGain,
     FrameOptic,
     HarmonicGain,
     HarmonicRetarder,
     HarmonicRotator,
+    PolarizedBackground,
+    StrayLight,
 )
-from astropolcal.optics.modulators import FerroelectricLiquidCrystal
-from astropolcal.optics.perturbations import GENERATORS, Dependence, Perturbation
+from astropolcal.optics.perturbations import GENERATORS, MuellerElement, Perturbation
 from astropolcal.optics.polarizers import (
+    BeamGain,
+    Depolarizer,
     Diattenuator,
     DiattenuatorRetarder,
     LinearPolarizer,
     VectorDiattenuator,
+    WollastonPrism,
 )
-from astropolcal.optics.retarders import EllipticalRetarder, LinearRetarder, TwoLayerWaveplate
-from astropolcal.optics.rotators import Rotator
+from astropolcal.optics.retarders import (
+    EllipticalRetarder,
+    LinearRetarder,
+    Rotator,
+    TwoLayerWaveplate,
+)
 from astropolcal.optics.sources import PolarizedSource, StarSource
 
 __all__ = [
@@ -39,7 +44,6 @@ __all__ = [
     "GENERATORS",
     "OPTICS",
     "BeamGain",
-    "Dependence",
     "Depolarizer",
     "Diattenuator",
     "DiattenuatorRetarder",
@@ -69,40 +73,11 @@ __all__ = [
     "TwoLayerWaveplate",
     "VectorDiattenuator",
     "WollastonPrism",
-    "rotation_generator",
 ]
 
-#: Every optic by class name.
+#: Every optic by class name: all classes above but the two bases.
 OPTICS = {
-    cls.__name__: cls
-    for cls in (
-        BeamGain,
-        Depolarizer,
-        Diattenuator,
-        DiattenuatorRetarder,
-        DriftRetarder,
-        DriftRotator,
-        EllipticalRetarder,
-        FerroelectricLiquidCrystal,
-        FluxGain,
-        HarmonicGain,
-        HarmonicRetarder,
-        HarmonicRotator,
-        KMirror,
-        LinearPolarizer,
-        LinearRetarder,
-        MetalMirror,
-        MuellerElement,
-        ParityFlip,
-        Perturbation,
-        PolarizedBackground,
-        PolarizedSource,
-        PowerLawMirror,
-        Rotator,
-        StarSource,
-        StrayLight,
-        TwoLayerWaveplate,
-        VectorDiattenuator,
-        WollastonPrism,
-    )
+    name: globals()[name]
+    for name in __all__
+    if not name.isupper() and name not in ("FrameOptic", "Optic")
 }

@@ -17,14 +17,48 @@ import numpy as np
 from astropy.modeling import FittableModel, InputParameterError, Parameter
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller.elements import _rotate, _rotation_matrix
-from astropolcal.optics._matrices import rotation_generator, turn
+from astropolcal.mueller import _rotate, _rotation_matrix, rotation_generator, turn
 from astropolcal.optics._modelling import KeywordOnly, copied_attributes
-from astropolcal.optics.positions import COORDINATES, FLUXES, check_broadcast, finite_position
-from astropolcal.units import canonical_factor, length_to_um, to_unit
+from astropolcal.units import angle_to_rad, canonical_factor, length_to_um, to_unit
 from astropolcal.words import did_you_mean
 
-__all__ = ["COORDINATES", "FLUXES", "Optic", "rotation_generator"]
+__all__ = ["COORDINATES", "Optic"]
+
+#: Positions that differ between wavelengths and beams: the flux of the beam, and that flux
+#: over the one in the frame before.
+FLUXES = ("flux", "total_flux", "previous_flux")
+
+#: By how much an angle changes from one frame to the next.
+RATES = ("parallactic_rate", "derotator_rate")
+
+#: The last move of a stage: 1 where it went backwards, else 0; and how far, in radian.
+MOVES = tuple(f"{stage}_{what}" for stage in ("hwp", "derotator") for what in ("direction", "move"))
+
+#: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
+#: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame, the
+#: last moves of the stages, and the fluxes.
+COORDINATES = ("sequence", "flc_state", "frame", *RATES, *MOVES, *FLUXES)
+
+
+def finite_position(value, name, stage=None):
+    """Return the position of a stage in radian, or as a number; refuse what is not finite."""
+    number = (stage or name) in COORDINATES
+    position = to_unit(value, None, name) if number else angle_to_rad(value, name)
+    if not np.all(np.isfinite(position)):
+        raise ParameterError(f"{name} = {value} must be finite")
+    return position
+
+
+def check_broadcast(wavelength, position):
+    """Refuse positions and wavelengths that do not broadcast."""
+    try:
+        np.broadcast_shapes(np.shape(wavelength), np.shape(position))
+    except ValueError:
+        raise ParameterError(
+            f"positions of shape {np.shape(position)} do not broadcast against wavelengths of "
+            f"shape {np.shape(wavelength)}; give the positions the shape (n_frames, 1)"
+        ) from None
+
 
 LIGHT = ("wavelength", "I", "Q", "U", "V")
 
@@ -48,7 +82,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     name : str, optional
         Name of the optic in its chain.
     **parameters : `~astropy.units.Quantity` or float
-        Values of the optic's parameters: a scalar, or one value a wavelength.
+        Values of the optic's parameters: a scalar, or one value per wavelength.
 
     Raises
     ------
@@ -81,7 +115,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     n_inputs = 5
     n_outputs = 5
-    # one value a wavelength is not to be broadcast by astropy against light of another shape
+    # one value per wavelength is not to be broadcast by astropy against light of another shape
     standard_broadcasting = False
     #: True for an optic that turns the frame of all that follows.
     rotates_frame = False
@@ -107,15 +141,21 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             )
         values = {key: kwargs.pop(key) for key in self.param_names if key in kwargs}
         values = {key: self._at_the_door(key, value) for key, value in values.items()}
+        settings = {
+            key: kwargs.pop(key, setting.default)
+            for key, setting in self._declared_settings.items()
+        }
         try:
             super().__init__(name=name, **values, **kwargs)
         except (TypeError, InputParameterError) as error:
             self._check_names(kwargs)
             raise ParameterError(f"{type(self).__name__}: {error}") from None
         # astropy would call the five channels x0 to x4
-        self._inputs = self._outputs = LIGHT
+        self.inputs = self.outputs = LIGHT
         self._mount, self._position = None, 0.0
         self.mount = mount
+        for key, value in settings.items():
+            setattr(self, key, value)
 
     def _check_names(self, kwargs):
         known = [*inspect.signature(type(self)).parameters, "bounds", "fixed", "tied", "meta"]
@@ -137,7 +177,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         if number.ndim > 1 or number.size == 0:
             raise ParameterError(
                 f"{cls.__name__}.{key} has shape {number.shape}; allowed are a "
-                "scalar or one value a wavelength"
+                "scalar or one value per wavelength"
             )
         return number if unit is None else number * unit
 
@@ -230,17 +270,10 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     def canonical_values(self):
         """
-        Return the parameter values as canonical floats, ``theta`` first.
+        Return the parameter values as canonical floats (radian, micrometre or 1), ``theta`` first.
 
-        Returns
-        -------
-        list of `~numpy.ndarray`
-            Radian, micrometre or 1; shape () or (n_wavelengths,).
-
-        Raises
-        ------
-        ParameterError
-            If a parameter was given another unit behind the optic's back.
+        Each has shape () or (n_wavelengths,). A parameter that was given another unit behind the
+        optic's back raises a ParameterError.
         """
         values = []
         for key in self.param_names:
@@ -365,7 +398,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             if value.size > 1 and (lam is None or np.shape(lam)[-1:] != value.shape[-1:]):
                 count = 0 if lam is None else np.size(lam)
                 raise ParameterError(
-                    f"{self.name or type(self).__name__}.{key} has {value.size} values, one a "
+                    f"{self.name or type(self).__name__}.{key} has {value.size} values, one per "
                     f"wavelength, but {count} wavelengths were given"
                 )
 
@@ -449,21 +482,10 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         return new
 
     def loosened(self, wavelength):
-        """
-        Return the optic with its law in wavelength replaced by one value a wavelength.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        Optic
-            Itself where it has no such law.
-        """
+        """Return the optic with one value per wavelength for its law, or itself without one."""
         return self
 
     def _settings(self):
         """Return the keyword arguments, other than parameters, that rebuild the optic."""
-        return {"name": self.name, "mount": self.mount}
+        own = {key: getattr(self, key) for key in self._declared_settings}
+        return {"name": self.name, "mount": self.mount} | own

@@ -17,18 +17,19 @@ from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.materials import get_material
-from astropolcal.mueller.elements import _diattenuator_retarder
-from astropolcal.optics._matrices import (
+from astropolcal.mueller import (
+    _diattenuator_retarder,
     diattenuation_slope,
     fill_phase_block,
     transverse_share,
 )
+from astropolcal.optics._modelling import Setting
 from astropolcal.optics.core import Optic
 from astropolcal.optics.polarizers import DiattenuatorRetarder
 from astropolcal.thinfilm import _Stack, _wrapped
 from astropolcal.units import canonical_factor
 
-__all__ = ["MetalMirror", "ParityFlip", "PowerLawMirror"]
+__all__ = ["KMirror", "MetalMirror", "ParityFlip", "PowerLawMirror"]
 
 # powers of ten as exp, whose derivative is at hand
 _LN10 = np.log(10.0)
@@ -118,51 +119,19 @@ class _Mirror(Optic):
         return self._log_ratio(dispersion, *values)
 
     def diattenuation(self, wavelength):
-        """
-        Return the diattenuation at a wavelength.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Scalar or shape (n_wavelengths,).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Positive where the field across the plane of incidence is better reflected.
-        """
+        """Return the diattenuation, positive where s is better reflected than p."""
         return -np.tanh(self._ratio_at(wavelength).real)
 
     def retardance(self, wavelength):
-        """
-        Return the retardance at a wavelength.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Scalar or shape (n_wavelengths,).
-
-        Returns
-        -------
-        `~astropy.units.Quantity`
-            0 to 360 deg; 180 deg for an ideal mirror.
-        """
+        """Return the retardance, 0 to 360 deg (Quantity); 180 deg for an ideal mirror."""
         return np.rad2deg(_wrapped(self._ratio_at(wavelength).imag)) * u.deg
 
     def law_slopes(self, wavelength):
         """
         Return the derivatives of diattenuation and retardance to the parameters.
 
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        dict of str to dict
-            ``"diattenuation"`` and ``"retardance"`` (degree) to the name of each parameter but
-            ``theta`` to the derivative per unit of that parameter, shape (n_wavelengths,).
+        ``"diattenuation"`` and ``"retardance"`` (degree) to the name of each parameter but
+        ``theta`` to the derivative per unit of that parameter, shape (n_wavelengths,).
         """
         dispersion, _, values = self._resolve(wavelength, None)
         ratio, slopes = self._log_slopes(dispersion, *values)
@@ -176,26 +145,14 @@ class _Mirror(Optic):
         return found
 
     def loosened(self, wavelength):
-        """
-        Return the diattenuator-retarder that starts with the same values.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        DiattenuatorRetarder
-            One free diattenuation and one free retardance a wavelength.
-        """
-        # name and mount only: the free optic has neither metal nor film
-        settings = Optic._settings(self)
+        """Return the diattenuator-retarder of the same values, free at each wavelength."""
+        # the free optic has neither metal nor film
         free = DiattenuatorRetarder(
             diattenuation=self.diattenuation(wavelength),
             retardance=self.retardance(wavelength),
             theta=self.theta.value * u.deg,
-            **settings,
+            name=self.name,
+            mount=self.mount,
         )
         free.theta.fixed, free.theta.bounds = self.theta.fixed, self.theta.bounds
         return free
@@ -280,58 +237,35 @@ class PowerLawMirror(_Mirror):
         return stack.log_ratio(), slopes
 
     def index(self, wavelength):
-        """
-        Return the complex index n + ik of the law.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Scalar or shape (n_wavelengths,).
-
-        Returns
-        -------
-        `~numpy.ndarray`
-            Complex.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.optics import PowerLawMirror
-        >>> PowerLawMirror().index(1.6 * u.um).round(1)
-        np.complex128(2+17j)
-        """
+        """Return the complex index n + ik of the law."""
         log, _, values = self._resolve(wavelength, None)
         return np.sqrt(sum(self._parts(log, *values[:4])))
+
+
+def _material_name(value, label):
+    """Return the name by which a material is found again, in a file too."""
+    if isinstance(value, str):
+        get_material(value)
+        return value
+    name = getattr(value, "name", None)
+    try:
+        if name and get_material(name) is value:
+            return name
+    except ParameterError:
+        pass
+    raise ParameterError(
+        f"{label} = {value!r}; allowed is the name of a material, which register_material "
+        "gives to one of your own"
+    )
 
 
 class _Metallic(_Mirror):
     """What is coated with a metal and a film: one or several reflections in one plane."""
 
-    def __init__(self, *args, material="silver", film="fused silica", **kwargs):
-        super().__init__(*args, **kwargs)
-        self.material = material
-        self.film = film
-
-    @property
-    def material(self):
-        """Name of the metal, see `~astropolcal.materials.get_material`."""
-        return self._material
-
-    @material.setter
-    def material(self, value):
-        self._material = _material_name(value, f"{type(self).__name__}.material")
-
-    @property
-    def film(self):
-        """Name of the material of the film."""
-        return self._film
-
-    @film.setter
-    def film(self, value):
-        self._film = _material_name(value, f"{type(self).__name__}.film")
-
-    def _settings(self):
-        return super()._settings() | {"material": self.material, "film": self.film}
+    material = Setting(
+        "silver", _material_name, "Name of the metal, see `~astropolcal.materials.get_material`."
+    )
+    film = Setting("fused silica", _material_name, "Name of the material of the film.")
 
     def _dispersion(self, wavelength):
         wavelength = np.asarray(wavelength)
@@ -439,18 +373,73 @@ class MetalMirror(_Metallic):
         return ((incidence, 1.0, 1),)
 
 
-def _material_name(value, label):
-    """Return the name by which a material is found again, in a file too."""
-    if isinstance(value, str):
-        get_material(value)
-        return value
-    name = getattr(value, "name", None)
-    try:
-        if name and get_material(name) is value:
-            return name
-    except ParameterError:
-        pass
-    raise ParameterError(
-        f"{label} = {value!r}; allowed is the name of a material, which register_material "
-        "gives to one of your own"
+class KMirror(_Metallic):
+    r"""
+    Image derotator of three mirrors in one plane, a K-mirror, with equal films.
+
+    Light meets the first and the last mirror at the angle of incidence
+    :math:`\alpha` and the middle one at :math:`2\alpha - 90^\circ`, so that it
+    leaves along the line on which it came: 60, 30, 60 deg by default. The
+    amplitudes of the three multiply; together they are one
+    diattenuator-retarder that turns with its mount ('t Hart et al. 2021, who fit
+    the film of that of Subaru).
+
+    Parameters
+    ----------
+    incidence : `~astropy.units.Quantity`
+        Angle of incidence :math:`\alpha` on the first and the last mirror.
+    film_thickness : `~astropy.units.Quantity`
+        Thickness of the film on each mirror.
+    n_scale, k_scale : float or array_like
+        Factors on the real and the imaginary part of the index of the metal.
+    material, film : str
+        Names of the metal and of the material of the film, see
+        `~astropolcal.materials.get_material`.
+    theta : `~astropy.units.Quantity`
+        Orientation of the field across the plane of incidence.
+
+    Raises
+    ------
+    ParameterError
+        If the angle of incidence is not from 45 deg to less than 90 deg, a thickness or
+        factor is negative, or a material is not known.
+    WavelengthRangeError
+        If the index of a material is not known at a wavelength.
+
+    References
+    ----------
+    't Hart et al. 2021, Proc. SPIE 11833, arXiv:2108.04833.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import KMirror
+    >>> derotator = KMirror(film_thickness=260 * u.nm, mount="derotator", name="derotator")
+    >>> derotator.retardance([1.2, 1.6, 2.2] * u.um).round(0)
+    <Quantity [144., 274., 303.] deg>
+    """
+
+    incidence = Parameter(
+        default=60.0,
+        unit=u.deg,
+        bounds=(50, 80),
+        fixed=True,
+        description="angle of incidence on the first and the last mirror",
     )
+    film_thickness = Parameter(
+        default=200.0, unit=u.nm, bounds=(0, 2000), description="thickness of the films"
+    )
+    n_scale = Parameter(
+        default=1.0, bounds=(0.05, 20), fixed=True, description="factor on n of the metal"
+    )
+    k_scale = Parameter(
+        default=1.0, bounds=(0.2, 5), fixed=True, description="factor on k of the metal"
+    )
+
+    def _reflections(self, incidence):
+        # a smaller angle leaves the middle mirror no place
+        good = incidence >= np.pi / 4
+        self._check(good, "incidence", np.rad2deg(incidence), " deg", "45 deg to less than 90 deg")
+        # a mirror at the angle a bends the light by 180 deg - 2 a; the outer two undo what the
+        # middle one does: 2 (180 - 2 a) = 180 - 2 b
+        return ((incidence, 1.0, 2), (2 * incidence - np.pi / 2, 2.0, 1))

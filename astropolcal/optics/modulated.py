@@ -4,7 +4,7 @@ Optics whose Mueller matrix changes from frame to frame.
 
 Their ``mount`` names what the matrix depends on: the angle of a stage
 (``"hwp"``), or how far the run has come (``"sequence"``, 0 to 1); those that
-follow the flux are in `astropolcal.optics.fluxes`. At zero parameters each is
+follow the flux are in `astropolcal.optics.modulated`. At zero parameters each is
 the identity, so that it adds to a chain one way in which a real instrument
 departs from an ideal one.
 """
@@ -14,23 +14,32 @@ import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.mueller.elements import (
+from astropolcal.mueller import (
     _elliptical_retarder,
     _linear_retarder,
+    _rotate,
     _rotation_matrix,
+    blank,
+    retardance_slope,
+    rotation_generator,
 )
-from astropolcal.optics._matrices import blank, retardance_slope
-from astropolcal.optics.beamsplitters import BEAMS, _BeamOptic
+from astropolcal.optics._modelling import Setting
 from astropolcal.optics.core import Optic
+from astropolcal.optics.polarizers import BEAMS, _BeamOptic
 from astropolcal.optics.retarders import EllipticalRetarder
+from astropolcal.units import to_unit
 
 __all__ = [
     "DriftRetarder",
     "DriftRotator",
+    "FerroelectricLiquidCrystal",
+    "FluxGain",
     "FrameOptic",
     "HarmonicGain",
     "HarmonicRetarder",
     "HarmonicRotator",
+    "PolarizedBackground",
+    "StrayLight",
 ]
 
 _IDENTITY = np.eye(4)
@@ -70,11 +79,28 @@ class FrameOptic(Optic):
         return coordinate + shift, angle + shift if self.turns else angle
 
 
-def one_of(allowed, value, name):
-    """Return a whole number of those allowed, or raise."""
-    if isinstance(value, bool | np.bool_) or not np.isscalar(value) or value not in allowed:
-        raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(map(str, allowed))}")
-    return int(value)
+def _one_of(*allowed):
+    """Return the check of a setting that is one of some whole numbers."""
+
+    def check(value, name):
+        if isinstance(value, bool | np.bool_) or not np.isscalar(value) or value not in allowed:
+            raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(map(str, allowed))}")
+        return int(value)
+
+    return check
+
+
+def _positive(value, name):
+    number = to_unit(value, None, name)
+    if number.ndim or not (np.isfinite(number) and number > 0):
+        raise ParameterError(f"{name} = {value!r} must be one positive number")
+    return float(number)
+
+
+def _true_or_false(value, name):
+    if not isinstance(value, bool | np.bool_):
+        raise ParameterError(f"{name} = {value!r}; allowed are True and False")
+    return bool(value)
 
 
 class _Harmonic(FrameOptic):
@@ -82,21 +108,7 @@ class _Harmonic(FrameOptic):
 
     takes_numbers = False
 
-    def __init__(self, *args, harmonic=1, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.harmonic = harmonic
-
-    @property
-    def harmonic(self):
-        """Number of periods in a turn of the mount: 1, 2 or 4."""
-        return self._harmonic
-
-    @harmonic.setter
-    def harmonic(self, value):
-        self._harmonic = one_of((1, 2, 4), value, f"{type(self).__name__}.harmonic")
-
-    def _settings(self):
-        return super()._settings() | {"harmonic": self.harmonic}
+    harmonic = Setting(1, _one_of(1, 2, 4), "Number of periods in a turn of the mount: 1, 2 or 4.")
 
     def _waves(self, coordinate):
         phase = self._harmonic * np.asarray(coordinate)
@@ -120,7 +132,7 @@ class HarmonicRotator(_Harmonic):
     Parameters
     ----------
     cosine, sine : `~astropy.units.Quantity`
-        Amplitudes a and b, angles; scalars, or one value a wavelength.
+        Amplitudes a and b, angles; scalars, or one value per wavelength.
     harmonic : {1, 2, 4}
         Periods n in a turn of the mount.
     theta : `~astropy.units.Quantity`
@@ -191,7 +203,7 @@ class DriftRetarder(FrameOptic):
     Parameters
     ----------
     horizontal, diagonal : `~astropy.units.Quantity`
-        Retardances h and d in the first frame; scalars, or one value a wavelength.
+        Retardances h and d in the first frame; scalars, or one value per wavelength.
     horizontal_rate, diagonal_rate : `~astropy.units.Quantity`
         Their changes over the run.
     theta : `~astropy.units.Quantity`
@@ -245,7 +257,7 @@ class HarmonicRetarder(_Harmonic):
     Parameters
     ----------
     cosine, sine : `~astropy.units.Quantity`
-        Amplitudes a and b; scalars, or one value a wavelength.
+        Amplitudes a and b; scalars, or one value per wavelength.
     harmonic : {1, 2, 4}
         Periods n in a turn of the mount.
     theta : `~astropy.units.Quantity`
@@ -285,7 +297,7 @@ class HarmonicGain(_BeamOptic, _Harmonic):
     Parameters
     ----------
     cosine, sine : float or array_like
-        Amplitudes a and b; scalars, or one value a wavelength.
+        Amplitudes a and b; scalars, or one value per wavelength.
     harmonic : {1, 2, 4}
         Periods n in a turn of the mount.
     differential : bool
@@ -307,30 +319,14 @@ class HarmonicGain(_BeamOptic, _Harmonic):
     cosine = Parameter(default=0.0, bounds=(-0.4, 0.4), description="cosine amplitude")
     sine = Parameter(default=0.0, bounds=(-0.4, 0.4), description="sine amplitude")
 
-    def __init__(self, *args, differential=False, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.differential = differential
-
-    @property
-    def differential(self):
-        """Whether the left beam changes with the opposite sign."""
-        return self._differential
-
-    @differential.setter
-    def differential(self, value):
-        if not isinstance(value, bool | np.bool_):
-            raise ParameterError(
-                f"HarmonicGain.differential = {value!r}; allowed are True and False"
-            )
-        self._differential = bool(value)
+    differential = Setting(
+        False, _true_or_false, "Whether the left beam changes with the opposite sign."
+    )
 
     @property
     def depends_on_beam(self):
         """True where the left beam changes with the opposite sign."""
         return self._differential
-
-    def _settings(self):
-        return super()._settings() | {"differential": self.differential}
 
     @property
     def _sign(self):
@@ -364,3 +360,225 @@ def _turned_slope(angle):
     out[..., 1, 2] = 2 * np.cos(2 * angle)
     out[..., 2, 1] = -out[..., 1, 2]
     return out
+
+
+class FerroelectricLiquidCrystal(FrameOptic):
+    r"""
+    Ferroelectric liquid crystal: a retarder whose axis switches between two orientations.
+
+    .. math:: M_s = T(-s\alpha)\, R(\delta)\, T(s\alpha)
+
+    with the state s from the frame (``mount="flc_state"``): 0 in state A, 1 in state B
+    (Norris et al. 2015,
+    doi:10.1093/mnras/stu2529). A half-wave retarder with a switching angle
+    of 45 deg exchanges the two beams.
+
+    Parameters
+    ----------
+    retardance : `~astropy.units.Quantity`
+        Retardance :math:`\delta`; scalar, or one value per wavelength.
+    switching_angle : `~astropy.units.Quantity`
+        Angle :math:`\alpha` from the fast axis in state A to that in state B; scalar, or one
+        value per wavelength.
+    theta : `~astropy.units.Quantity`
+        Orientation of the fast axis in state A.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import FerroelectricLiquidCrystal
+    >>> flc = FerroelectricLiquidCrystal(
+    ...     retardance=180 * u.deg, switching_angle=45 * u.deg, mount="flc_state", name="flc"
+    ... )
+    >>> [float(flc.mueller(position=state)[1, 1].round(6)) for state in (0, 1)]
+    [1.0, -1.0]
+    """
+
+    retardance = Parameter(
+        default=0.0, unit=u.deg, bounds=(-360, 360), description="retardance in both states"
+    )
+    switching_angle = Parameter(
+        default=0.0,
+        unit=u.deg,
+        bounds=(-90, 90),
+        description="angle of the fast axis in state B from that in state A",
+    )
+
+    @staticmethod
+    def _turned(matrix, coordinate, retardance, switching_angle):
+        angle = np.asarray(coordinate * switching_angle)
+        # states are (n_frames, 1) where there are several wavelengths
+        shape = np.broadcast_shapes(angle.shape, np.shape(retardance))
+        return _rotate(np.broadcast_to(matrix, (*shape, 4, 4)), np.broadcast_to(angle, shape))
+
+    def _matrix(self, coordinate, retardance, switching_angle):
+        return self._turned(_linear_retarder(retardance), coordinate, retardance, switching_angle)
+
+    def _derivatives(self, coordinate, retardance, switching_angle):
+        values = (coordinate, retardance, switching_angle)
+        slope = self._turned(retardance_slope(retardance), *values)
+        # the axis stands at s alpha: a turn of it, s times
+        turning = rotation_generator(self._matrix(*values))
+        return slope, np.asarray(coordinate)[..., None, None] * turning
+
+
+class _Referenced(FrameOptic):
+    """What is given for a reference flux, so that its parameters are numbers near one."""
+
+    reference = Setting(
+        1.0, _positive, "Flux of which the coefficients are shares, in the unit of the tables."
+    )
+
+
+class FluxGain(_BeamOptic, _Referenced):
+    r"""
+    Gain of each beam that depends on its flux.
+
+    :math:`1 + k (F/F_0)^m`, with the coefficient k of the beam and its flux F in
+    the table (``mount="flux"``). With m = 1 a detector that is not linear. With
+    ``mount="previous_flux"``, F is the flux over that of the frame before, and
+    m = -1 is persistence, a share :math:`k F_0` of it. Where F = 0 the gain is one.
+
+    Parameters
+    ----------
+    right, left : float or array_like
+        Coefficient k of each beam; scalars, or one value per wavelength.
+    power : {1, -1}
+        Exponent m.
+    reference : float
+        :math:`F_0`, in the unit of the tables.
+    beam : {"right", "left"}
+        The beam that goes on in a chain.
+    theta : `~astropy.units.Quantity`
+        Without consequence here.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import FluxGain
+    >>> bend = FluxGain(right=-0.01, left=-0.01, reference=1e7, mount="flux", name="nonlinearity")
+    >>> float(bend.mueller(position=5e6)[0, 0])
+    0.995
+    """
+
+    right = Parameter(default=0.0, bounds=(-0.5, 0.5), description="coefficient of the right beam")
+    left = Parameter(default=0.0, bounds=(-0.5, 0.5), description="coefficient of the left beam")
+
+    power = Setting(1, _one_of(1, -1), "Exponent of the flux, 1 or -1.")
+
+    def _level(self, coordinate):
+        # on the stage previous_flux the coordinate is F now over F before, so that its inverse
+        # is the afterglow of the frame before per flux of this one
+        relative = np.asarray(coordinate) / self._reference
+        if self._power == 1:
+            return relative
+        # where there is no flux, there is none to add to
+        return np.divide(1.0, relative, out=np.zeros_like(relative), where=relative != 0)
+
+    def _matrix(self, coordinate, right, left):
+        # each beam falls on a part of the detector of its own
+        own = right if self._beam == "right" else left
+        return scaled(1.0 + own * self._level(coordinate))
+
+    def _derivatives(self, coordinate, right, left):
+        shape = np.broadcast_shapes(*(np.shape(x) for x in (coordinate, right, left)))
+        slope = scaled(np.broadcast_to(self._level(coordinate), shape))
+        # what bends one beam does not move the other
+        none = np.zeros_like(slope)
+        return (slope, none) if self._beam == "right" else (none, slope)
+
+
+class StrayLight(_Referenced):
+    r"""
+    Unpolarized light that is added in front of the beam splitter, whatever the source does.
+
+    :math:`I' = I\,(1 + b F_0/F)` with F the sum of both beams in the table
+    (``mount="total_flux"``), so that a constant flux :math:`b F_0` is added to
+    each frame: background, stray light, ghosts (Patat & Romaniello 2006,
+    doi:10.1086/497581). Where F = 0 nothing is added.
+
+    Parameters
+    ----------
+    amount : float or array_like
+        Added flux b over :math:`F_0`; scalar, or one value per wavelength.
+    reference : float
+        :math:`F_0`, in the unit of the tables.
+    theta : `~astropy.units.Quantity`
+        Without consequence here.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import StrayLight
+    >>> ghost = StrayLight(amount=0.01, reference=1e6, mount="total_flux", name="ghost")
+    >>> float(ghost.mueller(position=5e5)[0, 0])
+    1.02
+    """
+
+    amount = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added flux over the reference")
+
+    def _share(self, coordinate):
+        flux = np.asarray(coordinate, dtype=float)
+        return np.divide(self._reference, flux, out=np.zeros_like(flux), where=flux != 0)
+
+    def _matrix(self, coordinate, amount):
+        out = blank(coordinate, amount)
+        out[...] = _IDENTITY
+        # added light has no polarization: only I to I grows
+        out[..., 0, 0] += amount * self._share(coordinate)
+        return out
+
+    def _derivatives(self, coordinate, amount):
+        out = blank(coordinate, amount)
+        out[..., 0, 0] = self._share(coordinate)
+        return (out,)
+
+
+class PolarizedBackground(StrayLight):
+    r"""
+    Polarized light that is added to that of the source, whatever the source does.
+
+    .. math:: I' = I\,(1 + b F_0/F),\quad Q' = Q + q F_0/F\,I,\quad U' = U + u F_0/F\,I
+
+    with F the sum of both beams in the table (``mount="total_flux"``), so that
+    the same Stokes vector :math:`(b, q, u) F_0` is added to each frame: moonlight,
+    twilight or a zodiacal background (Patat & Romaniello 2006,
+    doi:10.1086/497581). Where F = 0 nothing is added.
+
+    Parameters
+    ----------
+    amount : float or array_like
+        Added flux b over :math:`F_0`; 0 where the flux of the background was
+        subtracted, but not its polarization.
+    q, u : float or array_like
+        Added polarized flux over :math:`F_0`, in the frame of what follows;
+        scalars, or one value per wavelength.
+    reference : float
+        :math:`F_0`, in the unit of the tables.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes of q and u.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import PolarizedBackground
+    >>> moon = PolarizedBackground(q=0.01, reference=1e6, mount="total_flux", name="moon")
+    >>> float(moon.mueller(position=5e5)[1, 0])
+    0.02
+    """
+
+    q = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added Q over the reference")
+    u = Parameter(default=0.0, bounds=(-0.5, 0.5), description="added U over the reference")
+
+    def _matrix(self, coordinate, amount, q, u):
+        out = blank(coordinate, amount, q, u)
+        out[...] = _IDENTITY
+        for row, value in enumerate((amount, q, u)):
+            # the light is added whatever the polarization of the source: the first column only
+            out[..., row, 0] += value * self._share(coordinate)
+        return out
+
+    def _derivatives(self, coordinate, amount, q, u):
+        slopes = []
+        for row in range(3):
+            out = blank(coordinate, amount, q, u)
+            out[..., row, 0] = self._share(coordinate)
+            slopes.append(out)
+        return tuple(slopes)

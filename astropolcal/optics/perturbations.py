@@ -15,11 +15,13 @@ import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.optics.beamsplitters import BEAMS, _BeamOptic
+from astropolcal.mueller import blank
+from astropolcal.optics.core import Optic
 from astropolcal.optics.modulated import FrameOptic
+from astropolcal.optics.polarizers import BEAMS, _BeamOptic
 from astropolcal.words import did_you_mean
 
-__all__ = ["GENERATORS", "Dependence", "Perturbation"]
+__all__ = ["GENERATORS", "MuellerElement", "Perturbation"]
 
 _I, _Q, _U, _V = range(4)
 
@@ -53,31 +55,14 @@ GENERATORS = {
 @dataclass(frozen=True)
 class Dependence:
     """
-    How a perturbation depends on the frame.
+    How a perturbation depends on the frame, by the text that says so.
 
-    Parameters
-    ----------
-    text : str
-        ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
-        ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``,
-        cosine and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last
-        move of the stage was backwards; ``"move:STAGE"``, how far it was moved, in radian;
-        ``"dataset:NAME"``, in one dataset only. With ``"/dataset:NAME"`` behind it, any of the
-        others is in that dataset only.
-
-    Raises
-    ------
-    ParameterError
-        If the text is none of these.
-
-    Examples
-    --------
-    >>> from astropolcal.optics.perturbations import Dependence
-    >>> turn = Dependence("harmonic:hwp:2")
-    >>> turn.driver, turn.count
-    ('hwp', 2)
-    >>> turn.waves(0.0).tolist()
-    [1.0, 0.0]
+    ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
+    ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``, cosine
+    and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last move of the
+    stage was backwards; ``"move:STAGE"``, how far it was moved, in radian; ``"dataset:NAME"``, in
+    one dataset only. With ``"/dataset:NAME"`` behind it, any of the others is in that dataset
+    only.
     """
 
     text: str
@@ -122,18 +107,7 @@ class Dependence:
         return 2 if self.kind == "harmonic" else 1
 
     def waves(self, position):
-        """
-        Return the functions at positions of the driver, shape (count, ...).
-
-        Parameters
-        ----------
-        position : `~numpy.ndarray`
-            Radian or a number.
-
-        Returns
-        -------
-        `~numpy.ndarray`
-        """
+        """Return the functions at positions of the driver (canonical), shape (count, ...)."""
         x = np.asarray(position, dtype=float)
         if self.kind == "harmonic":
             angle = int(self.parts[2]) * x
@@ -164,11 +138,8 @@ def split_run(text):
     """
     Return a dependence without its dataset, and the name of that, None where it has none.
 
-    Examples
-    --------
-    >>> from astropolcal.optics.perturbations import split_run
-    >>> split_run("time/dataset:July"), split_run("dataset:July"), split_run("time")
-    (('time', 'July'), ('dataset', 'July'), ('time', None))
+    So ``"time/dataset:July"`` is ``("time", "July")``, and ``"dataset:July"`` ``("dataset",
+    "July")``.
     """
     if text.startswith(_DATASET):
         return "dataset", text.removeprefix(_DATASET)
@@ -180,19 +151,23 @@ class Perturbation(_BeamOptic, FrameOptic):
     r"""
     A small error of an optic: :math:`\exp\left[(a f_1 + b f_2)\,G\right]`.
 
-    G is a generator of Mueller matrices and the f are functions of the frame, see `Dependence`.
+    G is a generator of Mueller matrices and the f are functions of the frame.
 
     Parameters
     ----------
     amplitude : float or array_like
-        Size a: radian for retardance and rotation, else a share; scalar, or one value a
+        Size a: radian for retardance and rotation, else a share; scalar, or one value per
         wavelength.
     quadrature : float or array_like
         Size b of the second function, the sine of a harmonic; 0 for all other dependences.
     kind : str
         Key of `GENERATORS`.
     dependence : str
-        As `Dependence` takes it; the ``mount`` has to be its driver.
+        ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
+        ``"step:N"``, from frame N on; ``"frame:N"``; ``"harmonic:STAGE:N"``, cosine and sine of N
+        times the angle of a stage; ``"direction:STAGE"`` and ``"move:STAGE"``, the last move of a
+        stage; ``"dataset:NAME"``; each also with ``"/dataset:NAME"`` behind it. The ``mount`` has
+        to be what it follows.
     beam : {"right", "left"}
         The beam that goes on in a chain; of consequence for ``"gain"`` only.
     theta : `~astropy.units.Quantity`
@@ -280,3 +255,93 @@ class Perturbation(_BeamOptic, FrameOptic):
             np.broadcast_to(wave, np.shape(x))[..., None, None] * slope
             for wave in self._waves(coordinate)
         )
+
+
+# in the order in which the parameters are declared
+_ELEMENTS = [(row, column) for row in range(4) for column in range(4)]
+
+
+def _element(row, column):
+    return Parameter(
+        default=float(row == column),
+        # fluxes are compared up to a factor: a transmission needs no bound
+        bounds=(None, None) if (row, column) == (0, 0) else (-1, 1),
+        fixed=True,
+        description=f"element in row {row}, column {column}",
+    )
+
+
+class MuellerElement(Optic):
+    """
+    General element of constant Mueller matrix; the elements are parameters.
+
+    Parameters
+    ----------
+    m00, m01, ..., m33 : float or array_like
+        The elements, fixed by default; scalars, or one value per wavelength.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropolcal.optics import MuellerElement
+    >>> element = MuellerElement.from_matrix(np.diag([1, 0.9, 0.9, 0.8]), name="window")
+    >>> element.m33
+    Parameter('m33', value=0.8, fixed=True, bounds=(-1, 1))
+    """
+
+    m00, m01, m02, m03 = (_element(0, j) for j in range(4))
+    m10, m11, m12, m13 = (_element(1, j) for j in range(4))
+    m20, m21, m22, m23 = (_element(2, j) for j in range(4))
+    m30, m31, m32, m33 = (_element(3, j) for j in range(4))
+
+    @classmethod
+    def from_matrix(cls, matrix, **kwargs):
+        """
+        Make the element from a Mueller matrix.
+
+        Parameters
+        ----------
+        matrix : array_like
+            Shape (4, 4), or (n_wavelengths, 4, 4).
+        **kwargs
+            ``name``, ``mount``, ``theta`` as for any optic.
+
+        Returns
+        -------
+        MuellerElement
+
+        Raises
+        ------
+        ParameterError
+            If the shape is another or an element is not finite.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from astropolcal.optics import MuellerElement
+        >>> MuellerElement.from_matrix(np.eye(4)).mueller()[3, 3]
+        np.float64(1.0)
+        """
+        matrix = np.asarray(matrix, dtype=float)
+        if matrix.shape[-2:] != (4, 4) or matrix.ndim not in (2, 3):
+            raise ParameterError(
+                f"a Mueller matrix has shape (4, 4) or (n, 4, 4), not {matrix.shape}"
+            )
+        values = {f"m{i}{j}": matrix[..., i, j] for i, j in _ELEMENTS}
+        return cls(**values, **kwargs)
+
+    def _matrix(self, dispersion, *elements):
+        out = blank(*elements)
+        for (i, j), value in zip(_ELEMENTS, elements, strict=True):
+            out[..., i, j] = value
+        return out
+
+    def _derivatives(self, dispersion, *elements):
+        slopes = []
+        for i, j in _ELEMENTS:
+            out = blank(*elements)
+            out[..., i, j] = 1.0
+            slopes.append(out)
+        return tuple(slopes)

@@ -1,20 +1,31 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Optics that attenuate: polarizers, diattenuators and diattenuating retarders."""
+"""Optics that polarize, attenuate, depolarize or split the light."""
 
 import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
 
-from astropolcal.mueller.elements import _diattenuator, _diattenuator_retarder
-from astropolcal.optics._matrices import (
+from astropolcal.exceptions import ParameterError
+from astropolcal.mueller import (
+    _diattenuator,
+    _diattenuator_retarder,
     blank,
     diattenuation_slope,
     fill_phase_block,
     transverse_share,
 )
+from astropolcal.optics._modelling import Setting
 from astropolcal.optics.core import Optic
 
-__all__ = ["Diattenuator", "DiattenuatorRetarder", "LinearPolarizer", "VectorDiattenuator"]
+__all__ = [
+    "BeamGain",
+    "Depolarizer",
+    "Diattenuator",
+    "DiattenuatorRetarder",
+    "LinearPolarizer",
+    "VectorDiattenuator",
+    "WollastonPrism",
+]
 
 
 class LinearPolarizer(Optic):
@@ -145,7 +156,7 @@ class VectorDiattenuator(Optic):
     Parameters
     ----------
     horizontal, diagonal : float or array_like
-        The components; scalars, or one value a wavelength.
+        The components; scalars, or one value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the axes.
 
@@ -196,3 +207,173 @@ def _vector_slope(own, other, i):
     out[..., 1, 2] = out[..., 2, 1] = rise * own * other + share * other
     out[..., 3, 3] = fall
     return out
+
+
+class Depolarizer(Optic):
+    r"""
+    Diagonal depolarizer diag(1, a, b, c) with axes turned to ``theta``.
+
+    Parameters
+    ----------
+    retained_q, retained_u, retained_v : float or array_like
+        Share of Q, U and V (in the optic's frame) that survives, between 0
+        and 1; scalars, or one value per wavelength. Physical as long as the
+        coherency matrix stays positive, for instance ``a + b <= 1 + c``.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import Depolarizer
+    >>> Depolarizer(retained_q=0.99, retained_u=0.98, retained_v=0.97).mueller().diagonal()
+    array([1.  , 0.99, 0.98, 0.97])
+    """
+
+    retained_q = Parameter(default=1.0, bounds=(0, 1), description="share of Q that survives")
+    retained_u = Parameter(default=1.0, bounds=(0, 1), description="share of U that survives")
+    retained_v = Parameter(default=1.0, bounds=(0, 1), description="share of V that survives")
+
+    def _matrix(self, dispersion, *retained):
+        out = blank(*retained)
+        out[..., 0, 0] = 1.0
+        # the first element is the intensity, which is kept
+        for i, value in enumerate(retained, start=1):
+            out[..., i, i] = value
+        return out
+
+    def _derivatives(self, dispersion, *retained):
+        slopes = []
+        for i in range(1, 4):
+            out = blank(*retained)
+            out[..., i, i] = 1.0
+            slopes.append(out)
+        return tuple(slopes)
+
+
+# sign of eta: the right beam is the ordinary one
+BEAMS = {"right": 1.0, "left": -1.0}
+
+
+def _beam(value, name):
+    if value not in BEAMS:
+        raise ParameterError(f"beam = {value!r}; allowed are {sorted(BEAMS)}")
+    return value
+
+
+class _BeamOptic(Optic):
+    """What acts differently on the two beams, and follows one of them in a chain."""
+
+    depends_on_beam = True
+    beam = Setting("right", _beam, 'The beam that goes on in a chain, ``"right"`` or ``"left"``.')
+
+
+class WollastonPrism(_BeamOptic):
+    r"""
+    Wollaston prism: two beams of opposite linear polarization.
+
+    .. math:: M = \tfrac{1}{2}\begin{pmatrix}1&\pm\eta&0&0\\ \pm\eta&1&0&0\\
+              0&0&0&0\\0&0&0&0\end{pmatrix}
+
+    The right beam is ordinary (:math:`+\eta`), the left extraordinary
+    (:math:`-\eta`); paper, Eq. for :math:`M_\mathrm{Wol}`.
+
+    Parameters
+    ----------
+    efficiency : float or array_like
+        Modulation efficiency :math:`|\eta|`, between 0 and 1.
+    beam : {"right", "left"}
+        The beam that goes on in a chain; `beams` gives both.
+    theta : `~astropy.units.Quantity`
+        Orientation of the axes.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import WollastonPrism
+    >>> wollaston = WollastonPrism(efficiency=0.99, name="wollaston")
+    >>> right, left = wollaston.beams(1.6 * u.um, 1, 1, 0, 0)
+    >>> round(float(right[1]), 4), round(float(left[1]), 4)
+    (0.995, 0.005)
+    """
+
+    splits_light = True
+
+    efficiency = Parameter(default=1.0, bounds=(0, 1), description="modulation efficiency")
+
+    def _matrix(self, dispersion, efficiency):
+        out = blank(efficiency)
+        # half of unpolarized light goes into each beam
+        out[..., 0, 0] = out[..., 1, 1] = 0.5
+        out[..., 0, 1] = out[..., 1, 0] = 0.5 * BEAMS[self._beam] * efficiency
+        return out
+
+    def _derivatives(self, dispersion, efficiency):
+        out = blank(efficiency)
+        out[..., 0, 1] = out[..., 1, 0] = 0.5 * BEAMS[self._beam]
+        return (out,)
+
+    def beams(self, wavelength, I, Q, U, V):  # noqa: E741
+        """
+        Return the light of both beams.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Wavelength.
+        I, Q, U, V : float or `~numpy.ndarray`
+            The light that enters.
+
+        Returns
+        -------
+        right, left : tuple
+            ``(wavelength, I, Q, U, V)`` of each beam.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.optics import WollastonPrism
+        >>> right, left = WollastonPrism().beams(1.6 * u.um, 1, -1, 0, 0)
+        >>> float(right[1]), float(left[1])
+        (0.0, 1.0)
+        """
+        return tuple(self._through(beam)(wavelength, I, Q, U, V) for beam in ("right", "left"))
+
+    def _through(self, beam):
+        # the optic in the chain keeps its own beam
+        copy = self.copy()
+        copy.beam = beam
+        return copy
+
+
+class BeamGain(_BeamOptic):
+    r"""
+    Unequal gains of the two beams: :math:`1 + g` for the right, :math:`1 - g` for the left.
+
+    What is left of the flat field, or unequal transmission behind the beam
+    splitter (Patat & Romaniello 2006, doi:10.1086/497581).
+
+    Parameters
+    ----------
+    imbalance : float or array_like
+        Half the relative difference g of the gains.
+    beam : {"right", "left"}
+        The beam that goes on in a chain.
+    theta : `~astropy.units.Quantity`
+        Without consequence here.
+
+    Examples
+    --------
+    >>> from astropolcal.optics import BeamGain
+    >>> float(BeamGain(imbalance=0.01, beam="left").mueller()[0, 0])
+    0.99
+    """
+
+    imbalance = Parameter(default=0.0, bounds=(-0.5, 0.5), description="half the gain difference")
+
+    def _matrix(self, dispersion, imbalance):
+        gain = 1.0 + BEAMS[self._beam] * np.asarray(imbalance)
+        return gain[..., None, None] * np.eye(4)
+
+    def _derivatives(self, dispersion, imbalance):
+        sign = np.full(np.shape(imbalance), BEAMS[self._beam])
+        return (sign[..., None, None] * np.eye(4),)

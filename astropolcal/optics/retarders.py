@@ -1,16 +1,21 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Optics that retard: linear and elliptical retarders, and a waveplate of two layers."""
+"""Optics that retard or rotate: retarders, a waveplate of two layers, turns of the frame."""
 
 import astropy.units as u
 import numpy as np
 from astropy.modeling import Parameter
 
 from astropolcal.materials import MGF2, QUARTZ
-from astropolcal.mueller.elements import _elliptical_retarder, _linear_retarder
-from astropolcal.optics._matrices import blank, retardance_slope
+from astropolcal.mueller import (
+    _elliptical_retarder,
+    _linear_retarder,
+    _rotation_matrix,
+    blank,
+    retardance_slope,
+)
 from astropolcal.optics.core import Optic
 
-__all__ = ["EllipticalRetarder", "LinearRetarder", "TwoLayerWaveplate"]
+__all__ = ["EllipticalRetarder", "LinearRetarder", "Rotator", "TwoLayerWaveplate"]
 
 
 class LinearRetarder(Optic):
@@ -25,7 +30,7 @@ class LinearRetarder(Optic):
     Parameters
     ----------
     retardance : `~astropy.units.Quantity`
-        :math:`\Delta`: scalar, or one value a wavelength.
+        :math:`\Delta`: scalar, or one value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the axis.
 
@@ -107,50 +112,12 @@ class TwoLayerWaveplate(Optic):
         return tuple(per_um[..., None, None] * slope for per_um in dispersion)
 
     def retardance(self, wavelength):
-        """
-        Return the retardance at a wavelength.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Any shape.
-
-        Returns
-        -------
-        `~astropy.units.Quantity`
-            Retardance in degree, of the same shape, not wrapped.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.optics import TwoLayerWaveplate
-        >>> TwoLayerWaveplate().retardance(1.6 * u.um).round(0)
-        <Quantity -171. deg>
-        """
+        """Return the retardance at a wavelength of any shape, in degree and not wrapped."""
         dispersion, _, (w_sio2, w_mgf2) = self._resolve(wavelength, None)
         return (w_sio2 * dispersion[0] + w_mgf2 * dispersion[1]) * u.rad.to(u.deg) * u.deg
 
     def loosened(self, wavelength):
-        """
-        Return the linear retarder that starts with the same retardances.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        LinearRetarder
-            One free retardance a wavelength.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.optics import TwoLayerWaveplate
-        >>> TwoLayerWaveplate().loosened([1.2, 1.6] * u.um).retardance.shape
-        (2,)
-        """
+        """Return the linear retarder of the same retardances, free at each wavelength."""
         free = LinearRetarder(
             retardance=self.retardance(wavelength),
             theta=self.theta.value * u.deg,
@@ -183,7 +150,7 @@ class EllipticalRetarder(Optic):
     ----------
     horizontal, diagonal, circular : `~astropy.units.Quantity`
         :math:`\Delta_H`, :math:`\Delta_{45}`, :math:`\Delta_R`; scalars, or
-        one value a wavelength.
+        one value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the axes.
 
@@ -279,3 +246,38 @@ def _series(x2, first, *ratios):
     for ratio in reversed(ratios):
         total = 1.0 - x2 / ratio * total
     return total / first
+
+
+class Rotator(Optic):
+    r"""
+    Rotation of the reference frame for everything that follows.
+
+    .. math:: T(\Theta) = \begin{pmatrix}1&0&0&0\\0&\cos2\Theta&\sin2\Theta&0\\
+              0&-\sin2\Theta&\cos2\Theta&0\\0&0&0&1\end{pmatrix}
+
+    with :math:`\Theta` = ``theta`` + position of the mount (paper, Sec. 4.1).
+    The sky chain of CHARIS is ``Rotator(mount="parallactic") | m3 |
+    Rotator(mount="-altitude")``.
+
+    Parameters
+    ----------
+    theta : `~astropy.units.Quantity`
+        Angle of the rotation.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.optics import Rotator
+    >>> _, I, Q, U, V = Rotator(theta=45 * u.deg)(1.6 * u.um, 1, 1, 0, 0)
+    >>> round(float(U), 6)
+    -1.0
+    """
+
+    rotates_frame = True
+
+    def _matrix(self, dispersion):
+        # the turn by theta and mount is done in Optic, which knows `rotates_frame`
+        return _rotation_matrix(0.0)
+
+    def _derivatives(self, dispersion):
+        return ()

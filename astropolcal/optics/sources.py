@@ -5,7 +5,7 @@ import astropy.units as units
 import numpy as np
 from astropy.modeling import Parameter
 
-from astropolcal.optics._matrices import blank
+from astropolcal.mueller import blank
 from astropolcal.optics.core import Optic
 
 __all__ = ["PolarizedSource", "StarSource"]
@@ -27,7 +27,7 @@ class PolarizedSource(Optic):
     ----------
     q, u : float or array_like
         Normalized Stokes parameters, between -0.7 and 0.7 so that every pair is a
-        possible one; scalars, or one value a wavelength.
+        possible one; scalars, or one value per wavelength.
     theta : `~astropy.units.Quantity`
         Orientation of the axes of q and u.
 
@@ -136,34 +136,12 @@ class StarSource(PolarizedSource):
     )
 
     def stokes(self, wavelength):
-        """
-        Return q and u of the star.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,) or a scalar.
-
-        Returns
-        -------
-        q, u : `~numpy.ndarray`
-        """
+        """Return q and u of the star at wavelengths."""
         matrix = self.mueller(wavelength)
         return matrix[..., 1, 0], matrix[..., 2, 0]
 
     def loosened(self, wavelength):
-        """
-        Return the source with the q and u that the law has at each wavelength, held.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Shape (n_wavelengths,).
-
-        Returns
-        -------
-        PolarizedSource
-        """
+        """Return the source with the q and u that the law has at each wavelength, held."""
         upright = self.with_parameters(theta=0 * units.deg)
         upright.mount = None
         q, u = upright.stokes(wavelength)

@@ -13,6 +13,7 @@ from astropolcal.calibration.result.validity import (
     _dates,
     _moment,
     beam_words,
+    folded,
     instrument_of,
     optics_words,
     validity_of,
@@ -28,8 +29,9 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
-from astropolcal.instruments import Instrument, without_nuisance
-from astropolcal.instruments.keywords import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
+from astropolcal.instruments import Instrument
+from astropolcal.instruments.base import without_nuisance
+from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
 from astropolcal.observations.pointings import offline
 from astropolcal.observations.reading import numeric_column
 from astropolcal.units import plain_number
@@ -324,15 +326,11 @@ def _check_mode(held, label, mode, name, way):
         raise CalibrationFileError(
             f"{label}: its mode is not known, and {name} holds for {held}; {way} states it"
         )
-    if _folded(mode) != _folded(held.mode):
+    if folded(mode) != folded(held.mode):
         raise CalibrationFileError(
             f"{label} is in mode {mode!r}, but {name} holds for {held}; if it is the same by "
             f"another name, {way} says so"
         )
-
-
-def _folded(text):
-    return " ".join(str(text).split()).casefold()
 
 
 def _changes(calibration, light):

@@ -353,8 +353,10 @@ def changes(calibrations, parameters=None):
 
     Raises
     ------
-    FitError, ParameterError
-        As `significance`.
+    FitError
+        If there are fewer than two calibrations, or two share a dataset.
+    ParameterError
+        If a parameter is not free in one of them, or they are on different wavelengths.
 
     Examples
     --------

@@ -32,6 +32,7 @@ from astropolcal.calibration.result.validity import (
     Validity,
     _moment,
     beam_words,
+    folded,
     optics_sets,
     optics_words,
     validity_of,
@@ -68,7 +69,7 @@ class Entry:
     validity : Validity
         For what it holds.
     content_hash : str
-        See `content_hash`.
+        SHA-256 of all that the file keeps.
 
     Examples
     --------
@@ -416,24 +417,18 @@ def _fits(validity, key, value):
     if key == "date":
         return validity.holds(value)
     if key == "mode":
-        return validity.mode is None or _folded(validity.mode) == _folded(value)
+        return validity.mode is None or folded(validity.mode) == folded(value)
     if key == "beam":
         sets = validity.optics_in
-        return sets is None or any(_in_beam(names, value) for names in sets)
+        return sets is None or any(
+            all((name in names) == is_in for name, is_in in value.items()) for names in sets
+        )
     return validity.optics_in is not None and optics_sets(value)[0] in validity.optics_in
-
-
-def _in_beam(names, beam):
-    return all((name in names) == is_in for name, is_in in beam.items())
-
-
-def _folded(text):
-    return " ".join(str(text).split()).casefold()
 
 
 def _alike(one, other):
     """Return whether two calibrations may hold for the same frame but for its date."""
-    modes = None in (one.mode, other.mode) or _folded(one.mode) == _folded(other.mode)
+    modes = None in (one.mode, other.mode) or folded(one.mode) == folded(other.mode)
     sets = None in (one.optics_in, other.optics_in) or set(one.optics_in) & set(other.optics_in)
     return one.instrument == other.instrument and modes and bool(sets)
 

@@ -95,7 +95,7 @@ class SystemMueller:
         Covariance of the 16 elements of each matrix, row by row, shape (..., 16, 16).
 
         Infinite for what the data leave open and NaN for what they tell nothing of, as
-        `~astropolcal.calibration.Covariance.propagate` has it.
+        `~astropolcal.calibration.uncertainty.covariance.Covariance.propagate` has it.
         """
         matrix = self.covariance_in_gauge
         is_open, is_blind = (self._flat(flags) for flags in (self.is_open, self.is_blind))

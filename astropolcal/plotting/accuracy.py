@@ -83,8 +83,8 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
 
     Notes
     -----
-    Definitions as in `~astropolcal.calibration.accuracy_table` and
-    `~astropolcal.calibration.validation.standard_accuracy`; ``s_mean`` is s_rel of
+    Definitions as in `~astropolcal.calibration.validation.cross_validation.accuracy_table` and
+    `~astropolcal.calibration.validation.held_out.standard_accuracy`; ``s_mean`` is s_rel of
     McIntosh et al. (2026, Sec. 2.3).
 
     Examples

@@ -9,7 +9,8 @@ from astropolcal.exceptions import ParameterError
 from astropolcal.gap._numbers import Fitted
 from astropolcal.gap._words import is_determined, labels, share, shortened
 from astropolcal.gap.cells import places
-from astropolcal.optics import GENERATORS, Dependence
+from astropolcal.optics import GENERATORS
+from astropolcal.optics.perturbations import Dependence
 from astropolcal.plotting._style import (
     BLACK,
     BLUE,

@@ -29,7 +29,7 @@ from astropolcal.exceptions import (
     ParameterError,
 )
 from astropolcal.files import atomic_path, check_new
-from astropolcal.instruments.keywords import TEXTS, unit_of
+from astropolcal.instruments.layout import TEXTS, unit_of
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import offline, tracked
 from astropolcal.reduction.images import Detector, Scene, choice, number, per_wavelength, pixels
@@ -95,7 +95,7 @@ def simulate_cubes(
     chain : `~astropy.modeling.CompoundModel`
         The true chain, with a beam splitter.
     instrument : Instrument
-        With a `~astropolcal.instruments.layout.FileLayout`.
+        With a `~astropolcal.instruments.FileLayout`.
     frames : `~astropy.table.QTable`
         One row a frame: ``hwp`` as commanded, ``derotator`` and whatever else
         the chain needs; for a star ``parallactic`` and ``altitude``. A column
@@ -544,6 +544,7 @@ def file_names(directory, layout, prefix, first, n_frames, raw, overwrite):
 
 
 def write_cube(cube, raw_header, image, weight, header, layout):
+    """Write a simulated cube, and leave some keywords to the header of the raw frame."""
     # as real extraction leaves it: some keywords stay behind in the raw frame
     in_raw = {layout.keywords[c] for c in layout.raw_columns if c in layout.keywords}
     in_cube = {k: v for k, v in header.items() if raw_header is None or k not in in_raw}

@@ -53,7 +53,10 @@ def find_pair(image, good, offset, *, fwhm=4.0, significance=6.0, tolerance=4.0,
     positions = peaks[[right[best], left[best]]].astype(float)
     width = _width(smooth - level, positions)
     reason = ""
-    if _ambiguous(peaks[right], strength, best, companion, 2.0 * max(width, fwhm)):
+    # another pair nearly as bright that is not part of the same image; in the right beam, as
+    # the left one has the same distances
+    apart = np.hypot(*(peaks[right] - peaks[right[best]]).T) > 2.0 * max(width, fwhm)
+    if np.any(apart & (strength > companion * strength[best])):
         reason = "two stars"
     elif heights.max() > 20 * strength[best] and heights.argmax() not in (right[best], left[best]):
         reason = "one beam missing"
@@ -115,14 +118,6 @@ def _width(light, positions):
         labels, _ = ndimage.label(light > 0.5 * light[y, x])
         diameters.append(2.0 * np.sqrt((labels == labels[y, x]).sum() / np.pi))
     return float(np.mean(diameters))
-
-
-def _ambiguous(places, strength, best, companion, apart):
-    """Return whether another pair is nearly as bright and not part of the same image."""
-    # in the right beam; the left one has the same distances
-    distance = np.hypot(*(places - places[best]).T)
-    others = (distance > apart) & (strength > companion * strength[best])
-    return bool(others.any())
 
 
 # ---- Gaussians -----------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from erfa import ErfaError
 from astropolcal.exceptions import ObservationError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.fitscheck import primary_header
-from astropolcal.instruments.keywords import (
+from astropolcal.instruments.layout import (
     ANGLES,
     RANGES,
     TEXTS,

@@ -168,6 +168,8 @@ def moffat(box, place, fwhm, beta):
 
 @dataclass(frozen=True)
 class Detector:
+    """What a detector does to the electrons of a pixel, and what its errors follow from."""
+
     gain: float
     read_noise: float
     background: np.ndarray

@@ -273,7 +273,9 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
         pixel = np.maximum(spread, own.read_noise**2)
         result.variance[beam] = flux_variance(photons, area * scale, pixel, number)
         result.flag(kept < (1 - max_masked) * area, f"{BEAMS[beam]} aperture masked")
-        result.flag(_peak(cut, known, weights) >= own.saturation, "saturated")
+        # -inf never is the brightest
+        values = cut if known is None else np.where(known, cut, -np.inf)
+        result.flag(values[:, weights > 0].max(axis=1) >= own.saturation, "saturated")
         areas.append(area)
     if background == "outside":
         result.covariance[:] = shared_background(*areas, spread, number)
@@ -321,7 +323,9 @@ def _weighted(cut, known, weights):
 def _outliers(cut, known, weights, detector):
     """Return the single pixels that are far off their neighbours."""
     sample = (slice(None), *(index[::_SAMPLED] for index in np.nonzero(weights)))
-    level, spread = _robust(cut[sample], None if known is None else known[sample])
+    pixels, there = cut[sample], None if known is None else known[sample]
+    level = _median(pixels, there)
+    spread = MAD_TO_SIGMA * _median(np.abs(pixels - level[:, None]), there)
     # first those far off the others of their slice: only of these the neighbours are looked at
     low, high = (limit[:, None, None] for limit in _limits(level, spread, detector))
     kind = np.result_type(cut, np.float32)
@@ -348,24 +352,13 @@ def _limits(level, spread, detector):
     return np.minimum(level, 0.0) - reach, high
 
 
-def _robust(pixels, known):
-    """Return the median of each row and its robust standard deviation, infinite without a value."""
-    level = _median(pixels, known)
-    return level, MAD_TO_SIGMA * _median(np.abs(pixels - level[:, None]), known)
-
-
 def _median(pixels, known):
+    """Return the median of each row, infinite without a value."""
     # nanmedian takes ten times as long; of no value the infinite ones are left
     number = np.full(len(pixels), pixels.shape[1]) if known is None else known.sum(axis=1)
     ordered = np.sort(pixels if known is None else np.where(known, pixels, np.inf), axis=1)
     row = np.arange(len(pixels))
     return (ordered[row, (number - 1) // 2] + ordered[row, number // 2]) / 2.0
-
-
-def _peak(cut, known, weights):
-    # -inf never is the brightest
-    values = cut if known is None else np.where(known, cut, -np.inf)
-    return values[:, weights > 0].max(axis=1)
 
 
 def _level(cube, good, detector, layout):

@@ -506,7 +506,11 @@ def set_aside(frames, reduction):
 
 def _of_one_kind(frames, what, value, reduction):
     """Leave out frames that differ from most in what a run has in common."""
-    kinds = [None if value(frame) is None else _plain(value(frame)) for frame in frames]
+    # case, blanks and signs are written now so, now so; but BD+12 and BD-12 are two stars
+    kinds = [
+        None if value(frame) is None else re.sub(r"[^\w+-]|_", "", value(frame)).casefold()
+        for frame in frames
+    ]
     counts = Counter(kind for kind in kinds if kind is not None)
     if len(counts) < 2:
         return frames
@@ -525,12 +529,6 @@ def _of_one_kind(frames, what, value, reduction):
     return kept
 
 
-def _plain(text):
-    """Return a name without what is written now so, now so: case, blanks, signs."""
-    # but BD+12 and BD-12 are two stars
-    return re.sub(r"[^\w+-]|_", "", text).casefold()
-
-
 def _order(frame):
     """Order by frame number; what has none comes last, by time and name."""
     if frame.number is not None:
@@ -539,6 +537,7 @@ def _order(frame):
 
 
 def replace_angles(frames, sequence):
+    """Give the frames the angles of a sequence that repeats, in place."""
     if sequence is None:
         return
     sequence = [float(angle) for angle in sequence]

@@ -66,19 +66,24 @@ def spectra_from_table(table):
     >>> print(spectra["q"].flux, spectra["q"].spectral_axis)
     [0.01  0.008] [1.2 1.6] um
     """
-    spectrum = _spectrum_class()
+    try:
+        from specutils import Spectrum
+    except ImportError as error:
+        raise AstropolcalError(
+            "spectra of a target need the package specutils (2.0 or later): pip install specutils"
+        ) from error
     table, mask = _checked(table)
     axis = table["wavelength"]
     spectra = {}
-    for key in _present(table):
+    for key in (key for key, name in _NAMES.items() if name in table.colnames):
         # each spectrum its own: a user may change one
         meta = dict(table.meta)
         if key in ("q", "u") and _COVARIANCE in table.colnames:
-            meta[_COVARIANCE] = _plain(table[_COVARIANCE])
+            meta[_COVARIANCE] = u.Quantity(table[_COVARIANCE]).to_value(u.one)
         name = _NAMES[key]
         if f"{name}_{_SYSTEMATIC}" in table.colnames:
             meta[_SYSTEMATIC] = np.asarray(u.Quantity(table[f"{name}_{_SYSTEMATIC}"]).value)
-        spectra[key] = spectrum(
+        spectra[key] = Spectrum(
             flux=u.Quantity(table[name]),
             spectral_axis=axis,
             uncertainty=StdDevUncertainty(u.Quantity(table[f"{name}_err"])),
@@ -207,24 +212,6 @@ def read_spectra(path):
         if str(error).startswith(str(path)):
             raise
         raise ObservationError(f"{path}: {error}") from error
-
-
-def _spectrum_class():
-    try:
-        from specutils import Spectrum
-    except ImportError as error:
-        raise AstropolcalError(
-            "spectra of a target need the package specutils (2.0 or later): pip install specutils"
-        ) from error
-    return Spectrum
-
-
-def _present(table):
-    return [key for key, name in _NAMES.items() if name in table.colnames]
-
-
-def _plain(column):
-    return np.asarray(u.Quantity(column).to_value(u.one))
 
 
 def _checked(table):

@@ -247,7 +247,9 @@ def _aperture(cube, k, beam, places, radius):
     from photutils.aperture import CircularAperture
 
     place, image, detector = places[beam], cube.cube[k], cube.detector.of(beam)
-    if _beyond_edge(place, radius, image.shape, cube.edge):
+    # pixel 0 begins at -0.5
+    room = min(*place, image.shape[1] - 1 - place[0], image.shape[0] - 1 - place[1]) - radius + 0.5
+    if room < cube.edge:
         return "edge"
     mask = CircularAperture(place, radius).to_mask(method="exact")
     image, known, corner, inner = _cut(image, cube.good[k], mask.bbox, cube.annulus)
@@ -286,13 +288,6 @@ def _flux(inside, weights, ring, detector):
     without = flux_variance(photons, area, pixel)
     variance = flux_variance(photons, area, pixel, ring.size)
     return flux, float(variance), level, float(variance - without)
-
-
-def _beyond_edge(place, radius, shape, edge):
-    x, y = place
-    # pixel 0 begins at -0.5
-    inside = min(x - radius, y - radius, shape[1] - 1 - x - radius, shape[0] - 1 - y - radius)
-    return inside + 0.5 < edge
 
 
 def _cut(image, good, box, annulus):

@@ -174,7 +174,9 @@ def _fit(star, rings, detector, halo_radius):
     expected = np.broadcast_to(rings.values.mean(axis=1, keepdims=True), rings.values.shape)
     p = _START
     for _ in range(2):
-        weights = _weights(expected, rings, detector)
+        # of the sum of both beams in each ring
+        variances = [detector.of(b).variance(expected[b]) / rings.counts[b] for b in range(2)]
+        weights = 1 / np.sqrt(sum(variances))
         p, c, background, cost = _least_squares(profile, weights, p)
         light = np.tensordot(c, profile.in_rings(p), 1)
         share = star.flux / star.flux.sum(axis=0)
@@ -183,12 +185,6 @@ def _fit(star, rings, detector, halo_radius):
     found = (p, c, background)
     covariance = _covariance(profile, weights, found) * max(1.0, cost / freedom)
     return _shares(profile, found, covariance, cost / freedom)
-
-
-def _weights(expected, rings, detector):
-    """Return the inverse standard deviation of the sum of both beams in each ring."""
-    variances = [detector.of(b).variance(expected[b]) / rings.counts[b] for b in range(2)]
-    return 1 / np.sqrt(sum(variances))
 
 
 def _least_squares(profile, weights, start):

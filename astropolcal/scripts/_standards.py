@@ -400,7 +400,7 @@ def _site(text):
     """Return the place, by name or as LON,LAT,HEIGHT."""
     from astropy.coordinates import EarthLocation
 
-    from astropolcal.standards._sky import SITES, location
+    from astropolcal.standards.visibility import SITES, location
 
     if "," not in text:
         try:

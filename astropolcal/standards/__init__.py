@@ -10,23 +10,21 @@ well the polarization of a star is known. `SerkowskiLaw` is the wavelength
 dependence of interstellar polarization as an astropy model.
 """
 
-from astropolcal.standards.catalogues import KINDS, MAGNITUDES, StandardStar, catalogue, get, names
-from astropolcal.standards.information import TelescopeInformation, telescope_information
-from astropolcal.standards.law import LinearStokes, SerkowskiLaw, whittet_width
-from astropolcal.standards.priors import Interstellar, UnpolarizedError
-from astropolcal.standards.searching import search
-from astropolcal.standards.visibility import Observability, observability
+from astropolcal.standards.catalogues import StandardStar, catalogue, get, names
+from astropolcal.standards.law import SerkowskiLaw, whittet_width
+from astropolcal.standards.visibility import (
+    Observability,
+    TelescopeInformation,
+    observability,
+    search,
+    telescope_information,
+)
 
 __all__ = [
-    "KINDS",
-    "MAGNITUDES",
-    "Interstellar",
-    "LinearStokes",
     "Observability",
     "SerkowskiLaw",
     "StandardStar",
     "TelescopeInformation",
-    "UnpolarizedError",
     "catalogue",
     "get",
     "names",

@@ -17,7 +17,7 @@ from astropolcal.standards.priors import angles, interstellar, turning, unpolari
 from astropolcal.units import length_to_um
 from astropolcal.words import did_you_mean
 
-__all__ = ["KINDS", "MAGNITUDES", "StandardStar", "catalogue", "get", "names"]
+__all__ = ["StandardStar", "catalogue", "get", "names"]
 
 #: What a standard star may be.
 KINDS = ("polarized", "unpolarized")
@@ -96,29 +96,7 @@ class StandardStar:
         return bool(np.all(self.polarization["checked"]))
 
     def brightness(self, band=None):
-        """
-        Return the magnitude in a band, or in V where that band has none.
-
-        Parameters
-        ----------
-        band : str, optional
-            ``"V"``, ``"J"``, ``"H"`` or ``"K"``; others count as V.
-
-        Returns
-        -------
-        magnitude : float
-            Nan if neither is known.
-        band : str
-            The band that it is of.
-
-        Examples
-        --------
-        >>> from astropolcal import standards
-        >>> standards.get("HD 30675").brightness("H")
-        (6.687, 'H')
-        >>> standards.get("HD 293396").brightness("H")
-        (9.6, 'V')
-        """
+        """Return a magnitude (perhaps nan) and its band: V where the one asked for has none."""
         band = band if band in self.magnitudes else "V"
         magnitude = self.magnitudes.get(band)
         return (float("nan") if magnitude is None else float(magnitude.value)), band
@@ -210,32 +188,14 @@ class StandardStar:
 
     def unpolarized_error(self):
         r"""
-        Return how far the q and u of an unpolarized star may be from zero.
+        Return how far q and u of an unpolarized star may be from zero, and why: ``value, words``.
 
-        Returns
-        -------
-        UnpolarizedError
-            The standard error of q and of u, and where it comes from.
-
-        Raises
-        ------
-        ParameterError
-            If the star is polarized.
-
-        Notes
-        -----
-        A measured degree overestimates the true one, :math:`E[p^2] = P^2 + 2\sigma^2`,
-        and P has an unknown direction, so that q and u have the variance
-        :math:`P^2/2 + \sigma^2 = \max(p^2/2, \sigma^2)` each. Of several measurements the
-        best gives :math:`\sigma`, and all together give P. It is at least 0.01 %, and
-        0.1 % where no source states an error. Interstellar polarization is smaller in
-        the near infrared; that of a circumstellar disk need not be.
-
-        Examples
-        --------
-        >>> from astropolcal import standards
-        >>> print(standards.get("HD 35532").unpolarized_error().words)
-        Heiles 2000: 0 +- 0.2 % at 0.55 um
+        A measured degree overestimates the true one, :math:`E[p^2] = P^2 + 2\sigma^2`, and P has
+        an unknown direction, so that q and u have the variance :math:`P^2/2 + \sigma^2 =
+        \max(p^2/2, \sigma^2)` each. Of several measurements the best gives :math:`\sigma`, and all
+        together give P. It is at least 0.01 %, and 0.1 % where no source states an error.
+        Interstellar polarization is smaller in the near infrared; that of a circumstellar disk
+        need not be.
         """
         return unpolarized_error(self)
 
@@ -314,9 +274,9 @@ def catalogue():
     Returns
     -------
     stars : `~astropy.table.QTable`
-        One row a star; missing numbers are nan.
+        One row per star; missing numbers are nan.
     polarization : `~astropy.table.QTable`
-        One row a star, band and source.
+        One row per star, band and source.
 
     Examples
     --------

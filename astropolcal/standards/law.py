@@ -10,7 +10,7 @@ from astropy.modeling import Fittable1DModel, Parameter
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.units import angle_to_rad, length_to_um, to_unit
 
-__all__ = ["LinearStokes", "SerkowskiLaw", "whittet_width"]
+__all__ = ["SerkowskiLaw", "whittet_width"]
 
 # Whittet et al. (1992): K = intercept + slope * lambda_max / um
 _INTERCEPT, _SLOPE = 0.01, 1.66
@@ -22,22 +22,7 @@ _CANONICAL |= {"K": u.dimensionless_unscaled, "rotation": u.rad / u.um}
 
 
 class LinearStokes(NamedTuple):
-    """
-    Normalized linear Stokes parameters and their covariance.
-
-    Parameters
-    ----------
-    q, u : float or `~numpy.ndarray`
-        One value a wavelength.
-    covariance : `~numpy.ndarray` or None
-        Shape (..., 2, 2), in the order q, u; None if no errors are known.
-
-    Examples
-    --------
-    >>> from astropolcal.standards import LinearStokes
-    >>> LinearStokes(0.01, 0.0, None).q
-    0.01
-    """
+    """Normalized linear Stokes parameters, and their covariance (..., 2, 2), None if unknown."""
 
     q: np.ndarray
     u: np.ndarray
@@ -211,32 +196,7 @@ class SerkowskiLaw(Fittable1DModel):
         return columns
 
     def angle(self, wavelength):
-        """
-        Return the angle of polarization.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Any shape.
-
-        Returns
-        -------
-        `~astropy.units.Quantity`
-            In degree, from north through east, in [0, 180).
-
-        Raises
-        ------
-        WavelengthRangeError
-            If the law does not hold at a wavelength.
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.standards import SerkowskiLaw
-        >>> law = SerkowskiLaw(theta=58 * u.deg, rotation=2 * u.deg / u.um)
-        >>> law.angle(1.55 * u.um)
-        <Quantity 60. deg>
-        """
+        """Return the angle of polarization in degree, from north through east, in [0, 180)."""
         x = _in_range(length_to_um(wavelength, "wavelength"), self.valid_range)
         return np.mod(np.rad2deg(self._angle_rad(x)), 180) * u.deg
 
@@ -252,47 +212,11 @@ class SerkowskiLaw(Fittable1DModel):
         }
 
     def q(self, wavelength):
-        """
-        Return Stokes q, positive along north.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Any shape.
-
-        Returns
-        -------
-        float or `~numpy.ndarray`
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.standards import SerkowskiLaw
-        >>> float(SerkowskiLaw(p_max=0.04, theta=90 * u.deg).q(550 * u.nm))
-        -0.04
-        """
+        """Return Stokes q, positive along north."""
         return self.stokes(wavelength).q
 
     def u(self, wavelength):
-        """
-        Return Stokes u, positive towards north-east.
-
-        Parameters
-        ----------
-        wavelength : `~astropy.units.Quantity`
-            Any shape.
-
-        Returns
-        -------
-        float or `~numpy.ndarray`
-
-        Examples
-        --------
-        >>> import astropy.units as u
-        >>> from astropolcal.standards import SerkowskiLaw
-        >>> float(SerkowskiLaw(p_max=0.04, theta=45 * u.deg).u(550 * u.nm))
-        0.04
-        """
+        """Return Stokes u, positive towards north-east."""
         return self.stokes(wavelength).u
 
     def stokes(self, wavelength, covariance=None):

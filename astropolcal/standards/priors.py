@@ -9,7 +9,7 @@ import numpy as np
 from astropolcal.exceptions import ParameterError
 from astropolcal.standards.law import SerkowskiLaw, whittet_width
 
-__all__ = ["Interstellar", "UnpolarizedError"]
+__all__ = []
 
 # fractions, micrometres and degrees throughout this module
 # what a source does not state
@@ -38,22 +38,7 @@ _PARAMETERS = ("p_max", "lambda_max", "K", "theta", "rotation")
 
 
 class UnpolarizedError(NamedTuple):
-    """
-    How far the q and u of an unpolarized star may be from zero.
-
-    Parameters
-    ----------
-    value : float
-        Standard error of q and of u.
-    words : str
-        Where it comes from.
-
-    Examples
-    --------
-    >>> from astropolcal import standards
-    >>> standards.get("HD 293396").unpolarized_error().value
-    0.0018
-    """
+    """Standard error of q and of u of an unpolarized star, and in words where it comes from."""
 
     value: float
     words: str
@@ -63,28 +48,10 @@ class Interstellar(NamedTuple):
     """
     The Serkowski law of a polarized star, with an error of every parameter.
 
-    Parameters
-    ----------
-    law : SerkowskiLaw
-        The law.
-    errors : dict
-        Standard errors of ``p_max``, ``lambda_max``, ``K``, ``theta`` and
-        ``rotation``, as quantities where the parameter has a unit.
-    covariance : `~numpy.ndarray`
-        Of the five in this order and in the units of the law. The errors alone give
-        two or three times too much in the near infrared, where those of lambda_max
-        and K cancel.
-    source : str
-        The publications that the numbers are from.
-    assumed : tuple of str
-        What no publication of this star says, one sentence each.
-
-    Examples
-    --------
-    >>> from astropolcal import standards
-    >>> known = standards.get("HD 155197").interstellar()
-    >>> sorted(known.errors)
-    ['K', 'lambda_max', 'p_max', 'rotation', 'theta']
+    ``errors`` are by name, as quantities where the parameter has a unit. ``covariance`` is of
+    p_max, lambda_max, K, theta and rotation in the units of the law; the errors alone give two or
+    three times too much in the near infrared, where those of lambda_max and K cancel. ``source``
+    names the publications, ``assumed`` what none of them says, one sentence each.
     """
 
     law: SerkowskiLaw

@@ -1,30 +1,294 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""When in a night a standard star can be observed, and at which angles."""
+"""
+Which star to observe, when it is up and at which angles, and what it then tells of a telescope.
+"""
 
 from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import EarthLocation, SkyCoord
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_sun
 from astropy.table import QTable
+from astropy.time import Time
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.standards._sky import (
-    LIMIT,
-    STEP,
-    TWILIGHT,
-    checked,
-    date_of,
-    location,
-    night_table,
-    night_times,
-    offline,
-    pointing,
-)
-from astropolcal.standards.catalogues import StandardStar, get
-from astropolcal.standards.information import TelescopeInformation, telescope_information
+from astropolcal.observations.pointings import offline, pointing
+from astropolcal.standards.catalogues import StandardStar, check_kind, get, names
+from astropolcal.units import angle_to_rad, iso_date
+from astropolcal.words import did_you_mean
 
-__all__ = ["Observability", "observability"]
+__all__ = [
+    "Observability",
+    "TelescopeInformation",
+    "observability",
+    "search",
+    "telescope_information",
+]
+
+LIMIT = 30 * u.deg
+# end of nautical twilight: standards are bright, the sky need not be quite dark
+TWILIGHT = -12 * u.deg
+STEP = 10 * u.min
+# a coarser table would miss a transit, where the parallactic angle of a high star turns fast
+_LARGEST_STEP = 60 * u.min
+
+# east longitude and latitude in degree, height in metre
+SITES = {
+    "gemini_south": (-70.7367, -30.2407, 2738),
+    "keck": (-155.4750, 19.8264, 4145),
+    "paranal": (-70.4033, -24.6253, 2635),
+    "subaru": (-155.4760, 19.8255, 4139),
+}
+
+
+def location(site):
+    """Return the place on Earth that a name or an EarthLocation means."""
+    if isinstance(site, EarthLocation):
+        return site
+    key = str(site).strip().lower().replace(" ", "_").replace("-", "_")
+    if key in SITES:
+        place = EarthLocation.from_geodetic(*SITES[key])
+        place.info.name = key.replace("_", " ").title()
+        return place
+    raise ParameterError(
+        f"site = {site!r} is not known{did_you_mean(key, SITES)} (known: {', '.join(SITES)}; any "
+        "other as an EarthLocation)"
+    )
+
+
+def night_times(site, night, *, twilight, step):
+    """Return the times of a night with the Sun below ``twilight``, ``step`` apart."""
+    with offline():
+        # from noon to noon, so that a night is never cut in two whatever the longitude
+        times = _evening_noon(site, night) + np.arange(0, 1, step.to_value(u.day)) * u.day
+        sun = get_sun(times).transform_to(AltAz(obstime=times, location=site)).alt
+    dark = sun < twilight
+    if not np.any(dark):
+        raise ParameterError(
+            f"night = {night!s}: the Sun does not go below {twilight.to_value(u.deg):g} deg "
+            f"at this site; it gets to {sun.min().to_value(u.deg):.1f} deg"
+        )
+    return times[dark]
+
+
+def _evening_noon(site, night):
+    """Return the local mean noon of the date on which the night begins."""
+    date = Time(date_of(night), scale="utc")
+    # a time of its own, which is printed to the second
+    noon = Time(date.jd1, date.jd2, format="jd", scale="utc", precision=0)
+    # local mean noon is 12 h UTC minus the east longitude
+    return noon + (0.5 - site.lon.to_value(u.deg) / 360) * u.day
+
+
+def date_of(night):
+    """Return the date of the evening as text, or raise."""
+    try:
+        text = iso_date(night.to_value("iso", "date") if isinstance(night, Time) else night)
+        if "T" in text:
+            raise ValueError
+    except ValueError:
+        raise ParameterError(
+            f"night = {night!r} must be the date of the evening, such as '2025-11-03'"
+        ) from None
+    return text
+
+
+def checked(min_altitude, twilight, step):
+    """Return limits and step, or raise."""
+    limit = np.rad2deg(float(angle_to_rad(min_altitude, "min_altitude"))) * u.deg
+    dark = np.rad2deg(float(angle_to_rad(twilight, "twilight"))) * u.deg
+    if not 0 <= limit.value < 90:
+        raise ParameterError(f"min_altitude = {limit:g} must be from 0 to below 90 deg")
+    if not -90 <= dark.value <= 0:
+        raise ParameterError(f"twilight = {dark:g} must be from -90 to 0 deg")
+    if not (isinstance(step, u.Quantity) and step.unit.is_equivalent(u.s)):
+        raise ParameterError(f"step = {step!r} needs a unit of time")
+    if not 0 * u.s < step <= _LARGEST_STEP:
+        raise ParameterError(f"step = {step:g} must be positive and at most {_LARGEST_STEP:g}")
+    return limit, dark, step
+
+
+def night_table(times, altitude, parallactic, limit):
+    """Return the table of one star over the dark hours."""
+    # a star that culminates north of the zenith jumps from -180 to +180 deg there
+    smooth, up = np.unwrap(parallactic, period=360 * u.deg), altitude >= limit
+    lowest = np.min(smooth[up]) if np.any(up) else smooth[0]
+    # from -180 deg on, so that a star that culminates in the north passes +180
+    smooth = smooth - np.floor((lowest + 180 * u.deg) / (360 * u.deg)) * 360 * u.deg
+    return QTable({"time": times, "altitude": altitude, "parallactic": smooth, "observable": up})
+
+
+_NAMES = ("star_q", "star_u", "diattenuation", "offset_q", "offset_u")
+# singular values below this part of the largest count as zero
+_RANK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class TelescopeInformation:
+    """
+    Expected covariance of a star's polarization and a telescope's diattenuation.
+
+    Parameters
+    ----------
+    names : tuple of str
+        ``star_q``, ``star_u``, ``diattenuation``; with an offset also
+        ``offset_q``, ``offset_u``.
+    covariance : `~numpy.ndarray`
+        In the order of ``names``; rows and columns of what the frames cannot
+        separate are infinite.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.standards import telescope_information
+    >>> info = telescope_information([-45, 45] * u.deg)
+    >>> round(info.error("star_q"), 2)
+    0.71
+    """
+
+    names: tuple
+    covariance: np.ndarray
+
+    def error(self, name):
+        """Return the standard error of a parameter, infinite if the frames do not determine it."""
+        if name not in self.names:
+            raise ParameterError(f"no parameter {name!r}; there are {', '.join(self.names)}")
+        place = self.names.index(name)
+        return float(np.sqrt(self.covariance[place, place]))
+
+    @property
+    def diattenuation(self):
+        """Standard error of the telescope's diattenuation."""
+        return self.error("diattenuation")
+
+
+def telescope_information(
+    parallactic, altitude=None, *, frame_error=1.0, star_error=None, offset=False
+):
+    r"""
+    Return how well frames separate a telescope's diattenuation from the star.
+
+    In the frame of a tertiary mirror the star turns by the parallactic angle
+    :math:`\psi`, while the diattenuation :math:`D` of the mirror stays along q:
+
+    .. math::
+        q' = q \cos 2\psi + u \sin 2\psi + D, \qquad
+        u' = -q \sin 2\psi + u \cos 2\psi .
+
+    With an offset, the instrument adds a constant in its own frame, which
+    is turned by minus the altitude as in the chain of an alt-azimuth telescope's
+    Nasmyth focus. Each frame is taken to measure q' and u' with the same
+    error; the covariance is that of linear least squares. For a star that is not
+    known and without an offset,
+
+    .. math:: \sigma_D = \sigma_\mathrm{frame} \big/ \sqrt{n (1 - R^2)}, \qquad
+              R = \left|\frac1n \sum e^{2 i \psi}\right| ,
+
+    so only the spread of the parallactic angle counts: a half turn of the double
+    angle is all that one can wish for, and a star that barely turns says
+    nothing.
+
+    Parameters
+    ----------
+    parallactic : `~astropy.units.Quantity`
+        One angle per frame, shape (n,).
+    altitude : `~astropy.units.Quantity`, optional
+        One a frame; needed with ``offset``.
+    frame_error : float
+        Standard error of q and of u in one frame. The default of 1 gives errors
+        in units of it.
+    star_error : float, optional
+        Standard error of the star's q and u in a catalogue; by default the star
+        is not known.
+    offset : bool
+        Whether an offset of the instrument is determined as well.
+
+    Returns
+    -------
+    TelescopeInformation
+
+    Raises
+    ------
+    ParameterError
+        If angles are missing or do not match, or an error is not positive.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropolcal.standards import telescope_information
+    >>> angles = np.linspace(-45, 45, 101) * u.deg
+    >>> round(telescope_information(angles, frame_error=1e-3).diattenuation, 5)
+    0.00013
+    """
+    psi = _angles(parallactic, "parallactic")
+    turn = np.zeros_like(psi)
+    if altitude is not None:
+        turn = _angles(altitude, "altitude")
+    elif offset:
+        raise ParameterError("an offset can only be separated with the altitude of each frame")
+    if psi.shape != turn.shape:
+        raise ParameterError(f"there are {psi.size} parallactic angles and {turn.size} altitudes")
+    columns = _design(psi, turn, offset) / _positive(frame_error, "frame_error")
+    if star_error is not None:
+        columns = np.vstack([columns, _prior(columns.shape[1], star_error)])
+    return TelescopeInformation(_NAMES[: columns.shape[1]], _covariance(columns))
+
+
+def _design(psi, turn, offset):
+    """Return the derivatives of all q' and u' by the parameters, shape (2 n, 3 or 5)."""
+    # in the frame of the instrument; the turn itself changes no information
+    star, mirror = _rotation(psi - turn), _rotation(-turn)[..., :1]
+    # columns: star q, star u, diattenuation, and with an offset its q and u
+    parts = [star, mirror]
+    if offset:
+        parts.append(np.broadcast_to(np.eye(2), star.shape))
+    return np.concatenate(parts, axis=-1).reshape(2 * len(psi), -1)
+
+
+def _rotation(angle):
+    """Return the matrices that turn (q, u) by an angle, shape (n, 2, 2)."""
+    cosine, sine = np.cos(2 * angle), np.sin(2 * angle)
+    return np.stack([np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)], axis=-2)
+
+
+def _prior(width, star_error):
+    # a star known beforehand is two more measurements, of its q and u
+    rows = np.zeros((2, width))
+    rows[:, :2] = np.eye(2) / _positive(star_error, "star_error")
+    return rows
+
+
+def _covariance(columns):
+    """Return the covariance of least squares; infinite where nothing is determined."""
+    # all right vectors are there even if one frame gives fewer rows than columns; with more rows
+    # the full matrix of left ones would have the square of their number
+    short = columns.shape[0] < columns.shape[1]
+    _, size, directions = np.linalg.svd(columns, full_matrices=short)
+    # one frame gives two rows for three or more columns: the missing singular values are zero
+    size = np.concatenate([size, np.zeros(columns.shape[1] - len(size))])
+    good = size > _RANK * size.max()
+    half = directions[good] / size[good, None]
+    covariance = half.T @ half
+    # a parameter that takes part in an open direction has an infinite error, not that of a
+    # pseudo-inverse; null vectors are exact to about the root of the rank tolerance
+    lost = np.any(np.abs(directions[~good]) > np.sqrt(_RANK), axis=0)
+    covariance[lost, :] = covariance[:, lost] = np.inf
+    return covariance
+
+
+def _angles(value, name):
+    angles = np.atleast_1d(angle_to_rad(value, name))
+    if angles.ndim != 1 or not angles.size or not np.all(np.isfinite(angles)):
+        raise ParameterError(f"{name} must be finite angles, one per frame")
+    return angles
+
+
+def _positive(value, name):
+    value = u.Quantity(value).to_value(u.dimensionless_unscaled)
+    if not (np.isfinite(value) and value > 0):
+        raise ParameterError(f"{name} = {value!r} must be a positive number")
+    return float(value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +307,7 @@ class Observability:
     min_altitude : `~astropy.units.Quantity`
         Altitude below which the star is not observed.
     table : `~astropy.table.QTable`
-        One row a time of the dark hours: ``time, altitude, parallactic,
+        One row per time of the dark hours: ``time, altitude, parallactic,
         observable``. ``parallactic`` has no jumps, so it may pass +180 deg.
 
     Examples
@@ -107,7 +371,7 @@ class Observability:
         Parameters
         ----------
         frames : int, optional
-            How many pairs of q and u; by default one a row of the table.
+            How many pairs of q and u; by default one per row of the table.
         **options
             As for `telescope_information`.
 
@@ -203,3 +467,210 @@ def _spread(count, frames):
         raise ParameterError(f"frames = {frames!r} must be a positive whole number")
     # more frames than rows repeat rows, so that the number of frames still counts
     return np.round(np.linspace(0, count - 1, int(frames))).astype(int)
+
+
+# frames spread over the observable hours, for the error of the diattenuation
+FRAMES = 32
+# where m3_score and m3_error agree; photon noise grows as 10^(0.2 m)
+_REFERENCE_MAGNITUDE = 10
+_FORMATS = dict.fromkeys(("m3_error", "m3_score"), ".3f")
+_FORMATS |= dict.fromkeys(("altitude_min", "altitude_max", "hours"), ".1f")
+_FORMATS |= dict.fromkeys(("parallactic_min", "parallactic_max"), ".1f")
+_BANDS = ("U", "B", "V", "R", "I", "J", "H", "K")
+
+
+def search(
+    *,
+    center=None,
+    radius=None,
+    kind=None,
+    band=None,
+    magnitude=None,
+    site=None,
+    night=None,
+    min_altitude=LIMIT,
+):
+    r"""
+    Return the standard stars that fit, as a table.
+
+    Parameters
+    ----------
+    center : `~astropy.coordinates.SkyCoord`, optional
+        Look around this position.
+    radius : `~astropy.units.Quantity`, optional
+        How far; goes with ``center``.
+    kind : str, optional
+        ``"polarized"`` or ``"unpolarized"``.
+    band : str, optional
+        Of U, B, V, R, I, J, H, K: leaves polarized stars with a measurement in this
+        band or a published law (unpolarized ones are kept), and gives the
+        magnitude in it, or in V where the catalogue has none.
+    magnitude : (float, float), optional
+        Brightest and faintest magnitude; stars without one are left out.
+    site : str or `~astropy.coordinates.EarthLocation`, optional
+        As for `observability`; goes with ``night``.
+    night : str, optional
+        Date of the evening: leaves stars that rise above the limit.
+    min_altitude : `~astropy.units.Quantity`
+        That limit.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        ``name, kind, ra, dec, magnitude, magnitude_band, p, p_err`` (p in ``band``
+        or in the band nearest to V, from the law for a star without measurement),
+        with a center ``separation``, with a night ``altitude_min,
+        altitude_max, parallactic_min, parallactic_max, hours, transit, m3_error,
+        m3_score``. The order is that of the score, else of the separation, else of
+        right ascension. It may be empty.
+
+    Raises
+    ------
+    ParameterError
+        If an argument is not what it should be, or lacks its companion.
+
+    Notes
+    -----
+    ``m3_error`` is the standard error of a telescope's diattenuation, in units
+    of the error of one frame, from 32 frames spread over the observable hours, the
+    star's polarization unknown (`telescope_information`). ``m3_score`` multiplies
+    it by :math:`10^{0.2 (m - 10)}`, how much the photon noise exceeds that of
+    a star of magnitude 10. The smaller it is, the better the star fixes the
+    diattenuation, provided that it does not saturate the detector.
+
+    Examples
+    --------
+    >>> from astropolcal import standards
+    >>> found = standards.search(kind="unpolarized", magnitude=(9, 10), site="subaru",
+    ...                          night="2025-11-03")
+    >>> print(found["name", "m3_error"][:2])
+       name   m3_error
+    --------- --------
+     HD 14069    0.191
+    HD 293396    0.209
+    """
+    check_kind(kind)
+    if (site is None) != (night is None):
+        raise ParameterError("site and night go together")
+    if (center is None) != (radius is None):
+        raise ParameterError("center and radius go together")
+    if band not in (None, *_BANDS):
+        raise ParameterError(f"band = {band!r} must be one of {', '.join(_BANDS)}")
+    stars = [s for s in map(get, names(kind)) if _in_band(s, band) and _bright(s, band, magnitude)]
+    if center is not None:
+        stars = _around(stars, center, radius)
+    table = _describe(stars, band)
+    if center is not None:
+        table["separation"] = _places(stars).separation(center).to(u.deg)
+        table.sort("separation")
+    return table if night is None else _observable(table, site, night, min_altitude)
+
+
+def _in_band(star, band):
+    known = band is None or star.kind == "unpolarized" or star.law is not None
+    return known or band in star.polarization["band"]
+
+
+def _bright(star, band, limits):
+    if limits is None:
+        return True
+    try:
+        low, high = (float(limit) for limit in limits)
+    except (TypeError, ValueError):
+        raise ParameterError(f"magnitude = {limits!r} must be two numbers") from None
+    if not low <= high:
+        raise ParameterError(f"magnitude = {limits!r} must be the brightest and the faintest")
+    return low <= star.brightness(band)[0] <= high
+
+
+def _around(stars, center, radius):
+    if not isinstance(center, SkyCoord) or not center.isscalar:
+        raise ParameterError(f"center = {center!r} must be a SkyCoord of one position")
+    radius = float(angle_to_rad(radius, "radius"))
+    if not 0 < radius <= np.pi:
+        raise ParameterError(f"radius = {np.rad2deg(radius):g} deg must be from 0 to 180 deg")
+    # separation of no coordinates is an error in astropy
+    near = _places(stars).separation(center).rad <= radius if stars else []
+    return [star for star, inside in zip(stars, near, strict=True) if inside]
+
+
+def _places(stars):
+    return SkyCoord(
+        [s.coord.ra.deg for s in stars] * u.deg, [s.coord.dec.deg for s in stars] * u.deg
+    )
+
+
+def _describe(stars, band):
+    """Return the table that does not depend on the night."""
+    bright = [s.brightness(band) for s in stars]
+    degree = u.Quantity([_degree(s, band) for s in stars] or np.zeros((0, 2)), u.percent)
+    place = _places(stars)
+    return QTable(
+        {
+            "name": np.array([s.name for s in stars], dtype=str),
+            "kind": np.array([s.kind for s in stars], dtype=str),
+            "ra": place.ra.to(u.deg),
+            "dec": place.dec.to(u.deg),
+            "magnitude": np.array([m for m, _ in bright], dtype=float) * u.mag,
+            "magnitude_band": np.array([b for _, b in bright], dtype=str),
+            "p": degree[:, 0],
+            "p_err": degree[:, 1],
+        }
+    )
+
+
+def _degree(star, band):
+    """Return the degree of polarization and its error (percent) in or near a band."""
+    table = star.polarization
+    if band is not None and band in table["band"]:
+        table = table[table["band"] == band]
+    elif star.law is not None and (band is not None or not len(table)):
+        return _from_law(star, band)
+    at = int(np.argmin(np.abs(table["wavelength"] - 0.55 * u.um)))
+    return table["p"][at].to_value(u.percent), table["p_err"][at].to_value(u.percent)
+
+
+def _from_law(star, band):
+    place = dict(zip(_BANDS, (0.36, 0.44, 0.55, 0.65, 0.8, 1.25, 1.65, 2.2), strict=True))
+    wavelength = place.get(band, 0.55) * u.um
+    q, stokes_u, covariance = star.stokes(wavelength)
+    # the error of the degree is that along the direction of polarization in the (q, u) plane
+    along = np.array([q, stokes_u]) / np.hypot(q, stokes_u)
+    # where the angle alone is uncertain rounding may leave less than zero
+    error = np.sqrt(max(along @ covariance @ along, 0.0))
+    return 100 * float(np.hypot(q, stokes_u)), 100 * float(error)
+
+
+def _observable(table, site, night, min_altitude):
+    """Return the rows that rise above the limit, with their angles, in order of the score."""
+    place = location(site)
+    limit, dark, step = checked(min_altitude, TWILIGHT, STEP)
+    times = night_times(place, night, twilight=dark, step=step)
+    # all stars at once, because the transformation costs the same for one
+    altitude, parallactic = pointing(
+        SkyCoord(table["ra"][:, None], table["dec"][:, None]), times, place
+    )
+    up = np.any(altitude >= limit, axis=1)
+    found = table[up]
+    seen = [
+        Observability(str(name), place, date_of(night), limit, night_table(times, a, p, limit))
+        for name, a, p in zip(found["name"], altitude[up], parallactic[up], strict=True)
+    ]
+    _add_night(found, seen)
+    found.sort(["m3_score", "name"])
+    return found
+
+
+def _add_night(found, seen):
+    for name in ("altitude", "parallactic"):
+        ranges = u.Quantity([getattr(s, name) for s in seen] or np.zeros((0, 2)), u.deg)
+        found[f"{name}_min"], found[f"{name}_max"] = ranges[:, 0], ranges[:, 1]
+    found["hours"] = u.Quantity([s.hours for s in seen] or [], u.h)
+    with offline():
+        found["transit"] = np.array([s.transit.iso[:16] for s in seen], dtype=str)
+    errors = np.array([s.information(FRAMES).diattenuation for s in seen], dtype=float)
+    excess = found["magnitude"].value - _REFERENCE_MAGNITUDE
+    found["m3_error"], found["m3_score"] = errors, errors * 10 ** (0.2 * excess)
+    for name in found.colnames:
+        if name in _FORMATS:
+            found[name].info.format = _FORMATS[name]

@@ -10,7 +10,7 @@ from astropolcal.optics import OPTICS
 
 _PACKAGE = Path(astropolcal.__file__).parent
 _DRAWING = ("build", "examples", "fingerprints", "optic_figures")
-_COMMON = ("chain.py", "propagation.py", "mueller", "optics")
+_COMMON = ("chain.py", "propagation.py", "mueller.py", "optics")
 _OF_EFFECTS = ("gap/effects", "gap/problem.py", "gap/channels.py", "instruments/charis.py")
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from astropolcal import instruments
 from astropolcal.calibration import calibrate
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 # star_data.py, which several folders use

@@ -35,22 +35,23 @@ def cal(make):
 # --- errors of what is at a bound ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("weights", [None, "errors"])
-def test_one_sided_error_is_where_the_profile_has_risen_by_one(make, weights):
-    # far from the bound, near it, at the lower one, and several at bounds that correlate
-    cases = [((85, 90.2), None), ((85, 90.39), None), ((90.5, 95), None), ((85, 90.2), 0.965)]
-    for bounds, efficiency in cases:
-        cal = fitted(make, bounds, efficiency=efficiency, weights=weights)
-        assert POLARIZER in cal.at_bound
-        assert len(cal.at_bound) > 1 or efficiency is None
-        for name in cal.at_bound:
-            row = cal.parameters[cal.parameters["name"] == name][0]
-            assert (row["status"], np.isnan(row["std"])) == ("at bound", True)
-            made = profile(cal, name, n=13)
-            best = getattr(made.best, "value", made.best)
-            ends = [abs(getattr(end, "value", end) - best) for end in made.interval()]
-            assert min(ends) == pytest.approx(row["std_inward"], rel=0.02)
-            assert max(ends) == np.inf
+@pytest.mark.slow
+def test_one_sided_error_is_where_the_profile_has_risen_by_one(make):
+    for weights in [None, "errors"]:
+        # far from the bound, near it, at the lower one, and several at bounds that correlate
+        cases = [((85, 90.2), None), ((85, 90.39), None), ((90.5, 95), None), ((85, 90.2), 0.965)]
+        for bounds, efficiency in cases:
+            cal = fitted(make, bounds, efficiency=efficiency, weights=weights)
+            assert POLARIZER in cal.at_bound, weights
+            assert len(cal.at_bound) > 1 or efficiency is None, weights
+            for name in cal.at_bound:
+                row = cal.parameters[cal.parameters["name"] == name][0]
+                assert (row["status"], np.isnan(row["std"])) == ("at bound", True), weights
+                made = profile(cal, name, n=13)
+                best = getattr(made.best, "value", made.best)
+                ends = [abs(getattr(end, "value", end) - best) for end in made.interval()]
+                assert min(ends) == pytest.approx(row["std_inward"], rel=0.02), weights
+                assert max(ends) == np.inf, weights
 
 
 # --- errors next to a bound ---------------------------------------------------------------------
@@ -126,6 +127,7 @@ def test_status_of_every_kind():
         assert status in STATUSES
 
 
+@pytest.mark.slow
 def test_file_keeps_them_and_refuses_what_is_none(cal, tmp_path):
     cal.write(tmp_path / "cal.asdf")
     again = Calibration.read(tmp_path / "cal.asdf")

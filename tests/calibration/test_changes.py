@@ -21,10 +21,12 @@ def _change(chi2, dof, **options):
 # --- probabilities ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dof", [1, 2, 7, 60])
-@pytest.mark.parametrize("chi2", [0.1, 3.0, 50.0, 400.0, 1200.0])
-def test_logarithm_of_the_probability_is_that_of_scipy(chi2, dof):
-    assert _log_p(chi2, dof) == pytest.approx(stats.chi2.logsf(chi2, dof), rel=1e-9, abs=1e-12)
+def test_logarithm_of_the_probability_is_that_of_scipy():
+    for dof in [1, 2, 7, 60]:
+        for chi2 in [0.1, 3.0, 50.0, 400.0, 1200.0]:
+            assert _log_p(chi2, dof) == pytest.approx(
+                stats.chi2.logsf(chi2, dof), rel=1e-9, abs=1e-12
+            ), (dof, chi2)
 
 
 @pytest.mark.parametrize("dof", [1, 2, 5, 40])
@@ -63,13 +65,14 @@ def test_nothing_compared_is_no_sigma():
     assert "nothing that is determined in all of them to compare, from a to b" in str(_change(0, 0))
 
 
-@pytest.mark.parametrize(
-    ("chi2", "words"), [(2.0, "no change seen from a to b"), (30.0, "changed from a to b")]
-)
-def test_a_change_in_words(chi2, words):
-    text = str(_change(chi2, 2))
-    assert text.startswith("m3.diattenuation: " + words)
-    assert f"(chi-square {chi2:.1f} of 2, p = {stats.chi2.sf(chi2, 2):.1g})" in text
+def test_a_change_in_words():
+    for chi2, words in [(2.0, "no change seen from a to b"), (30.0, "changed from a to b")]:
+        text = str(_change(chi2, 2))
+        assert text.startswith("m3.diattenuation: " + words), (chi2, words)
+        assert f"(chi-square {chi2:.1f} of 2, p = {stats.chi2.sf(chi2, 2):.1g})" in text, (
+            chi2,
+            words,
+        )
 
 
 # --- chi-square of one common value ------------------------------------------------------
@@ -84,13 +87,13 @@ def test_two_numbers_differ_by_their_combined_error():
     assert rank == 1
 
 
-@pytest.mark.parametrize("n", [2, 3, 5])
-def test_several_scatter_about_their_weighted_mean(n):
-    rng = np.random.default_rng(n)
-    values, sigma = rng.normal(size=n), rng.uniform(0.5, 2, n)
-    chi2, _ = _chi_square([np.array([v]) for v in values], [np.eye(1) * s**2 for s in sigma])
-    mean = np.average(values, weights=sigma**-2.0)
-    assert chi2 == pytest.approx(np.sum(((values - mean) / sigma) ** 2))
+def test_several_scatter_about_their_weighted_mean():
+    for n in [2, 3, 5]:
+        rng = np.random.default_rng(n)
+        values, sigma = rng.normal(size=n), rng.uniform(0.5, 2, n)
+        chi2, _ = _chi_square([np.array([v]) for v in values], [np.eye(1) * s**2 for s in sigma])
+        mean = np.average(values, weights=sigma**-2.0)
+        assert chi2 == pytest.approx(np.sum(((values - mean) / sigma) ** 2)), n
 
 
 def test_correlated_errors_count_in_full():
@@ -154,14 +157,11 @@ def test_a_trace_of_an_open_direction_does_not_count():
     assert _determined([np.array([[1e-7, 0.0]])], 2).shape == (2, 2)
 
 
-@pytest.mark.parametrize(
-    ("element", "parameters", "inside"),
-    [
+def test_an_element_belongs_to_a_parameter_or_an_optic():
+    for element, parameters, inside in [
         ("m3.n[2]", ["m3.n"], True),
         ("m3.n[2]", ["m3"], True),
         ("m3.n", ["m3.k"], False),
         ("m30.n", ["m3"], False),
-    ],
-)
-def test_an_element_belongs_to_a_parameter_or_an_optic(element, parameters, inside):
-    assert _belongs(element, parameters) == inside
+    ]:
+        assert _belongs(element, parameters) == inside, (element, inside)

@@ -53,10 +53,10 @@ def test_autocorrelation_of_ar1_falls_geometrically():
     np.testing.assert_allclose(found, 0.8 ** np.arange(8), atol=0.03)
 
 
-@pytest.mark.parametrize("memory", [0.0, 0.5, 0.9])
-def test_time_of_ar1_is_known(memory):
-    expected = (1 + memory) / (1 - memory)
-    assert autocorrelation_time(_ar1(memory)) == pytest.approx(expected, rel=0.1)
+def test_time_of_ar1_is_known():
+    for memory in [0.0, 0.5, 0.9]:
+        expected = (1 + memory) / (1 - memory)
+        assert autocorrelation_time(_ar1(memory)) == pytest.approx(expected, rel=0.1), memory
 
 
 def test_walkers_that_stay_apart_are_correlated():
@@ -67,11 +67,11 @@ def test_walkers_that_stay_apart_are_correlated():
     assert autocorrelation_time(chain) > 50
 
 
-@pytest.mark.parametrize("value", [0.0, 3.0, -1e9])
-def test_what_does_not_move_has_no_time(value):
-    chain = np.full((50, 4), value)
-    assert np.isnan(autocorrelation(chain)).all()
-    assert np.isnan(autocorrelation_time(chain))
+def test_what_does_not_move_has_no_time():
+    for value in [0.0, 3.0, -1e9]:
+        chain = np.full((50, 4), value)
+        assert np.isnan(autocorrelation(chain)).all()
+        assert np.isnan(autocorrelation_time(chain))
 
 
 def test_the_window_closes_before_the_noise_of_large_lags_sums_up():
@@ -156,14 +156,12 @@ def test_a_long_run_of_agreeing_walkers_has_no_complaint():
     assert found.agreement() == "R-hat is 1.000 or less, the effective sample size 10000 or more."
 
 
-@pytest.mark.parametrize(
-    ("time", "wanted"), [(201.0, 11000), (212.3, 11000), (999.0, 50000), (1001.0, 51000)]
-)
-def test_a_short_run_says_how_long_it_should_be(time, wanted):
+def test_a_short_run_says_how_long_it_should_be():
     """ENOUGH times, rounded up to two digits."""
-    (words,) = _made([time, 3.0], n_steps=1000).complaints(["a", "b"])
-    assert words == f"{ENOUGH} times are needed; run {wanted} steps or more"
-    assert wanted >= ENOUGH * time
+    for time, wanted in [(201.0, 11000), (212.3, 11000), (999.0, 50000), (1001.0, 51000)]:
+        (words,) = _made([time, 3.0], n_steps=1000).complaints(["a", "b"])
+        assert words == f"{ENOUGH} times are needed; run {wanted} steps or more", (time, wanted)
+        assert wanted >= ENOUGH * time, (time, wanted)
 
 
 def test_the_limits_themselves_are_allowed():
@@ -171,21 +169,19 @@ def test_the_limits_themselves_are_allowed():
     assert _made([10000 / ENOUGH], **edge).complaints(["a"]) == []
 
 
-@pytest.mark.parametrize("kind", ["bulk", "tail"])
-def test_too_few_samples_name_the_worst_parameter(kind):
-    found = _made([10.0, 10.0, 10.0], **{f"ess_{kind}": np.array([500.0, 399.0, 450.0])})
-    assert found.complaints("abc") == [
-        f"b has an effective sample size ({kind}) of 399, but {FEWEST_SAMPLES} are needed"
-    ]
+def test_too_few_samples_name_the_worst_parameter():
+    for kind in ["bulk", "tail"]:
+        found = _made([10.0, 10.0, 10.0], **{f"ess_{kind}": np.array([500.0, 399.0, 450.0])})
+        assert found.complaints("abc") == [
+            f"b has an effective sample size ({kind}) of 399, but {FEWEST_SAMPLES} are needed"
+        ], kind
 
 
-@pytest.mark.parametrize(
-    ("key", "words"), [("r_hat", "R-hat of b is nan"), ("ess_bulk", "b has an")]
-)
-def test_what_is_no_number_is_the_worst(key, words):
-    values = np.array([1.2, np.nan]) if key == "r_hat" else np.array([10.0, np.nan])
-    (found,) = _made([10.0, 10.0], **{key: values}).complaints("ab")
-    assert found.startswith(words)
+def test_what_is_no_number_is_the_worst():
+    for key, words in [("r_hat", "R-hat of b is nan"), ("ess_bulk", "b has an")]:
+        values = np.array([1.2, np.nan]) if key == "r_hat" else np.array([10.0, np.nan])
+        (found,) = _made([10.0, 10.0], **{key: values}).complaints("ab")
+        assert found.startswith(words), (key, words)
 
 
 def test_without_arviz_only_the_length_counts():
@@ -195,7 +191,7 @@ def test_without_arviz_only_the_length_counts():
     assert not _made([10.0], n_steps=100, **none).converged
 
 
-@pytest.mark.parametrize("changes", [{"std": np.zeros(3)}, {"r_hat": np.zeros((2, 1))}])
-def test_shapes_must_agree(changes):
-    with pytest.raises(ParameterError, match="one value a parameter is allowed"):
-        _made([1.0, 2.0], **changes)
+def test_shapes_must_agree():
+    for changes in [{"std": np.zeros(3)}, {"r_hat": np.zeros((2, 1))}]:
+        with pytest.raises(ParameterError, match="one value a parameter is allowed"):
+            _made([1.0, 2.0], **changes)

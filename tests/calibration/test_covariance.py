@@ -59,18 +59,15 @@ def test_unknown_name_is_refused(covariance):
         covariance.std("hwp.phase")
 
 
-@pytest.mark.parametrize(
-    ("names", "units", "shape"),
-    [
+def test_shapes_must_agree():
+    for names, units, shape in [
         (NAMES, UNITS, (2, 2)),
         (NAMES, UNITS, (3, 2)),
         (NAMES[:2], UNITS, (3, 3)),
         (NAMES, UNITS[:2], (3, 3)),
-    ],
-)
-def test_shapes_must_agree(names, units, shape):
-    with pytest.raises(ParameterError, match="covariance of"):
-        Covariance(names, units, np.ones(shape))
+    ]:
+        with pytest.raises(ParameterError, match="covariance of"):
+            Covariance(names, units, np.ones(shape))
 
 
 @pytest.mark.parametrize("stds", [(1.0, 1.0), (10.0, 1e-6), (1e-16, 1e-16)])
@@ -158,10 +155,10 @@ def test_full_rank_is_the_textbook_formula(slopes):
     np.testing.assert_allclose(plain.propagate(slopes), expected, rtol=1e-6, atol=scale)
 
 
-@pytest.mark.parametrize("slopes", [[1, 2], [[1, 2]], np.ones((1, 1, 3)), 1.0])
-def test_slopes_must_fit(covariance, slopes):
-    with pytest.raises(ParameterError, match="do not fit"):
-        covariance.propagate(slopes)
+def test_slopes_must_fit(covariance):
+    for slopes in [[1, 2], [[1, 2]], np.ones((1, 1, 3)), 1.0]:
+        with pytest.raises(ParameterError, match="do not fit"):
+            covariance.propagate(slopes)
 
 
 def test_directions_must_be_finite():
@@ -174,26 +171,26 @@ def test_directions_must_be_finite():
 LAM = [1.2, 1.6, 2.2] * u.um
 
 
-@pytest.mark.parametrize("weights", [None, "errors"])
-@pytest.mark.parametrize("fixed", [True, False])
-def test_directions_agree_with_the_matrix(make, fixed, weights):
-    truth = make.truth(make.chain("elliptical", fixed=fixed, wavelength=LAM))
-    data = make.observe(truth, wavelength=LAM, seed=1)
-    cal = calibrate(truth, data, weights=weights, search=False, cross_validate=False)
-    full = full_covariance(cal)
-    assert full == cal.covariance
-    rank = cal.identifiability.rank
-    assert full.factor.shape == (rank, len(full))
-    assert full.null.shape == (len(full) - rank, len(full))
-    known = np.isfinite(full.stds)
-    product = full.factor.T @ full.factor
-    np.testing.assert_allclose(
-        product[np.ix_(known, known)], full.matrix[np.ix_(known, known)], rtol=1e-6
-    )
-    variances = np.diag(full.propagate(np.eye(len(full))))
-    np.testing.assert_allclose(variances[known], full.stds[known] ** 2, rtol=1e-6)
-    assert np.isinf(variances[~known]).all()
-    assert known.all() == fixed
+def test_directions_agree_with_the_matrix(make):
+    for weights in [None, "errors"]:
+        for fixed in [True, False]:
+            truth = make.truth(make.chain("elliptical", fixed=fixed, wavelength=LAM))
+            data = make.observe(truth, wavelength=LAM, seed=1)
+            cal = calibrate(truth, data, weights=weights, search=False, cross_validate=False)
+            full = full_covariance(cal)
+            assert full == cal.covariance, (weights, fixed)
+            rank = cal.identifiability.rank
+            assert full.factor.shape == (rank, len(full)), (weights, fixed)
+            assert full.null.shape == (len(full) - rank, len(full)), (weights, fixed)
+            known = np.isfinite(full.stds)
+            product = full.factor.T @ full.factor
+            np.testing.assert_allclose(
+                product[np.ix_(known, known)], full.matrix[np.ix_(known, known)], rtol=1e-6
+            )
+            variances = np.diag(full.propagate(np.eye(len(full))))
+            np.testing.assert_allclose(variances[known], full.stds[known] ** 2, rtol=1e-6)
+            assert np.isinf(variances[~known]).all(), (weights, fixed)
+            assert known.all() == fixed, (weights, fixed)
 
 
 def test_prior_closes_an_open_direction(make):

@@ -23,7 +23,9 @@ from astropolcal.calibration.identifiability.linearized import (
     plain,
     step_of,
 )
-from astropolcal.measurement import FreeParameters, Normal, Uniform
+from astropolcal.measurement import Normal
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.measurement.priors import Uniform
 
 N = 3
 NAMES = ["polarizer.theta", "hwp.w_sio2", *(f"retarder.retardance[{i}]" for i in range(N))]
@@ -60,9 +62,8 @@ def _unit(**parts):
 # --- steps -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("unit", "canonical", "declared"),
-    [
+def test_a_step_is_a_degree_a_micrometre_or_a_percent():
+    for unit, canonical, declared in [
         (u.deg, np.deg2rad(1), 1),
         (u.rad, np.deg2rad(1), np.deg2rad(1)),
         (u.arcsec, np.deg2rad(1), 3600),
@@ -70,11 +71,9 @@ def _unit(**parts):
         (u.mm, 1, 1e-3),
         (u.nm, 1, 1000),
         (None, 0.01, 0.01),
-    ],
-)
-def test_a_step_is_a_degree_a_micrometre_or_a_percent(unit, canonical, declared):
-    assert step_of(unit)[0] == pytest.approx(canonical)
-    assert declared_step(unit) == pytest.approx(declared)
+    ]:
+        assert step_of(unit)[0] == pytest.approx(canonical)
+        assert declared_step(unit) == pytest.approx(declared)
 
 
 def test_scale_has_the_step_of_every_element(free):
@@ -140,17 +139,14 @@ def test_what_hardly_moves_is_not_named(free):
     assert set(direction["parameters"]) == {"polarizer.theta", "retarder.retardance"}
 
 
-@pytest.mark.parametrize(
-    ("prior", "words"),
-    [
+def test_a_parameter_that_changes_nothing():
+    for prior, words in [
         (None, "it cannot be determined and keeps its start value"),
         (Uniform(-5 * u.deg, 5 * u.deg), "it cannot be determined and keeps its start value"),
         (Normal(0 * u.deg, 1 * u.deg), "it cannot be determined by them, only its prior tells it"),
-    ],
-)
-def test_a_parameter_that_changes_nothing(prior, words):
-    (direction,) = open_directions(_free(prior), _unit(polarizer_theta=1)[None])
-    assert direction["words"] == f"polarizer.theta changes no datum: {words}"
+    ]:
+        (direction,) = open_directions(_free(prior), _unit(polarizer_theta=1)[None])
+        assert direction["words"] == f"polarizer.theta changes no datum: {words}"
 
 
 def test_numbers_for_machines_are_plain():
@@ -191,20 +187,20 @@ def test_good_errors_are_not_worth_a_word(free):
     assert found == []
 
 
-@pytest.mark.parametrize(
-    ("name", "limit", "words"),
-    [
+def test_the_limit_is_5_deg_50_um_or_5_percent(free):
+    """In steps of a degree, a micrometre and a percent."""
+    for name, limit, words in [
         ("polarizer.theta", LARGE[" deg"], "polarizer.theta is uncertain by {} deg"),
         ("hwp.w_sio2", LARGE[" um"], "hwp.w_sio2 is uncertain by {} um"),
         ("wollaston.efficiency[1]", 100 * LARGE[""], "wollaston.efficiency[1] is uncertain by {}"),
-    ],
-)
-def test_the_limit_is_5_deg_50_um_or_5_percent(free, name, limit, words):
-    """In steps of a degree, a micrometre and a percent."""
-    assert _near(free, _errors(**{name: 0.99 * limit}))[0] == []
-    (direction,), _ = _near(free, _errors(**{name: 1.2 * limit}))
-    shown = 1.2 * limit / (100 if "efficiency" in name else 1)
-    assert direction["words"] == words.format(f"{shown:.2g}") + " at the noise of this fit"
+    ]:
+        assert _near(free, _errors(**{name: 0.99 * limit}))[0] == [], (name, words)
+        (direction,), _ = _near(free, _errors(**{name: 1.2 * limit}))
+        shown = 1.2 * limit / (100 if "efficiency" in name else 1)
+        assert direction["words"] == words.format(f"{shown:.2g}") + " at the noise of this fit", (
+            name,
+            words,
+        )
 
 
 def test_errors_grow_with_the_noise(free):
@@ -309,17 +305,17 @@ def _alike(count, name="m.d", other="w.e"):
     ]
 
 
-@pytest.mark.parametrize(("count", "more"), [(3, 0), (4, 0), (5, 2), (22, 19)])
-def test_open_directions_that_differ_by_wavelength_are_counted(count, more):
-    other = {"words": "hwp.theta by +1 deg cannot be told from w.e", "parameters": {"w.e": 1.0}}
-    alone = {"words": "m.d[9] changes no datum", "parameters": {"m.d": 1.0, "x.y": 1.0}}
-    words = first_of_each_kind([other, *_alike(count), alone])
-    assert words[0] == other["words"]
-    assert words[-1] == alone["words"]
-    told = [line for line in words if line.startswith("m.d[") and line != alone["words"]]
-    assert len(told) + more == count
-    says = [f"and {more} more of the same kind"] if more else []
-    assert [line for line in words if "of the same kind" in line] == says
+def test_open_directions_that_differ_by_wavelength_are_counted():
+    for count, more in [(3, 0), (4, 0), (5, 2), (22, 19)]:
+        other = {"words": "hwp.theta by +1 deg cannot be told from w.e", "parameters": {"w.e": 1.0}}
+        alone = {"words": "m.d[9] changes no datum", "parameters": {"m.d": 1.0, "x.y": 1.0}}
+        words = first_of_each_kind([other, *_alike(count), alone])
+        assert words[0] == other["words"], (count, more)
+        assert words[-1] == alone["words"], (count, more)
+        told = [line for line in words if line.startswith("m.d[") and line != alone["words"]]
+        assert len(told) + more == count, (count, more)
+        says = [f"and {more} more of the same kind"] if more else []
+        assert [line for line in words if "of the same kind" in line] == says, (count, more)
 
 
 def test_directions_of_parameters_for_all_wavelengths_are_all_told():

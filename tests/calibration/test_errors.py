@@ -103,6 +103,7 @@ def test_singular_wavelength_has_no_error(make):
     assert np.isfinite(known["hwp.retardance[1]"])
 
 
+@pytest.mark.slow
 def test_bad_input_is_refused(cal, tmp_path):
     with pytest.raises(
         FitError, match="method = 'jackknife'; allowed are covariance, white, robust, van-"

@@ -43,35 +43,34 @@ def calibrated(few):
 # --- it arrives at the truth ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "observable", sorted(n for n, one in OBSERVABLES.items() if one.frames_per_datum < 4)
-)
-@pytest.mark.parametrize("kind", ["linear", "elliptical"])
-def test_noiseless_data_give_back_the_truth(make, observable, kind):
-    chain = make.chain(kind, wavelength=FEW)
-    truth = make.truth(chain)
-    data = make.observe(truth, wavelength=FEW, noise=False)
-    cal = calibrate(chain, data, observable=observable, cross_validate=False)
-    assert cal.settings["observable"] == observable
-    np.testing.assert_allclose(cal.residuals, 0, atol=1e-7)
-    np.testing.assert_allclose(
-        cal.measurement.vector(), true_vector(cal, truth), rtol=1e-5, atol=1e-5
-    )
+@pytest.mark.slow
+def test_noiseless_data_give_back_the_truth(make):
+    for observable in sorted(n for n, one in OBSERVABLES.items() if one.frames_per_datum < 4):
+        for kind in ["linear", "elliptical"]:
+            chain = make.chain(kind, wavelength=FEW)
+            truth = make.truth(chain)
+            data = make.observe(truth, wavelength=FEW, noise=False)
+            cal = calibrate(chain, data, observable=observable, cross_validate=False)
+            assert cal.settings["observable"] == observable, kind
+            np.testing.assert_allclose(cal.residuals, 0, atol=1e-7)
+            np.testing.assert_allclose(
+                cal.measurement.vector(), true_vector(cal, truth), rtol=1e-5, atol=1e-5
+            )
 
 
-@pytest.mark.parametrize("strategy", ["joint", "two-step"])
-def test_noisy_data_give_the_truth_within_errors(few, strategy):
-    chain, truth, data = few
-    cal = calibrate(chain, data, weights="errors", strategy=strategy, cross_validate=False)
-    assert cal.converged
-    stds = cal.covariance.stds * cal.measurement.free.factors()
-    pulls = (cal.measurement.vector() - true_vector(cal, truth)) / stds
-    # the two-step procedure is not the least-squares minimum, but within its neighbourhood
-    assert np.abs(pulls).max() < {"joint": 4, "two-step": 6}[strategy]
-    chi2 = np.sum((cal.residuals / cal.measurement.sigma) ** 2) / (
-        cal.measurement.n_data - len(pulls)
-    )
-    assert chi2 == pytest.approx(1.0, abs={"joint": 0.5, "two-step": 1.0}[strategy])
+def test_noisy_data_give_the_truth_within_errors(few):
+    for strategy in ["joint", "two-step"]:
+        chain, truth, data = few
+        cal = calibrate(chain, data, weights="errors", strategy=strategy, cross_validate=False)
+        assert cal.converged, strategy
+        stds = cal.covariance.stds * cal.measurement.free.factors()
+        pulls = (cal.measurement.vector() - true_vector(cal, truth)) / stds
+        # the two-step procedure is not the least-squares minimum, but within its neighbourhood
+        assert np.abs(pulls).max() < {"joint": 4, "two-step": 6}[strategy], strategy
+        chi2 = np.sum((cal.residuals / cal.measurement.sigma) ** 2) / (
+            cal.measurement.n_data - len(pulls)
+        )
+        assert chi2 == pytest.approx(1.0, abs={"joint": 0.5, "two-step": 1.0}[strategy]), strategy
 
 
 def test_unknown_errors_are_scaled_to_the_residuals(few):
@@ -99,14 +98,14 @@ def test_known_errors_are_taken_as_they_are(few):
     np.testing.assert_allclose(two.covariance.stds, 2 * one.covariance.stds, rtol=1e-3)
 
 
-@pytest.mark.parametrize("fitter", [TRFLSQFitter, LevMarLSQFitter, DogBoxLSQFitter])
-def test_any_fitter_reaches_the_same_minimum(few, calibrated, fitter):
-    chain, _, data = few
-    cal = calibrate(chain, data, weights="errors", fitter=fitter(), cross_validate=False)
-    assert cal.settings["fitter"] == fitter.__name__
-    stds = cal.covariance.stds * cal.measurement.free.factors()
-    shift = (cal.measurement.vector() - calibrated.measurement.vector()) / stds
-    assert np.abs(shift).max() < 0.02
+def test_any_fitter_reaches_the_same_minimum(few, calibrated):
+    for fitter in [TRFLSQFitter, LevMarLSQFitter, DogBoxLSQFitter]:
+        chain, _, data = few
+        cal = calibrate(chain, data, weights="errors", fitter=fitter(), cross_validate=False)
+        assert cal.settings["fitter"] == fitter.__name__
+        stds = cal.covariance.stds * cal.measurement.free.factors()
+        shift = (cal.measurement.vector() - calibrated.measurement.vector()) / stds
+        assert np.abs(shift).max() < 0.02
 
 
 def test_chain_given_is_not_changed(few):
@@ -166,18 +165,18 @@ def test_single_wavelength_finds_its_branch(make):
 # --- ties and several datasets ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("strategy", ["joint", "two-step"])
-def test_ties_are_kept(few, strategy):
-    chain, _, data = few
-    ties = {"derotator.theta": Tie("calibration_polarizer.theta", 0.5, offset=-45 * u.deg)}
-    cal = calibrate(chain, data, ties=ties, strategy=strategy, cross_validate=False)
-    polarizer = cal.chain["calibration_polarizer"].theta.value
-    assert cal.chain["derotator"].theta.value == pytest.approx(0.5 * polarizer - 45)
-    known = cal.parameter_values()["derotator.theta"]
-    assert known["tied"] == "calibration_polarizer.theta"
-    assert "derotator.theta" not in cal.covariance.names
-    assert not any("derotator.theta" in row for row in cal.parameters["name"])
-    assert cal.measurement_of(data).free.size == len(cal.covariance)
+def test_ties_are_kept(few):
+    for strategy in ["joint", "two-step"]:
+        chain, _, data = few
+        ties = {"derotator.theta": Tie("calibration_polarizer.theta", 0.5, offset=-45 * u.deg)}
+        cal = calibrate(chain, data, ties=ties, strategy=strategy, cross_validate=False)
+        polarizer = cal.chain["calibration_polarizer"].theta.value
+        assert cal.chain["derotator"].theta.value == pytest.approx(0.5 * polarizer - 45), strategy
+        known = cal.parameter_values()["derotator.theta"]
+        assert known["tied"] == "calibration_polarizer.theta", strategy
+        assert "derotator.theta" not in cal.covariance.names, strategy
+        assert not any("derotator.theta" in row for row in cal.parameters["name"]), strategy
+        assert cal.measurement_of(data).free.size == len(cal.covariance), strategy
 
 
 def test_what_follows_a_held_parameter_is_held_at_its_place(few, make):
@@ -257,17 +256,14 @@ def test_joint_fit_is_at_least_as_good_as_two_steps(few, calibrated):
 # --- objections ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_unknown_choice_is_refused(few):
+    for options, words in [
         ({"strategy": "three-step"}, "strategy = 'three-step'; allowed are joint, two-step"),
         ({"weights": "none"}, "weights = 'none'; allowed are None, 'wavelength', 'errors'"),
-    ],
-)
-def test_unknown_choice_is_refused(few, options, words):
-    chain, _, data = few
-    with pytest.raises(FitError, match=words):
-        calibrate(chain, data, **options)
+    ]:
+        chain, _, data = few
+        with pytest.raises(FitError, match=words):
+            calibrate(chain, data, **options)
 
 
 def test_weights_without_errors_are_refused(few):
@@ -349,6 +345,7 @@ def test_fitter_that_leaves_the_bounds_is_told_on(few):
     assert not cal.converged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strategy", "search", "searches"),
     [

@@ -66,6 +66,7 @@ def test_the_minimal_gauge_moves_the_angles_least(observations):
     assert polarizer + plate == pytest.approx(0.0, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_every_gauge_fits_the_data_as_well(observations):
     costs = [
         np.sum(_fit(chain, observations, **options).residuals ** 2)
@@ -79,6 +80,7 @@ def test_every_gauge_fits_the_data_as_well(observations):
     np.testing.assert_allclose(costs, costs[0], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_gauge_is_recorded_and_read_back(observations, tmp_path):
     minimal = _fit(_chain(), observations)
     assert minimal.settings["gauge"].startswith("minimal")
@@ -186,25 +188,28 @@ def test_describe_gauge_names_priors_and_choice(observations):
 # --- what moves no datum --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fitter", [TRFLSQFitter, LevMarLSQFitter, DogBoxLSQFitter])
-@pytest.mark.parametrize("gauge", ["minimal", None])
-def test_what_moves_no_datum_stays_at_its_start(observations, fitter, gauge):
+@pytest.mark.slow
+def test_what_moves_no_datum_stays_at_its_start(observations):
     """One wavelength without data: its four parameters, and nothing else, keep their values."""
-    mask = np.zeros((observations.n_frames, 4), dtype=bool)
-    mask[:, 1] = True
-    masked, chain = observations.with_mask(mask, "test"), _chain()
-    start = Measurement(chain, masked).vector()
-    cal = _fit(chain, masked, fitter=fitter(), gauge=gauge)
-    silent = ["horizontal", "diagonal", "circular"]
-    silent = [f"derotator.{key}[1]" for key in silent] + ["wollaston.efficiency[1]"]
-    assert cal.identifiability.silent == silent
-    rows = [cal.covariance.names.index(name) for name in silent]
-    np.testing.assert_array_equal(cal.measurement.vector()[rows], start[rows])
-    assert np.isnan(cal.covariance.stds[rows]).all()
-    assert not cal.at_bound
-    for name in silent:
-        words = f"{name} changes no datum: it cannot be determined and keeps its start value"
-        assert words in str(cal.identifiability)
+    for fitter in [TRFLSQFitter, LevMarLSQFitter, DogBoxLSQFitter]:
+        for gauge in ["minimal", None]:
+            mask = np.zeros((observations.n_frames, 4), dtype=bool)
+            mask[:, 1] = True
+            masked, chain = observations.with_mask(mask, "test"), _chain()
+            start = Measurement(chain, masked).vector()
+            cal = _fit(chain, masked, fitter=fitter(), gauge=gauge)
+            silent = ["horizontal", "diagonal", "circular"]
+            silent = [f"derotator.{key}[1]" for key in silent] + ["wollaston.efficiency[1]"]
+            assert cal.identifiability.silent == silent, gauge
+            rows = [cal.covariance.names.index(name) for name in silent]
+            np.testing.assert_array_equal(cal.measurement.vector()[rows], start[rows])
+            assert np.isnan(cal.covariance.stds[rows]).all(), gauge
+            assert not cal.at_bound, gauge
+            for name in silent:
+                words = (
+                    f"{name} changes no datum: it cannot be determined and keeps its start value"
+                )
+                assert words in str(cal.identifiability), gauge
 
 
 def test_what_drifted_without_a_datum_is_brought_back(observations):
@@ -260,15 +265,12 @@ def test_without_a_choice_there_is_no_gauge(observations):
     assert _fit(linear, observations).settings["gauge"] == "the data determine every free parameter"
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "complaint"),
-    [
+def test_nonsense_is_refused(observations):
+    for options, error, complaint in [
         ({"gauge": "landau"}, FitError, "'minimal' and None"),
         ({"fix": {"hwp.tilt": None}}, FitError, "no parameter 'hwp.tilt'"),
         ({"fix": {"hwp.theta": 1 * u.mm}}, ParameterError, "not convertible"),
         ({"fix": {"hwp.theta": 1}}, ParameterError, "needs a unit"),
-    ],
-)
-def test_nonsense_is_refused(observations, options, error, complaint):
-    with pytest.raises(error, match=complaint):
-        _fit(_chain(), observations, **options)
+    ]:
+        with pytest.raises(error, match=complaint):
+            _fit(_chain(), observations, **options)

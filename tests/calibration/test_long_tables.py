@@ -62,15 +62,16 @@ def test_short_measurement_is_not_thinned():
     assert fewer.n_data == whole.n_data
 
 
-@pytest.mark.parametrize("weights", [None, "wavelength", "errors"])
-def test_fit_of_a_long_table_ends_where_one_without_the_short_cut_does(long, weights, monkeypatch):
-    quick = calibrate(*long, cross_validate=False, weights=weights)
-    monkeypatch.setattr(fit_module, "_LONG", 1000)
-    slow = calibrate(*long, cross_validate=False, weights=weights)
-    assert quick.converged
-    assert slow.converged
-    residuals = [np.sum((c.residuals / c.measurement.sigma) ** 2) for c in (quick, slow)]
-    assert residuals[0] == pytest.approx(residuals[1], rel=1e-6)
+@pytest.mark.slow
+def test_fit_of_a_long_table_ends_where_one_without_the_short_cut_does(long, monkeypatch):
+    for weights in [None, "wavelength", "errors"]:
+        quick = calibrate(*long, cross_validate=False, weights=weights)
+        monkeypatch.setattr(fit_module, "_LONG", 1000)
+        slow = calibrate(*long, cross_validate=False, weights=weights)
+        assert quick.converged, weights
+        assert slow.converged, weights
+        residuals = [np.sum((c.residuals / c.measurement.sigma) ** 2) for c in (quick, slow)]
+        assert residuals[0] == pytest.approx(residuals[1], rel=1e-6), weights
 
 
 @pytest.mark.slow
@@ -88,21 +89,24 @@ def test_time_is_linear_in_the_number_of_frames():
 # --- cross-validation with many groups ----------------------------------------------------------
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-def test_groups_in_one_step_are_as_fits_without_them(weighted, monkeypatch):
-    chain, data = lamp(160, seed=5)
-    cal = calibrate(chain, data, cross_validate=False)
-    measurement = cal.measurement
-    weights = 1 / measurement.sigma if weighted else None
-    fitted = calibrate(chain, data, cross_validate=False, weights="errors" if weighted else None)
-    vector = fitted.measurement.vector()
-    linear = cross_validated_residuals(measurement, vector, weights)
-    monkeypatch.setattr(accuracy, "_MANY", 1000)
-    exact = cross_validated_residuals(measurement, vector, weights)
-    assert np.isfinite(linear).all()
-    # larger than the residuals of the fit, by the same
-    change = exact - measurement.residuals(vector)
-    assert np.std(linear - exact) < 0.02 * np.std(change)
+@pytest.mark.slow
+def test_groups_in_one_step_are_as_fits_without_them(monkeypatch):
+    for weighted in [False, True]:
+        chain, data = lamp(160, seed=5)
+        cal = calibrate(chain, data, cross_validate=False)
+        measurement = cal.measurement
+        weights = 1 / measurement.sigma if weighted else None
+        fitted = calibrate(
+            chain, data, cross_validate=False, weights="errors" if weighted else None
+        )
+        vector = fitted.measurement.vector()
+        linear = cross_validated_residuals(measurement, vector, weights)
+        monkeypatch.setattr(accuracy, "_MANY", 1000)
+        exact = cross_validated_residuals(measurement, vector, weights)
+        assert np.isfinite(linear).all(), weighted
+        # larger than the residuals of the fit, by the same
+        change = exact - measurement.residuals(vector)
+        assert np.std(linear - exact) < 0.02 * np.std(change), weighted
 
 
 def test_group_that_alone_determines_something_is_not_predicted(monkeypatch):
@@ -118,6 +122,7 @@ def test_group_that_alone_determines_something_is_not_predicted(monkeypatch):
 # --- nearly degenerate parameters of stars -----------------------------------------------------
 
 
+@pytest.mark.slow
 def test_power_law_next_to_a_lamp_takes_few_steps():
     lamp_meta = {
         "source": "polarized",

@@ -64,22 +64,23 @@ def run(target, moves, n_steps, n_walkers=None, start=1.0, seed=1):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [3, 10, 60])
-def test_default_moves_keep_a_normal_distribution(n):
-    target = Normal(n)
-    chain = run(target, default_moves(emcee, Laplace(target)), 3000)
-    assert target.whitened(chain).std() == pytest.approx(1, abs=0.02)
+def test_default_moves_keep_a_normal_distribution():
+    for n in [3, 10, 60]:
+        target = Normal(n)
+        chain = run(target, default_moves(emcee, Laplace(target)), 3000)
+        assert target.whitened(chain).std() == pytest.approx(1, abs=0.02), n
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mistaken", [0.5, 2.0])
-def test_default_moves_find_the_distribution_though_the_fit_is_wrong(mistaken):
+def test_default_moves_find_the_distribution_though_the_fit_is_wrong():
     """The steps around the fit then hardly help, but do no harm."""
-    target = Normal(20, mistaken=mistaken)
-    chain = run(target, default_moves(emcee, Laplace(target)), 6000)
-    assert target.whitened(chain).std() == pytest.approx(1, abs=0.04)
+    for mistaken in [0.5, 2.0]:
+        target = Normal(20, mistaken=mistaken)
+        chain = run(target, default_moves(emcee, Laplace(target)), 6000)
+        assert target.whitened(chain).std() == pytest.approx(1, abs=0.04), mistaken
 
 
+@pytest.mark.slow
 def test_default_moves_widen_a_start_that_is_too_narrow():
     target = Normal(20)
     chain = run(target, default_moves(emcee, Laplace(target)), 2000, start=0.3)
@@ -213,6 +214,7 @@ def test_default_numbers_of_walkers_and_of_steps_kept_grow(calibration, monkeypa
     assert asked == [(n, 2 * n, 5000, 1), (1, 24, 5000, 1)]
 
 
+@pytest.mark.slow
 def test_resumed_run_of_many_parameters_is_the_uninterrupted_one(calibration, tmp_path):
     """The steps around the fit draw the same random numbers."""
     pytest.importorskip("h5py")
@@ -226,27 +228,29 @@ def test_resumed_run_of_many_parameters_is_the_uninterrupted_one(calibration, tm
     assert whole.settings["moves"][1] == ["CrankNicolsonMove", 0.5]
 
 
-@pytest.mark.parametrize(("burn_in", "kept"), [(0, 0), (7, 3), (30, 10)])
-def test_burn_in_is_in_steps_of_the_sampler(calibration, burn_in, kept):
-    with pytest.warns(AstropolcalWarning, match="shorter than 50"):
-        posterior = sample(
-            calibration,
-            parameters=["hwp.w_sio2"],
-            n_walkers=6,
-            n_steps=60,
-            thin=3,
-            burn_in=burn_in,
-            seed=1,
-            progress=False,
-        )
-    assert posterior.burn_in == kept
-    assert posterior.convergence.burn_in == 3 * kept
+def test_burn_in_is_in_steps_of_the_sampler(calibration):
+    for burn_in, kept in [(0, 0), (7, 3), (30, 10)]:
+        with pytest.warns(AstropolcalWarning, match="shorter than 50"):
+            posterior = sample(
+                calibration,
+                parameters=["hwp.w_sio2"],
+                n_walkers=6,
+                n_steps=60,
+                thin=3,
+                burn_in=burn_in,
+                seed=1,
+                progress=False,
+            )
+        assert posterior.burn_in == kept, (burn_in, kept)
+        assert posterior.convergence.burn_in == 3 * kept, (burn_in, kept)
 
 
-@pytest.mark.parametrize("burn_in", [-1, 55, 2.5])
-def test_bad_burn_in(calibration, burn_in):
-    with pytest.raises(FitError, match=r"burn_in = .*60 steps allow whole numbers from 0 to 54"):
-        sample(calibration, n_walkers=80, n_steps=60, thin=3, burn_in=burn_in, progress=False)
+def test_bad_burn_in(calibration):
+    for burn_in in [-1, 55, 2.5]:
+        with pytest.raises(
+            FitError, match=r"burn_in = .*60 steps allow whole numbers from 0 to 54"
+        ):
+            sample(calibration, n_walkers=80, n_steps=60, thin=3, burn_in=burn_in, progress=False)
 
 
 def test_settings_say_what_was_sampled(calibration):

@@ -61,19 +61,16 @@ def test_without_a_wish_all_wavelengths_are_taken():
     assert bins.tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize(
-    ("wanted", "bins"),
-    [
+def test_wavelengths_are_recognized_in_any_unit_and_order():
+    for wanted, bins in [
         (1.6 * u.um, [1]),
         ([2200, 1200] * u.nm, [2, 0]),
         (GRID[1] * (1 + 5e-7), [1]),
         ([1.2e-6] * u.m, [0]),
-    ],
-)
-def test_wavelengths_are_recognized_in_any_unit_and_order(wanted, bins):
-    lam, found = match_wavelengths(GRID, _several(), wanted)
-    assert found.tolist() == bins
-    np.testing.assert_allclose(lam.to_value(u.nm), GRID.value[bins], rtol=1e-6)
+    ]:
+        lam, found = match_wavelengths(GRID, _several(), wanted)
+        assert found.tolist() == bins
+        np.testing.assert_allclose(lam.to_value(u.nm), GRID.value[bins], rtol=1e-6)
 
 
 def test_between_the_grid_a_law_answers_and_a_table_does_not():
@@ -84,18 +81,18 @@ def test_between_the_grid_a_law_answers_and_a_table_does_not():
         match_wavelengths(GRID, _several(), [1400, 1600] * u.nm)
 
 
-@pytest.mark.parametrize("wanted", [1100, 2300])
-def test_beyond_the_grid_nothing_answers(wanted):
-    with pytest.raises(
-        WavelengthRangeError, match=rf"{wanted}\.00 nm is outside.*1200\.00 nm to 2200"
-    ):
-        match_wavelengths(GRID, _law(), wanted * u.nm)
+def test_beyond_the_grid_nothing_answers():
+    for wanted in [1100, 2300]:
+        with pytest.raises(
+            WavelengthRangeError, match=rf"{wanted}\.00 nm is outside.*1200\.00 nm to 2200"
+        ):
+            match_wavelengths(GRID, _law(), wanted * u.nm)
 
 
-@pytest.mark.parametrize("wanted", [1600, "H", 1600 * u.s])
-def test_a_wavelength_has_a_unit_of_length(wanted):
-    with pytest.raises(ParameterError, match="needs a unit such as nm"):
-        match_wavelengths(GRID, _several(), wanted)
+def test_a_wavelength_has_a_unit_of_length():
+    for wanted in [1600, "H", 1600 * u.s]:
+        with pytest.raises(ParameterError, match="needs a unit such as nm"):
+            match_wavelengths(GRID, _several(), wanted)
 
 
 def test_a_chain_at_some_bins_has_their_values():
@@ -139,10 +136,10 @@ def _calibration(*chains, instrument=None, metas=None):
     )
 
 
-@pytest.mark.parametrize(("name", "known"), [("charis", "charis"), ("own", None), (None, None)])
-def test_instrument_of_a_calibration(name, known):
-    found = instrument_of(SimpleNamespace(instrument=name))
-    assert (found and found.name) == known
+def test_instrument_of_a_calibration():
+    for name, known in [("charis", "charis"), ("own", None), (None, None)]:
+        found = instrument_of(SimpleNamespace(instrument=name))
+        assert (found and found.name) == known, (name, known)
 
 
 def test_telescope_of_a_calibration_begins_behind_its_star():
@@ -160,16 +157,13 @@ def _with_and_without():
     return _calibration(plate | window | splitter, plate.copy() | splitter.copy())
 
 
-@pytest.mark.parametrize(
-    ("choice", "names"),
-    [
+def test_optics_in_the_beam_tell_chains_apart():
+    for choice, names in [
         ({"optics_in": ["window"]}, ["hwp", "window", "wollaston"]),
         ({"beam": {"window": False}}, ["hwp", "wollaston"]),
         ({"beam": {"window": True}}, ["hwp", "window", "wollaston"]),
-    ],
-)
-def test_optics_in_the_beam_tell_chains_apart(choice, names):
-    assert [leaf.name for leaf in inner_optics(_with_and_without(), **choice)] == names
+    ]:
+        assert [leaf.name for leaf in inner_optics(_with_and_without(), **choice)] == names
 
 
 def test_chains_that_cannot_be_told_apart_are_named():
@@ -227,16 +221,13 @@ def test_what_the_user_states_is_not_looked_for():
     assert describe(_header(INSTRUME="HICIAO"), "charis", {"instrument"})["stated"] is None
 
 
-@pytest.mark.parametrize(
-    ("header", "words"),
-    [
+def test_an_unknown_instrument_is_asked_for():
+    for header, words in [
         ({}, "the header does not say it; give instrument=, one of charis"),
         ({"INSTRUME": "HICIAO"}, "the header says 'HICIAO', which is not known"),
-    ],
-)
-def test_an_unknown_instrument_is_asked_for(header, words):
-    with pytest.raises(InstrumentError, match=words):
-        describe(header)
+    ]:
+        with pytest.raises(InstrumentError, match=words):
+            describe(header)
 
 
 def test_a_date_that_is_none_is_shown():
@@ -255,20 +246,17 @@ def test_angles_of_frames_are_in_radian():
     np.testing.assert_allclose(frames.position("hwp")[0], np.deg2rad(22.5))
 
 
-@pytest.mark.parametrize(
-    ("headers", "error", "words"),
-    [
+def test_angles_that_cannot_be_used():
+    for headers, error, words in [
         ([], ObservationError, "no header: at least one frame"),
         ([_header(RET_ANG1="fast")], ObservationError, "frame 0: RET-ANG1 = 'fast', a number"),
         ([_header(), _header(RET_ANG1=721.0)], ObservationError, "frame 1: RET-ANG1 = 721.0, all"),
         ([_header(ALTITUDE=91)], ObservationError, "frame 0: ALTITUDE = 91, allowed are 0 to 90"),
         ([_header(), _header(D_IMRANG=None)], ObservationError, "frame 1: no D_IMRANG in the hea"),
         ([_header(D_IMRANG="")] * 2, ObservationError, "position of 'derotator': no D_IMRANG"),
-    ],
-)
-def test_angles_that_cannot_be_used(headers, error, words):
-    with pytest.raises(error, match=words):
-        FrameAngles(headers, CHARIS).position("derotator")
+    ]:
+        with pytest.raises(error, match=words):
+            FrameAngles(headers, CHARIS).position("derotator")
 
 
 def test_a_stage_without_a_keyword():
@@ -309,37 +297,31 @@ def test_an_instrument_without_files_has_no_map():
 # --- statements ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("given", "sets", "words"),
-    [
+def test_sets_of_optics_have_one_form():
+    for given, sets, words in [
         (None, None, "optics in the beam not known"),
         ([], ((),), "no optional optics"),
         (["nbs", "a", "nbs"], (("a", "nbs"),), "with a + nbs"),
         ([["nbs"], []], ((), ("nbs",)), "no optional optics or with nbs"),
         ([["b", "a"], ("a", "b")], (("a", "b"),), "with a + b"),
-    ],
-)
-def test_sets_of_optics_have_one_form(given, sets, words):
-    assert optics_sets(given) == sets
-    assert optics_words(sets) == words
+    ]:
+        assert optics_sets(given) == sets, words
+        assert optics_words(sets) == words, words
 
 
-@pytest.mark.parametrize("given", ["nbs", [1], ["nbs", ["a"]], [["a", 2]]])
-def test_what_is_no_set_of_optics(given):
-    with pytest.raises(CalibrationFileError, match="names of optics are needed"):
-        optics_sets(given)
+def test_what_is_no_set_of_optics():
+    for given in ["nbs", [1], ["nbs", ["a"]], [["a", 2]]]:
+        with pytest.raises(CalibrationFileError, match="names of optics are needed"):
+            optics_sets(given)
 
 
-@pytest.mark.parametrize(
-    ("beam", "words"),
-    [
+def test_a_beam_in_words():
+    for beam, words in [
         ({"nbs": True, "a": True}, "with a + nbs"),
         ({"nbs": False}, "without nbs"),
         ({"b": False, "a": True, "c": False}, "with a, without b + c"),
-    ],
-)
-def test_a_beam_in_words(beam, words):
-    assert beam_words(beam) == words
+    ]:
+        assert beam_words(beam) == words, words
 
 
 def test_validity_in_words_and_as_a_dictionary():
@@ -353,18 +335,17 @@ def test_validity_in_words_and_as_a_dictionary():
     )
 
 
-@pytest.mark.parametrize(
-    ("date", "inside"),
-    [
+def test_the_start_belongs_to_the_range_and_the_end_does_not():
+    for date, inside in [
         ("2025-09-30T23:59:59.999", False),
         ("2025-10-01", True),
         (Time("2025-11-01"), True),
         ("2025-12-31T23:59:59", True),
         ("2026-01-01", False),
-    ],
-)
-def test_the_start_belongs_to_the_range_and_the_end_does_not(date, inside):
-    assert Validity(valid_from="2025-10-01", valid_until="2026-01-01").holds(date) == inside
+    ]:
+        assert Validity(valid_from="2025-10-01", valid_until="2026-01-01").holds(date) == inside, (
+            inside
+        )
 
 
 def test_without_limits_every_moment_is_inside():
@@ -373,21 +354,18 @@ def test_without_limits_every_moment_is_inside():
     assert not Validity(valid_until="2000-01-01").holds("2001-01-01")
 
 
-@pytest.mark.parametrize(
-    ("dates", "start"),
-    [
+def test_start_is_the_first_date_that_is_one():
+    for dates, start in [
         (["2025-10-05", "2025-09-30"], "2025-09-30"),
         (["2025-10", None], "2025-10-01"),
         (["20251005", 60952], "2025-10-04"),
         (["2025-10-06", "2025-10-05T09:30"], "2025-10-05T09:30:00.000"),
         ([" ", None], None),
         ([], None),
-    ],
-)
-def test_start_is_the_first_date_that_is_one(dates, start):
-    chain = _several()
-    cal = _calibration(*[chain] * len(dates), metas=[{"date": d} for d in dates])
-    assert validity_of(cal).valid_from == start
+    ]:
+        chain = _several()
+        cal = _calibration(*[chain] * len(dates), metas=[{"date": d} for d in dates])
+        assert validity_of(cal).valid_from == start, start
 
 
 def test_date_that_cannot_be_read_does_not_pass_for_any_date():
@@ -398,12 +376,10 @@ def test_date_that_cannot_be_read_does_not_pass_for_any_date():
         validity_of(cal)
 
 
-@pytest.mark.parametrize(
-    ("modes", "mode"), [(["J", "J"], "J"), (["J", "H"], None), (["J", None], None), ([3], None)]
-)
-def test_mode_is_that_of_all_datasets(modes, mode):
-    cal = _calibration(*[_several()] * len(modes), metas=[{"mode": m} for m in modes])
-    assert validity_of(cal).mode == mode
+def test_mode_is_that_of_all_datasets():
+    for modes, mode in [(["J", "J"], "J"), (["J", "H"], None), (["J", None], None), ([3], None)]:
+        cal = _calibration(*[_several()] * len(modes), metas=[{"mode": m} for m in modes])
+        assert validity_of(cal).mode == mode, mode
 
 
 def test_nonsense_in_a_file_is_told():

@@ -38,10 +38,10 @@ def posterior():
 # --- autocorrelation ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rho", [0.0, 0.5, 0.9, 0.98])
-def test_autocorrelation_time_of_a_known_process(rho):
-    expected = (1 + rho) / (1 - rho)
-    assert autocorrelation_time(correlated(rho)) == pytest.approx(expected, rel=0.12)
+def test_autocorrelation_time_of_a_known_process():
+    for rho in [0.0, 0.5, 0.9, 0.98]:
+        expected = (1 + rho) / (1 - rho)
+        assert autocorrelation_time(correlated(rho)) == pytest.approx(expected, rel=0.12), rho
 
 
 def test_autocorrelation_of_a_known_process():
@@ -200,11 +200,11 @@ def test_converged_without_arviz_is_a_matter_of_length(monkeypatch):
     assert Posterior.from_dict(found.thinned().to_dict()) == found.thinned()
 
 
-@pytest.mark.parametrize("n_steps", [2, 3])
-def test_hardly_any_steps_have_not_converged(n_steps):
-    found = make_posterior(0.1, n_steps)
-    assert not found.converged
-    assert "NOT CONVERGED" in found.words()
+def test_hardly_any_steps_have_not_converged():
+    for n_steps in [2, 3]:
+        found = make_posterior(0.1, n_steps)
+        assert not found.converged, n_steps
+        assert "NOT CONVERGED" in found.words(), n_steps
 
 
 # --- burn-in ------------------------------------------------------------------------------
@@ -218,10 +218,10 @@ def test_burn_in_that_is_given(posterior):
     assert given != posterior
 
 
-@pytest.mark.parametrize("burn_in", [-1, 3999, 5000])
-def test_bad_burn_in(posterior, burn_in):
-    with pytest.raises(ParameterError, match="allowed are 0 to 3998 of 4000 kept steps"):
-        Posterior.from_dict(posterior.to_dict() | {"burn_in": burn_in})
+def test_bad_burn_in(posterior):
+    for burn_in in [-1, 3999, 5000]:
+        with pytest.raises(ParameterError, match="allowed are 0 to 3998 of 4000 kept steps"):
+            Posterior.from_dict(posterior.to_dict() | {"burn_in": burn_in})
 
 
 # --- thinned, for files -------------------------------------------------------------------
@@ -266,10 +266,10 @@ def test_thinned_again_is_the_same(posterior):
     assert once.thinned(2).convergence is posterior.convergence
 
 
-@pytest.mark.parametrize(("draws", "kept"), [(8, 8), (3, 8), (100, 88), (10**9, None)])
-def test_size_of_a_thinned_posterior(posterior, draws, kept):
-    found = posterior.thinned(draws=draws).log_prob.size
-    assert found == (kept or 8 * (4000 - posterior.burn_in))
+def test_size_of_a_thinned_posterior(posterior):
+    for draws, kept in [(8, 8), (3, 8), (100, 88), (10**9, None)]:
+        found = posterior.thinned(draws=draws).log_prob.size
+        assert found == (kept or 8 * (4000 - posterior.burn_in)), kept
 
 
 def test_quantiles_of_a_thinned_posterior_are_about_the_same(posterior):
@@ -332,15 +332,14 @@ def test_round_trip_of_a_thinned_posterior(posterior):
     assert Posterior.from_dict(other) != thinned
 
 
-@pytest.mark.parametrize("change", [{"seed": 2}, {"fitted": None}, {"units": ["rad", ""]}])
-def test_posteriors_that_differ(posterior, change):
-    assert Posterior.from_dict(posterior.to_dict() | change) != posterior
-    assert posterior != "posterior"
+def test_posteriors_that_differ(posterior):
+    for change in [{"seed": 2}, {"fitted": None}, {"units": ["rad", ""]}]:
+        assert Posterior.from_dict(posterior.to_dict() | change) != posterior
+        assert posterior != "posterior"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_bad_parts(posterior):
+    for change, message in [
         ({"chain": np.zeros((10, 8, 3))}, r"shape \(10, 8, 3\)"),
         ({"chain": np.zeros((10, 8))}, "allowed is"),
         ({"log_prob": np.zeros((10, 8))}, r"log_prob has shape \(10, 8\)"),
@@ -350,17 +349,15 @@ def test_posteriors_that_differ(posterior, change):
         ({"color": "red"}, "missing or unknown color"),
         ({"convergence": CONVERGENCE}, "convergence of 1 parameters in a chain of 2"),
         ({"convergence": CONVERGENCE | {"std": [1.0, 2.0]}}, "one value a parameter is allowed"),
-    ],
-)
-def test_bad_parts(posterior, change, message):
-    with pytest.raises(ParameterError, match=message):
-        Posterior.from_dict(posterior.to_dict() | change)
+    ]:
+        with pytest.raises(ParameterError, match=message):
+            Posterior.from_dict(posterior.to_dict() | change)
 
 
-@pytest.mark.parametrize("step", [0, 4001])
-def test_bad_thinning(posterior, step):
-    with pytest.raises(ParameterError, match=f"allowed are 1 to {4000 - posterior.burn_in}"):
-        posterior.thinned(step)
+def test_bad_thinning(posterior):
+    for step in [0, 4001]:
+        with pytest.raises(ParameterError, match=f"allowed are 1 to {4000 - posterior.burn_in}"):
+            posterior.thinned(step)
 
 
 def test_bad_quantile(posterior):

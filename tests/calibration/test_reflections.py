@@ -74,22 +74,22 @@ def test_values_of_a_law_have_errors(metal):
         assert (np.abs(table[key].value - true) < 4 * std).all()
 
 
-@pytest.mark.parametrize("make", [PowerLawMirror, MetalMirror])
-def test_slopes_of_a_law_are_those_of_differences(make):
-    mirror = make(incidence=50 * u.deg)
-    values = {"film_thickness": 60 * u.nm} if make is MetalMirror else {}
-    mirror = mirror.with_parameters(**values)
-    slopes = mirror.law_slopes(WAVELENGTH)
-    for key in mirror.own_names:
-        parameter, ends = getattr(mirror, key), []
-        step, unit = 1e-5 * max(abs(parameter.value), 1), parameter.unit or 1
-        for sign in (1, -1):
-            moved = mirror.with_parameters(**{key: (parameter.value + sign * step) * unit})
-            ends.append((moved.diattenuation(WAVELENGTH), moved.retardance(WAVELENGTH).value))
-        for name, high, low in zip(slopes, *ends, strict=True):
-            np.testing.assert_allclose(
-                slopes[name][key], (high - low) / (2 * step), rtol=1e-4, atol=1e-9
-            )
+def test_slopes_of_a_law_are_those_of_differences():
+    for make in [PowerLawMirror, MetalMirror]:
+        mirror = make(incidence=50 * u.deg)
+        values = {"film_thickness": 60 * u.nm} if make is MetalMirror else {}
+        mirror = mirror.with_parameters(**values)
+        slopes = mirror.law_slopes(WAVELENGTH)
+        for key in mirror.own_names:
+            parameter, ends = getattr(mirror, key), []
+            step, unit = 1e-5 * max(abs(parameter.value), 1), parameter.unit or 1
+            for sign in (1, -1):
+                moved = mirror.with_parameters(**{key: (parameter.value + sign * step) * unit})
+                ends.append((moved.diattenuation(WAVELENGTH), moved.retardance(WAVELENGTH).value))
+            for name, high, low in zip(slopes, *ends, strict=True):
+                np.testing.assert_allclose(
+                    slopes[name][key], (high - low) / (2 * step), rtol=1e-4, atol=1e-9
+                )
 
 
 def test_mirror_without_a_film_has_errors():
@@ -122,6 +122,7 @@ def test_summary_and_json_have_the_mirrors(free):
     json.dumps(entry, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_figures_of_mirrors_and_targets(free, metal, tmp_path):
     top, bottom = plot_mirrors(free[0]).axes
     lines = " ".join(str(line.get_label()) for line in top.get_lines())
@@ -145,6 +146,7 @@ def night(truth, name="HD 30675", scale=1.0, **options):
     )
 
 
+@pytest.mark.slow
 def test_a_standard_comes_out_as_the_catalogue_has_it(free):
     cal, truth = free
     table = star_check(cal, star_chain("star"), night(truth, seed=3))
@@ -163,6 +165,7 @@ def test_a_star_that_is_not_as_the_catalogue_has_it(free):
     np.testing.assert_allclose(table["dolp_error"].to_value(u.percent), known, atol=0.05)
 
 
+@pytest.mark.slow
 def test_check_is_kept_in_file_summary_and_json(free, tmp_path):
     cal, truth = free
     add_star_check(cal, star_chain("star"), night(truth, seed=3))

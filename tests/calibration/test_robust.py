@@ -66,15 +66,16 @@ def mean_ratio(cal, noises, truth, **options):
 # --- the truth, by simulation -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("block", ["derotator", "pair"])
-def test_white_noise_gives_the_ordinary_errors_in_the_mean(few, block):
+@pytest.mark.slow
+def test_white_noise_gives_the_ordinary_errors_in_the_mean(few):
     """The correction for leverage is exact here: 120 draws, 5 % each parameter."""
-    n = few.measurement.n_data
-    noises = np.random.default_rng(1).normal(0, 1e-3, (120, n))
-    truth = true_stds(few, 1e-6 * np.eye(n))
-    ratio = mean_ratio(few, noises, truth, groups=block)
-    np.testing.assert_allclose(ratio, 1, atol=0.2)
-    assert np.mean(ratio) == pytest.approx(1, abs=0.06)
+    for block in ["derotator", "pair"]:
+        n = few.measurement.n_data
+        noises = np.random.default_rng(1).normal(0, 1e-3, (120, n))
+        truth = true_stds(few, 1e-6 * np.eye(n))
+        ratio = mean_ratio(few, noises, truth, groups=block)
+        np.testing.assert_allclose(ratio, 1, atol=0.2)
+        assert np.mean(ratio) == pytest.approx(1, abs=0.06), block
 
 
 def test_without_the_leverage_eight_groups_give_too_little(few):
@@ -96,6 +97,7 @@ def shared(cal, rng, n_draws):
     return common + rng.normal(0, np.sqrt(1e-7), common.shape), covariance
 
 
+@pytest.mark.slow
 def test_errors_shared_by_an_angle_are_found(many):
     """Within 12 % in the mean and 35 % each, where the ordinary errors are off by more."""
     noises, covariance = shared(many, np.random.default_rng(3), 100)
@@ -108,6 +110,7 @@ def test_errors_shared_by_an_angle_are_found(many):
     assert np.abs(np.log(ordinary)).max() > 2 * np.abs(np.log(ratio)).max()
 
 
+@pytest.mark.slow
 def test_one_sigma_covers_where_errors_are_shared(many):
     """Pulls of 100 draws: unit width with robust errors, twice it with ordinary ones."""
     labels = leave_out_groups(many.measurement)
@@ -143,6 +146,7 @@ def test_unequal_noise_needs_no_groups(few):
     assert ordinary.min() < 0.7
 
 
+@pytest.mark.slow
 def test_bootstrap_agrees(many):
     """Two estimates of the same from the same residuals, 24 blocks."""
     noises, _ = shared(many, np.random.default_rng(4), 1)
@@ -209,18 +213,15 @@ def test_groups_make_standard_errors_robust(few):
     np.testing.assert_array_equal(given["std"], table["std"])
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_bad_choices_are_refused(few):
+    for options, message in [
         ({"groups": "night"}, "block = 'night'; allowed are derotator, pair"),
         ({"groups": np.zeros(4)}, r"groups of shape \(4,\); allowed are \(96,\), one a datum"),
         ({"groups": np.zeros(96)}, "1 groups; a robust covariance needs 3"),
         ({"correction": "none"}, "correction = 'none'; allowed are leverage, number"),
-    ],
-)
-def test_bad_choices_are_refused(few, options, message):
-    with pytest.raises(FitError, match=message):
-        robust_covariance(few, **options)
+    ]:
+        with pytest.raises(FitError, match=message):
+            robust_covariance(few, **options)
 
 
 def test_other_methods_know_no_groups(few):
@@ -252,24 +253,26 @@ def test_errors_of_dataset_3_are_those_of_the_bootstrap(charis_data, make):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["dataset1_", "dataset3_"])
-def test_derotator_angles_left_out_are_predicted_within_the_errors(charis_data, make, name):
+def test_derotator_angles_left_out_are_predicted_within_the_errors(charis_data, make):
     """Errors of the parameters without an angle, and the scatter of its own data, together."""
-    data = charis_data(name)
-    cal = calibrate(make.charis.chains_for([data]), data, cross_validate=False)
-    model, weighting = cal.measurement, weighting_of(cal)
-    whitened = around(model, weighting)
-    (part,) = Scatter(model, weighting, whitened).parts
-    applied = part.applied(np.eye(model.n_data))
-    middle = sum(s * matrix for s, matrix in zip(part.shares, applied, strict=True))
-    scatter = part.amplitude[:, None] * middle * part.amplitude
-    held_out = cross_validated_residuals(model, model.vector())
-    slopes, groups, pulls = whitened.rows[:, whitened.live], leave_out_groups(model), []
-    for group in np.unique(groups):
-        out = groups == group
-        inverse = np.linalg.pinv(slopes[~out], rcond=1e-9)
-        moved = slopes[out] @ inverse
-        variance = np.diag(scatter)[out] + np.diag(moved @ scatter[np.ix_(~out, ~out)] @ moved.T)
-        pulls.append(held_out[out] / np.sqrt(variance))
-    width = np.sqrt(np.nanmean(np.concatenate(pulls) ** 2))
-    assert 0.8 < width < 1.3
+    for name in ["dataset1_", "dataset3_"]:
+        data = charis_data(name)
+        cal = calibrate(make.charis.chains_for([data]), data, cross_validate=False)
+        model, weighting = cal.measurement, weighting_of(cal)
+        whitened = around(model, weighting)
+        (part,) = Scatter(model, weighting, whitened).parts
+        applied = part.applied(np.eye(model.n_data))
+        middle = sum(s * matrix for s, matrix in zip(part.shares, applied, strict=True))
+        scatter = part.amplitude[:, None] * middle * part.amplitude
+        held_out = cross_validated_residuals(model, model.vector())
+        slopes, groups, pulls = whitened.rows[:, whitened.live], leave_out_groups(model), []
+        for group in np.unique(groups):
+            out = groups == group
+            inverse = np.linalg.pinv(slopes[~out], rcond=1e-9)
+            moved = slopes[out] @ inverse
+            variance = np.diag(scatter)[out] + np.diag(
+                moved @ scatter[np.ix_(~out, ~out)] @ moved.T
+            )
+            pulls.append(held_out[out] / np.sqrt(variance))
+        width = np.sqrt(np.nanmean(np.concatenate(pulls) ** 2))
+        assert 0.8 < width < 1.3, name

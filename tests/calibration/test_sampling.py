@@ -24,7 +24,8 @@ from astropolcal.exceptions import (
     FitError,
     ParameterError,
 )
-from astropolcal.measurement import Normal, Uniform
+from astropolcal.measurement import Normal
+from astropolcal.measurement.priors import Uniform
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 NOISE = 0.01
@@ -148,12 +149,10 @@ def test_name_of_a_parameter_stands_for_all_its_values(small):
     assert found == ["wollaston.efficiency[0]", "wollaston.efficiency[1]"]
 
 
-@pytest.mark.parametrize(
-    ("noise", "expected"), [(1 * u.percent, [0.01, 0.01]), ([0.01, 0.02], [0.01, 0.02])]
-)
-def test_noise_given(small, noise, expected):
-    posterior = LogPosterior(small.measurement, noise=noise)
-    assert posterior.sigma == pytest.approx(np.array(expected)[small.measurement.bins])
+def test_noise_given(small):
+    for noise, expected in [(1 * u.percent, [0.01, 0.01]), ([0.01, 0.02], [0.01, 0.02])]:
+        posterior = LogPosterior(small.measurement, noise=noise)
+        assert posterior.sigma == pytest.approx(np.array(expected)[small.measurement.bins])
 
 
 def test_noise_from_the_table(small):
@@ -187,9 +186,8 @@ def test_no_noise_without_residuals():
         noise_of(cal.measurement, "wavelength")
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
+def test_bad_log_posterior(small):
+    for options, error, message in [
         ({"parameters": ["hwp.theta"]}, ParameterError, r"no free parameter 'hwp\.theta'; allowed"),
         ({"parameters": ["hwp.retardance"] * 2}, ParameterError, "nothing twice"),
         ({"parameters": []}, ParameterError, "must name something"),
@@ -204,17 +202,15 @@ def test_no_noise_without_residuals():
         ({"noise": 1 * u.m}, ParameterError, "wrong unit"),
         ({"noise": "much"}, ParameterError, "not a number"),
         ({"weights": "equal"}, FitError, "allowed are None, 'wavelength', 'errors'"),
-    ],
-)
-def test_bad_log_posterior(small, options, error, message):
-    with pytest.raises(error, match=message):
-        LogPosterior(small.measurement, **options)
+    ]:
+        with pytest.raises(error, match=message):
+            LogPosterior(small.measurement, **options)
 
 
-@pytest.mark.parametrize("shape", [(2,), (4,), (5, 2), (2, 2, 3), ()])
-def test_log_posterior_of_a_wrong_shape(small, shape):
-    with pytest.raises(ParameterError, match="values of shape"):
-        LogPosterior(small.measurement)(np.zeros(shape))
+def test_log_posterior_of_a_wrong_shape(small):
+    for shape in [(2,), (4,), (5, 2), (2, 2, 3), ()]:
+        with pytest.raises(ParameterError, match="values of shape"):
+            LogPosterior(small.measurement)(np.zeros(shape))
 
 
 def test_weights_without_errors():
@@ -256,6 +252,7 @@ def test_uniform_prior_and_bounds_are_never_left():
     assert samples.std(axis=0) == pytest.approx(0.065 / 12**0.5, rel=0.15)
 
 
+@pytest.mark.slow
 def test_walkers_start_within_bounds_where_the_fit_is_at_one():
     chain = make_chain(retardance_free=False)
     chain["wollaston"].efficiency = [1.0, 0.85]
@@ -296,6 +293,7 @@ def test_parameters_held_have_no_share_in_the_errors(full_rank):
     assert (posterior.covariance.stds < full_rank.covariance.stds[rows]).all()
 
 
+@pytest.mark.slow
 def test_undetermined_direction_is_filled_by_its_prior():
     """Polarizer and half-wave plate turned together: only the prior keeps them apart."""
     chain = make_chain(retardance_free=False)
@@ -318,6 +316,7 @@ def test_undetermined_direction_is_filled_by_its_prior():
 RUN = {"n_walkers": 10, "n_steps": 60, "seed": 7, "progress": False}
 
 
+@pytest.mark.slow
 def test_seed_repeats_the_run(small):
     first, second = (quiet_sample(small, **RUN) for _ in range(2))
     assert first == second
@@ -345,6 +344,7 @@ def test_log_prob_belongs_to_the_chain(small):
     np.testing.assert_allclose(again, posterior.log_prob[-1], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thin", [1, 4])
 @pytest.mark.parametrize("interval", [1, 7, 100])
 def test_resumed_chain_is_the_uninterrupted_one(small, tmp_path, thin, interval):
@@ -449,14 +449,14 @@ def test_other_last_digits_do_not_matter(small, tmp_path):
     assert len(quiet_sample(other, **RUN, checkpoint=path).chain) == 60
 
 
-@pytest.mark.parametrize("content", [b"", b"no HDF5 at all" * 100])
-def test_other_files_are_not_touched(small, tmp_path, content):
-    path = tmp_path / "chain.h5"
-    path.write_bytes(content)
-    for resume in (True, False):
-        with pytest.raises(FitError, match=r"chain\.h5: is no checkpoint"):
-            quiet_sample(small, **RUN, checkpoint=path, resume=resume)
-    assert path.read_bytes() == content
+def test_other_files_are_not_touched(small, tmp_path):
+    for content in [b"", b"no HDF5 at all" * 100]:
+        path = tmp_path / "chain.h5"
+        path.write_bytes(content)
+        for resume in (True, False):
+            with pytest.raises(FitError, match=r"chain\.h5: is no checkpoint"):
+                quiet_sample(small, **RUN, checkpoint=path, resume=resume)
+        assert path.read_bytes() == content
 
 
 def test_other_hdf5_files_are_not_touched(small, tmp_path):
@@ -569,9 +569,8 @@ def test_killed_runs_lose_one_interval_at_most(tmp_path, request):
 # --- bad input ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_bad_numbers(small):
+    for options, message in [
         ({"n_walkers": 5}, r"n_walkers = 5; 3 parameters need a whole number from 6 up"),
         ({"n_walkers": 10.0}, r"n_walkers = 10\.0"),
         ({"n_steps": 0}, "n_steps = 0; allowed are whole numbers"),
@@ -579,13 +578,11 @@ def test_killed_runs_lose_one_interval_at_most(tmp_path, request):
         ({"thin": 0}, "thin = 0"),
         ({"thin": 40}, "n_steps = .*; allowed are whole numbers from 80 up, as one in 40"),
         ({"checkpoint_every": -1}, "checkpoint_every = -1"),
-    ],
-)
-def test_bad_numbers(small, options, message):
-    with pytest.raises(FitError, match=message) as caught:
-        sample(small, **(RUN | options))
-    # a command says it in words of its options
-    assert str(caught.value).startswith(f"{caught.value.argument} = ")
+    ]:
+        with pytest.raises(FitError, match=message) as caught:
+            sample(small, **(RUN | options))
+        # a command says it in words of its options
+        assert str(caught.value).startswith(f"{caught.value.argument} = ")
 
 
 def test_calibration_from_a_file_has_no_data(small, tmp_path):
@@ -638,6 +635,7 @@ def paper(charis_data):
     return quiet_sample(cal, parameters=names, n_steps=800, seed=1, progress=False)
 
 
+@pytest.mark.slow
 def test_thicknesses_of_dataset_3_are_degenerate(paper):
     """
     McIntosh et al. (2026, Appendix on MCMC): "perfectly degenerate with each other".

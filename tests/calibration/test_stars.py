@@ -149,6 +149,7 @@ def joint(prepared):
     return calibrate(CHARIS.chains_for(data), data, instrument="charis")
 
 
+@pytest.mark.slow
 def test_joint_fit_is_fast(joint, prepared):
     data = prepared("dataset3", "dataset4", "hd293396")
     chains = CHARIS.chains_for(data)
@@ -162,6 +163,7 @@ def test_joint_fit_is_fast(joint, prepared):
     assert min(seconds) < 4
 
 
+@pytest.mark.slow
 def test_diattenuation_of_m3_falls_from_1_6_to_1_2_percent(joint, prepared):
     """If the star were exactly unpolarized; as nobody knows that, it is up to 0.2 % less."""
     data = prepared("dataset3", "dataset4", "hd293396")
@@ -183,6 +185,7 @@ def test_diattenuation_of_m3_falls_from_1_6_to_1_2_percent(joint, prepared):
     assert np.median(free["std"]) > 5e-4
 
 
+@pytest.mark.slow
 def test_residuals_are_below_those_of_the_published_law(joint, prepared):
     (star,) = prepared("hd293396")
     ours = joint.residuals[joint.measurement.segments[2]]
@@ -191,6 +194,7 @@ def test_residuals_are_below_those_of_the_published_law(joint, prepared):
     assert np.sqrt(np.mean(ours**2)) < np.sqrt(np.mean(theirs**2))
 
 
+@pytest.mark.slow
 def test_fold_mirror_is_within_the_published_range(joint, shared_data):
     """Four values a wavelength are published, which differ by up to 0.2 %."""
     from astropy.table import Table
@@ -204,6 +208,7 @@ def test_fold_mirror_is_within_the_published_range(joint, shared_data):
     assert ours < 0.6 * np.median(table["s_unpol"])
 
 
+@pytest.mark.slow
 def test_accuracy_for_a_target_is_the_papers(joint):
     """Paper, Fig. of s_p: 0.02 to 0.12 % for a target of 1 %."""
     (table,) = paper_accuracies(joint, [(1 * u.percent, 50 * u.deg)])
@@ -213,12 +218,14 @@ def test_accuracy_for_a_target_is_the_papers(joint):
     assert s_p.max() < 0.12
 
 
+@pytest.mark.slow
 def test_frames_left_out_are_stated_beside(joint):
     star = joint.datasets[2].accuracy
     s_cv, s_res = (np.median(star[key].to_value(u.percent)) for key in ("s_cv", "s_res"))
     assert 0.8 * s_res < s_cv < 1.3 * s_res
 
 
+@pytest.mark.slow
 def test_unpolarized_star_is_what_the_fit_has_found_of_it(joint, prepared):
     (star,) = prepared("hd293396")
     (chain,) = CHARIS.chains_for([star])
@@ -233,6 +240,7 @@ def test_unpolarized_star_is_what_the_fit_has_found_of_it(joint, prepared):
     assert table["n_cycles"].max() == 23
 
 
+@pytest.mark.slow
 def test_four_numbers_of_the_power_law_are_not_determined(prepared):
     (star,) = prepared("hd293396")
     (chain,) = CHARIS.chains_for([star], m3="power law")
@@ -260,6 +268,7 @@ def february(prepared):
     return calibrate(CHARIS.chains_for(data), data, instrument="charis", cross_validate=False)
 
 
+@pytest.mark.slow
 def test_polarized_standard_comes_out(february, joint, prepared):
     """
     The paper's appendix: DoLP residual below 0.3 % in J and H. No fit has seen it.
@@ -286,6 +295,7 @@ def test_polarized_standard_comes_out(february, joint, prepared):
         assert (found["aolp_sys_err"] < 10 * u.deg).all()
 
 
+@pytest.mark.slow
 def test_polarized_standard_is_predicted(february, prepared):
     (star,) = prepared("hd30675")
     (chain,) = CHARIS.chains_for([star])

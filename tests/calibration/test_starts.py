@@ -37,14 +37,15 @@ def anywhere(make, kind, seed):
 # --- recovery from wrong branches ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("kind", ["linear", "elliptical"])
-def test_every_wavelength_finds_a_branch_that_explains_it(make, kind, seed):
+@pytest.mark.slow
+def test_every_wavelength_finds_a_branch_that_explains_it(make):
     """Chi-square of 32 data in each bin; a wrong valley gives 1e3 to 1e7."""
-    start, _, data = anywhere(make, kind, seed)
-    cal = calibrate(start, data, weights="errors", cross_validate=False)
-    pulls = cal.residuals / cal.measurement.sigma
-    assert np.bincount(cal.measurement.bins, pulls**2).max() < 75
+    for seed in range(8):
+        for kind in ["linear", "elliptical"]:
+            start, _, data = anywhere(make, kind, seed)
+            cal = calibrate(start, data, weights="errors", cross_validate=False)
+            pulls = cal.residuals / cal.measurement.sigma
+            assert np.bincount(cal.measurement.bins, pulls**2).max() < 75, kind
 
 
 def test_without_search_wavelengths_stay_in_wrong_branches(make):
@@ -195,9 +196,9 @@ def test_polish_is_not_held_up_at_a_bound(make):
     np.testing.assert_allclose(few[efficiency], 0.95)
 
 
-@pytest.mark.parametrize(
-    ("build", "expected"),
-    [
+def test_scan_runs_along_the_main_retardance(make):
+    """Neither an angle of orientation nor a thickness is a retardance to scan."""
+    for build, expected in [
         (
             lambda g: optics.EllipticalRetarder(horizontal=g, diagonal=g, circular=g, name="x"),
             ["x.horizontal"],
@@ -219,20 +220,17 @@ def test_polish_is_not_held_up_at_a_bound(make):
             ),
             [],
         ),
-    ],
-)
-def test_scan_runs_along_the_main_retardance(make, build, expected):
-    """Neither an angle of orientation nor a thickness is a retardance to scan."""
-    grid = np.linspace(1, 2, 3) * u.deg
-    lam = [1.2, 1.6, 2.0] * u.um
-    chain = (
-        optics.LinearPolarizer(theta=30 * u.deg, name="polarizer")
-        | optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
-        | build(grid)
-        | optics.WollastonPrism(efficiency=0.9, name="wollaston")
-    )
-    problem = problem_of(chain, make.observe(chain, wavelength=lam, seed=1))
-    assert [problem.slots[row].name for row, *_ in problem.main_retardances()] == expected
+    ]:
+        grid = np.linspace(1, 2, 3) * u.deg
+        lam = [1.2, 1.6, 2.0] * u.um
+        chain = (
+            optics.LinearPolarizer(theta=30 * u.deg, name="polarizer")
+            | optics.LinearRetarder(retardance=170 * u.deg, mount="hwp", name="hwp")
+            | build(grid)
+            | optics.WollastonPrism(efficiency=0.9, name="wollaston")
+        )
+        problem = problem_of(chain, make.observe(chain, wavelength=lam, seed=1))
+        assert [problem.slots[row].name for row, *_ in problem.main_retardances()] == expected
 
 
 # --- priors -------------------------------------------------------------------------------------
@@ -247,15 +245,16 @@ def with_prior(make, prior, seed=3):
     return start, truth, make.observe(truth, seed=seed)
 
 
-@pytest.mark.parametrize("weights", [None, "wavelength", "errors"])
-@pytest.mark.parametrize("mean", [95, -265])
-def test_prior_decides_between_equal_branches(make, weights, mean):
+@pytest.mark.slow
+def test_prior_decides_between_equal_branches(make):
     """A retardance of d and of d - 360 deg are the same optic; a broad prior knows which it is."""
-    start, truth, data = with_prior(make, Normal(mean * u.deg, 60 * u.deg))
-    start["derotator"].retardance = np.full(N_BINS, -300.0 if mean > 0 else 300.0) * u.deg
-    cal = calibrate(start, data, weights=weights, cross_validate=False)
-    expected = truth["derotator"].retardance.value + (0 if mean > 0 else -360)
-    np.testing.assert_allclose(cal.chain["derotator"].retardance.value, expected, atol=0.3)
+    for weights in [None, "wavelength", "errors"]:
+        for mean in [95, -265]:
+            start, truth, data = with_prior(make, Normal(mean * u.deg, 60 * u.deg))
+            start["derotator"].retardance = np.full(N_BINS, -300.0 if mean > 0 else 300.0) * u.deg
+            cal = calibrate(start, data, weights=weights, cross_validate=False)
+            expected = truth["derotator"].retardance.value + (0 if mean > 0 else -360)
+            np.testing.assert_allclose(cal.chain["derotator"].retardance.value, expected, atol=0.3)
 
 
 def test_prior_does_not_overrule_the_data(make):

@@ -72,30 +72,29 @@ def fitted(data):
 # --- what calibrates what -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("source", "kind"),
-    [
+def test_kind_of_a_source():
+    for source, kind in [
         ("polarized", "polarized"),
         ("unpolarized", "unpolarized"),
         ("unpolarized standard star", "star"),
         ("polarized standard star", "star"),
         (None, "polarized"),
-    ],
-)
-def test_kind_of_a_source(source, kind):
-    assert kind_of_source(source) == kind
+    ]:
+        assert kind_of_source(source) == kind, (source, kind)
 
 
 # --- joint and sequential -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("strategy", ["joint", "sequential"])
-def test_truth_comes_back(fitted, strategy):
-    values = fitted[strategy].parameter_values()
-    assert fitted[strategy].converged
-    for name, expected in (("m3.diattenuation", M3), ("fold_mirror.diattenuation", FOLD)):
-        np.testing.assert_allclose(values[name]["value"], expected, atol=3e-4)
-    assert values["calibration_polarizer.theta"]["value"] == pytest.approx(90.4, abs=0.1)
+def test_truth_comes_back(fitted):
+    for strategy in ["joint", "sequential"]:
+        values = fitted[strategy].parameter_values()
+        assert fitted[strategy].converged, strategy
+        for name, expected in (("m3.diattenuation", M3), ("fold_mirror.diattenuation", FOLD)):
+            np.testing.assert_allclose(values[name]["value"], expected, atol=3e-4)
+        assert values["calibration_polarizer.theta"]["value"] == pytest.approx(90.4, abs=0.1), (
+            strategy
+        )
 
 
 def test_joint_fit_has_one_covariance_of_all(fitted):
@@ -209,6 +208,7 @@ def spoiled(data):
     return start, [*observations[:2], Observations.from_table(table, name="star")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "bisquare"])
 def test_robust_loss_is_not_pulled(spoiled, loss):
     def error(**options):
@@ -237,6 +237,7 @@ def test_good_data_have_no_outliers(fitted):
     assert len(outlying_data(fitted["joint"])) == 0
 
 
+@pytest.mark.slow
 def test_robust_noise_is_found_again_from_the_file(spoiled, tmp_path):
     from astropolcal.calibration.noise.weighting import weighting_of
 

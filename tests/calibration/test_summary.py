@@ -81,22 +81,21 @@ def test_long_lines_are_broken_behind_their_bullet():
     assert " ".join(" ".join(lines).split()) == " ".join((long + " short").split())
 
 
-@pytest.mark.parametrize(
-    ("converged", "instrument", "words"),
-    [
+def test_heading():
+    for converged, instrument, words in [
         (True, "lab", ["Calibration of lab from night", "F, 1.23 s, converged"]),
         (False, None, ["Calibration of an instrument from night", "F, 1.23 s, NOT CONVERGED"]),
-    ],
-)
-def test_heading(converged, instrument, words):
-    lines = _heading(_calibration(converged=converged, instrument=instrument))
-    assert [lines[0], lines[2]] == words
-    assert lines[1] == "joint fit of 7 parameters to 48 normalized differences,"
+    ]:
+        lines = _heading(_calibration(converged=converged, instrument=instrument))
+        assert [lines[0], lines[2]] == words, (converged, instrument)
+        assert lines[1] == "joint fit of 7 parameters to 48 normalized differences,", (
+            converged,
+            instrument,
+        )
 
 
-@pytest.mark.parametrize(
-    ("entry", "words"),
-    [
+def test_a_parameter_for_all_wavelengths():
+    for entry, words in [
         (_entry(1.5, 0.25, u.deg), "     1.50000 +- 0.25000 deg"),
         (_entry(0.5, 0.025), "     0.50000 +- 0.02500"),
         (_entry(1.5, 12.0, u.deg), "     1.50000 +- 12 deg (badly determined)"),
@@ -115,12 +114,10 @@ def test_heading(converged, instrument, words):
         ),
         (_entry(1.5, np.nan, u.deg), "     1.50000 deg (open: not determined alone)"),
         (_entry(1.5, 0.25, u.deg, tied="b.c"), "     1.50000 deg (follows b.c)"),
-    ],
-)
-def test_a_parameter_for_all_wavelengths(entry, words):
-    head, line = _global_lines({"a.theta": entry})
-    assert head == "Parameters for all wavelengths"
-    assert line == f"  {'a.theta':<28}{words}"
+    ]:
+        head, line = _global_lines({"a.theta": entry})
+        assert head == "Parameters for all wavelengths"
+        assert line == f"  {'a.theta':<28}{words}"
 
 
 def test_fixed_ones_and_those_of_a_wavelength_are_not_among_them():
@@ -244,15 +241,18 @@ def _outlier(i):
     }
 
 
-@pytest.mark.parametrize(("count", "more"), [(1, None), (5, None), (6, 1), (9, 4)])
-def test_some_outliers_are_named_and_the_others_counted(count, more):
-    cal = _calibration(fit={"outliers": [_outlier(i) for i in range(count)]})
-    text = " ".join(" ".join(_goodness_lines(cal)).split())
-    assert text.startswith("Goodness of fit - frames 0, 1 of night are at odds with the fit")
-    assert text.count("robust sigma, brightness 0.25") == min(count, 5)
-    assert ("more pairs at odds with the fit" in text) == (more is not None)
-    if more:
-        assert f"- and {more} more pairs" in text
+def test_some_outliers_are_named_and_the_others_counted():
+    for count, more in [(1, None), (5, None), (6, 1), (9, 4)]:
+        cal = _calibration(fit={"outliers": [_outlier(i) for i in range(count)]})
+        text = " ".join(" ".join(_goodness_lines(cal)).split())
+        assert text.startswith("Goodness of fit - frames 0, 1 of night are at odds with the fit"), (
+            count,
+            more,
+        )
+        assert text.count("robust sigma, brightness 0.25") == min(count, 5), (count, more)
+        assert ("more pairs at odds with the fit" in text) == (more is not None), (count, more)
+        if more:
+            assert f"- and {more} more pairs" in text, (count, more)
 
 
 def test_nothing_tested_nothing_said():
@@ -352,9 +352,8 @@ def test_mirrors_at_all_of_a_few_wavelengths(n, shown, says, monkeypatch):
     assert title.endswith(f"one in {says} of {n} wavelengths" if says else "at 45 deg")
 
 
-@pytest.mark.parametrize(
-    ("percent", "std", "says"),
-    [
+def test_a_mirror_unlike_any_metal_is_pointed_at(monkeypatch):
+    for percent, std, says in [
         ([1.0, 1.0], [0.1, 0.1], None),
         # 3 times the 1.2 % of the worst metal is 3.6 %
         ([3.7, -4.9], [0.01, 0.5], "m3: 3.70 % at 600.0 nm is more than 3 times"),
@@ -362,23 +361,23 @@ def test_mirrors_at_all_of_a_few_wavelengths(n, shown, says, monkeypatch):
         # what is open says nothing, what is held has no error
         ([50.0, 1.0], [np.inf, 0.1], None),
         ([50.0, 1.0], [np.nan, 0.1], "m3: 50.00 % at 600.0 nm"),
-    ],
-)
-def test_a_mirror_unlike_any_metal_is_pointed_at(percent, std, says, monkeypatch):
-    from astropolcal.calibration.result import summary as _sky_summary
+    ]:
+        from astropolcal.calibration.result import summary as _sky_summary
 
-    columns = {"wavelength": [600, 800] * u.nm, "diattenuation": percent * u.percent}
-    columns |= {"diattenuation_err": std * u.percent}
-    metals = {f"diattenuation_{metal}": [0.5, -1.2] * u.percent for metal in _sky_summary.METALS}
-    metals["diattenuation_gold"] = [1.2, 0.3] * u.percent
-    table = QTable(columns | metals, meta={"name": "m3"})
-    monkeypatch.setattr(_sky_summary, "mirror_names", lambda calibration: ["m3"])
-    monkeypatch.setattr(_sky_summary, "mirror_values", lambda calibration, name: table)
-    lines = mirror_lines(_calibration(wavelength=[600, 800] * u.nm))
-    # the table, and a sentence that is broken like the rest of the summary
-    assert " ".join(lines[4:]).startswith(says or "")
-    assert bool(lines[4:]) is bool(says)
-    assert all(len(line) <= 80 for line in lines)
+        columns = {"wavelength": [600, 800] * u.nm, "diattenuation": percent * u.percent}
+        columns |= {"diattenuation_err": std * u.percent}
+        metals = {
+            f"diattenuation_{metal}": [0.5, -1.2] * u.percent for metal in _sky_summary.METALS
+        }
+        metals["diattenuation_gold"] = [1.2, 0.3] * u.percent
+        table = QTable(columns | metals, meta={"name": "m3"})
+        monkeypatch.setattr(_sky_summary, "mirror_names", lambda calibration: ["m3"])
+        monkeypatch.setattr(_sky_summary, "mirror_values", lambda calibration, name, t=table: t)
+        lines = mirror_lines(_calibration(wavelength=[600, 800] * u.nm))
+        # the table, and a sentence that is broken like the rest of the summary
+        assert " ".join(lines[4:]).startswith(says or "")
+        assert bool(lines[4:]) is bool(says)
+        assert all(len(line) <= 80 for line in lines)
 
 
 # --- stars ---------------------------------------------------------------------------------------
@@ -403,9 +402,8 @@ def test_a_star_beside_its_catalogue():
 # --- for machines ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("value", "expected"),
-    [
+def test_what_json_knows():
+    for value, expected in [
         (np.float64(1.5), 1.5),
         (np.int32(3), 3),
         (np.bool_(True), True),
@@ -416,9 +414,7 @@ def test_a_star_beside_its_catalogue():
         (2 * u.deg, {"value": 2.0, "unit": "deg"}),
         ([1, 2] * u.mm, {"value": [1.0, 2.0], "unit": "mm"}),
         ({"a": {"b": np.array([1])}}, {"a": {"b": [1]}}),
-    ],
-)
-def test_what_json_knows(value, expected):
-    found = _plain(value)
-    assert found == expected
-    assert json.loads(json.dumps(found, allow_nan=False)) == expected
+    ]:
+        found = _plain(value)
+        assert found == expected
+        assert json.loads(json.dumps(found, allow_nan=False)) == expected

@@ -114,6 +114,7 @@ def test_the_weighted_fit_is_a_minimum_of_the_weighted_residuals(fitted):
     assert np.abs(step / stds).max() < 0.01
 
 
+@pytest.mark.slow
 def test_levels_of_the_wavelengths_are_recovered(make, truth):
     """Ten runs of 28 degrees of freedom a wavelength: 4 % in the mean."""
     found = []
@@ -125,6 +126,7 @@ def test_levels_of_the_wavelengths_are_recovered(make, truth):
     np.testing.assert_allclose(cal.measurement.sigma, LEVELS[cal.measurement.bins], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_levels_are_unbiased(truth, data):
     """Restricted maximum likelihood, 150 draws; without leverages it were 0.92 and less."""
     live, rng = Measurement(truth, data), np.random.default_rng(5)
@@ -144,6 +146,7 @@ def test_levels_are_unbiased(truth, data):
     np.testing.assert_allclose(np.mean(squares, axis=0) / LEVELS**2, 1, atol=4 * error)
 
 
+@pytest.mark.slow
 def test_errors_are_right_where_wavelengths_are_unequally_noisy(make, truth):
     """40 runs of 11 parameters: the pulls have unit width, also where one level weighted all."""
     pulls = {None: [], "wavelength": []}
@@ -175,13 +178,13 @@ def test_datasets_have_levels_of_their_own(make, truth):
     assert len(np.unique(noise.sigma)) == 8
 
 
-@pytest.mark.parametrize("strategy", ["joint", "two-step"])
-def test_both_strategies_know_it(truth, data, strategy, fitted):
-    cal = fit(truth, data, "wavelength", strategy=strategy)
-    assert cal.converged
-    ratio = weighting_of(cal).sigma / weighting_of(fitted["wavelength"]).sigma
-    # the two-step fit is not the minimum
-    np.testing.assert_allclose(ratio, 1, atol={"joint": 1e-6, "two-step": 0.3}[strategy])
+def test_both_strategies_know_it(truth, data, fitted):
+    for strategy in ["joint", "two-step"]:
+        cal = fit(truth, data, "wavelength", strategy=strategy)
+        assert cal.converged, strategy
+        ratio = weighting_of(cal).sigma / weighting_of(fitted["wavelength"]).sigma
+        # the two-step fit is not the minimum
+        np.testing.assert_allclose(ratio, 1, atol={"joint": 1e-6, "two-step": 0.3}[strategy])
 
 
 # --- noise that is given ------------------------------------------------------------------
@@ -198,16 +201,18 @@ def test_noise_given_as_it_is_in_the_table_gives_the_same_fit(truth, data, fitte
         np.testing.assert_array_equal(cal.covariance.stds, fitted["errors"].covariance.stds)
 
 
-@pytest.mark.parametrize(
-    ("noise", "expected"),
-    [(0.3 * u.percent, [0.003] * 4), ([0.1, 0.2, 0.3, 0.4] * u.percent, [1e-3, 2e-3, 3e-3, 4e-3])],
-)
-def test_noise_given_by_wavelength(truth, data, noise, expected):
-    cal = fit(truth, data, noise)
-    np.testing.assert_allclose(weighting_of(cal).sigma, np.array(expected)[cal.measurement.bins])
-    (kept,) = cal.settings["noise"]
-    np.testing.assert_allclose(kept["sigma_percent"], 100 * np.array(expected))
-    np.testing.assert_allclose(kept["wavelength_nm"], LAM.to_value(u.nm))
+def test_noise_given_by_wavelength(truth, data):
+    for noise, expected in [
+        (0.3 * u.percent, [0.003] * 4),
+        ([0.1, 0.2, 0.3, 0.4] * u.percent, [1e-3, 2e-3, 3e-3, 4e-3]),
+    ]:
+        cal = fit(truth, data, noise)
+        np.testing.assert_allclose(
+            weighting_of(cal).sigma, np.array(expected)[cal.measurement.bins]
+        )
+        (kept,) = cal.settings["noise"]
+        np.testing.assert_allclose(kept["sigma_percent"], 100 * np.array(expected))
+        np.testing.assert_allclose(kept["wavelength_nm"], LAM.to_value(u.nm))
 
 
 def test_estimate_of_the_noise_may_be_given(truth, data):
@@ -219,20 +224,17 @@ def test_estimate_of_the_noise_may_be_given(truth, data):
     assert lack_of_fit(cal.measurement, cal, noise).p_value > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("weights", "error", "message"),
-    [
+def test_bad_weights_are_refused(truth, data):
+    for weights, error, message in [
         ("none", FitError, "'none'; allowed are None, 'wavelength', 'errors', or the noise"),
         ("given", FitError, "was not fitted with a noise given"),
         (0.0, ParameterError, "must be positive"),
         ([0.1, 0.2], ParameterError, r"shape \(2,\); allowed are one value, 4"),
         (3 * u.mm, ParameterError, "wrong unit"),
         (1 / 0.002, ParameterError, "noise of 5e[+]04 %: weights takes the noise"),
-    ],
-)
-def test_bad_weights_are_refused(truth, data, weights, error, message):
-    with pytest.raises(error, match=message):
-        fit(truth, data, weights)
+    ]:
+        with pytest.raises(error, match=message):
+            fit(truth, data, weights)
 
 
 def test_estimate_of_another_measurement_is_refused(make, truth, data):
@@ -317,47 +319,47 @@ def test_choice_is_written_and_read(fitted, tmp_path, choice):
         weighting_of(again)
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_same_data_give_the_same_noise_again(truth, data, fitted, choice):
+def test_same_data_give_the_same_noise_again(truth, data, fitted):
     """As after reading from a file, where the measurement is made anew."""
-    cal = fitted[choice]
-    anew = dataclasses.replace(cal, measurement=Measurement(cal.chains, data))
-    assert anew.measurement.weighting is None
-    again = weighting_of(anew)
-    np.testing.assert_allclose(again.sigma, weighting_of(cal).sigma, rtol=0.01)
-    assert again.choice == weighting_of(cal).choice
+    for choice in CHOICES:
+        cal = fitted[choice]
+        anew = dataclasses.replace(cal, measurement=Measurement(cal.chains, data))
+        assert anew.measurement.weighting is None
+        again = weighting_of(anew)
+        np.testing.assert_allclose(again.sigma, weighting_of(cal).sigma, rtol=0.01)
+        assert again.choice == weighting_of(cal).choice
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_sampler_assumes_the_noise_of_the_fit(fitted, choice):
-    cal = fitted[choice]
-    for options in ({}, {"weights": cal.settings["weights"]}):
-        sigma = LogPosterior(cal.measurement, **options).sigma
-        np.testing.assert_array_equal(sigma, weighting_of(cal).sigma)
+def test_sampler_assumes_the_noise_of_the_fit(fitted):
+    for choice in CHOICES:
+        cal = fitted[choice]
+        for options in ({}, {"weights": cal.settings["weights"]}):
+            sigma = LogPosterior(cal.measurement, **options).sigma
+            np.testing.assert_array_equal(sigma, weighting_of(cal).sigma)
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_posterior_peaks_at_the_fit_with_its_width(fitted, choice):
+def test_posterior_peaks_at_the_fit_with_its_width(fitted):
     """By finite differences of the log-posterior along every parameter."""
-    cal = fitted[choice]
-    posterior = LogPosterior(cal.measurement)
-    curvature = np.linalg.inv(cal.covariance.matrix)
-    for i, std in enumerate(cal.covariance.stds):
-        step = np.zeros(len(cal.covariance))
-        step[i] = 0.1 * std * posterior.factors[i]
-        up, here, down = (posterior(posterior.centre + s * step) for s in (1, 0, -1))
-        drop = 2 * here - up - down
-        assert drop == pytest.approx(curvature[i, i] * (0.1 * std) ** 2, rel=0.01)
-        assert abs(up - down) / 2 < 0.02 * np.sqrt(drop)
+    for choice in CHOICES:
+        cal = fitted[choice]
+        posterior = LogPosterior(cal.measurement)
+        curvature = np.linalg.inv(cal.covariance.matrix)
+        for i, std in enumerate(cal.covariance.stds):
+            step = np.zeros(len(cal.covariance))
+            step[i] = 0.1 * std * posterior.factors[i]
+            up, here, down = (posterior(posterior.centre + s * step) for s in (1, 0, -1))
+            drop = 2 * here - up - down
+            assert drop == pytest.approx(curvature[i, i] * (0.1 * std) ** 2, rel=0.01)
+            assert abs(up - down) / 2 < 0.02 * np.sqrt(drop)
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_refits_stay_at_the_fit(fitted, choice):
-    cal = fitted[choice]
-    vector, _, arrived = Refit(cal).fit(cal.measurement.vector())
-    assert arrived
-    moved = (vector - cal.measurement.vector()) / cal.measurement.free.factors()
-    assert np.abs(moved / cal.covariance.stds).max() < 0.01
+def test_refits_stay_at_the_fit(fitted):
+    for choice in CHOICES:
+        cal = fitted[choice]
+        vector, _, arrived = Refit(cal).fit(cal.measurement.vector())
+        assert arrived
+        moved = (vector - cal.measurement.vector()) / cal.measurement.free.factors()
+        assert np.abs(moved / cal.covariance.stds).max() < 0.01
 
 
 def test_profile_and_bootstrap_know_the_weights(fitted):
@@ -455,16 +457,17 @@ def walk(cal, n=16_000, share=0.3):
     return np.array(samples[n // 10 :]) @ half.T / stds
 
 
-@pytest.mark.parametrize("weights", [None, "wavelength"])
-def test_posterior_of_dataset_3_agrees_with_its_fit(dataset_3, weights):
+@pytest.mark.slow
+def test_posterior_of_dataset_3_agrees_with_its_fit(dataset_3):
     """Medians within 0.3 sigma and widths within 20 %; measured: 0.1 sigma and 7 %."""
-    cal = dataset_3[weights]
-    assert np.isfinite(cal.covariance.stds).sum() == 92
-    samples, names = walk(cal), cal.covariance.names
-    common = ["hwp.w_sio2", "hwp.w_mgf2", "hwp.theta", "derotator.theta"]
-    rows = [names.index(name) for name in [*common, "calibration_polarizer.theta"]]
-    assert np.abs(np.median(samples, axis=0)[rows]).max() < 0.3
-    np.testing.assert_allclose(samples.std(axis=0)[rows], 1, atol=0.2)
+    for weights in [None, "wavelength"]:
+        cal = dataset_3[weights]
+        assert np.isfinite(cal.covariance.stds).sum() == 92, weights
+        samples, names = walk(cal), cal.covariance.names
+        common = ["hwp.w_sio2", "hwp.w_mgf2", "hwp.theta", "derotator.theta"]
+        rows = [names.index(name) for name in [*common, "calibration_polarizer.theta"]]
+        assert np.abs(np.median(samples, axis=0)[rows]).max() < 0.3, weights
+        np.testing.assert_allclose(samples.std(axis=0)[rows], 1, atol=0.2)
 
 
 def test_wavelengths_of_dataset_3_are_unequally_noisy(dataset_3):

@@ -9,7 +9,8 @@ import scipy.stats
 from astropolcal import optics
 from astropolcal.converters.nodes import node_from_priors, restore_priors, without_priors
 from astropolcal.exceptions import CalibrationFileError
-from astropolcal.measurement import Normal, Uniform
+from astropolcal.measurement import Normal
+from astropolcal.measurement.priors import Uniform
 
 
 def chain(**priors):
@@ -27,37 +28,31 @@ def again(original):
     return bare
 
 
-@pytest.mark.parametrize(
-    "prior",
-    [
+def test_our_own_come_back_in_their_units():
+    for prior in [
         Normal(0 * u.deg, 6 * u.arcmin),
         Uniform(-1 * u.rad, 1 * u.rad),
         Normal(0.5, 0.25),
         Uniform(-1, 1),
-    ],
-)
-def test_our_own_come_back_in_their_units(prior):
-    found = again(chain(hwp__theta=prior))["hwp"].theta.prior
-    assert type(found) is type(prior)
-    for key in ("mean", "std") if isinstance(prior, Normal) else ("low", "high"):
-        expected = getattr(prior, key)
-        assert getattr(found, key) == expected
-        assert getattr(getattr(found, key), "unit", None) == getattr(expected, "unit", None)
+    ]:
+        found = again(chain(hwp__theta=prior))["hwp"].theta.prior
+        assert type(found) is type(prior)
+        for key in ("mean", "std") if isinstance(prior, Normal) else ("low", "high"):
+            expected = getattr(prior, key)
+            assert getattr(found, key) == expected
+            assert getattr(getattr(found, key), "unit", None) == getattr(expected, "unit", None)
 
 
-@pytest.mark.parametrize(
-    "prior",
-    [
+def test_those_of_scipy_have_the_same_density():
+    for prior in [
         scipy.stats.truncnorm(-5, 0, loc=1, scale=0.03),
         scipy.stats.beta(2, 3),
         scipy.stats.norm(loc=0.98, scale=0.01),
         scipy.stats.uniform(0.9, 0.1),
-    ],
-)
-def test_those_of_scipy_have_the_same_density(prior):
-    found = again(chain(wollaston__efficiency=prior))["wollaston"].efficiency.prior
-    x = np.linspace(0.9, 1.0, 11)
-    np.testing.assert_array_equal(found.logpdf(x), prior.logpdf(x))
+    ]:
+        found = again(chain(wollaston__efficiency=prior))["wollaston"].efficiency.prior
+        x = np.linspace(0.9, 1.0, 11)
+        np.testing.assert_array_equal(found.logpdf(x), prior.logpdf(x))
 
 
 def test_parameters_without_a_prior_are_not_listed():
@@ -88,23 +83,21 @@ class Homemade:
         return 0.0
 
 
-@pytest.mark.parametrize(
-    "prior", [Homemade(), scipy.stats.poisson(3), scipy.stats.gaussian_kde([0.1, 0.2, 0.4])]
-)
-def test_what_files_cannot_hold(prior):
-    with pytest.raises(
-        CalibrationFileError,
-        match=rf"prior of hwp.theta is a {type(prior).__name__}, which files cannot hold; allowed",
-    ):
-        node_from_priors([chain(hwp__theta=prior)])
+def test_what_files_cannot_hold():
+    for prior in [Homemade(), scipy.stats.poisson(3), scipy.stats.gaussian_kde([0.1, 0.2, 0.4])]:
+        with pytest.raises(
+            CalibrationFileError,
+            match=rf"prior of hwp.theta is a {type(prior).__name__}, which files cannot hold",
+        ):
+            node_from_priors([chain(hwp__theta=prior)])
 
 
 NODE = {"parameter": "hwp.theta", "kind": "scipy", "distribution": "norm", "args": [], "kwds": {}}
 
 
-@pytest.mark.parametrize(
-    ("nodes", "words"),
-    [
+def test_nodes_that_are_refused():
+    """Nothing but a distribution of scipy can be named, so nothing else is ever called."""
+    for nodes, words in [
         ([NODE, NODE], "prior of 'hwp.theta' is given twice"),
         ([NODE | {"parameter": "m3.theta"}], "prior of 'm3.theta', which no chain has"),
         ([NODE | {"distribution": "poisson"}], "no continuous distribution 'poisson'"),
@@ -119,9 +112,6 @@ NODE = {"parameter": "hwp.theta", "kind": "scipy", "distribution": "norm", "args
         ([NODE | {"args": [0, -1]}], r"norm of \[0, -1\] and {} is no distribution"),
         ([NODE | {"args": [0, float("nan")]}], "is no distribution"),
         ([NODE | {"args": [[0, 1], 1]}], "prior of hwp.theta: "),
-    ],
-)
-def test_nodes_that_are_refused(nodes, words):
-    """Nothing but a distribution of scipy can be named, so nothing else is ever called."""
-    with pytest.raises(CalibrationFileError, match=words):
-        restore_priors([chain()], nodes)
+    ]:
+        with pytest.raises(CalibrationFileError, match=words):
+            restore_priors([chain()], nodes)

@@ -33,6 +33,7 @@ def light(rows, stokes, clouds):
     return np.einsum("bwfs,sw,wf->bfw", rows, stokes, np.broadcast_to(clouds, rows.shape[1:3]))
 
 
+@pytest.mark.slow
 @given(
     q=st.floats(-0.4, 0.4),
     v=st.floats(-0.4, 0.4),

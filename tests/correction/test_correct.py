@@ -89,6 +89,7 @@ def test_what_some_frames_do_not_show_is_found_from_the_others(sky, charis, trac
     np.testing.assert_allclose(found.stokes, stokes, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_any_turn_of_the_field(sky, charis, track, scene, seen):
     hwp, positions = track(2)
     stokes = scene(22, size=31)
@@ -140,6 +141,7 @@ def test_pulls_of_noise(disk_frames, sky, charis):
     assert np.median(errors["q"]) <= np.median(correct(sky, frames).fractional_errors()["q"]) * 1.01
 
 
+@pytest.mark.slow
 def test_pulls_of_the_calibration(calibration, star, charis, seen, track):
     """Systematic errors alone, noise off: each true instrument differs from the calibrated."""
     from astropolcal.correction.rows import RowModel
@@ -164,6 +166,7 @@ def test_pulls_of_the_calibration(calibration, star, charis, seen, track):
         assert abs(np.std(values) - 1) < 0.1
 
 
+@pytest.mark.slow
 def test_errors_stay_apart(calibration, star, charis, track):
     hwp, positions = track()
     variance = np.full(star.right.shape, 100.0)
@@ -223,6 +226,7 @@ def test_bad_pixels_count_in_the_other_frames(disk_frames, sky, charis):
     assert np.isfinite(correct(sky, frames, observable="intensity").q[6, 3, 4])
 
 
+@pytest.mark.slow
 def test_dask_changes_no_number(disk_frames, sky, charis):
     da = pytest.importorskip("dask.array", reason="dask is not installed")
     _, right, left, positions, _ = disk_frames
@@ -409,6 +413,7 @@ def test_v_and_its_fraction(sky, charis, track, seen):
     assert list(found.stokes_axis.symbol) == ["I", "Q", "U", "V"]
 
 
+@pytest.mark.slow
 def test_too_few_angles(star, sky, charis):
     keep = [0, 1]
     positions = {k: v[keep] for k, v in star.positions.items()}
@@ -494,6 +499,7 @@ def test_frames_that_do_not_fit(star, charis, calibration):
 # ---- laws and other implementations -----------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(turn=st.floats(-90, 90))
 def test_turning_the_sky_turns_q_and_u(star, sky, charis, turn):
     positions = star.positions | {"parallactic": star.positions["parallactic"] + turn * u.deg}

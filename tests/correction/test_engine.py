@@ -25,6 +25,7 @@ def test_a_cluster_changes_no_number(star, sky, charis):
     np.testing.assert_array_equal(found.stokes, correct(sky, frames).stokes)
 
 
+@pytest.mark.slow
 def test_workers_that_are_processes(cubes_of_stars):
     """Files are opened by each worker; nothing but their names and the solution is sent."""
     distributed = pytest.importorskip("distributed", reason="distributed is not installed")
@@ -87,6 +88,7 @@ def test_an_error_in_a_block_comes_out():
             run_blocks(fail, (1, 4), workers=workers)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_frames(sky, charis, track, tmp_path):
     pytest.importorskip("dask", reason="dask is not installed")
     peaks = []

@@ -87,6 +87,7 @@ def test_pixels_without_value_stay_without():
     np.testing.assert_allclose(bad.mean(axis=0) - MIDDLE, [c * y + s * x, c * x - s * y], atol=0.6)
 
 
+@pytest.mark.slow
 def test_variances_are_those_of_turned_noise():
     for angle in [0.0, 17.0, 45.0]:
         for order in [1, 3]:

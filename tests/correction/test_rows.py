@@ -167,6 +167,7 @@ def test_chain_of_the_optics_in_the_beam(two_beams):
         sky_chain(two_beams, beam={"dichroic": True, "nbs": False})
 
 
+@pytest.mark.slow
 def test_optics_of_one_dataset_are_no_part_of_the_chain(charis):
     """Gains of the beams that a fit has beside the instrument do not come on sky."""
     frames = half_wave_plate_cycles(derotator=[50, 65, 80] * u.deg)

@@ -36,6 +36,7 @@ def test_stokes_come_back(sky, charis, star):
         assert not solution.flags(), observable
 
 
+@pytest.mark.slow
 @given(weights=st.lists(st.floats(0.1, 10), min_size=16, max_size=16))
 def test_no_weights_change_what_is_exact(sky, charis, star, weights):
     rows = measurement_rows(sky, star.positions, charis.wavelength)
@@ -168,6 +169,7 @@ def test_pairs_that_name_no_frame():
         Channels("double", 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observable", CHANNELS)
 @given(seed=st.integers(0, 1000))
 def test_gains_of_beams_are_those_of_channels(observable, seed):

@@ -30,6 +30,7 @@ def linear(model, solution):
     return linear_systematic(model, solution)
 
 
+@pytest.mark.slow
 def test_linear_agrees_with_sampled(model, solution, linear):
     sampled = sampled_systematic(model, solution, n_samples=400, seed=3)
     for w in (0, 8, 21):
@@ -52,6 +53,7 @@ def test_derivatives_of_the_solution_are_exact(model, solution, linear):
         np.testing.assert_allclose(predicted, numeric, atol=1e-6 * np.abs(predicted).max() + 1e-12)
 
 
+@pytest.mark.slow
 def test_wrong_calibrations_scatter_as_predicted(model, solution, linear):
     """Frames of a true instrument, corrected with the calibrated one."""
     from astropolcal.correction.systematic import _draws

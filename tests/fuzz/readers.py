@@ -765,9 +765,9 @@ class Product(Reader):
         return binary.mutate_fits(rng, content)
 
     def read(self, path):
-        from astropolcal.correction.product import read_product
+        from astropolcal.correction import Corrected
 
-        return read_product(path)
+        return Corrected.read(path)
 
     def check(self, found, path):
         with warnings.catch_warnings(), np.errstate(all="ignore"):

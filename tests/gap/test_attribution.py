@@ -152,6 +152,7 @@ def test_a_law_is_freed_where_the_data_ask_for_it():
         assert 0 <= quiet.freer(one).evidence - one.evidence < 3
 
 
+@pytest.mark.slow
 def test_of_noise_statistics_are_chi_square_with_their_rank(found):
     values, ranks = [], []
     for seed in range(6):

@@ -50,6 +50,7 @@ def differences(model, cell):
         yield (ends[1] - ends[0]) / (2 * EPS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["charis", "cassegrain", "irdis lamp", "vampires"])
 def test_derivative_of_every_cell_is_that_of_the_chain_with_its_optic(name):
     model = model_of(name)

@@ -43,6 +43,7 @@ def bench(seed=1, **more):
 # ---- what is made -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_seed_makes_the_same_challenge_again():
     one, two, three = (make_challenge(seed, setup=SMALL, fault=DRIFT) for seed in (3, 3, 4))
     assert one[2] == two[2]

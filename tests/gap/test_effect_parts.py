@@ -117,6 +117,7 @@ def test_laws_limits_and_priors_of_an_edit():
     assert edit.priors == pytest.approx({"a.b": np.pi / 18, "a.c": 0.25})
 
 
+@pytest.mark.slow
 @given(st.text(min_size=1, max_size=12))
 def test_label_is_a_name_that_an_optic_may_have(name):
     label = label_of(name)

@@ -385,6 +385,7 @@ def test_places_and_sizes_of_every_effect():
             assert not effect.applies(edit.chains), name
 
 
+@pytest.mark.slow
 def test_no_effect_is_possible_beyond_the_bounds_of_its_optic():
     """Half way to the nearer of bound and limit it is, on each side that has room."""
     for name in SMOOTH:
@@ -488,6 +489,7 @@ def test_every_effect_is_the_cells_that_it_says():
 TAKEN_UP = {"wollaston_orientation", "derotator_retardance_bound"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(SHOWN) - TAKEN_UP))
 def test_recovery(name):
     """Each effect comes first among one of each kind of fingerprint, at its true size."""
@@ -533,6 +535,7 @@ PAIRS = [
 ]
 
 
+@pytest.mark.slow
 def test_pairs():
     """Two effects in one chain, whichever is added first."""
     for pair in PAIRS:
@@ -552,6 +555,7 @@ def test_pairs():
 # ---- improved chains are ordinary chains ---------------------------------------------------
 
 
+@pytest.mark.slow
 def test_improved_chains_serialize(tmp_path):
     written = {}
     for name in CASES:
@@ -579,6 +583,7 @@ def test_improved_chains_serialize(tmp_path):
                     assert (own.fixed, tuple(own.bounds)) == (read.fixed, tuple(read.bounds))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::astropolcal.exceptions.AstropolcalWarning")
 @pytest.mark.parametrize("name", ["static_retarder", "derotator_encoder", "hwp_tilt"])
 def test_improved_chains_calibrate(name, tmp_path):

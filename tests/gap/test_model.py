@@ -5,8 +5,9 @@ import gap_data as data
 import numpy as np
 import pytest
 
+from astropolcal.gap.challenge import make_challenge
 from astropolcal.gap.effects import Context, get_effect
-from astropolcal.gap.model import Model
+from astropolcal.gap.model import Model, nominal_model
 from astropolcal.gap.problem import Fit
 
 DIATTENUATOR = "static_diattenuator"
@@ -94,3 +95,16 @@ def test_an_effect_without_a_place_is_left_out():
     model = data.clean_model()
     assert not get_effect("m3_diattenuation").applies(model.chains)
     assert model.with_effects([(get_effect("m3_diattenuation"), None)]) is model
+
+
+def test_a_mounting_that_is_known_is_a_datum():
+    """A mirror that is 9 deg off costs what its prior says, and is named."""
+    fault = {"type": "listed", "effect": "mirror_misalignment"}
+    observations, chains, _ = make_challenge([5, 1], kind="listed", snr=40.0, fault=fault)
+    nominal = nominal_model(chains, observations)
+    assert nominal.problem.known
+    assert nominal.p_value < 1e-6
+    free = nominal.with_effects([(get_effect("mirror_misalignment"), None)])
+    assert free.p_value > 1e-3
+    (angle,), *_ = free.sizes("mirror_misalignment")["fold_mirror.theta"]
+    assert abs(angle) > 3

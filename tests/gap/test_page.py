@@ -132,6 +132,7 @@ def test_a_page_that_asks_for_the_network_would_be_noticed(browser, page, tmp_pa
 # ---- without one ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nothing_is_loaded_and_nothing_runs(text):
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text).group(1)
     rules = {rule.strip() for rule in policy.split(";")}
@@ -139,6 +140,7 @@ def test_nothing_is_loaded_and_nothing_runs(text):
     assert not re.search(r"<script|<link|<iframe|\son\w+=|@import|url\(|https?://", text)
 
 
+@pytest.mark.slow
 def test_images_can_be_decoded_and_have_their_size(text):
     outline = Outline(text)
     for image in outline.images:
@@ -152,6 +154,7 @@ def test_images_can_be_decoded_and_have_their_size(text):
         assert stated == pytest.approx(width / height, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_screen_reader_finds_its_way(text):
     outline = Outline(text)
     assert ("html", {"lang": "en"}) in outline.tags
@@ -177,6 +180,7 @@ def contrast(one, two):
     return (high + 0.05) / (low + 0.05)
 
 
+@pytest.mark.slow
 def test_text_has_contrast_in_light_and_in_dark(text):
     """WCAG 2 asks for 4.5 for text; 7 is its stricter level."""
     schemes = re.findall(r":root \{([^}]*--page[^}]*)\}", text)[:2]

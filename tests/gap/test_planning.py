@@ -131,6 +131,7 @@ def elliptical(angles):
     return fitted(observed(true, table=table), [true])
 
 
+@pytest.mark.slow
 def test_open_directions_are_fixed_by_another_derotator_angle():
     (found,) = plan(open_only(elliptical([60])))
     assert found["question"] == "parameters"

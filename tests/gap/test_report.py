@@ -92,6 +92,7 @@ def with_cell(diagnosis, cell, **values):
 # ---- numbers --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_contract(content, nothing, unknown):
     for one in (content, to_dict(nothing), to_dict(unknown)):
         assert set(one) >= CONTRACT
@@ -104,6 +105,7 @@ def test_contract(content, nothing, unknown):
     assert to_dict(unknown)["verdict"] == "unexplained"
 
 
+@pytest.mark.slow
 def test_gap_is_that_of_left_out_frames(found, content):
     assert content["cross_validated"]
     for when in ("before", "after"):
@@ -123,6 +125,7 @@ def test_gap_is_that_of_left_out_frames(found, content):
     )
 
 
+@pytest.mark.slow
 def test_unequal_gains_cancel_in_double_differences(content):
     (cause,) = content["causes"]
     assert cause["double_difference_share"] < 0.01
@@ -134,12 +137,14 @@ def test_unequal_gains_cancel_in_double_differences(content):
     assert content["gap_before_percent"] > 5 * content["gap_after_percent"]
 
 
+@pytest.mark.slow
 def test_what_turns_with_the_derotator_is_left_in_double_differences(nothing):
     model = nothing.nominal.with_effect(CellEffect(Cell("in:derotator", "rotation", "time"), 0))
     share = Fitted(model).double_share("in:derotator/rotation/time")
     assert 0.5 < share <= 1
 
 
+@pytest.mark.slow
 def test_double_differences_are_those_of_calibrate(found, content):
     model = found.nominal
     calibration = calibrate(model.chains, model.observations)
@@ -154,6 +159,7 @@ def test_double_differences_are_those_of_calibrate(found, content):
     assert Fitted(unpaired).doubles is None
 
 
+@pytest.mark.slow
 def test_sizes_are_those_of_the_simulation(content):
     (cause,) = content["causes"]
     (entry,) = cause["size"].values()
@@ -172,6 +178,7 @@ def test_angles_of_cells_are_in_degrees(found):
     assert entry["value"][0] == pytest.approx(np.rad2deg(basis @ radian[0])[0])
 
 
+@pytest.mark.slow
 def test_the_sky_is_that_of_calibrate(content, nothing):
     for when in ("before", "after"):
         targets = content[f"accuracy_{when}"]["targets"]
@@ -218,6 +225,7 @@ def test_an_alternative_has_no_size_and_the_nominal_model_no_prediction(found):
     assert entry["left_out_after_percent"] == found.held_out[0].percent
 
 
+@pytest.mark.slow
 def test_table(found, nothing):
     other = Candidate(get_effect("background"), None, 30.0, 2, 10.0)
     grouped = replace(found, causes=[replace(found.causes[0], aliases=[(other, 0.3)])])
@@ -229,6 +237,7 @@ def test_table(found, nothing):
     assert causes_table(nothing).colnames == table.colnames
 
 
+@pytest.mark.slow
 def test_the_first_lines_are_the_summary(found, content):
     lines = summary(found, content, ["gap.html"]).splitlines()
     assert max(map(len, lines)) <= 80
@@ -273,6 +282,7 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.words).replace("\u2011", "-").split())
 
 
+@pytest.mark.slow
 def test_page_is_self_contained_and_complete(found, content, tmp_path):
     figure = Figure(figsize=(3, 2))
     figure.subplots().plot([1, 2])
@@ -293,6 +303,7 @@ def test_page_is_self_contained_and_complete(found, content, tmp_path):
     assert {f"{nm:.1f}" for nm in WAVELENGTH.to_value(u.nm)} <= set(page.words)
 
 
+@pytest.mark.slow
 def test_page_of_every_verdict(found, nothing, unknown, tmp_path):
     located = with_cell(found, Cell("in:derotator", "rotation", "time"), probability=0.95)
     for diagnosis, words in (
@@ -307,6 +318,7 @@ def test_page_of_every_verdict(found, nothing, unknown, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["gap.html"]
 
 
+@pytest.mark.slow
 def test_page_that_cannot_be_written(found, content, tmp_path):
     with pytest.raises(GapError, match="cannot be written"):
         write_html(found, tmp_path / "nowhere" / "gap.html", content=content)

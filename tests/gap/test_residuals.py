@@ -47,10 +47,12 @@ def first(where, kind="pattern"):
 # ---- noise ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_noise_is_silent():
     assert sum(bool(locate(clean_model(seed))) for seed in range(8)) <= 1
 
 
+@pytest.mark.slow
 def test_p_values_of_patterns_are_uniform_on_noise(noise):
     p = np.array([one["p_single"] for where in noise for one in where if one["kind"] == "pattern"])
     # the p-values of one dataset depend on each other, those of two do not: no test over all
@@ -64,6 +66,7 @@ def test_p_values_of_patterns_are_uniform_on_noise(noise):
     assert stats.kstest(one, "uniform").pvalue > 0.01
 
 
+@pytest.mark.slow
 def test_p_values_of_places_are_uniform_on_noise(noise):
     for axis in ("wavelength", "derotator", "beam"):
         wanted = (axis, "place")
@@ -71,6 +74,7 @@ def test_p_values_of_places_are_uniform_on_noise(noise):
         assert stats.kstest([x["p_single"] for x in found], "uniform").pvalue > 0.005, axis
 
 
+@pytest.mark.slow
 def test_corrected_values_are_never_below_single_ones(noise):
     for one in noise[0]:
         assert one["p_value"] >= one["p_single"]

@@ -17,7 +17,8 @@ from astropolcal.gap.effects import Context
 from astropolcal.gap.effects.effect import CellEffect, label_of
 from astropolcal.gap.report import summary, to_dict
 from astropolcal.gap.runs import changes, distinct, paragraph
-from astropolcal.optics import Dependence, LinearRetarder, Perturbation
+from astropolcal.optics import LinearRetarder, Perturbation
+from astropolcal.optics.perturbations import Dependence
 from astropolcal.scripts.main import main
 
 JULY, OCTOBER = "July: 15", "October 5"

@@ -41,6 +41,7 @@ PLANTED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "cell", "sizes"), PLANTED)
 def test_a_planted_cell_is_found_first_and_alone(name, cell, sizes):
     setup = SETUPS[name]()
@@ -55,6 +56,7 @@ def test_a_planted_cell_is_found_first_and_alone(name, cell, sizes):
     assert sum(shares) == pytest.approx(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "size"), [("nonlinearity", 0.003), ("background_of_one_beam", 0.003)]
 )
@@ -65,6 +67,7 @@ def test_an_error_of_the_detector_is_found(kind, size):
     assert found.groups[0].probability > 0.9
 
 
+@pytest.mark.slow
 def test_two_planted_causes_are_both_found_and_left_out_frames_agree():
     setup = SETUPS["charis"]()
     first = Cell("in:derotator", "retardance_h", "time")
@@ -83,6 +86,7 @@ def test_two_planted_causes_are_both_found_and_left_out_frames_agree():
     assert list(found.model.added) == [group.best.name for group in found.groups]
 
 
+@pytest.mark.slow
 def test_a_name_is_given_where_it_does_as_well_as_its_cell():
     setup = SETUPS["charis"]()
     observations = setup.observed(setup.with_effect("beam_gain", imbalance=0.005))
@@ -97,6 +101,7 @@ def test_a_name_is_given_where_it_does_as_well_as_its_cell():
     assert all(candidate.is_named for candidate, _ in alone.members)
 
 
+@pytest.mark.slow
 def test_a_law_of_any_form_is_one_cause():
     """A gain at one wavelength alone."""
     true = data.with_effect("beam_gain")

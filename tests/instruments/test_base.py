@@ -12,9 +12,9 @@ from astropolcal import instruments, optics
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import ChainError, InstrumentError
 from astropolcal.instruments import Instrument, SkyLaw, add_nuisance
-from astropolcal.instruments._choices import check_choice
-from astropolcal.instruments._subaru_optics import fold_mirror, misaligned, polarizer
+from astropolcal.instruments.base import check_choice
 from astropolcal.instruments.layout import FileLayout
+from astropolcal.instruments.telescope import fold_mirror, misaligned, polarizer
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 GRID = [0.6, 0.7, 0.8] * u.um
@@ -79,9 +79,8 @@ def night(**meta):
 # --- choices --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("arguments", "options", "words"),
-    [
+def test_choice_that_is_not_known():
+    for arguments, options, words in [
         (("moon",), {}, r"^bench: source = 'moon'; allowed are polarized, star$"),
         (("star", ["lens"]), {}, r"^bench: optics_in = 'lens'; allowed are window$"),
         (("star", ["window", "lens"]), {}, "optics_in = 'lens'"),
@@ -91,11 +90,9 @@ def night(**meta):
             r"m3 = 'glass'; allowed are free, metal$",
         ),
         (("star",), {"order": (3, (1, 2))}, r"bench: order = 3; allowed are 1, 2$"),
-    ],
-)
-def test_choice_that_is_not_known(arguments, options, words):
-    with pytest.raises(InstrumentError, match=words):
-        BENCH.check_choices(*arguments, **options)
+    ]:
+        with pytest.raises(InstrumentError, match=words):
+            BENCH.check_choices(*arguments, **options)
 
 
 def test_choices_that_are_known_pass():
@@ -116,16 +113,16 @@ def test_grid_is_the_usual_one_or_that_asked_for():
     assert BENCH.grid(0.65 * u.um).shape == (1,)
 
 
-@pytest.mark.parametrize("name", instruments.names())
-def test_chain_of_one_wavelength_is_that_of_a_grid_of_one(name):
+def test_chain_of_one_wavelength_is_that_of_a_grid_of_one():
     """A scalar wavelength is one wavelength, not a chain of parameters without an axis."""
-    instrument = instruments.get(name)
-    lam = instrument.wavelength[0]
-    scalar, grid = (instrument.chain(wavelength=w) for w in (lam, lam[None]))
-    for a, b in zip(leaves(scalar), leaves(grid), strict=True):
-        for key in a.param_names:
-            assert getattr(a, key).shape == getattr(b, key).shape in [(), (1,)]
-            np.testing.assert_array_equal(getattr(a, key).value, getattr(b, key).value)
+    for name in instruments.names():
+        instrument = instruments.get(name)
+        lam = instrument.wavelength[0]
+        scalar, grid = (instrument.chain(wavelength=w) for w in (lam, lam[None]))
+        for a, b in zip(leaves(scalar), leaves(grid), strict=True):
+            for key in a.param_names:
+                assert getattr(a, key).shape == getattr(b, key).shape in [(), (1,)], name
+                np.testing.assert_array_equal(getattr(a, key).value, getattr(b, key).value)
 
 
 # --- sources of tables --------------------------------------------------------------------
@@ -146,30 +143,27 @@ def test_spellings_of_a_source_know_no_case():
         BENCH.source_of(night(source="polarized"), spellings)
 
 
-@pytest.mark.parametrize(
-    ("name", "optic", "meta"),
-    [
+def test_meta_of_what_is_taken_out_say_so_to_setup():
+    """What ``meta_without`` writes is what ``setup`` reads."""
+    for name, optic, meta in [
         ("charis", "nbs", {"nasmyth_beam_switcher": "not installed"}),
         ("charis", "dichroic", {"yjh50_dichroic": "out"}),
         ("vampires", "flc", {"flc": "out", "pairing": "hwp"}),
-    ],
-)
-def test_meta_of_what_is_taken_out_say_so_to_setup(name, optic, meta):
-    """What ``meta_without`` writes is what ``setup`` reads."""
-    instrument = instruments.get(name)
-    assert instrument.meta_without([optic]) == meta
-    assert instrument.meta_without(["hwp"]) == {}
-    table = night(**(instrument.published_meta() | {"date": "2025-11-01"}))
-    assert optic in instrument.setup(table)[1]
-    table.meta.update(instrument.meta_without([optic]))
-    assert optic not in instrument.setup(table)[1]
+    ]:
+        instrument = instruments.get(name)
+        assert instrument.meta_without([optic]) == meta, (name, optic, meta)
+        assert instrument.meta_without(["hwp"]) == {}, (name, optic, meta)
+        table = night(**(instrument.published_meta() | {"date": "2025-11-01"}))
+        assert optic in instrument.setup(table)[1], (name, optic, meta)
+        table.meta.update(instrument.meta_without([optic]))
+        assert optic not in instrument.setup(table)[1], (name, optic, meta)
 
 
-@pytest.mark.parametrize("name", instruments.names())
-def test_every_optional_optic_can_be_told_out(name):
-    instrument = instruments.get(name)
-    for optic in instrument.optional_optics:
-        assert instrument.meta_without([optic]), optic
+def test_every_optional_optic_can_be_told_out():
+    for name in instruments.names():
+        instrument = instruments.get(name)
+        for optic in instrument.optional_optics:
+            assert instrument.meta_without([optic]), optic
 
 
 # --- particulars ------------------------------------------------------------------------------
@@ -185,12 +179,13 @@ def test_particulars_are_what_the_chain_takes():
     }
 
 
-@pytest.mark.parametrize(
-    "meta", [{"source": "polarized", "object": "lamp"}, {"source": "star"},
-             {"source": "star", "object": " -+ "}],
-)  # fmt: skip
-def test_what_has_no_name_has_no_particulars(meta):
-    assert BENCH.particulars(night(**meta)) == {}
+def test_what_has_no_name_has_no_particulars():
+    for meta in [
+        {"source": "polarized", "object": "lamp"},
+        {"source": "star"},
+        {"source": "star", "object": " -+ "},
+    ]:
+        assert BENCH.particulars(night(**meta)) == {}, meta
 
 
 def test_particulars_make_the_chain_of_each_dataset():
@@ -214,9 +209,9 @@ def test_names_and_aliases_in_any_case(name):
     assert BENCH.answers_to(name)
 
 
-@pytest.mark.parametrize("name", ["", "ben", "bench ", "lab"])
-def test_other_names(name):
-    assert not BENCH.answers_to(name)
+def test_other_names():
+    for name in ["", "ben", "bench ", "lab"]:
+        assert not BENCH.answers_to(name), name
 
 
 def test_repr_has_class_and_name():
@@ -300,19 +295,19 @@ def test_telescope_is_known_by_either_method():
     assert Whole().has_telescope
 
 
-@pytest.mark.parametrize("name", instruments.names())
 @pytest.mark.filterwarnings("ignore:irdis. neither date nor coating")
-def test_optics_behind_the_plate_are_those_of_the_lamp(name):
+def test_optics_behind_the_plate_are_those_of_the_lamp():
     """The same objects are modelled, whichever light comes: names, stages and values."""
-    instrument = instruments.get(name)
-    inner = instrument.published()
-    sky = instrument.on_sky(inner)
-    behind = leaves(inner)[1:]
-    assert set(stages(sky)) >= {"parallactic", "hwp", "derotator"}
-    for old, new in zip(behind, leaves(sky)[-len(behind) :], strict=True):
-        assert (old.name, old.mount) == (new.name, new.mount)
-        for key in old.param_names:
-            np.testing.assert_array_equal(getattr(old, key).value, getattr(new, key).value)
+    for name in instruments.names():
+        instrument = instruments.get(name)
+        inner = instrument.published()
+        sky = instrument.on_sky(inner)
+        behind = leaves(inner)[1:]
+        assert set(stages(sky)) >= {"parallactic", "hwp", "derotator"}, name
+        for old, new in zip(behind, leaves(sky)[-len(behind) :], strict=True):
+            assert (old.name, old.mount) == (new.name, new.mount), name
+            for key in old.param_names:
+                np.testing.assert_array_equal(getattr(old, key).value, getattr(new, key).value)
 
 
 # --- what the instruments of one telescope share ------------------------------------------------

@@ -7,8 +7,10 @@ import pytest
 
 from astropolcal import optics
 from astropolcal.exceptions import ObservationError, ParameterError
-from astropolcal.measurement import FreeParameters, Measurement, Normal, Tie, Uniform, bind_prior
+from astropolcal.measurement import Measurement, Normal, Tie
 from astropolcal.measurement.datasets import as_pairs
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.measurement.priors import Uniform, bind_prior
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -43,17 +45,17 @@ def _by_hand(observations):
     return found
 
 
-@pytest.mark.parametrize("cells", [(), ((0, 0), (3, 2)), ((5, 1), (6, 1), (7, 1))])
-def test_data_and_errors_are_those_of_the_pairs(chain, observations, cells):
-    table = _masked(observations, *cells)
-    measurement = Measurement(chain, table)
-    (part,) = measurement.datasets
-    expected = _by_hand(table)
-    assert measurement.n_data == part.n_data == len(expected)
-    for i, key in enumerate(zip(part.group_of_datum, part.bin_of_datum, strict=True)):
-        x, sigma = expected[int(key[0]), int(key[1])]
-        assert measurement.observed[i] == pytest.approx(x, rel=1e-12)
-        assert measurement.sigma[i] == pytest.approx(sigma, rel=1e-9)
+def test_data_and_errors_are_those_of_the_pairs(chain, observations):
+    for cells in [(), ((0, 0), (3, 2)), ((5, 1), (6, 1), (7, 1))]:
+        table = _masked(observations, *cells)
+        measurement = Measurement(chain, table)
+        (part,) = measurement.datasets
+        expected = _by_hand(table)
+        assert measurement.n_data == part.n_data == len(expected), cells
+        for i, key in enumerate(zip(part.group_of_datum, part.bin_of_datum, strict=True)):
+            x, sigma = expected[int(key[0]), int(key[1])]
+            assert measurement.observed[i] == pytest.approx(x, rel=1e-12), cells
+            assert measurement.sigma[i] == pytest.approx(sigma, rel=1e-9), cells
 
 
 def test_frames_of_a_datum_are_those_of_its_positions(chain, observations):
@@ -120,12 +122,12 @@ def test_thinning_draws_the_same_frames_again_and_leaves_the_whole_alone(chain, 
     np.testing.assert_array_equal(whole.predict(whole.vector()), before)
 
 
-@pytest.mark.parametrize("most", [20, 1000])
-def test_a_short_table_keeps_all_of_its_frames(chain, observations, most):
-    whole = Measurement(chain, observations)
-    fewer, kept = whole.thinned(most)
-    assert kept.all()
-    assert fewer.datasets[0] is whole.datasets[0]
+def test_a_short_table_keeps_all_of_its_frames(chain, observations):
+    for most in [20, 1000]:
+        whole = Measurement(chain, observations)
+        fewer, kept = whole.thinned(most)
+        assert kept.all(), most
+        assert fewer.datasets[0] is whole.datasets[0], most
 
 
 def test_long_and_short_tables_are_thinned_by_themselves(chain, observations, frames):
@@ -201,17 +203,14 @@ def test_one_chain_serves_several_tables(chain, observations):
     assert [position for _, _, position in found] == [None] * 3
 
 
-@pytest.mark.parametrize(
-    ("chains", "tables", "positions", "words"),
-    [
+def test_numbers_that_differ_are_told(chain, observations):
+    for chains, tables, positions, words in [
         (2, 3, None, "3 datasets, 2 chains and 3 sets"),
         (1, 2, 1, "2 datasets, 1 chains and 1 sets"),
         (0, 0, None, "0 datasets, 0 chains and 0 sets"),
-    ],
-)
-def test_numbers_that_differ_are_told(chain, observations, chains, tables, positions, words):
-    with pytest.raises(ObservationError, match=words):
-        as_pairs([chain] * chains, [observations] * tables, positions and [{}] * positions)
+    ]:
+        with pytest.raises(ObservationError, match=words):
+            as_pairs([chain] * chains, [observations] * tables, positions and [{}] * positions)
 
 
 def test_wavelength_off_the_grid_names_the_nearest(chain, observations):
@@ -265,18 +264,19 @@ def test_values_of_fixed_followers_and_free_parameters_have_units(make_chain):
 # --- priors ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "scale", "bounds"),
-    [("lognorm", 0.5, (None, None)), ("gamma", 2.0, (0, None)), ("t", 4.0, (None, None))],
-)
-def test_mode_of_a_skew_density_is_where_it_peaks(name, scale, bounds):
+def test_mode_of_a_skew_density_is_where_it_peaks():
     """Against the closed forms: exp(-s^2), (a - 1), 0."""
-    from scipy import stats
+    for name, scale, bounds in [
+        ("lognorm", 0.5, (None, None)),
+        ("gamma", 2.0, (0, None)),
+        ("t", 4.0, (None, None)),
+    ]:
+        from scipy import stats
 
-    prior = bind_prior(getattr(stats, name)(scale), "a.b", None, bounds)
-    expected = {"lognorm": np.exp(-(0.5**2)), "gamma": 1.0, "t": 0.0}[name]
-    assert prior.mode == pytest.approx(expected, abs=1e-5)
-    assert prior.residual(prior.mode) == pytest.approx(0, abs=1e-4)
+        prior = bind_prior(getattr(stats, name)(scale), "a.b", None, bounds)
+        expected = {"lognorm": np.exp(-(0.5**2)), "gamma": 1.0, "t": 0.0}[name]
+        assert prior.mode == pytest.approx(expected, abs=1e-5), (name, scale, bounds)
+        assert prior.residual(prior.mode) == pytest.approx(0, abs=1e-4), (name, scale, bounds)
 
 
 def test_a_density_that_peaks_at_its_end():
@@ -289,9 +289,8 @@ def test_a_density_that_peaks_at_its_end():
     assert np.isfinite(prior.slope(0.05))
 
 
-@pytest.mark.parametrize(
-    ("prior", "words"),
-    [
+def test_priors_that_are_none():
+    for prior, words in [
         (Uniform(1 * u.deg, 1 * u.deg), "needs low below high"),
         (Uniform(0 * u.deg, np.inf * u.deg), "needs low below high"),
         (Normal(0 * u.deg, 0 * u.deg), "needs a positive std"),
@@ -299,12 +298,10 @@ def test_a_density_that_peaks_at_its_end():
         (Normal(0, 1), "needs a unit"),
         (0.3, "is a float; allowed are Normal, Uniform"),
         (Uniform(10 * u.deg, 20 * u.deg), "outside the bounds -5 to 5 deg"),
-    ],
-)
-def test_priors_that_are_none(prior, words):
-    with pytest.raises(ParameterError, match=words) as caught:
-        bind_prior(prior, "hwp.theta", u.deg, (-5, 5))
-    assert "hwp.theta" in str(caught.value)
+    ]:
+        with pytest.raises(ParameterError, match=words) as caught:
+            bind_prior(prior, "hwp.theta", u.deg, (-5, 5))
+        assert "hwp.theta" in str(caught.value), (prior, words)
 
 
 def test_a_table_from_memory_is_a_dataset_too(chain, observations):

@@ -134,6 +134,7 @@ def _noiseless(chain, frames):
         return simulate(chain, WAVELENGTH, frames, noise=False)
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(chain=chains(), observable=st.sampled_from(sorted(OBSERVABLES)))
 def test_jacobian_is_the_derivative_for_any_chain_and_observable(chain, observable):
@@ -148,6 +149,7 @@ def test_jacobian_is_the_derivative_for_any_chain_and_observable(chain, observab
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(chain=chains(), observable=st.sampled_from(sorted(OBSERVABLES)))
 def test_prediction_is_what_a_simulation_without_noise_measures(chain, observable):
@@ -161,21 +163,21 @@ def test_prediction_is_what_a_simulation_without_noise_measures(chain, observabl
 # --- special measurements -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("observable", PLAIN)
-def test_masked_cells_give_no_datum(chain, observations, observable):
-    mask = np.zeros((observations.n_frames, 3), dtype=bool)
-    mask[5, 1] = mask[6] = True
-    masked = observations.with_mask(mask, "test")
-    whole, part = (Measurement(chain, o, observable=observable) for o in (observations, masked))
-    frames = whole.datasets[0].frames
-    # a datum of frame 5 in one bin, and those of frame 6 in all three
-    assert sum({5, 6} <= set(pair) for pair in frames.tolist()) == 0
-    assert whole.n_data - part.n_data == 1 + 3
-    assert np.isfinite(part.observed).all()
-    assert_jacobian_right(part)
-    kept = part.datasets[0].valid.ravel()
-    np.testing.assert_array_equal(whole.observed[kept], part.observed)
-    np.testing.assert_array_equal(whole.bins[kept], part.bins)
+def test_masked_cells_give_no_datum(chain, observations):
+    for observable in PLAIN:
+        mask = np.zeros((observations.n_frames, 3), dtype=bool)
+        mask[5, 1] = mask[6] = True
+        masked = observations.with_mask(mask, "test")
+        whole, part = (Measurement(chain, o, observable=observable) for o in (observations, masked))
+        frames = whole.datasets[0].frames
+        # a datum of frame 5 in one bin, and those of frame 6 in all three
+        assert sum({5, 6} <= set(pair) for pair in frames.tolist()) == 0, observable
+        assert whole.n_data - part.n_data == 1 + 3, observable
+        assert np.isfinite(part.observed).all(), observable
+        assert_jacobian_right(part)
+        kept = part.datasets[0].valid.ravel()
+        np.testing.assert_array_equal(whole.observed[kept], part.observed)
+        np.testing.assert_array_equal(whole.bins[kept], part.bins)
 
 
 def test_nothing_left_is_an_error(chain, observations):
@@ -313,11 +315,11 @@ def test_unknown_observable_is_an_error(chain, observations):
         Measurement(chain, observations, observable="triple difference")
 
 
-@pytest.mark.parametrize(("n_chains", "n_positions"), [(2, None), (1, 2), (0, None)])
-def test_numbers_that_do_not_go_together(chain, observations, n_chains, n_positions):
-    positions = None if n_positions is None else [{}] * n_positions
-    with pytest.raises(ObservationError, match="do not go together"):
-        Measurement([chain] * n_chains, [observations], positions=positions)
+def test_numbers_that_do_not_go_together(chain, observations):
+    for n_chains, n_positions in [(2, None), (1, 2), (0, None)]:
+        positions = None if n_positions is None else [{}] * n_positions
+        with pytest.raises(ObservationError, match="do not go together"):
+            Measurement([chain] * n_chains, [observations], positions=positions)
 
 
 def test_no_dataset_is_an_error(chain):
@@ -338,11 +340,11 @@ def test_index_picks_data(chain, observations):
     )
 
 
-@pytest.mark.parametrize("index", [-1.0, 0.5, 1e6])
-def test_index_of_no_datum_is_an_error(chain, observations, index):
-    measurement = Measurement(chain, observations)
-    with pytest.raises(ObservationError, match="whole number below"):
-        measurement(np.array([0.0, index]))
+def test_index_of_no_datum_is_an_error(chain, observations):
+    for index in [-1.0, 0.5, 1e6]:
+        measurement = Measurement(chain, observations)
+        with pytest.raises(ObservationError, match="whole number below"):
+            measurement(np.array([0.0, index]))
 
 
 def test_remembered_sweep_belongs_to_its_vector(chain, observations):

@@ -10,7 +10,9 @@ from scipy import stats
 
 from astropolcal import optics
 from astropolcal.exceptions import ParameterError
-from astropolcal.measurement import FreeParameters, Measurement, Normal, Uniform, bind_prior
+from astropolcal.measurement import Measurement, Normal
+from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.measurement.priors import Uniform, bind_prior
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 DISTRIBUTIONS = [
@@ -40,28 +42,28 @@ def _measurement(chain, noise=False):
     return Measurement(chain, simulate(truth, [1.2, 1.6] * u.um, frames, noise=noise, seed=3))
 
 
-@pytest.mark.parametrize("distribution", DISTRIBUTIONS, ids=lambda d: d.dist.name)
-def test_half_square_of_the_residual_is_minus_the_log_density(distribution):
-    prior = bind_prior(distribution, "x.y", None, (None, None))
-    x = distribution.ppf(np.linspace(0.02, 0.98, 31))
-    depth = distribution.logpdf(prior.mode) - distribution.logpdf(x)
-    np.testing.assert_allclose(prior.residual(x) ** 2 / 2, depth, atol=1e-7)
-    assert np.all(np.diff(prior.residual(x)) > 0)
+def test_half_square_of_the_residual_is_minus_the_log_density():
+    for distribution in DISTRIBUTIONS:
+        prior = bind_prior(distribution, "x.y", None, (None, None))
+        x = distribution.ppf(np.linspace(0.02, 0.98, 31))
+        depth = distribution.logpdf(prior.mode) - distribution.logpdf(x)
+        np.testing.assert_allclose(prior.residual(x) ** 2 / 2, depth, atol=1e-7)
+        assert np.all(np.diff(prior.residual(x)) > 0), distribution
 
 
-@pytest.mark.parametrize(
-    "distribution", [*DISTRIBUTIONS, stats.uniform(0.1, 0.5)], ids=lambda d: d.dist.name
-)
-@pytest.mark.parametrize("unit", [None, u.deg])
-def test_log_densities_are_those_of_scipy(distribution, unit):
+def test_log_densities_are_those_of_scipy():
     """For rows of values at once, outside of the support too."""
-    prior = bind_prior(distribution, "x.y", unit, (None, None))
-    values = np.linspace(-3, 3, 12).reshape(4, 3)
-    expected = distribution.logpdf(values)
-    np.testing.assert_allclose(prior.log_densities(values * prior.factor), expected, atol=1e-9)
-    inside = distribution.ppf([0.2, 0.7])
-    found = prior.log_density(inside * prior.factor)
-    assert found == pytest.approx(distribution.logpdf(inside).sum())
+    for distribution in [*DISTRIBUTIONS, stats.uniform(0.1, 0.5)]:
+        for unit in [None, u.deg]:
+            prior = bind_prior(distribution, "x.y", unit, (None, None))
+            values = np.linspace(-3, 3, 12).reshape(4, 3)
+            expected = distribution.logpdf(values)
+            np.testing.assert_allclose(
+                prior.log_densities(values * prior.factor), expected, atol=1e-9
+            )
+            inside = distribution.ppf([0.2, 0.7])
+            found = prior.log_density(inside * prior.factor)
+            assert found == pytest.approx(distribution.logpdf(inside).sum()), (distribution, unit)
 
 
 def test_bounds_are_told_for_a_whole_vector():
@@ -76,15 +78,16 @@ def test_bounds_are_told_for_a_whole_vector():
     assert free.bounds()[0].max() < 7
 
 
-@pytest.mark.parametrize("distribution", DISTRIBUTIONS, ids=lambda d: d.dist.name)
-def test_slope_is_the_derivative_of_the_residual(distribution):
-    prior = bind_prior(distribution, "x.y", u.deg, (None, None))
-    x = distribution.ppf([0.05, 0.3, 0.7, 0.95]) * prior.factor
-    step = 1e-4 * distribution.std() * prior.factor
-    difference = (prior.residual(x + step) - prior.residual(x - step)) / (2 * step)
-    np.testing.assert_allclose(prior.slope(x), difference, rtol=1e-3)
+def test_slope_is_the_derivative_of_the_residual():
+    for distribution in DISTRIBUTIONS:
+        prior = bind_prior(distribution, "x.y", u.deg, (None, None))
+        x = distribution.ppf([0.05, 0.3, 0.7, 0.95]) * prior.factor
+        step = 1e-4 * distribution.std() * prior.factor
+        difference = (prior.residual(x + step) - prior.residual(x - step)) / (2 * step)
+        np.testing.assert_allclose(prior.slope(x), difference, rtol=1e-3)
 
 
+@pytest.mark.slow
 @given(st.floats(-3, 3), st.floats(0.01, 2), st.floats(-10, 10))
 def test_normal_in_any_unit(mean, std, value):
     here = bind_prior(Normal(mean * u.deg, std * u.deg), "a.theta", u.deg, (None, None))
@@ -95,9 +98,8 @@ def test_normal_in_any_unit(mean, std, value):
     assert there.residual(radian) == pytest.approx(float(here.residual(radian)), abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("prior", "unit", "bounds", "complaint"),
-    [
+def test_a_prior_that_does_not_fit_is_refused():
+    for prior, unit, bounds, complaint in [
         (Normal(1, 2), u.deg, (None, None), "needs a unit"),
         (Normal(1 * u.mm, 2 * u.mm), u.deg, (None, None), "not convertible"),
         (Normal(0 * u.deg, -1 * u.deg), u.deg, (None, None), "positive std"),
@@ -106,11 +108,9 @@ def test_normal_in_any_unit(mean, std, value):
         (Uniform(2 * u.deg, 1 * u.deg), u.deg, (-5, 5), "low below high"),
         (0.3, None, (0, 1), "is a float"),
         (stats.poisson(3), None, (0, 10), "continuous"),
-    ],
-)
-def test_a_prior_that_does_not_fit_is_refused(prior, unit, bounds, complaint):
-    with pytest.raises(ParameterError, match=complaint):
-        bind_prior(prior, "plate.theta", unit, bounds)
+    ]:
+        with pytest.raises(ParameterError, match=complaint):
+            bind_prior(prior, "plate.theta", unit, bounds)
 
 
 def test_uniform_is_a_tighter_bound_and_moves_the_start_inside():

@@ -107,6 +107,7 @@ def test_single_frame():
     assert obs.position("flux").shape == (2, obs.n_bins, 1)
 
 
+@pytest.mark.slow
 @given(times=st.lists(st.floats(-1e6, 1e6), min_size=4, max_size=4))
 def test_sequence_is_monotonic_in_time(times):
     found = make(np.array(times)).position("sequence")

@@ -47,6 +47,7 @@ def usable(row):
     return all(0 < row[name].value < np.inf for name in ("flux_right", "flux_left"))
 
 
+@pytest.mark.slow
 @given(tables())
 def test_grid_agrees_with_a_loop_over_rows(table):
     assume(any(usable(row) for row in table))
@@ -62,6 +63,7 @@ def test_grid_agrees_with_a_loop_over_rows(table):
     np.testing.assert_array_equal(grid.reason > 0, np.isnan(expected))
 
 
+@pytest.mark.slow
 @given(tables())
 def test_every_masked_cell_has_the_right_reason(table):
     assume(any(usable(row) for row in table))
@@ -83,6 +85,7 @@ def test_every_masked_cell_has_the_right_reason(table):
             assert reason is None
 
 
+@pytest.mark.slow
 @given(tables())
 def test_a_table_without_a_usable_cell_is_refused(table):
     assume(not any(usable(row) for row in table))
@@ -90,6 +93,7 @@ def test_a_table_without_a_usable_cell_is_refused(table):
         quiet_grid(table)
 
 
+@pytest.mark.slow
 @given(tables())
 def test_to_table_and_back(table):
     assume(any(usable(row) for row in table))

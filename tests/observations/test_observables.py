@@ -201,6 +201,7 @@ def test_covariance_without_shared_frames_is_the_variance(observable):
     np.testing.assert_allclose(covariance, np.eye(N_DATA) * variance[:, :, None], atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "observable", [o for o in OBSERVABLES.values() if o.frames_per_datum == 2], ids=lambda o: o.name
 )

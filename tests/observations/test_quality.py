@@ -179,6 +179,7 @@ def test_unstable_lamp_of_the_real_runs(shared_data):
         np.testing.assert_allclose(derotator, 45, atol=1)
 
 
+@pytest.mark.slow
 def test_simulated_runs_of_others_keep_all_frames(shared_data):
     folders = sorted((shared_data / "gap-cases").glob("case*"))[::4]
     for path in (p for folder in folders for p in folder.glob("*.ecsv")):

@@ -541,6 +541,7 @@ def test_numeric_column_copies(table):
 VALUES = "nan inf -inf 0 -1 1e308 1e-320 0.1 45 180 -0.0 2 x True 99999999999999999999".split()
 
 
+@pytest.mark.slow
 def test_wrong_values_end_in_an_error_or_a_sound_table(tmp_path):
     for seed in range(3):
         table = example_table()
@@ -594,6 +595,7 @@ def damaged(content, rng, start=0):
     return bytes(data)
 
 
+@pytest.mark.slow
 def test_damaged_files_end_in_one_kind_of_error(tmp_path):
     for seed in range(3):
         for part in ["anywhere", "rows"]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations import Observations, example_table
-from astropolcal.observations.pairing import FrameGroups, pair_states, quadruples
+from astropolcal.observations.pairing import pair_states, quadruples
 
 AB = [0, 1]
 
@@ -138,11 +138,11 @@ def test_groups_of_other_sizes_are_refused():
 
 
 def test_groups_are_found_once_and_cannot_be_changed():
-    groups = FrameGroups(modulated((0, 0, 45, 45), "ABAB"))
-    first = groups.pairs()
-    assert groups.pairs(0.3 * u.deg, 30 * u.arcmin) is first
-    assert groups.pairs(0.2 * u.deg) is not first
-    assert groups.quadruples() is groups.quadruples()
+    obs = modulated((0, 0, 45, 45), "ABAB")
+    first = obs.pairs()
+    assert obs.pairs(0.3 * u.deg, derotator_tolerance=30 * u.arcmin) is first
+    assert obs.pairs(0.2 * u.deg) is not first
+    assert obs.groups(4) is obs.groups(4)
     with pytest.raises(ValueError, match="read-only"):
         first[0, 0] = 3
 

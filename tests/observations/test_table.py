@@ -395,6 +395,7 @@ def test_stars_pair_within_a_cycle():
         assert np.ptp(obs.position("altitude")) > 0, name
 
 
+@pytest.mark.slow
 @needs_shared
 @pytest.mark.parametrize("name", [*INTERNAL, *STARS])
 def test_real_tables_survive_everything(tmp_path, name):

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal import mueller
 from astropolcal.exceptions import ParameterError
 from astropolcal.optics import LinearPolarizer, WollastonPrism
 
@@ -23,21 +22,25 @@ def test_beams_share_the_light(efficiency, q, theta):
     assert right[1] - left[1] == pytest.approx(expected, abs=1e-14)
 
 
-@pytest.mark.parametrize(("beam", "sign"), [("right", 1), ("left", -1)])
-def test_beam_of_the_paper(beam, sign):
-    eta = 0.9
-    expected = 0.5 * np.array([[1, sign * eta, 0, 0], [sign * eta, 1, 0, 0], [0] * 4, [0] * 4])
-    found = WollastonPrism(efficiency=eta, beam=beam).mueller()
-    np.testing.assert_array_equal(found, expected)
+def test_beam_of_the_paper():
+    for beam, sign in [("right", 1), ("left", -1)]:
+        eta = 0.9
+        expected = 0.5 * np.array([[1, sign * eta, 0, 0], [sign * eta, 1, 0, 0], [0] * 4, [0] * 4])
+        found = WollastonPrism(efficiency=eta, beam=beam).mueller()
+        np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.slow
 @given(efficiency=FRACTION)
 def test_unpolarized_light_is_halved_and_polarized(efficiency):
     for beam in ("right", "left"):
         matrix = WollastonPrism(efficiency=efficiency, beam=beam).mueller()
         assert matrix[0, 0] == 0.5
-        assert mueller.polarizance(matrix) == pytest.approx(efficiency, abs=1e-12)
-        assert np.all(mueller.is_passive(matrix))
+        # what is polarized along the axis goes through, and no more than all of it
+        np.testing.assert_allclose(
+            matrix[1:, 0], [efficiency / 2 * (1 if beam == "right" else -1), 0, 0]
+        )
+        assert matrix[0, 0] + np.linalg.norm(matrix[0, 1:]) <= 1 + 1e-12
 
 
 def test_perfect_prism_is_two_polarizers():
@@ -65,11 +68,11 @@ def test_beams_stand_where_the_prism_stands():
     assert (right[1], left[1]) == (pytest.approx(0, abs=1e-15), pytest.approx(1))
 
 
-@pytest.mark.parametrize("beam", ["up", None, 1])
-def test_unknown_beam_is_refused(beam):
-    with pytest.raises(ParameterError, match=r"allowed are \['left', 'right'\]"):
-        WollastonPrism(beam=beam)
-    prism = WollastonPrism()
-    with pytest.raises(ParameterError, match="beam"):
-        prism.beam = beam
-    assert prism.beam == "right"
+def test_unknown_beam_is_refused():
+    for beam in ["up", None, 1]:
+        with pytest.raises(ParameterError, match=r"allowed are \['left', 'right'\]"):
+            WollastonPrism(beam=beam)
+        prism = WollastonPrism()
+        with pytest.raises(ParameterError, match="beam"):
+            prism.beam = beam
+        assert prism.beam == "right", beam

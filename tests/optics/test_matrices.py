@@ -14,16 +14,17 @@ from hypothesis.extra.numpy import arrays
 
 from astropolcal import mueller, optics, thinfilm
 from astropolcal.exceptions import ParameterError
-from astropolcal.optics import OPTICS, rotation_generator
-from astropolcal.optics._matrices import (
+from astropolcal.mueller import (
     blank,
     diattenuation_slope,
     fill_phase_block,
     retardance_slope,
+    rotation_generator,
     transverse_share,
     turn,
 )
-from astropolcal.optics.positions import (
+from astropolcal.optics import OPTICS
+from astropolcal.optics.core import (
     COORDINATES,
     FLUXES,
     MOVES,
@@ -61,14 +62,14 @@ def test_turned_frame_moves_on_one_side_only(matrix, angle):
     np.testing.assert_allclose(turn(turned(angle)), difference(turned, angle), atol=1e-8)
 
 
-@pytest.mark.parametrize("shape", [(), (3,), (2, 5)])
-def test_generators_act_on_the_last_axes(shape):
-    matrices = np.random.default_rng(1).normal(size=(*shape, 4, 4))
-    for function in (rotation_generator, turn):
-        found = function(matrices)
-        assert found.shape == matrices.shape
-        for i in np.ndindex(shape):
-            np.testing.assert_array_equal(found[i], function(matrices[i]))
+def test_generators_act_on_the_last_axes():
+    for shape in [(), (3,), (2, 5)]:
+        matrices = np.random.default_rng(1).normal(size=(*shape, 4, 4))
+        for function in (rotation_generator, turn):
+            found = function(matrices)
+            assert found.shape == matrices.shape, shape
+            for i in np.ndindex(shape):
+                np.testing.assert_array_equal(found[i], function(matrices[i]))
 
 
 def test_what_has_no_axis_does_not_move():
@@ -126,20 +127,20 @@ def bound_optic():
     return plate
 
 
-@pytest.mark.parametrize("how", [copy.deepcopy, lambda optic: optic.copy()])
-def test_copy_shares_nothing_that_can_change(how):
-    plate = bound_optic()
-    twin = how(plate)
-    twin.retardance = [7, 8] * u.deg
-    twin.retardance.bounds, twin.retardance.fixed = (-1, 1), False
-    twin.retardance.prior["mean"].append(3)
-    twin.mount, twin.name, twin.position = "stage", "twin", 1 * u.rad
-    np.testing.assert_array_equal(plate.retardance.value, [1, 2])
-    assert plate.retardance.bounds == (0, 5)
-    assert plate.retardance.fixed
-    assert plate.retardance.prior == {"mean": [1, 2]}
-    assert (plate.mount, plate.name) == ("-hwp", "plate")
-    assert plate.position == 3 * u.deg
+def test_copy_shares_nothing_that_can_change():
+    for how in [copy.deepcopy, lambda optic: optic.copy()]:
+        plate = bound_optic()
+        twin = how(plate)
+        twin.retardance = [7, 8] * u.deg
+        twin.retardance.bounds, twin.retardance.fixed = (-1, 1), False
+        twin.retardance.prior["mean"].append(3)
+        twin.mount, twin.name, twin.position = "stage", "twin", 1 * u.rad
+        np.testing.assert_array_equal(plate.retardance.value, [1, 2])
+        assert plate.retardance.bounds == (0, 5), how
+        assert plate.retardance.fixed, how
+        assert plate.retardance.prior == {"mean": [1, 2]}, how
+        assert (plate.mount, plate.name) == ("-hwp", "plate"), how
+        assert plate.position == 3 * u.deg, how
 
 
 def test_parameter_of_a_copy_belongs_to_the_copy():
@@ -157,32 +158,32 @@ def test_optics_of_a_list_stay_one_where_they_were_one():
     assert first is not plate
 
 
-@pytest.mark.parametrize("name", OPTICS)
-def test_signature_is_of_keywords_with_their_defaults(name):
-    signature = inspect.signature(OPTICS[name])
-    kinds = {parameter.kind for parameter in signature.parameters.values()}
-    assert kinds == {inspect.Parameter.KEYWORD_ONLY}
-    made = OPTICS[name]()
-    assert {*made.param_names, "mount", "name"} <= set(signature.parameters)
-    for key in made.param_names:
-        assert u.Quantity(signature.parameters[key].default) == u.Quantity(
-            getattr(made, key).value, getattr(made, key).unit
-        )
+def test_signature_is_of_keywords_with_their_defaults():
+    for name in OPTICS:
+        signature = inspect.signature(OPTICS[name])
+        kinds = {parameter.kind for parameter in signature.parameters.values()}
+        assert kinds == {inspect.Parameter.KEYWORD_ONLY}, name
+        made = OPTICS[name]()
+        assert {*made.param_names, "mount", "name"} <= set(signature.parameters), name
+        for key in made.param_names:
+            assert u.Quantity(signature.parameters[key].default) == u.Quantity(
+                getattr(made, key).value, getattr(made, key).unit
+            ), name
 
 
 # --- positions ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stage", [*COORDINATES, "-"])
-def test_numbers_and_angles_of_stages(stage):
-    if stage in COORDINATES:
-        assert finite_position(0.5, "position", stage) == 0.5
-        with pytest.raises(ParameterError, match="position has unit deg"):
-            finite_position(1 * u.deg, "position", stage)
-    else:
-        assert finite_position(180 * u.deg, "position", "hwp") == pytest.approx(np.pi)
-        with pytest.raises(ParameterError, match=r"position = 0\.5 needs a unit such as rad"):
-            finite_position(0.5, "position", "hwp")
+def test_numbers_and_angles_of_stages():
+    for stage in [*COORDINATES, "-"]:
+        if stage in COORDINATES:
+            assert finite_position(0.5, "position", stage) == 0.5, stage
+            with pytest.raises(ParameterError, match="position has unit deg"):
+                finite_position(1 * u.deg, "position", stage)
+        else:
+            assert finite_position(180 * u.deg, "position", "hwp") == pytest.approx(np.pi), stage
+            with pytest.raises(ParameterError, match=r"position = 0\.5 needs a unit such as rad"):
+                finite_position(0.5, "position", "hwp")
 
 
 def test_stage_is_the_name_where_there_is_no_other():
@@ -191,12 +192,12 @@ def test_stage_is_the_name_where_there_is_no_other():
         finite_position(1.0, "hwp")
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_position_is_finite(bad):
-    with pytest.raises(ParameterError, match=r"flux = .* must be finite"):
-        finite_position([1.0, bad], "flux")
-    with pytest.raises(ParameterError, match=r"hwp = .* must be finite"):
-        finite_position([0.0, bad] * u.deg, "hwp")
+def test_position_is_finite():
+    for bad in [np.nan, np.inf, -np.inf]:
+        with pytest.raises(ParameterError, match=r"flux = .* must be finite"):
+            finite_position([1.0, bad], "flux")
+        with pytest.raises(ParameterError, match=r"hwp = .* must be finite"):
+            finite_position([0.0, bad] * u.deg, "hwp")
 
 
 def test_kinds_of_positions_do_not_overlap():
@@ -204,16 +205,18 @@ def test_kinds_of_positions_do_not_overlap():
     assert {*FLUXES, *RATES, *MOVES, "sequence", "flc_state", "frame"} == set(COORDINATES)
 
 
-@pytest.mark.parametrize(("lam", "position"), [((3,), (4,)), ((3,), (2, 4)), ((3, 1, 5), (2, 5))])
-def test_positions_that_do_not_broadcast(lam, position):
-    fits = np.broadcast_shapes
-    try:
-        fits(lam, position)
-    except ValueError:
-        with pytest.raises(ParameterError, match=r"give the positions the shape \(n_frames, 1\)"):
-            check_broadcast(np.ones(lam), np.ones(position))
-    else:
-        assert check_broadcast(np.ones(lam), np.ones(position)) is None
+def test_positions_that_do_not_broadcast():
+    for lam, position in [((3,), (4,)), ((3,), (2, 4)), ((3, 1, 5), (2, 5))]:
+        fits = np.broadcast_shapes
+        try:
+            fits(lam, position)
+        except ValueError:
+            with pytest.raises(
+                ParameterError, match=r"give the positions the shape \(n_frames, 1\)"
+            ):
+                check_broadcast(np.ones(lam), np.ones(position))
+        else:
+            assert check_broadcast(np.ones(lam), np.ones(position)) is None, (lam, position)
 
 
 # --- the matrices in the docstrings -------------------------------------------------------------
@@ -248,19 +251,16 @@ def _sum(cell, values):
     return total
 
 
-@pytest.mark.parametrize(
-    ("cls", "settings"),
-    [
+def test_documented_matrix_is_that_of_the_code():
+    for cls, settings in [
         (optics.LinearRetarder, {"retardance": 1.1 * u.rad}),
         (optics.Diattenuator, {"diattenuation": 0.3}),
         (optics.DiattenuatorRetarder, {"diattenuation": 0.3, "retardance": 1.1 * u.rad}),
         (optics.LinearPolarizer, {}),
-    ],
-)
-def test_documented_matrix_is_that_of_the_code(cls, settings):
-    expected = documented(cls, e=0.3, t=np.sqrt(1 - 0.09), c=np.cos(1.1), s=np.sin(1.1))
-    expected = 0.5 * expected if cls is optics.LinearPolarizer else expected
-    np.testing.assert_allclose(cls(**settings).mueller(), expected, atol=1e-14)
+    ]:
+        expected = documented(cls, e=0.3, t=np.sqrt(1 - 0.09), c=np.cos(1.1), s=np.sin(1.1))
+        expected = 0.5 * expected if cls is optics.LinearPolarizer else expected
+        np.testing.assert_allclose(cls(**settings).mueller(), expected, atol=1e-14)
 
 
 def test_documented_mirror_is_that_of_its_amplitudes():

@@ -10,7 +10,6 @@ from astropy.table import QTable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from astropolcal import mueller
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.materials import GOLD, SILVER, Metal, TabulatedLaw
@@ -23,7 +22,7 @@ from astropolcal.optics import (
     PowerLawMirror,
     Rotator,
 )
-from astropolcal.thinfilm import fresnel, reflect
+from astropolcal.thinfilm import reflect
 
 WAVELENGTH = [1.2, 1.6, 2.2] * u.um
 REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "reference"
@@ -84,17 +83,20 @@ def test_it_is_the_diattenuator_retarder_of_its_own_numbers(cls):
 # --- metals -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("metal", [SILVER, GOLD], ids=lambda m: m.name)
-def test_a_bare_metal_is_fresnel(metal):
-    mirror = MetalMirror(material=metal.name, incidence=52 * u.deg)
-    r_s, r_p = fresnel(metal.index(WAVELENGTH).value, 52 * u.deg)
-    product = abs(r_s) ** 2 + abs(r_p) ** 2
-    expected = (abs(r_s) ** 2 - abs(r_p) ** 2) / product
-    np.testing.assert_allclose(mirror.diattenuation(WAVELENGTH), expected, rtol=1e-10)
-    phase = np.angle(r_p) - np.angle(r_s)
-    np.testing.assert_allclose(
-        np.exp(1j * mirror.retardance(WAVELENGTH).to_value(u.rad)), np.exp(1j * phase), rtol=1e-12
-    )
+def test_a_bare_metal_is_fresnel():
+    for metal in [SILVER, GOLD]:
+        mirror = MetalMirror(material=metal.name, incidence=52 * u.deg)
+        bare = reflect(WAVELENGTH, 52 * u.deg, metal.index(WAVELENGTH).value)
+        r_s, r_p = bare.r_s, bare.r_p
+        product = abs(r_s) ** 2 + abs(r_p) ** 2
+        expected = (abs(r_s) ** 2 - abs(r_p) ** 2) / product
+        np.testing.assert_allclose(mirror.diattenuation(WAVELENGTH), expected, rtol=1e-10)
+        phase = np.angle(r_p) - np.angle(r_s)
+        np.testing.assert_allclose(
+            np.exp(1j * mirror.retardance(WAVELENGTH).to_value(u.rad)),
+            np.exp(1j * phase),
+            rtol=1e-12,
+        )
 
 
 def test_theory_at_45_degrees():
@@ -163,38 +165,40 @@ def test_a_film_stays_in_a_chain():
     assert leaves(chain.copy())[0].film == "fused silica"
 
 
-@pytest.mark.parametrize("cls", [MetalMirror, KMirror])
-@pytest.mark.parametrize("key", ["material", "film"])
-def test_an_unknown_material_is_refused(cls, key):
-    law = TabulatedLaw([1.0, 2.5] * u.um, [0.3 + 6j, 1.0 + 16j])
-    stranger = Metal("stranger", law, measured_range=[1.0, 2.5] * u.um)
-    with pytest.raises(ParameterError, match="did you mean 'silver'"):
-        cls(**{key: "silvr"})
-    for bad in (stranger, 1.5 + 3j, None, 3):
-        with pytest.raises(ParameterError, match=rf"{cls.__name__}.{key} = .*register_material"):
-            cls(**{key: bad})
+def test_an_unknown_material_is_refused():
+    for cls in [MetalMirror, KMirror]:
+        for key in ["material", "film"]:
+            law = TabulatedLaw([1.0, 2.5] * u.um, [0.3 + 6j, 1.0 + 16j])
+            stranger = Metal("stranger", law, measured_range=[1.0, 2.5] * u.um)
+            with pytest.raises(ParameterError, match="did you mean 'silver'"):
+                cls(**{key: "silvr"})
+            for bad in (stranger, 1.5 + 3j, None, 3):
+                with pytest.raises(
+                    ParameterError, match=rf"{cls.__name__}.{key} = .*register_material"
+                ):
+                    cls(**{key: bad})
 
 
-@pytest.mark.parametrize("cls", [MetalMirror, KMirror])
-def test_a_wavelength_out_of_range_is_refused(cls):
-    with pytest.raises(WavelengthRangeError, match="fused silica"):
-        cls().mueller(5 * u.um)
+def test_a_wavelength_out_of_range_is_refused():
+    for cls in [MetalMirror, KMirror]:
+        with pytest.raises(WavelengthRangeError, match="fused silica"):
+            cls().mueller(5 * u.um)
 
 
 @each
-@pytest.mark.parametrize("degrees", [-90, 90, 120])
-def test_an_impossible_incidence_is_refused(cls, degrees):
-    mirror = cls(incidence=[50, degrees, 50] * u.deg, name="it")
-    for use in (mirror.mueller, mirror.mueller_derivatives, mirror.diattenuation):
-        with pytest.raises(ParameterError, match=rf"it\.incidence = {degrees} deg; allowed"):
-            use(WAVELENGTH)
+def test_an_impossible_incidence_is_refused(cls):
+    for degrees in [-90, 90, 120]:
+        mirror = cls(incidence=[50, degrees, 50] * u.deg, name="it")
+        for use in (mirror.mueller, mirror.mueller_derivatives, mirror.diattenuation):
+            with pytest.raises(ParameterError, match=rf"it\.incidence = {degrees} deg; allowed"):
+                use(WAVELENGTH)
 
 
-@pytest.mark.parametrize("key", ["film_thickness", "n_scale", "k_scale"])
-def test_a_negative_value_is_refused(key):
-    unit = u.nm if key == "film_thickness" else 1
-    with pytest.raises(ParameterError, match=f"it.{key} = -.*not negative"):
-        MetalMirror(**{key: -0.1 * unit}, name="it").mueller(WAVELENGTH)
+def test_a_negative_value_is_refused():
+    for key in ["film_thickness", "n_scale", "k_scale"]:
+        unit = u.nm if key == "film_thickness" else 1
+        with pytest.raises(ParameterError, match=f"it.{key} = -.*not negative"):
+            MetalMirror(**{key: -0.1 * unit}, name="it").mueller(WAVELENGTH)
 
 
 # --- the law of the paper -------------------------------------------------------------
@@ -244,7 +248,7 @@ def test_four_numbers_are_nearly_two():
 def test_k_mirror_is_three_mirrors_in_a_row():
     film = {"film_thickness": 150 * u.nm, "material": "gold", "film": "Al2O3"}
     one, two = MetalMirror(incidence=62 * u.deg, **film), MetalMirror(incidence=34 * u.deg, **film)
-    product = mueller.compose(*(m.mueller(WAVELENGTH) for m in (one, two, one)))
+    product = one.mueller(WAVELENGTH) @ two.mueller(WAVELENGTH) @ one.mueller(WAVELENGTH)
     product /= product[:, :1, :1]
     whole = KMirror(incidence=62 * u.deg, **film)
     np.testing.assert_allclose(whole.mueller(WAVELENGTH), product, atol=1e-13)

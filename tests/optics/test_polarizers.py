@@ -49,11 +49,9 @@ def test_crossed_polarizers_extinguish():
 @given(epsilon=EPSILON)
 def test_diattenuator_has_its_diattenuation(epsilon):
     matrix = Diattenuator(diattenuation=epsilon).mueller()
-    assert mueller.diattenuation(matrix) == pytest.approx(abs(epsilon), abs=1e-12)
+    np.testing.assert_array_equal(mueller.diattenuation_vector(matrix), [epsilon, 0, 0])
     assert matrix[0, 0] == 1
-    # unit transmission of unpolarized light: physical, but not passive
     assert mueller.is_physical(matrix)
-    assert mueller.is_passive(matrix) == (abs(epsilon) <= 1e-9)
 
 
 @given(epsilon=EPSILON)
@@ -92,12 +90,12 @@ def test_diattenuator_retarder_is_both_in_either_order(epsilon, retardance, thet
     np.testing.assert_allclose(both, retard @ attenuate, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("epsilon", [-1.0, 1.0])
-def test_derivatives_are_finite_at_full_diattenuation(epsilon):
-    optic = DiattenuatorRetarder(diattenuation=epsilon, retardance=30 * u.deg)
-    for derivative in optic.mueller_derivatives().values():
-        assert np.all(np.isfinite(derivative.value))
-    assert optic.mueller_derivatives()["diattenuation"][0, 1] == 1
+def test_derivatives_are_finite_at_full_diattenuation():
+    for epsilon in [-1.0, 1.0]:
+        optic = DiattenuatorRetarder(diattenuation=epsilon, retardance=30 * u.deg)
+        for derivative in optic.mueller_derivatives().values():
+            assert np.all(np.isfinite(derivative.value)), epsilon
+        assert optic.mueller_derivatives()["diattenuation"][0, 1] == 1, epsilon
 
 
 def test_mirror_is_a_half_wave_diattenuator_retarder():

@@ -10,6 +10,8 @@ import importlib
 import inspect
 import pkgutil
 from dataclasses import dataclass, field
+from functools import reduce
+from itertools import product
 
 import astropy.units as u
 import numpy as np
@@ -57,7 +59,7 @@ def mueller_elements(draw):
     """Elements of a random physical Mueller matrix of unit transmission."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     root = rng.normal(size=(4, 4)) + 1j * rng.normal(size=(4, 4))
-    matrix = mueller.mueller_from_coherency(root @ root.conj().T)
+    matrix = np.einsum("ijkl,kl->ij", mueller._BASIS, root @ root.conj().T).real
     matrix /= matrix[0, 0]
     return {f"m{i}{j}": matrix[i, j] for i in range(4) for j in range(4)}
 
@@ -105,8 +107,8 @@ def coated(metal, reflections, incidence, film_thickness, n_scale, k_scale):
     index = n_scale * index.real + 1j * k_scale * index.imag
     film = ("fused silica", film_thickness)
     stages = [reflect(WAVELENGTH, angle, index, [film]).mueller() for angle in reflections]
-    product = mueller.compose(*stages)
-    return product / product[..., :1, :1]
+    whole = reduce(lambda so_far, stage: stage @ so_far, stages)
+    return whole / whole[..., :1, :1]
 
 
 def metal_mirror(incidence, **values):
@@ -491,10 +493,29 @@ HOW = (
     "tested for physicality, derivatives, light against matrix, copies, with_parameters and units"
 )
 
-every = pytest.mark.parametrize("label", CASES)
+
+def each(labels):
+    """Run a test of one label for all; a failure names its label."""
+
+    def decorated(test):
+        def run():
+            for label in labels:
+                try:
+                    test(label=label)
+                except BaseException as error:
+                    error.add_note(f"the case is {label!r}")
+                    raise
+
+        run.__name__, run.__doc__, run.__module__ = test.__name__, test.__doc__, test.__module__
+        return run
+
+    return decorated
+
+
+every = each(CASES)
 FRAME_OPTICS = [label for label, case_ in CASES.items() if case_.per_frame]
-each_frame_optic = pytest.mark.parametrize("label", FRAME_OPTICS)
-each_that_turns = pytest.mark.parametrize("label", sorted(set(CASES) - set(FRAME_OPTICS)))
+each_frame_optic = each(FRAME_OPTICS)
+each_that_turns = each(sorted(set(CASES) - set(FRAME_OPTICS)))
 
 
 def unit_of(optic, key):
@@ -577,16 +598,15 @@ def test_every_optic_is_registered():
     assert not missing, f"name {sorted(missing)} in OPTICS of astropolcal/optics/__init__.py"
 
 
-@pytest.mark.parametrize("name", OPTICS)
-def test_registry_name_is_the_public_name(name):
-    assert OPTICS[name].__name__ == name
-    assert getattr(optics, name) is OPTICS[name]
-    assert name in optics.__all__
+def test_registry_name_is_the_public_name():
+    for name, cls in OPTICS.items():
+        assert cls.__name__ == name
+        assert name in optics.__all__
 
 
-@pytest.mark.parametrize("name", OPTICS)
-def test_parameters_are_declared_in_full(name):
-    optic = OPTICS[name]()
+@each(OPTICS)
+def test_parameters_are_declared_in_full(label):
+    name, optic = label, OPTICS[label]()
     assert optic.param_names[0] == "theta", "theta comes first, as the derivatives do"
     for key in optic.param_names:
         parameter = getattr(optic, key)
@@ -600,9 +620,9 @@ def test_parameters_are_declared_in_full(name):
         assert high is None or parameter.value <= high
 
 
-@pytest.mark.parametrize("name", OPTICS)
-def test_only_theta_is_not_the_optics_own(name):
-    optic = OPTICS[name]()
+@each(OPTICS)
+def test_only_theta_is_not_the_optics_own(label):
+    optic = OPTICS[label]()
     assert ("theta", *optic.own_names) == optic.param_names
     assert optic.theta.fixed
     assert optic.inputs == optic.outputs == ("wavelength", "I", "Q", "U", "V")
@@ -611,6 +631,7 @@ def test_only_theta_is_not_the_optics_own(name):
 # --- physics ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=40)
@@ -620,6 +641,7 @@ def test_mueller_matrix_is_physical(label, data):
     assert np.all(mueller.is_physical(optic.mueller(WAVELENGTH)))
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=40)
@@ -630,6 +652,7 @@ def test_mueller_matrix_is_that_of_the_mueller_functions(label, data):
     np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=0, atol=2e-13)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=25)
@@ -644,6 +667,7 @@ def test_one_value_a_wavelength_is_the_stack_of_the_scalars(label, data):
         np.testing.assert_allclose(row, alone, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=25)
@@ -658,6 +682,7 @@ def test_orientation_turns_the_matrix(label, data, angle):
     np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @each_that_turns
 @given(data=st.data(), theta=st.floats(-90, 90), position=st.floats(-90, 90))
 @settings(max_examples=25)
@@ -674,6 +699,7 @@ def test_position_adds_to_theta(label, data, theta, position):
         np.testing.assert_array_equal(optic.mueller(WAVELENGTH), given_)
 
 
+@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data(), theta=ANGLE)
 @settings(max_examples=25)
@@ -691,6 +717,7 @@ def test_position_is_the_coordinate(label, data, theta):
         np.testing.assert_array_equal(optic.mueller(WAVELENGTH), other.mueller(WAVELENGTH))
 
 
+@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data(), theta=ANGLE)
 @settings(max_examples=10)
@@ -700,6 +727,7 @@ def test_without_amplitude_a_frame_optic_is_the_identity(label, data, theta):
     np.testing.assert_allclose(optic.mueller(), np.eye(4), rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=25)
@@ -714,6 +742,7 @@ def test_light_is_matrix_times_stokes(label, data, angle):
     np.testing.assert_allclose(np.array(through[1:]), expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=10)
@@ -740,6 +769,7 @@ def differences(optic, key, position=None):
     return (8 * (matrix(1) - matrix(-1)) - (matrix(2) - matrix(-2))) / (12 * step)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=12)
@@ -758,6 +788,7 @@ def test_derivatives_against_differences(label, data, angle):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * scale)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=8)
@@ -768,6 +799,7 @@ def test_derivative_to_theta_may_vary_with_wavelength(label, data):
     np.testing.assert_allclose(found, differences(optic, "theta"), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 @each_frame_optic
 @given(data=st.data())
 @settings(max_examples=8)
@@ -785,6 +817,7 @@ def test_derivatives_at_several_positions(label, data):
 # --- units ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data(), angle=ANGLE)
 @settings(max_examples=10)
@@ -829,21 +862,19 @@ def test_wrong_unit_is_refused(label):
 
 
 @every
-@pytest.mark.parametrize("bad", [np.nan, np.inf, [0.1, np.nan]])
-def test_value_that_is_not_finite_is_refused(label, bad):
+def test_value_that_is_not_finite_is_refused(label):
     cls = CASES[label].optic
-    for key in cls().param_names:
+    for key, bad in product(cls().param_names, [np.nan, np.inf, [0.1, np.nan]]):
         value = np.asarray(bad) * unit_of(cls(), key)
         with pytest.raises(ParameterError, match=f"{cls.__name__}.{key} = .* must be finite"):
             cls(**{key: value})
 
 
 @every
-@pytest.mark.parametrize("shape", [(0,), (2, 2), (1, 3)])
-def test_value_of_other_shape_is_refused(label, shape):
+def test_value_of_other_shape_is_refused(label):
     cls = CASES[label].optic
-    for key in cls().param_names:
-        with pytest.raises(ParameterError, match="scalar or one value a wavelength"):
+    for key, shape in product(cls().param_names, [(0,), (2, 2), (1, 3)]):
+        with pytest.raises(ParameterError, match="scalar or one value per wavelength"):
             cls(**{key: np.zeros(shape) * unit_of(cls(), key)})
 
 
@@ -852,7 +883,7 @@ def test_value_of_other_number_of_wavelengths_is_refused(label):
     cls = CASES[label].optic
     for key in cls().param_names:
         optic = cls(**{key: np.full(2, 0.5) * unit_of(cls(), key)}, name="it")
-        message = rf"it.{key} has 2 values, one a wavelength, but {{}} wavelengths"
+        message = rf"it.{key} has 2 values, one per wavelength, but {{}} wavelengths"
         for wavelength in (WAVELENGTH, 1.6 * u.um, None):
             count = 0 if wavelength is None else np.size(wavelength)
             with pytest.raises(ParameterError, match=message.format(count)):
@@ -896,6 +927,7 @@ def test_unit_changed_behind_the_optics_back_is_refused(label):
 # --- copies -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=10)
@@ -934,6 +966,7 @@ def state(optic):
     ]
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=5)
@@ -950,6 +983,7 @@ def test_copy_is_equal_and_independent(label, data):
     assert (optic.mount, optic.theta.fixed, optic.theta.value) == (mount, False, 0)
 
 
+@pytest.mark.slow
 @every
 @given(data=st.data())
 @settings(max_examples=5)

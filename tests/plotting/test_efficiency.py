@@ -129,6 +129,7 @@ def seen():
     return [standards.observability(name, "subaru", NIGHT) for name in names]
 
 
+@pytest.mark.slow
 def test_curves_are_the_tables(seen):
     upper, lower = plot_observability(seen).axes
     dotted = [line for line in upper.lines if line.get_linestyle() == ":" and len(line.get_xdata())]
@@ -141,6 +142,7 @@ def test_curves_are_the_tables(seen):
         np.testing.assert_allclose(line.get_ydata(), star.table["parallactic"].value)
 
 
+@pytest.mark.slow
 def test_thick_curves_are_only_where_the_star_is_observable(seen):
     upper, _ = plot_observability(seen).axes
     thick = [line for line in upper.lines if line.get_linewidth() == 2]
@@ -149,6 +151,7 @@ def test_thick_curves_are_only_where_the_star_is_observable(seen):
         np.testing.assert_array_equal(drawn, star.table["observable"])
 
 
+@pytest.mark.slow
 def test_the_angle_goes_on_beyond_half_a_turn_as_in_the_table(seen):
     # culminates north of the zenith
     upper, lower = plot_observability(seen[1:2]).axes
@@ -169,6 +172,7 @@ def test_the_title_says_of_how_many_stars_these_are_the_first(seen):
     assert plot_observability(seen, total=3).get_suptitle().startswith("Standard stars, night of")
 
 
+@pytest.mark.slow
 def test_labels_have_units_and_the_legend_is_outside(seen):
     figure = plot_observability(seen)
     upper, lower = figure.axes
@@ -191,6 +195,7 @@ def test_stars_differ_in_colour_and_marker(seen):
     assert len({line.get_marker() for line in marked}) == 3
 
 
+@pytest.mark.slow
 def test_what_cannot_be_drawn_together_is_refused(seen):
     with pytest.raises(ParameterError, match="0 stars"):
         plot_observability([])

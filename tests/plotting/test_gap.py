@@ -63,6 +63,7 @@ def none():
     return make(0.0)
 
 
+@pytest.mark.slow
 def test_a_figure_without_traces(gap, none):
     for plot in ALL:
         before = dict(mpl.rcParams)
@@ -110,6 +111,7 @@ def test_frames_show_what_the_causes_do(gap, none):
     assert "after" not in labels
 
 
+@pytest.mark.slow
 def test_titles_of_many_causes_fit(gap, monkeypatch):
     """Names of causes and of a dataset that are too long stay within the figure."""
     many = [replace(gap.causes[0], effect=get_effect("hwp_encoder_eccentricity"))] * 6

@@ -267,6 +267,7 @@ def test_impossible_requests_are_refused(elliptical):
         plot_identifiability(nothing)
 
 
+@pytest.mark.slow
 def test_words_are_below_the_panels_and_inside_the_figure(undetermined):
     figure = plot_identifiability(undetermined)
     figure.draw_without_rendering()

@@ -195,6 +195,7 @@ def test_chain_without_retarder_is_refused(scalar):
         plot_retardances(bare)
 
 
+@pytest.mark.slow
 def test_legend_lies_outside_the_axes(undetermined):
     for draw in [plot_retardances, plot_efficiency, plot_parameters]:
         figure = draw(undetermined)
@@ -525,6 +526,7 @@ def texts(ax):
     return [text.get_text() for text in ax.texts]
 
 
+@pytest.mark.slow
 def test_panels_labels_and_changes(years):
     figure = plot_history(years)
     titles = [ax.get_title() for ax in figure.axes]
@@ -562,6 +564,7 @@ def test_held_values_are_open_symbols(years):
     assert np.isfinite(ax.get_ylim()).all()
 
 
+@pytest.mark.slow
 def test_bad_input(years):
     record = dataclasses.replace(years[0].datasets[0], meta={})
     undated = dataclasses.replace(years[0], datasets=[record])

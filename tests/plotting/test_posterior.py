@@ -45,6 +45,7 @@ def rendered(figure, tmp_path):
     return figure
 
 
+@pytest.mark.slow
 def test_corner_shows_every_pair(corner_plot):
     assert len(corner_plot.axes) == 9
     panels = np.array(corner_plot.axes).reshape(3, 3)
@@ -52,6 +53,7 @@ def test_corner_shows_every_pair(corner_plot):
     assert [axes.get_title() for axes in panels.diagonal()] == ["τ = 1 steps"] * 3
 
 
+@pytest.mark.slow
 def test_corner_labels_have_units_and_what_is_taken_off(corner_plot):
     bottom = corner_plot.axes[6:]
     assert [axes.get_xlabel().split("\n")[0] for axes in bottom] == [
@@ -68,6 +70,7 @@ def test_corner_labels_have_units_and_what_is_taken_off(corner_plot):
     assert low < 0 < high < 0.01
 
 
+@pytest.mark.slow
 def test_corner_marks_the_fit(posterior, corner_plot):
     def marks(figure):
         return [
@@ -91,6 +94,7 @@ def test_corner_leaves_out_a_fit_far_away():
     assert high - low < 15
 
 
+@pytest.mark.slow
 def test_corner_is_within_its_figure(corner_plot, tmp_path):
     box = rendered(corner_plot, tmp_path).get_tightbbox()
     width, height = corner_plot.get_size_inches()
@@ -111,6 +115,7 @@ def test_corner_of_a_chain_that_is_too_short_says_so():
     assert "CHAIN TOO SHORT" in plot_corner(make_posterior(40)).get_suptitle()
 
 
+@pytest.mark.slow
 def test_corner_draws_into_a_given_figure(posterior):
     pytest.importorskip("corner")
     from matplotlib.figure import Figure
@@ -150,6 +155,7 @@ def test_missing_corner(posterior, monkeypatch):
         plot_corner(posterior)
 
 
+@pytest.mark.slow
 def test_traces_show_all_walkers(posterior, tmp_path):
     figure = rendered(plot_traces(posterior), tmp_path)
     traces, correlations = figure.axes[::2], figure.axes[1::2]
@@ -177,6 +183,7 @@ def test_traces_of_many_walkers_do_not_draw_every_step():
     assert len(axes.lines[0].get_xdata()) == 300
 
 
+@pytest.mark.slow
 def test_traces_of_a_thinned_posterior(posterior, tmp_path):
     """Steps are those of the run; samples are counted instead of correlated."""
     thinned = posterior.thinned(10)
@@ -195,6 +202,7 @@ def test_traces_of_a_thinned_posterior(posterior, tmp_path):
     assert texts(counts[0]) == ["τ = 1"]
 
 
+@pytest.mark.slow
 def test_corner_of_a_thinned_posterior(posterior):
     pytest.importorskip("corner")
     figure = plot_corner(posterior.thinned())
@@ -210,6 +218,7 @@ def test_figures_of_walkers_that_do_not_agree_say_so(posterior):
     assert "(NOT CONVERGED)" in plot_traces(apart, NAMES[:1]).get_suptitle()
 
 
+@pytest.mark.slow
 def test_traces_of_what_does_not_move(posterior, tmp_path):
     chain = posterior.chain.copy()
     chain[..., 1] = 1.3

@@ -101,6 +101,7 @@ def modulated():
     return calibrate(chain, observations, cross_validate=False)
 
 
+@pytest.mark.slow
 def test_curve_goes_through_the_model_at_the_data(request):
     for name in ["elliptical", "masked", "two_step", "single_angle", "modulated"]:
         calibration = request.getfixturevalue(name)
@@ -124,6 +125,7 @@ def test_curve_is_fine_and_spans_the_data(elliptical):
         assert np.diff(x).max() < 1
 
 
+@pytest.mark.slow
 def test_axes_have_units_and_the_legend_hides_no_data(elliptical):
     figure = plot_double_differences(elliptical)
     figure.draw_without_rendering()
@@ -175,6 +177,7 @@ def test_nearest_wavelengths_are_shown_once(elliptical):
     assert [title.split(" ")[0] for title in titles] == ["1600.0", "2200.0"]
 
 
+@pytest.mark.slow
 def test_moving_stage_leaves_the_model_at_the_data_only():
     chain = (
         optics.LinearPolarizer(name="polarizer")
@@ -264,6 +267,7 @@ def test_one_wavelength_and_many_derotator_angles():
 # ---- real data -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_charis_dataset_is_drawn_as_the_paper_has_it(shared_data):
     """Dataset 3: 8 derotator angles, 4 double differences, amplitude near 1 at 1329 nm."""
     (path,) = (shared_data / "data" / "charis").glob("dataset3_*.ecsv")

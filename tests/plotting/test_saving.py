@@ -70,6 +70,7 @@ def test_writes_every_figure_as_png(elliptical, tmp_path):
 
 
 @pytest.mark.usefixtures("unpainted")
+@pytest.mark.slow
 def test_each_dataset_has_its_double_differences(several, tmp_path):
     found = names(save_all(several, tmp_path))
     assert found[:2] == ["double_differences.png", "double_differences_2.png"]
@@ -86,6 +87,7 @@ def test_what_no_other_figure_shows_is_drawn(elliptical, tmp_path):
 
 
 @pytest.mark.usefixtures("unpainted")
+@pytest.mark.slow
 def test_calibration_without_data_gets_the_other_figures(elliptical, tmp_path):
     paths = save_all(replace(elliptical, measurement=None), tmp_path)
     assert names(paths) == [
@@ -99,6 +101,7 @@ def test_calibration_without_data_gets_the_other_figures(elliptical, tmp_path):
 
 
 @pytest.mark.usefixtures("unpainted")
+@pytest.mark.slow
 def test_dataset_without_a_datum_is_left_out(several, tmp_path):
     measurement = copy(several.measurement)
     empty = copy(measurement.datasets[1])
@@ -158,6 +161,7 @@ def test_posterior_is_drawn(elliptical, tmp_path):
 
 
 @pytest.mark.usefixtures("unpainted")
+@pytest.mark.slow
 def test_posterior_of_a_file_is_drawn(elliptical, tmp_path):
     pytest.importorskip("corner")
     sampled = with_posterior(elliptical, ["hwp.w_sio2", "hwp.w_mgf2", "wollaston.efficiency[0]"])
@@ -165,6 +169,7 @@ def test_posterior_of_a_file_is_drawn(elliptical, tmp_path):
     assert names(save_all(stored, tmp_path))[-2:] == ["traces.png", "corner.png"]
 
 
+@pytest.mark.slow
 def test_few_parameters_are_all_drawn(elliptical, tmp_path, drawn):
     sampled = with_posterior(elliptical, elliptical.covariance.names[:12])
     save_all(sampled, tmp_path)
@@ -187,6 +192,7 @@ def test_of_many_parameters_the_common_and_the_slowest_are_drawn(elliptical, tmp
     assert max(times[name] for name in left_out) <= times[others[-1]]
 
 
+@pytest.mark.slow
 def test_of_many_parameters_without_common_ones_the_slowest_are_drawn(elliptical, tmp_path, drawn):
     sampled = with_posterior(elliptical, [n for n in elliptical.covariance.names if "[" in n])
     save_all(sampled, tmp_path)
@@ -195,6 +201,7 @@ def test_of_many_parameters_without_common_ones_the_slowest_are_drawn(elliptical
 
 
 @pytest.mark.usefixtures("unpainted")
+@pytest.mark.slow
 def test_without_corner_the_other_figures_are_drawn(elliptical, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "corner", None)
     sampled = with_posterior(elliptical, ["hwp.w_sio2"])
@@ -206,6 +213,7 @@ def test_without_corner_the_other_figures_are_drawn(elliptical, tmp_path, monkey
 
 
 @pytest.mark.usefixtures("unpainted")
+@pytest.mark.slow
 def test_parameter_that_does_not_move_costs_the_corner_plot(elliptical, tmp_path):
     pytest.importorskip("corner")
     stuck = with_posterior(elliptical, ["hwp.w_sio2", "hwp.w_mgf2"])
@@ -215,6 +223,7 @@ def test_parameter_that_does_not_move_costs_the_corner_plot(elliptical, tmp_path
 
 
 @pytest.mark.usefixtures("unpainted")
+@pytest.mark.slow
 def test_existing_files_are_replaced(elliptical, tmp_path):
     path = tmp_path / "accuracy.png"
     path.write_text("old")
@@ -222,6 +231,7 @@ def test_existing_files_are_replaced(elliptical, tmp_path):
     assert path.read_text() == "painted"
 
 
+@pytest.mark.slow
 def test_failure_leaves_the_old_file_whole(elliptical, tmp_path, monkeypatch):
     def fail(self, path, **_):
         path.write_text("half a fig")

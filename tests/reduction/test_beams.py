@@ -6,8 +6,7 @@ import pytest
 from astropy.io import fits
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.instruments.layout import FileLayout
-from astropolcal.instruments.readout import ReadOut
+from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.reduction.frames import Frame, beam_scale, match_beams, open_cube
 from astropolcal.reduction.photometry import detector_of
 

@@ -239,6 +239,7 @@ def test_halo_takes_its_share_of_the_core(tmp_path):
     assert with_halo[0, 30, 33] > 10 * plain[0, 30, 33]
 
 
+@pytest.mark.slow
 def test_motion_and_seeing_change_from_frame_to_frame(tmp_path):
     frames = sky_frames()[[0] * 40]
     moving = [image(p)[0] for p in write_star(tmp_path, frames=frames, noise=False, motion=0.5)]
@@ -488,6 +489,7 @@ def on_sky(n_cycles, q, u_):
     return charis, chain, frames
 
 
+@pytest.mark.slow
 def test_internal_source_comes_back_unbiased(tmp_path):
     charis = instruments.get("charis")
     # 1056 fluxes: the mean of their pulls is known to 0.03
@@ -504,6 +506,7 @@ def test_internal_source_comes_back_unbiased(tmp_path):
     np.testing.assert_allclose(observations.frames["derotator"], frames["derotator"])
 
 
+@pytest.mark.slow
 def test_star_comes_back_unbiased_and_so_does_its_polarization(tmp_path):
     q, u_ = 0.008, -0.006
     charis, chain, frames = on_sky(4, q, u_)
@@ -520,6 +523,7 @@ def test_star_comes_back_unbiased_and_so_does_its_polarization(tmp_path):
     _polarization_agrees(chain, observations, charis, q, u_)
 
 
+@pytest.mark.slow
 def test_aperture_correction_recovers_the_wings_and_the_polarization(tmp_path):
     """A Moffat star with a halo, of whose light a tenth lies outside of the apertures."""
     q, u_ = 0.008, -0.006
@@ -540,6 +544,7 @@ def test_aperture_correction_recovers_the_wings_and_the_polarization(tmp_path):
     _polarization_agrees(chain, corrected, charis, q, u_)
 
 
+@pytest.mark.slow
 def test_polarization_survives_wings_outside_the_aperture(tmp_path):
     q, u_ = 0.008, -0.006
     charis, chain, frames = on_sky(2, q, u_)

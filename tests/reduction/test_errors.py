@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.instruments.readout import ReadOut
+from astropolcal.instruments.layout import ReadOut
 from astropolcal.reduction.photometry import (
     Detector,
     detector_of,

@@ -243,6 +243,7 @@ def test_radius_by_growth_and_aperture_correction(star_cube):
     )
 
 
+@pytest.mark.slow
 def test_aperture_correction_has_the_error_of_its_factor():
     for kind in [True, "growth"]:
         # light, noise and aperture such that the error of the factor is most of all

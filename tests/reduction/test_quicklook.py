@@ -65,6 +65,7 @@ def test_run_over_time(star_run, flat_run):
     assert len(plot_run(flat_run).axes) == 2
 
 
+@pytest.mark.slow
 def test_quicklook_files(star_run, tmp_path):
     written = save_quicklook(star_run, tmp_path / "look")
     assert [path.name for path in written] == ["apertures.png", "run.png"]

@@ -51,6 +51,7 @@ def flat_frames(folder, angles=(*CYCLE, 90.0), derotator=45.0, start=1):
 # --- from cubes to truth ---------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_internal_run_recovers_the_fluxes_and_calibrates(tmp_path):
     charis = instruments.get("charis")
     frames = half_wave_plate_cycles(derotator=[45, 70] * u.deg)
@@ -380,6 +381,7 @@ def test_frames_survive_the_journal(tmp_path, small):
     assert again.values == frame.values
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_and_report_progress(tmp_path, small):
     paths = star_frames(tmp_path)
     counts = []
@@ -391,6 +393,7 @@ def test_processes_give_the_same_and_report_progress(tmp_path, small):
     assert counts == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
+@pytest.mark.slow
 def test_file_that_kills_its_process_does_not_take_the_others_with_it(tmp_path, small, monkeypatch):
     paths = star_frames(tmp_path)
     paths[1] = paths[1].rename(tmp_path / "deadly_00000002_cube.fits")

@@ -62,6 +62,7 @@ def test_spectra_hold_the_columns_on_one_axis():
     np.testing.assert_array_equal(spectra["u"].meta["covariance_qu"], table["covariance_qu"])
 
 
+@pytest.mark.slow
 @given(n=st.integers(1, 12), seed=st.integers(0, 1000), some=st.booleans())
 def test_there_and_back_is_the_same_table(n, seed, some):
     table = target(n, seed)

@@ -65,6 +65,7 @@ def pulls_of(profile, seeds, **options):
 # --- all of the flux -------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_left_without_noise_is_far_below_the_errors():
     for profile in PROFILES:
         pulls, bias = pulls_of(profile, range(3), noise=False)
@@ -72,6 +73,7 @@ def test_what_is_left_without_noise_is_far_below_the_errors():
         assert abs(bias.mean()) < 5e-4, profile
 
 
+@pytest.mark.slow
 def test_fluxes_are_unbiased_with_honest_errors():
     """The error of the correction is common to a frame, so frames are what counts."""
     for profile in PROFILES:
@@ -85,11 +87,11 @@ def test_fluxes_are_unbiased_with_honest_errors():
 @pytest.mark.slow
 def test_many_cubes():
     for profile in PROFILES:
-        pulls, bias = pulls_of(profile, range(1000, 1050))
+        pulls, bias = pulls_of(profile, range(1000, 1020))
         means, squares = pulls.mean(axis=(1, 2)), (pulls**2).mean(axis=(1, 2))
-        # what may be wrong with the errors, and twice what 50 frames scatter by
-        assert abs(means.mean()) < 0.1 + 2 * means.std() / np.sqrt(len(means)), profile
-        assert abs(squares.mean() - 1) < 0.15 + 2 * squares.std() / np.sqrt(len(squares)), profile
+        # what may be wrong with the errors, and three times what 20 frames scatter by
+        assert abs(means.mean()) < 0.1 + 3 * means.std() / np.sqrt(len(means)), profile
+        assert abs(squares.mean() - 1) < 0.15 + 3 * squares.std() / np.sqrt(len(squares)), profile
         assert abs(bias.mean()) < 1e-3, profile
 
 

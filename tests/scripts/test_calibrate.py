@@ -68,6 +68,7 @@ def complaint(capsys, *arguments):
 # ---- standards ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_standard_is_predicted_and_not_fitted(tables, tmp_path):
     alone = run(tmp_path, tables["first"])
     with_standard = run(tmp_path, tables["first"], "--standard", tables["second"])
@@ -97,6 +98,7 @@ def test_the_command_predicts_what_the_function_predicts(tables, tmp_path):
     np.testing.assert_allclose(entry["s_standard_percent"], found, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_several_standards_and_optics_of_their_own(tables, tmp_path, capsys):
     files = [tables["first"], "--standard", tables["second"], "--standard", tables["dark"]]
     assert "dark: nothing determines fold_mirror.diattenuation" in complaint(capsys, *files)
@@ -148,6 +150,7 @@ def test_a_standard_at_other_wavelengths_is_refused(tables, tmp_path, capsys):
 # ---- groups ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_cross_validation_leaves_out_what_is_asked_for(tables, tmp_path, capsys):
     assert build_parser().parse_args(["calibrate"]).groups is None
     usual = run(tmp_path, tables["first"])
@@ -162,6 +165,7 @@ def test_cross_validation_leaves_out_what_is_asked_for(tables, tmp_path, capsys)
     assert "s_cv: rms error on half-wave-plate cycles left out" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_whole_datasets_may_be_left_out(tables, tmp_path, capsys):
     both = run(tmp_path, tables["first"], tables["second"], "--groups", "dataset")
     assert both["left_out"] == "datasets"
@@ -249,6 +253,7 @@ def test_impossible_targets_get_one_line(tables, capsys):
 # ---- gauge -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_fixed_is_named_in_the_gauge(tables, tmp_path):
     summary = run(tmp_path, tables["first"], *HELD)
     assert summary["gauge"] == (
@@ -310,6 +315,7 @@ def _shown(capsys, *arguments):
     return lines
 
 
+@pytest.mark.slow
 def test_a_lamp_with_the_wrong_source_is_not_usable(tables, tmp_path, capsys):
     wrong = _edited(
         tables["first"], tmp_path / "lamp.ecsv", lambda t: t.meta.update(source="unpolarized")
@@ -319,6 +325,7 @@ def test_a_lamp_with_the_wrong_source_is_not_usable(tables, tmp_path, capsys):
     assert _shown(capsys, tables["first"], tables["dark"], *HELD)[0] == "Usable"
 
 
+@pytest.mark.slow
 def test_exchanged_beams_are_not_usable(tmp_path, capsys):
     def exchange(table):
         left, right = table["flux_left"].copy(), table["flux_right"].copy()
@@ -355,6 +362,7 @@ def test_what_is_printed_fits_a_terminal_and_tells_what_is_hidden(tables, tmp_pa
     assert len(full) > 50
 
 
+@pytest.mark.slow
 def test_quiet_warns_of_what_is_not_usable(tables, capsys):
     for options in (["-q"], ["--json", "-"]):
         assert main(["calibrate", str(tables["first"]), *options]) == 0
@@ -394,6 +402,7 @@ def star_table(tables):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*frames (masked|left out)")
 @pytest.mark.slow
 def test_lamps_and_star_together(tables, star_table, tmp_path):
@@ -414,6 +423,7 @@ def test_nothing_is_masked_where_all_is_to_be_kept(tables, star_table, tmp_path)
     assert content["datasets"][0]["n"] == [15, 15, 15]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*frames (masked|left out)")
 def test_model_of_the_tertiary_mirror(tables, star_table, tmp_path):
     content = run(tmp_path, star_table, tables["first"], *HELD, "--m3", "metal")
@@ -432,6 +442,7 @@ def test_unknown_models_get_one_line(tables, capsys):
 # ---- refit of what changed ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_start_holds_all_but_what_is_free(tables, tmp_path):
     old, new = tmp_path / "old.asdf", tmp_path / "new.asdf"
     assert main(["calibrate", str(tables["first"]), "-q", "-o", str(old), *HELD]) == 0

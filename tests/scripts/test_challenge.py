@@ -42,6 +42,7 @@ def test_it_prints_rates_and_writes_what_is_asked_for(command, tmp_path, capsys)
         assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_json_on_stdout_is_nothing_but_json(command, capsys):
     command("run", *SMALL, "--json", "-", "-n", "1")
     assert json.loads(capsys.readouterr().out)["settings"]["seed"] == 0
@@ -78,6 +79,7 @@ def test_bad_input_is_refused(command):
             command(*options)
 
 
+@pytest.mark.slow
 def test_an_unknown_format_of_the_figure_is_refused(command, tmp_path):
     with pytest.raises(AstropolcalError, match="odd"):
         command(*SMALL, "-n", "1", "--figure", tmp_path / "f.odd")

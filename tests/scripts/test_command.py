@@ -51,6 +51,7 @@ def _fails(capsys, *argv):
 # ---- calibrate ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_without_files_the_packaged_example_is_calibrated_and_it_says_so(capsys, tmp_path):
     assert main(["calibrate", "--json", str(tmp_path / "out.json")]) == 0
     text = capsys.readouterr().out
@@ -78,6 +79,7 @@ def test_json_holds_the_keys_of_the_contract(small, tmp_path):
     assert len(summary["parameters"]["derotator.horizontal"]["value"]) == 3
 
 
+@pytest.mark.slow
 def test_json_on_the_standard_output_is_nothing_but_json(small, capsys):
     assert main(["calibrate", str(small), "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["instrument"] == "charis"
@@ -113,6 +115,7 @@ def test_priors_and_gauge(small, tmp_path):
     assert "accident" in json.loads(out.read_text())["gauge"]
 
 
+@pytest.mark.slow
 def test_models_and_strategies(small, tmp_path):
     for option, free in [(("--derotator", "linear"), 3 * 2 + 5), (("--strategy", "two-step"), 17)]:
         out = tmp_path / "out.json"
@@ -120,6 +123,7 @@ def test_models_and_strategies(small, tmp_path):
         assert json.loads(out.read_text())["n_free"] == free, (option, free)
 
 
+@pytest.mark.slow
 def test_output_and_info_tell_the_same(small, tmp_path, capsys):
     path = tmp_path / "cal.asdf"
     assert main(["calibrate", str(small), "-o", str(path), "--json", str(tmp_path / "a.json")]) == 0
@@ -291,6 +295,7 @@ def _damage(path, how):
         path.write_text("hello")
 
 
+@pytest.mark.slow
 def test_info_of_a_damaged_calibration(small, capsys, tmp_path):
     for how in ["truncated", "not ours", "other version", "text"]:
         path = tmp_path / "cal.asdf"

@@ -130,6 +130,7 @@ def test_the_calibration_comes_from_a_library(night, tmp_path):
     assert str(tmp_path / "lib") in fits.getheader(tmp_path / "out.fits")["CALFILE"]
 
 
+@pytest.mark.slow
 def test_no_calibration_holds_for_the_date(night, tmp_path):
     library = pytest.importorskip("astropolcal.pipeline.library").Library
     from astropolcal import Calibration
@@ -142,6 +143,7 @@ def test_no_calibration_holds_for_the_date(night, tmp_path):
         command(night / "cubes", "--calibration", tmp_path / "lib", *words)
 
 
+@pytest.mark.slow
 def test_a_file_that_does_not_hold_is_refused(night, tmp_path):
     from astropolcal import Calibration
     from astropolcal.calibration.result.validity import with_validity
@@ -169,6 +171,7 @@ def test_another_instrument_is_refused(night, tmp_path):
         command(tmp_path / path.name, "--calibration", night / "charis.asdf", *words)
 
 
+@pytest.mark.slow
 def test_a_frame_without_angles_is_named(night, tmp_path):
     paths = sorted((night / "cubes").glob("*.fits"))[:2]
     for path in paths:
@@ -221,6 +224,7 @@ def test_too_few_angles(night, tmp_path):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_no_calibration(night, tmp_path):
     with pytest.raises(AstropolcalError, match="nowhere"):
         command(night / "cubes", "--calibration", tmp_path / "nowhere", "-o", tmp_path / "o.fits")
@@ -237,6 +241,7 @@ def changed(night, folder, *keywords):
     return paths
 
 
+@pytest.mark.slow
 def test_frames_of_another_set_up(night, tmp_path):
     calibration = Calibration.read(night / "charis.asdf")
     stated = with_validity(calibration, mode="broadband JHK", valid_from="2025-01-01")

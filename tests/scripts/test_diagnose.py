@@ -112,6 +112,7 @@ def check_improved(saved, content):
     np.testing.assert_allclose(gain.value, entry["value"], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_model_of_a_calibration(folder, cal, tmp_path):
     content = run(tmp_path, cal, folder / "polarized.ecsv", *FEW)
     assert content["causes"][0]["effect"] == "beam_gain"
@@ -139,6 +140,7 @@ def test_list_of_effects(capsys):
     assert [line.split()[0] for line in lines if not line.startswith(" ")] == list(EFFECTS)
 
 
+@pytest.mark.slow
 def test_bad_input(folder, cal, tmp_path, capsys):
     table, dark = folder / "polarized.ecsv", folder / "unpolarized.ecsv"
     assert "at least one FILE" in complaint(capsys)

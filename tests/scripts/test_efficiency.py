@@ -65,6 +65,7 @@ def test_calibration_of_a_lamp_is_taken_to_the_sky(calibration, tmp_path):
     assert content["derotator_deg"] == [0, 15, 30, 45, 60, 75, 90]
 
 
+@pytest.mark.slow
 def test_best_offset_for_a_night(capsys):
     run("--target", "72.7,28.3", "--night", NIGHT)
     out = capsys.readouterr().out
@@ -76,6 +77,7 @@ def test_best_offset_for_a_night(capsys):
     assert first < -180 < last < first + 180
 
 
+@pytest.mark.slow
 def test_table_is_printed_beside_a_target_if_it_is_asked_for(capsys):
     for words in [["--altitude", "60"], ["--parallactic", "0"], ["--derotator", "90"]]:
         run("--target", "72.7,28.3", "--night", NIGHT, *words)
@@ -99,6 +101,7 @@ def test_instrument_without_telescope_is_seen_behind_its_source(capsys, monkeypa
     assert "of charis behind the internal source" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_figure_is_written(tmp_path):
     run("-o", tmp_path / "efficiency.png", "-q")
     assert (tmp_path / "efficiency.png").stat().st_size > 10_000
@@ -119,6 +122,7 @@ def test_unknown_format_of_the_figure_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_bad_input_is_one_error():
     for argv, error, words in [
         (["--target", "72.7,28.3"], ParameterError, "--target and --night belong together"),

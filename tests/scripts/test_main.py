@@ -194,6 +194,7 @@ def refused(capsys, words):
     return err
 
 
+@pytest.mark.slow
 def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch, capsys):
     for command in COMMANDS:
         monkeypatch.chdir(tmp_path)
@@ -214,6 +215,7 @@ def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+@pytest.mark.slow
 def test_nothing_is_read_that_is_no_regular_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
@@ -324,6 +326,7 @@ def test_quiet_commands_print_nothing(desk, capsys):
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_quiet_reduction_still_says_what_is_left_out(desk, tmp_path, capsys):
     (tmp_path / "CRSA00000099_cube.fits").write_text("no FITS")
     words = f"reduce cubes {tmp_path} --raw cubes/raw --source star -o some.ecsv -q"
@@ -342,6 +345,7 @@ def test_quiet_errors_are_printed(desk, capsys):
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_one_frame_is_no_frames(desk, capsys):
     call(desk, "simulate -o single.ecsv --derotator 45 --hwp 0 --without dichroic")
     assert "(1 frame x 22 wavelengths)" in capsys.readouterr().out
@@ -349,6 +353,7 @@ def test_one_frame_is_no_frames(desk, capsys):
     assert "one (1 cube)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_summary_has_no_negative_zero(desk, capsys):
     """Misalignments that are held at zero, and those that the data pull just below it."""
     held = "--fix hwp.theta=-1e-9 --fix derotator.theta=0"

@@ -35,6 +35,7 @@ def cubes(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_cubes_to_table(cubes, tmp_path, capsys):
     (cubes / "CRSA00000077_cube.fits").write_text("no FITS")
     table, summary = tmp_path / "obs.ecsv", tmp_path / "summary.json"

@@ -111,6 +111,7 @@ def test_samples_are_about_the_fit_and_as_wide_as_is_known_otherwise(sampled, ca
     assert np.abs((posterior.convergence.median - posterior.fitted) / expected).max() < 1.5
 
 
+@pytest.mark.slow
 def test_json_has_the_calibration_and_its_posterior(sampled, calibration):
     content = json.loads((sampled / "out.json").read_text())
     assert content["n_free"] == len(Calibration.read(calibration).covariance)
@@ -142,6 +143,7 @@ def test_figures_have_those_of_the_posterior(sampled):
     assert {"corner.png", "traces.png", "residuals.png", "accuracy.png"} <= found
 
 
+@pytest.mark.slow
 def test_words_and_table_on_the_terminal(sampled):
     text = (sampled / "out.txt").read_text()
     lines = text.splitlines()
@@ -157,6 +159,7 @@ def test_words_and_table_on_the_terminal(sampled):
     assert f"Written: {sampled / 'out.asdf'}" in text
 
 
+@pytest.mark.slow
 def test_short_run_warns_and_says_so_in_the_file(calibration, table, capsys, tmp_path):
     out = tmp_path / "out.asdf"
     assert main(["sample", calibration, table, *RUN, "-q", "-o", str(out)]) == 0
@@ -171,6 +174,7 @@ def test_json_on_the_standard_output_is_nothing_but_json(calibration, table, cap
     assert json.loads(capsys.readouterr().out)["posterior"]["n_steps"] == 60
 
 
+@pytest.mark.slow
 def test_quiet_prints_nothing_but_warnings(calibration, table, capsys):
     assert main(["sample", calibration, table, *RUN, "-q"]) == 0
     captured = capsys.readouterr()
@@ -187,6 +191,7 @@ def test_all_free_parameters_by_default(calibration, table, tmp_path):
     assert again.posterior.chain.shape[1] == max(2 * len(again.covariance), 24)
 
 
+@pytest.mark.slow
 def test_burn_in(calibration, table, tmp_path):
     """A run as short as this leaves out half of itself."""
     for text, expected in [("17", 17), ("auto", 30)]:
@@ -197,6 +202,7 @@ def test_burn_in(calibration, table, tmp_path):
         assert Calibration.read(out).posterior.convergence.burn_in == expected, (text, expected)
 
 
+@pytest.mark.slow
 def test_reader_that_goes_away_does_not_cost_the_samples(calibration, table, tmp_path, monkeypatch):
     def gone(_):
         raise BrokenPipeError
@@ -218,6 +224,7 @@ def test_file_may_be_replaced_by_itself(calibration, table, tmp_path):
     assert main(["sample", str(path), table, *RUN, "-q", "-o", str(path)]) == 0
 
 
+@pytest.mark.slow
 def test_two_tables_in_any_order(tmp_path):
     tables = [make_table(tmp_path / f"{i}.ecsv", i) for i in (1, 2)]
     path = tmp_path / "both.asdf"
@@ -259,6 +266,7 @@ def interrupt_after(patch, count):
     patch.setattr(Chain, "append", interrupted)
 
 
+@pytest.mark.slow
 def test_interrupted_run_goes_on(calibration, table, tmp_path, capsys):
     checkpoint = tmp_path / "run.h5"
     whole = ["sample", calibration, table, *RUN, "-q"]
@@ -275,6 +283,7 @@ def test_interrupted_run_goes_on(calibration, table, tmp_path, capsys):
     assert first == second
 
 
+@pytest.mark.slow
 def test_resume_without_a_checkpoint_yet_begins_one(calibration, table, tmp_path):
     checkpoint = tmp_path / "run.h5"
     argv = ["sample", calibration, table, *RUN, "-q", "--checkpoint", str(checkpoint), "--resume"]
@@ -286,6 +295,7 @@ def test_resume_without_a_checkpoint_yet_begins_one(calibration, table, tmp_path
     assert json.loads((tmp_path / "out.json").read_text())["posterior"]["n_steps"] == 80
 
 
+@pytest.mark.slow
 def test_checkpoint_is_not_overwritten(calibration, table, tmp_path, capsys):
     checkpoint = tmp_path / "run.h5"
     checkpoint.write_bytes(b"precious")
@@ -306,6 +316,7 @@ def test_checkpoint_of_another_run(calibration, table, tmp_path, capsys):
 # ---- bad input -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_tables_of_something_else(calibration, table, capsys, tmp_path):
     other = make_table(tmp_path / "other.ecsv", 99)
     complaint = fails(capsys, calibration, other)
@@ -315,6 +326,7 @@ def test_tables_of_something_else(calibration, table, capsys, tmp_path):
     assert "same frames" in fails(capsys, calibration, table, table)
 
 
+@pytest.mark.slow
 def test_table_that_is_missing(capsys, tmp_path):
     tables = [make_table(tmp_path / f"{i}.ecsv", i) for i in (1, 2)]
     assert main(["calibrate", *tables, "-q", "-o", str(tmp_path / "both.asdf")]) == 0
@@ -347,6 +359,7 @@ def test_bad_options_get_one_line_and_status_two(calibration, table, capsys, tmp
         assert list(tmp_path.iterdir()) == [], (options, complaint)
 
 
+@pytest.mark.slow
 def test_files_that_are_none(calibration, table, capsys, tmp_path):
     assert "the following arguments are required: FILE" in fails(capsys, calibration)
     assert "missing.asdf: no such file" in fails(capsys, tmp_path / "missing.asdf", table)
@@ -364,6 +377,7 @@ def test_missing_emcee(calibration, table, capsys, monkeypatch):
     assert "no free parameter 'hwp.tilt'" in complaint
 
 
+@pytest.mark.slow
 def test_what_only_the_summary_needs_is_missed_before_the_run(
     calibration, table, capsys, monkeypatch
 ):

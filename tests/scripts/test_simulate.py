@@ -74,6 +74,7 @@ def test_cubes_of_a_star_show_two_images(tmp_path):
     assert abs(other[0] - y) == pytest.approx(dy, abs=1)
 
 
+@pytest.mark.slow
 def test_calibration_of_the_internal_source_serves_for_a_star(tmp_path):
     lamp, cal, table = (tmp_path / name for name in ("lamp.ecsv", "cal.asdf", "star.ecsv"))
     assert simulated("-o", lamp) == 0
@@ -115,6 +116,7 @@ def test_cubes_are_not_written_over_others(tmp_path, capsys):
 
 
 # an internal source and an unpolarized star do not tell where north is
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the calibration leaves open")
 @pytest.mark.slow
 def test_the_defaults_of_one_command_are_good_input_for_the_next(tmp_path, monkeypatch):

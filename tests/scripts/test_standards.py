@@ -150,6 +150,7 @@ def stars_in(text):
     return [line[:15].strip() for line in lines[:end]], lines[end:]
 
 
+@pytest.mark.slow
 def test_a_night_lists_the_best_and_says_how_many_more(capsys):
     names, rest = stars_in(printed(capsys, *NIGHT))
     every = standards.search(site="subaru", night="2025-11-03")["name"]
@@ -205,6 +206,7 @@ def test_a_column_of_zero_has_no_sign():
     assert "   0 to    0" in line
 
 
+@pytest.mark.slow
 def test_a_figure_of_fewer_stars_than_are_listed_says_so(capsys, tmp_path):
     plot = ["--plot", str(tmp_path / "night.png")]
     text = printed(capsys, *NIGHT, "--limit", "6", *plot)

@@ -42,7 +42,7 @@ def test_numbers_are_possible():
         assert np.all(~np.isfinite(error) | (error > 0))
     theta = POLARIZATION["theta"].value
     assert np.all(np.isnan(theta) | ((theta >= 0) & (theta <= 180)))
-    assert set(STARS["kind"]) == set(standards.KINDS)
+    assert set(STARS["kind"]) == set(standards.catalogues.KINDS)
 
 
 def test_bands_are_where_they_should_be():
@@ -89,13 +89,13 @@ def test_unpolarized_stars_are_and_polarized_are():
             assert star.law is not None or np.max(degree) > 0.3
 
 
-@pytest.mark.parametrize("name", ["HD 293396", "HD 35532"])
-def test_unpolarized_stars_of_the_charis_calibration(name):
-    star = standards.get(name)
-    assert star.kind == "unpolarized"
-    assert star.polarization["p"][0] == 0
-    # published 0.0 +- 0.2 %
-    assert round(star.polarization["p_err"][0].to_value(u.percent), 1) == 0.2
+def test_unpolarized_stars_of_the_charis_calibration():
+    for name in ["HD 293396", "HD 35532"]:
+        star = standards.get(name)
+        assert star.kind == "unpolarized", name
+        assert star.polarization["p"][0] == 0, name
+        # published 0.0 +- 0.2 %
+        assert round(star.polarization["p_err"][0].to_value(u.percent), 1) == 0.2, name
 
 
 def test_hd30675_has_the_law_of_whittet_1992():
@@ -140,9 +140,8 @@ def test_the_angle_of_a_law_is_that_of_the_bands():
         assert star.law.rotation.value > 5
 
 
-@pytest.mark.parametrize(
-    ("written", "name"),
-    [
+def test_names_are_forgiven():
+    for written, name in [
         ("hd30675", "HD 30675"),
         (" HD_030675 ", "HD 30675"),
         ("HDE 283812", "HD 283812"),
@@ -154,10 +153,8 @@ def test_the_angle_of_a_law_is_that_of_the_bands():
         ("g191b2b", "G191-B2B"),
         ("SA 93-317", "SA93-317"),
         ("Vela1 95", "Vel I No. 95"),
-    ],
-)
-def test_names_are_forgiven(written, name):
-    assert standards.get(written).name == name
+    ]:
+        assert standards.get(written).name == name, (written, name)
 
 
 def test_no_two_stars_share_a_name():
@@ -167,10 +164,10 @@ def test_no_two_stars_share_a_name():
     assert len(set(keys)) >= len(stars)
 
 
-@pytest.mark.parametrize("name", ["HD 999", "HR 1", "Vega", "star"])
-def test_a_star_like_no_other_gets_none(name):
-    with pytest.raises(ParameterError, match=rf"no standard star '{name}'$"):
-        standards.get(name)
+def test_a_star_like_no_other_gets_none():
+    for name in ["HD 999", "HR 1", "Vega", "star"]:
+        with pytest.raises(ParameterError, match=rf"no standard star '{name}'$"):
+            standards.get(name)
 
 
 def test_unknown_star_gets_a_suggestion():

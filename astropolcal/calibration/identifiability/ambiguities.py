@@ -25,7 +25,7 @@ from astropolcal.calibration.identifiability.sky import (
 )
 from astropolcal.calibration.system import split_chain
 from astropolcal.chain import join, leaves, stages, system_mueller
-from astropolcal.instruments import without_nuisance
+from astropolcal.instruments.base import without_nuisance
 from astropolcal.optics import COORDINATES, EllipticalRetarder, LinearRetarder, MuellerElement
 
 __all__ = []

@@ -20,7 +20,8 @@ from astropolcal import instruments
 from astropolcal.calibration.system import Rows, free_of, from_first_stage
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainError
-from astropolcal.instruments import SkyLaw, without_nuisance
+from astropolcal.instruments import SkyLaw
+from astropolcal.instruments.base import without_nuisance
 from astropolcal.optics import COORDINATES
 
 __all__ = []

@@ -52,7 +52,7 @@ class LogPosterior:
     Raises
     ------
     FitError
-        If there is no noise to be had, see `noise_of`.
+        If there is no noise to be had.
     ParameterError
         If a parameter is unknown, fixed or named twice, or the noise has the
         wrong shape or is not positive.

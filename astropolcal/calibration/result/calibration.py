@@ -259,7 +259,8 @@ class Calibration:
         Parameters
         ----------
         groups : `~numpy.ndarray` or str, optional
-            Group of each datum, or what makes a group, see `groups_by`; by
+            Group of each datum, or what makes a group, ``"derotator"``,
+            ``"cycle"`` (of the half-wave plate) or ``"dataset"``; by
             default its derotator angle.
 
         Returns

@@ -96,6 +96,11 @@ def optics_words(sets):
     return " or ".join(f"with {' + '.join(s)}" if s else "no optional optics" for s in sets)
 
 
+def folded(mode):
+    """Return a mode as it is compared: case and blanks do not matter."""
+    return " ".join(str(mode).split()).casefold()
+
+
 def beam_words(beam):
     """Return in words which optics are known to be in the beam or not."""
     told = {True: [], False: []}

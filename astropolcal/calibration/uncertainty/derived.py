@@ -24,7 +24,7 @@ from astropolcal.chain import (
     with_beam,
 )
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
-from astropolcal.measurement import FreeParameters
+from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.optics import (
     Diattenuator,
     DiattenuatorRetarder,

@@ -293,7 +293,7 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     -------
     `~astropy.table.QTable`
         Columns ``wavelength``, ``s_rel``, ``s_unpol``, ``s_sky``, ``s_abs``, ``s_Q``,
-        ``s_U``, ``s_p`` (percent) and ``s_chi`` (degree), see `propagate_accuracy`;
+        ``s_U``, ``s_p`` (percent) and ``s_chi`` (degree), by the equations of the paper (Sec. 2.3);
         meta ``column``, ``missing`` and ``words``.
 
     Raises
@@ -520,7 +520,7 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     dataset : int
         Which dataset of the calibration.
     groups : {"derotator", "cycle", "dataset"} or `~numpy.ndarray`, optional
-        Cross-validate anew by `groups_by`, or by the group of each datum; by
+        Cross-validate anew by what makes a group, or by the group of each datum; by
         default ``s_cv`` is what the calibration remembers (derotator angles).
 
     Returns

