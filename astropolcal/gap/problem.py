@@ -218,15 +218,20 @@ class GapProblem:
         return np.concatenate([*(channel.whiten(r).ravel() for channel, r in parts), known])
 
     def jacobian(self, coefficients, whitened=True):
-        """Return the derivative of the predicted rows, shape (n_rows, n_coefficients)."""
+        """
+        Return the derivative of the predicted rows, shape (n_rows, n_coefficients).
+
+        Those that are not whitened are of the data alone.
+        """
         vector = self.vector(coefficients)
         out = np.empty((self.size, self.n_rows))
         for channel, dataset, rows in zip(self.channels, self.datasets, self.segments, strict=True):
             slopes = self._slopes(channel, dataset, vector)
             slopes = channel.whiten(slopes) if whitened else slopes
             out[:, rows] = slopes.reshape(self.size, rows.stop - rows.start)
-        out[:, self.n_rows - len(self.known) :] = self._holds.T
-        return out.T
+        seen = self.n_rows - len(self.known)
+        out[:, seen:] = self._holds.T
+        return out.T if whitened else out.T[:seen]
 
     def rows(self, masks):
         """Return which rows masks (of each dataset, broadcast) keep; what is known is kept."""

@@ -5,10 +5,12 @@ import gap_data as data
 import numpy as np
 import pytest
 
+from astropolcal.gap import diagnose
 from astropolcal.gap.challenge import make_challenge
 from astropolcal.gap.effects import Context, get_effect
 from astropolcal.gap.model import Model, nominal_model
 from astropolcal.gap.problem import Fit
+from astropolcal.gap.report import to_dict
 
 DIATTENUATOR = "static_diattenuator"
 
@@ -108,3 +110,12 @@ def test_a_mounting_that_is_known_is_a_datum():
     assert free.p_value > 1e-3
     (angle,), *_ = free.sizes("mirror_misalignment")["fold_mirror.theta"]
     assert abs(angle) > 3
+
+
+def test_a_known_mounting_is_no_row_of_the_data():
+    """What is worked out of the rows knows which of them are data: page, proposals, places."""
+    fault = {"type": "cell", "place": "in:hwp", "kind": "rotation", "dependence": "time"}
+    observations, chains, _ = make_challenge(3, snr=40.0, fault=fault)
+    told = to_dict(diagnose(chains, observations))
+    assert told["verdict"] in ("named", "located")
+    assert told["causes"][0]["cell"]["dependence"] == "time"

@@ -279,8 +279,7 @@ def _check_derivative(effect, problem, parameter):
         middle[where] += place * scale
         slopes = problem.jacobian(middle, whitened=False)
         for column in range(where.start, where.stop):
-            expected = _difference(problem, middle, column, scale)
-            found = slopes[: len(expected), column]
+            found, expected = slopes[:, column], _difference(problem, middle, column, scale)
             # a derivative that is zero has no relative error
             size = max(np.abs(expected).max(), 1e-9 / scale)
             worst = np.abs(found - expected).max() / size
