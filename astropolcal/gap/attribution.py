@@ -21,7 +21,7 @@ from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.optics.perturbations import split_run
 
-__all__ = ["Candidate", "Scan", "false_discovery", "scan"]
+__all__ = []
 
 # sizes of the prior, in units of the usual one
 _SIZES = (0.1, 1.0, 10.0)
@@ -73,12 +73,6 @@ class Candidate:
         Degree of the law in wavelength of a cell, None for one value a wavelength.
     context : Context or None
         With which a named effect is added, None for that of the data.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.attribution import Candidate
-    >>> Candidate(None, None, 30.0, 2, 10.0).evidence
-    10.0
     """
 
     named: object
@@ -106,18 +100,7 @@ class Candidate:
         return CellEffect(self.cell, self.degree) if self.named is None else self.named
 
     def tempered(self, temper):
-        """
-        Return the same with residuals of another variance, in units of the noise.
-
-        Parameters
-        ----------
-        temper : float
-            The variance.
-
-        Returns
-        -------
-        Candidate
-        """
+        """Return the same with residuals of another variance, in units of the noise."""
         values, share, scale = self.spectrum
         evidence = _log_factor(values[None], share[None], scale, temper)[0] + self.prior
         return replace(self, evidence=float(evidence))
@@ -151,12 +134,6 @@ class Scan:
         Derivatives of the data to the cells.
     temper : float
         Variance of the residuals about the model with the cause, in units of the noise.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.attribution import Scan
-    >>> Scan([]).best is None
-    True
     """
 
     candidates: list
@@ -164,18 +141,7 @@ class Scan:
     temper: float = 1.0
 
     def freer(self, candidate):
-        """
-        Return a cause with the law in wavelength for which there is most evidence.
-
-        Parameters
-        ----------
-        candidate : Candidate
-            One of the candidates.
-
-        Returns
-        -------
-        Candidate
-        """
+        """Return a cause with the law in wavelength for which there is most evidence."""
         best, probes = candidate, self.probes
         near = () if probes is None or candidate.is_named else probes.steps_near(candidate.cell)
         if near:
@@ -191,37 +157,11 @@ class Scan:
         return best
 
     def of_cell(self, cell, degree):
-        """
-        Return the candidate of a cell with a law of some degree, None where it does nothing.
-
-        Parameters
-        ----------
-        cell : Cell
-            Its place and kind are among those of the probes.
-        degree : int or None
-            Degree of the law in wavelength.
-
-        Returns
-        -------
-        Candidate or None
-        """
+        """Return the candidate of a cell with a law of some degree, None where it does nothing."""
         return next(iter(_of_cell(self.probes, cell, degree, self.temper)), None)
 
     def by_run(self, candidate):
-        """
-        Return the evidence for a cause in each of several runs alone.
-
-        Parameters
-        ----------
-        candidate : Candidate
-            A cause that the model of the scan does not have.
-
-        Returns
-        -------
-        dict of str to float
-            Name of the dataset to the logarithm of the Bayes factor; without those that have no
-            place for it, and empty where there is one run only or the cause is in one.
-        """
+        """Return the evidence for a cause in each of several runs alone."""
         probes = self.probes
         if probes is None or probes.run_of(candidate.cell) is not None:
             return {}
@@ -237,20 +177,7 @@ class Scan:
         return found
 
     def named_as(self, candidate, effects):
-        """
-        Return the names of a cell, each with the law for which there is most evidence.
-
-        Parameters
-        ----------
-        candidate : Candidate
-            A cell.
-        effects : sequence of Effect
-            The library.
-
-        Returns
-        -------
-        list of Candidate
-        """
+        """Return the names of a cell, each with the law for which there is most evidence."""
         chains, own = self.probes.model.trains, self.probes.own
         same = [
             effect
@@ -274,37 +201,9 @@ def scan(model, effects=(), *, cells=True, temper=1.0, without=None, like=None):
     """
     Return the evidence for all cells and named effects beside a fitted model.
 
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    effects : sequence of Effect
-        Named effects; those that are in the model or have no place in it are left out.
-    cells : bool
-        Whether to ask for the cells as well.
-    temper : float
-        Variance of the residuals about the model with the cause, in units of the noise.
-    without : str, optional
-        Name of an effect of the model that is taken out, to first order.
-    like : Probes, optional
-        Those of another scan of the same model, whose derivatives are taken over.
-
-    Returns
-    -------
-    Scan
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.attribution import scan
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> model = nominal_model([chain], [simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)])
-    >>> bool(scan(model).best.evidence < 5)
-    True
+    Effects that are in the model or have no place in it are left out; ``temper`` is the variance of
+    the residuals about the model with the cause, in units of the noise. One effect of the model may
+    be taken out, to first order; derivatives are those of Probes ``like`` them, where given.
     """
     probes = Probes(model, () if without is None else (without,), like)
     found = _cells(probes, temper) if cells else []
@@ -538,27 +437,7 @@ def _with_name(effect, model, values, share, temper):
 
 
 def false_discovery(p_values):
-    """
-    Return p-values corrected for the number of looks.
-
-    Parameters
-    ----------
-    p_values : sequence of float
-        One a test.
-
-    Returns
-    -------
-    list of float
-        The smallest false discovery rate at which each is called; Benjamini &
-        Yekutieli (2001, doi:10.1214/aos/1013699998), which allows for any
-        dependence.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.attribution import false_discovery
-    >>> [round(p, 4) for p in false_discovery([0.001, 0.5])]
-    [0.003, 0.75]
-    """
+    """Return p-values corrected for the number of looks."""
     if not len(p_values):
         return []
     return [float(p) for p in stats.false_discovery_control(p_values, method="by")]

@@ -24,7 +24,7 @@ from astropolcal.optics import GENERATORS
 from astropolcal.optics.core import COORDINATES
 from astropolcal.optics.perturbations import Dependence, split_run
 
-__all__ = ["Cell", "Place", "Probes", "dependences", "places"]
+__all__ = []
 
 # kinds that a detector may have, and the dependence of each where there is one only
 _DETECTOR = {
@@ -72,12 +72,6 @@ class Cell:
     dependence : str
         As `~astropolcal.optics.Perturbation` takes it, or ``"flux"`` and ``"previous"``; in one of
         several runs only with ``"/dataset:NAME"`` behind it.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.cells import Cell
-    >>> Cell("in:derotator", "retardance_h", "time").title
-    'retardance along the axes of the derotator that drifts through the run'
     """
 
     place: str
@@ -194,13 +188,6 @@ class Place:
         Stage whose frame it has, with its sign.
     theta : float
         Orientation in that frame, radian.
-
-    Examples
-    --------
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.cells import places
-    >>> [place.name for place in places(instruments.get("charis").chain())]
-    ['source', 'in:hwp', 'after:hwp', 'in:derotator', 'after:derotator']
     """
 
     name: str
@@ -216,27 +203,7 @@ class Place:
 
 
 def places(chain):
-    """
-    Return the places of a chain, in the order in which the light meets them.
-
-    Parameters
-    ----------
-    chain : Optic or `~astropy.modeling.CompoundModel`
-        The chain.
-
-    Returns
-    -------
-    list of Place
-        Behind the source; in front of the plate where there is a telescope; in the frame of each
-        optic on a stage, and behind it; and behind what stands still and retards.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.cells import places
-    >>> from astropolcal import instruments
-    >>> len(places(instruments.get("charis").chain()))
-    5
-    """
+    """Return the places of a chain, in the order in which the light meets them."""
     found = [o for o in leaves(chain) if not (o.name or "").startswith("gap_")]
     split = next(i for i, o in enumerate(found) if o.splits_light)
     found = found[: split + 1]
@@ -270,34 +237,7 @@ def _behind(optic, other, found):
 
 
 def dependences(problem, most_steps=_MOST_STEPS):
-    """
-    Return the functions of the frame that the data of a problem can tell.
-
-    Parameters
-    ----------
-    problem : GapProblem
-        Chains and datasets.
-    most_steps : int
-        Steps are looked for at so many frames.
-
-    Returns
-    -------
-    dict of str to list of `~numpy.ndarray`
-        Dependence to its functions, shape (count, F), one array a dataset.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.cells import dependences
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> model = nominal_model([chain], [simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)])
-    >>> list(dependences(model.problem, 0))[:4]
-    ['constant', 'time', 'time2', 'harmonic:hwp:1']
-    """
+    """Return the functions of the frame that the data of a problem can tell."""
     stages = dict.fromkeys(
         stage
         for dataset in problem.datasets
@@ -328,18 +268,7 @@ _MOVED = ("direction", "move")
 
 
 def count_runs(problem):
-    """
-    Return how many runs of the same kind of source the datasets of a problem are at most.
-
-    Parameters
-    ----------
-    problem : GapProblem
-        Chains and datasets.
-
-    Returns
-    -------
-    int
-    """
+    """Return how many runs of the same kind of source the datasets of a problem are at most."""
     return max(Counter(d.observations.source for d in problem.datasets).values())
 
 
@@ -391,20 +320,6 @@ class Probes:
         Those of the same model, whose derivatives are taken over.
     most_steps : int
         Steps are looked for at so many frames.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.cells import Probes
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> observations = simulate(charis.chain(), charis.wavelength, frames, seed=1)
-    >>> probes = Probes(nominal_model([charis.chain()], [observations]))
-    >>> len({cell.place for cell in probes.cells})
-    6
     """
 
     def __init__(self, model, without=(), like=None, most_steps=_MOST_STEPS):
@@ -469,15 +384,7 @@ class Probes:
         """
         Return dependences with their functions of the frame, those of as many together.
 
-        Parameters
-        ----------
-        names : sequence of str
-            Dependences.
-
-        Returns
-        -------
-        list of tuple
-            Names, and their functions of each dataset, shape (n, count, F).
+        Each is the names and, per dataset, an array (n, count, F).
         """
         key = tuple(names)
         if key not in self._groups:
@@ -668,18 +575,8 @@ class Reduced:
         """
         Return the normal equations of dependences, less tangent and lamp.
 
-        Parameters
-        ----------
-        waves : list of `~numpy.ndarray`
-            Functions of the frame, m for each of n dependences, shape (n, m, F), one array a
-            dataset.
-
-        Returns
-        -------
-        gram : `~numpy.ndarray`
-            Shape (n, m k, m k), of a law of k columns.
-        target : `~numpy.ndarray`
-            Shape (n, m k).
+        The functions of the frame are m for each of n dependences, an array (n, m, F) per dataset;
+        the equations have shapes (n, m k, m k) and (n, m k), for a law of k columns.
         """
         n, m = waves[0].shape[:2]
         k = self.target[0].shape[1]

@@ -18,7 +18,7 @@ from astropolcal.gap.attribution import scan
 from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.gap.shrinkage import foreseen, stability
 
-__all__ = ["Group", "Selection", "explained_by_one", "select"]
+__all__ = []
 
 # the best candidates count where residuals are no noise
 _RETEMPERED = 400
@@ -80,13 +80,6 @@ class Group:
         Share of the halves of the wavelengths and of left-out angles in which it is found.
     by_dataset : dict of str to float
         Evidence for it in each of several runs alone.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.attribution import Candidate
-    >>> from astropolcal.gap.selection import Group
-    >>> Group([(Candidate(None, None, 30.0, 2, 10.0), 1.0)], 0.9).best.evidence
-    10.0
     """
 
     members: list
@@ -118,12 +111,6 @@ class Selection:
         Probability that the gap has a cause that no table has.
     history : list of HeldOut or None
         Errors on left-out frames of the base and after each cause.
-
-    Examples
-    --------
-    >>> from astropolcal.gap.selection import Selection
-    >>> Selection([], None, None, 0.0, []).groups
-    []
     """
 
     groups: list
@@ -147,42 +134,7 @@ class _State:
 
 
 def select(base, library, groups, say, *, cells=True, changes=False):
-    """
-    Choose the causes that a model lacks.
-
-    Parameters
-    ----------
-    base : Model
-        The fitted model.
-    library : sequence of Effect
-        Named effects that are not discrete.
-    groups : tuple or None
-        As `frame_groups` gives them; None to trust the evidence alone.
-    say : callable
-        Called with a line on what is done next.
-    cells : bool
-        Whether to ask for cells as well as for names.
-    changes : bool
-        Whether causes of one run only come first.
-
-    Returns
-    -------
-    Selection
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.gap.selection import select
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> model = nominal_model([chain], [simulate(chain, charis.wavelength, frames, seed=1)])
-    >>> select(model, [], None, lambda line: None).groups
-    []
-    """
+    """Choose the causes that a model lacks."""
     first = _scanned(base, library, cells)
     runs = count_runs(base.problem)
     most = _MOST if runs < 2 or not cells else _MOST // 2
@@ -275,36 +227,7 @@ def _growing(best):
 
 
 def explained_by_one(model, library, *, cells=True):
-    """
-    Return whether a single cause leaves no more than noise.
-
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    library : sequence of Effect
-        Named effects that are not discrete.
-    cells : bool
-        Whether to ask for cells as well as for names.
-
-    Returns
-    -------
-    bool
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.gap.selection import explained_by_one
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)
-    >>> model = nominal_model([chain], [data])
-    >>> explained_by_one(model, [])
-    False
-    """
+    """Return whether a single cause leaves no more than noise."""
     found = _scanned(model, library, cells)
     for one in map(found.freer, _distinct(found.candidates, _WIDTH[0])):
         if one.evidence > ENOUGH and model.with_effect(*one.recipe, **_QUICK).p_value > _NOISE:

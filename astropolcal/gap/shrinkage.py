@@ -15,7 +15,7 @@ import numpy as np
 from astropolcal.exceptions import GapError
 from astropolcal.gap.model import Linear
 
-__all__ = ["HeldOut", "foreseen", "frame_groups", "held_out", "left_out_fits", "stability"]
+__all__ = []
 
 # degree; angles that differ by less are one group
 _SAME_ANGLE = 0.5
@@ -45,14 +45,6 @@ class HeldOut:
         Half the sum of squares of the whitened prediction errors of both channels.
     counts : `~numpy.ndarray`
         Number of data of each group.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropolcal.gap.shrinkage import HeldOut
-    >>> one = HeldOut(["a", "b"], np.array([0.02, 0.02]), np.ones(2), np.array([200, 200]))
-    >>> round(one.percent, 6)
-    1.0
     """
 
     labels: list
@@ -74,15 +66,7 @@ class HeldOut:
         """
         Return by how much the mean square is lower in another model, in percent.
 
-        Parameters
-        ----------
-        other : HeldOut
-            Of the same groups.
-
-        Returns
-        -------
-        value, low, high : float
-            With the 16th and 84th percentile of a bootstrap over the groups.
+        With the 16th and 84th percentile of a bootstrap over the groups.
         """
         value = 1 - other.squares.sum() / self.squares.sum()
         rng = np.random.default_rng(20261121)
@@ -93,20 +77,7 @@ class HeldOut:
         return 100 * float(value), 100 * float(low), 100 * float(high)
 
     def better_than(self, other):
-        """
-        Return by how many standard errors the whitened squares are below those of another.
-
-        Parameters
-        ----------
-        other : HeldOut
-            Of the same groups.
-
-        Returns
-        -------
-        float
-            Mean difference over the groups by its standard error; at least two
-            groups.
-        """
+        """Return by how many standard errors the whitened squares are below those of another."""
         difference = (other.whitened - self.whitened) / self.counts
         error = difference.std(ddof=1) / np.sqrt(len(difference))
         if error > 0:
@@ -117,35 +88,9 @@ class HeldOut:
 
 def frame_groups(observations):
     """
-    Return the group of every frame of every dataset.
+    Return the names of the groups, and the group of every frame, an array per dataset.
 
-    Parameters
-    ----------
-    observations : sequence of Observations
-        The datasets.
-
-    Returns
-    -------
-    labels : list of str
-        Names of the groups.
-    numbers : list of `~numpy.ndarray`
-        Group of each frame, one array a dataset.
-
-    Raises
-    ------
-    GapError
-        If there are fewer than three groups to leave out.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.shrinkage import frame_groups
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> frame_groups([simulate(charis.chain(), charis.wavelength, frames, seed=1)])[0]
-    ['derotator at 45 deg', 'derotator at 60 deg', 'derotator at 90 deg']
+    Fewer than three groups are refused: a derotator angle each, or blocks in time.
     """
     if all("derotator" in o.frames.colnames for o in observations):
         angles = [np.rad2deg(o.position("derotator")) for o in observations]
@@ -175,35 +120,7 @@ def _blocks(observations, count=8):
 
 
 def held_out(model, groups):
-    """
-    Return the prediction errors of a model on frames left out in groups.
-
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    groups : tuple
-        As `frame_groups` gives them.
-
-    Returns
-    -------
-    HeldOut
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.gap.shrinkage import frame_groups, held_out
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> charis = instruments.get("charis")
-    >>> chain = charis.chain(derotator="linear")
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 75, 90] * u.deg)
-    >>> observations = simulate(chain, charis.wavelength, frames, seed=1)
-    >>> model = nominal_model([chain], [observations])
-    >>> bool(held_out(model, frame_groups([observations])).percent < 0.1)
-    True
-    """
+    """Return the prediction errors of a model on frames left out in groups."""
     labels, numbers = groups
     problem = model.problem
     squares, whitened, counts = (np.zeros(len(labels)) for _ in range(3))
@@ -228,31 +145,6 @@ def foreseen(model, groups):
     With an orthonormal basis N of the derivatives, residuals r of a group become
     :math:`(1 - N N^T)^{-1} r` where the group does not take part in the fit: exact in a linear
     model (Cook & Weisberg 1982, Residuals and Influence in Regression, Sec. 2.2).
-
-    Parameters
-    ----------
-    model : Model or Linear
-        The fitted model, or one from which effects were taken.
-    groups : tuple
-        As `frame_groups` gives them.
-
-    Returns
-    -------
-    HeldOut
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.gap.shrinkage import foreseen, frame_groups
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)
-    >>> model = nominal_model([chain], [data])
-    >>> bool(foreseen(model, frame_groups([data])).percent < 0.2)
-    True
     """
     labels, numbers = groups
     linear = model if isinstance(model, Linear) else model.without(())
@@ -292,34 +184,6 @@ def stability(model, groups, temper):
 
     The parts are the odd and the even wavelengths, and the data without each group of frames. An
     effect is asked for where the evidence for its size by Schwarz (1978) is above that for none.
-
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    groups : tuple or None
-        As `frame_groups` gives them; None for the halves of the wavelengths alone.
-    temper : float
-        Variance of the residuals, in units of the noise.
-
-    Returns
-    -------
-    dict of str to float
-        Share by name of the effect.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from astropolcal import instruments
-    >>> from astropolcal.gap.model import nominal_model
-    >>> from astropolcal.gap.shrinkage import stability
-    >>> from astropolcal.simulation import half_wave_plate_cycles, simulate
-    >>> chain = instruments.get("charis").chain(derotator="linear", wavelength=[1.2, 1.6] * u.um)
-    >>> frames = half_wave_plate_cycles(derotator=[45, 60, 90] * u.deg)
-    >>> data = simulate(chain, [1.2, 1.6] * u.um, frames, seed=1)
-    >>> model = nominal_model([chain], [data])
-    >>> stability(model, None, 1.0)
-    {}
     """
     problem, q = model.problem, model.fit.coefficients
     absent, jacobian = problem.coefficients(problem._absent()), model.jacobian
@@ -367,26 +231,7 @@ def _parts(problem, groups):
 
 
 def left_out_fits(model, labels, numbers):
-    """
-    Yield the fit of a model without each group of frames.
-
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    labels, numbers
-        As `frame_groups` gives them.
-
-    Yields
-    ------
-    Fit
-
-    Examples
-    --------
-    >>> from astropolcal.gap.shrinkage import left_out_fits
-    >>> list(left_out_fits(None, [], []))
-    []
-    """
+    """Yield the fit of a model without each group of frames."""
     for i in range(len(labels)):
         rows = model.problem.rows([number != i for number in numbers])
         yield model.problem.fit(model.fit.coefficients, rows=rows, steps=_STEPS, share=_SHARE)

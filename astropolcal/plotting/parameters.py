@@ -484,7 +484,7 @@ def plot_mirrors(calibration, names=None, reference=None, *, figure=None):
     calibration : Calibration
         The calibration; one read from a file will do.
     names : sequence of str, optional
-        Mirrors, by default all, see `~astropolcal.calibration.mirror_names`.
+        Mirrors whose diattenuation is given per wavelength; by default all.
     reference : dict of str to dict, optional
         Name of a mirror to others that it is compared with, by label, such as
         ``{"m3": {"published": published_mirror()}}``; anything with the methods ``diattenuation``

@@ -10,6 +10,7 @@ import numpy as np
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
+    MODEL,
     Input,
     Output,
     add_command,
@@ -22,6 +23,7 @@ from astropolcal.scripts._common import (
     printer,
     read_datasets,
     show,
+    stated_model,
     write_calibration,
 )
 from astropolcal.units import plain_number
@@ -58,7 +60,7 @@ def add_parser(commands):
         type=Output,
     )
     add("--instrument NAME", "default: as the tables say")
-    _add_model_options(add)
+    _add_model_options(parser, add)
     _add_fit_options(add)
     add_shared(parser, "fix", "free")
     add(
@@ -78,23 +80,9 @@ def add_parser(commands):
     add_shared(parser, "plots", "full", "json", "online", "quiet")
 
 
-def _add_model_options(add):
+def _add_model_options(parser, add):
     """Add what says how the model is made."""
-    add(
-        "--derotator MODEL",
-        "elliptical (default) or linear retarder, or kmirror: three silver mirrors with films",
-    )
-    add("--bounds KIND", "physical (default), or those of the paper")
-    add(
-        "--m3 MODEL",
-        "tertiary mirror of stars: free (default, a diattenuation a wavelength), "
-        "'power law' (the paper's permittivity) or metal (silver with a film)",
-    )
-    add(
-        "--plate MODEL",
-        "half-wave plate of VAMPIRES: free (default, a retardance per band) or two-layer (one "
-        "law for all bands)",
-    )
+    add_shared(parser, *MODEL)
     add(
         "--exact",
         "take the polarization of standard stars and the orientation of fixed optics as "
@@ -194,9 +182,7 @@ def run(arguments):
         datasets = [instrument.prepare(table) for table in datasets]
         standards = [instrument.prepare(table) for table in standards]
     tables = [*datasets, *standards]
-    # only what was typed: an instrument need not know all options
-    stated = {key: getattr(arguments, key) for key in ("derotator", "bounds", "m3", "plate")}
-    options = {key: value for key, value in stated.items() if value is not None}
+    options = stated_model(arguments)
     exact = {"nuisance": arguments.nuisance, "exact": arguments.exact}
     chains = instrument.chains_for(datasets, **exact, **options)
     # each on its own wavelengths

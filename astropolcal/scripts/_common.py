@@ -258,7 +258,32 @@ def add_shared(parser, *names):
         adder(parser)(form, meaning, **({"type": kind[0]} if kind else {}))
 
 
+#: Options of an instrument's chains; only what was typed, as not every instrument knows all.
+MODEL = ("derotator", "bounds", "m3", "plate")
+
+
+def stated_model(arguments):
+    """Return the options of an instrument's chains that were typed."""
+    stated = {key: getattr(arguments, key) for key in MODEL}
+    return {key: value for key, value in stated.items() if value is not None}
+
+
 _SHARED = {
+    "derotator": (
+        "--derotator MODEL",
+        "elliptical (default) or linear retarder, or kmirror: three silver mirrors with films",
+    ),
+    "bounds": ("--bounds KIND", "physical (default), or those of the paper"),
+    "m3": (
+        "--m3 MODEL",
+        "tertiary mirror of stars: free (default, a diattenuation per wavelength), "
+        "'power law' (the paper's permittivity) or metal (silver with a film)",
+    ),
+    "plate": (
+        "--plate MODEL",
+        "half-wave plate of VAMPIRES: free (default, a retardance per band) or two-layer (one "
+        "law for all bands)",
+    ),
     "full": (
         "--full",
         "print everything; by default what fits a terminal of 80 columns and 24 lines",

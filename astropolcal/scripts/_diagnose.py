@@ -8,6 +8,7 @@ from pathlib import Path
 
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.scripts._common import (
+    MODEL,
     Input,
     Output,
     add_command,
@@ -20,6 +21,7 @@ from astropolcal.scripts._common import (
     printer,
     read_datasets,
     show,
+    stated_model,
     wrapped,
     write_json,
 )
@@ -68,11 +70,8 @@ def add_parser(commands):
         type=Input,
     )
     add("--instrument NAME", "default: as the tables say")
-    add(
-        "--derotator MODEL",
-        "elliptical (default) or linear retarder, or kmirror; not with a calibration",
-    )
-    add_shared(parser, "without", "free", "fix")
+    # not with a calibration, which has a model
+    add_shared(parser, *MODEL, "without", "free", "fix")
     add(
         "--effects all|NAME,NAME",
         "which effects to try (default: all; help lists them)",
@@ -166,8 +165,7 @@ def _nominal(arguments):
     if known:
         return _of_calibration(known, files, datasets, edits, arguments)
     instrument = instrument_of(arguments, datasets)
-    options = {"derotator": arguments.derotator} if arguments.derotator else {}
-    chains = instrument.chains_for(datasets, **options)
+    chains = instrument.chains_for(datasets, **stated_model(arguments))
     return edit_chains(chains, **edits), datasets, instrument.name
 
 
@@ -175,7 +173,7 @@ def _of_calibration(path, files, datasets, edits, arguments):
     """Return the model of a calibration for the datasets, which need not be its own."""
     from astropolcal.calibration import Calibration
 
-    for option in ("instrument", "derotator"):
+    for option in ("instrument", *MODEL):
         if getattr(arguments, option):
             raise AstropolcalError(f"--{option}: the model is that of {path}; give one of them")
     calibration = Calibration.read(path)
