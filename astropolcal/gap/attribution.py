@@ -30,6 +30,8 @@ _SIZES = (0.1, 1.0, 10.0)
 _DEGREES, _FREER = (0, 2), (4, None)
 # so many named effects stand in the same chain: each sees the light through all the others
 _TOGETHER = 20
+#: What explains the data less well than another by less than this (log evidence) is its alias.
+ALIKE = 7.0
 #: Prior odds of a name against a cell of the table.
 NAMED = 5.0
 # log prior odds of dependences: what changes needs a reason
@@ -146,8 +148,12 @@ class Scan:
         near = () if probes is None or candidate.is_named else probes.steps_near(candidate.cell)
         if near:
             # the step itself, of which only some frames were looked at
-            best = _of_cell(probes, candidate.cell, candidate.degree, self.temper, near)[0]
-            candidate = best
+            steps = _of_cell(probes, candidate.cell, candidate.degree, self.temper, near)
+            best = candidate = steps[0]
+            # scans from now on ask all places and kinds for these steps
+            for one in steps:
+                if one.evidence > best.evidence - ALIKE:
+                    probes.waves.setdefault(one.cell.dependence, probes.waves_of(one.cell))
         for degree in _FREER if probes is not None else ():
             if candidate.is_named:
                 found = _named(probes, [candidate.named], self.temper, degree)
@@ -251,7 +257,7 @@ def _bent(probes, place, kind, law):
 
 
 def _of_cell(probes, cell, degree, temper, others=()):
-    """Return the candidate of a cell, or the best of several, with one law, in a list."""
+    """Return the candidates of a cell and of others of its place and kind, best first."""
     law = law_basis(probes.problem.wavelength, degree)
     bent = _bent(probes, cell.place, cell.kind, law) if cell.dependence == "constant" else None
     if bent is None:
@@ -262,7 +268,7 @@ def _of_cell(probes, cell, degree, temper, others=()):
     else:
         names, parts = [cell.dependence], [part[None] for part in bent]
     found = _candidates(cell.place, cell.kind, names, [(degree, parts)], temper)
-    return sorted(found, key=lambda one: -one.evidence)[:1]
+    return sorted(found, key=lambda one: -one.evidence)
 
 
 def _candidates(place, kind, names, by_law, temper):

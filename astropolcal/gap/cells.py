@@ -332,7 +332,7 @@ class Probes:
         self.ones = [np.ones((1, d.observations.n_frames)) for d in problem.datasets]
         #: Functions of the frame, see `dependences`.
         self.waves = problem.waves = problem.waves or dependences(problem, most_steps)
-        self._groups = {}
+        self._groups, self._asked = {}, len(self.waves)
         #: Second derivatives over the size that is tried, where they outdo the first ones.
         self.bends = {} if like is None else like.bends
         self.slopes = self._at_places() if like is None else like.slopes
@@ -379,6 +379,11 @@ class Probes:
             return [_waves(Dependence(name), dataset) for dataset in self.problem.datasets]
         # the derivative of what belongs to a detector has its dependence in it
         return self.waves.get(name, self.ones)
+
+    @property
+    def has_more_steps(self):
+        """Whether functions of the frame are known by now that were not when these were made."""
+        return len(self.waves) > self._asked
 
     def grouped(self, names):
         """

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from astropolcal.gap.attribution import scan
+from astropolcal.gap.attribution import ALIKE, scan
 from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.gap.shrinkage import foreseen, stability
 
@@ -51,7 +51,7 @@ _MORE = 3
 # causes that lower chi-square by shares closer than this are the same for these data
 _SAME = 1e-6
 # an alias is no less probable than this against the best; so many are listed
-_ALIAS, _MOST_ALIASES = np.exp(-7.0), 40
+_ALIAS, _MOST_ALIASES = np.exp(-ALIKE), 40
 # a rival whose statistic is as near as this share is fitted in full, where it is as large as that
 _NEAR, _BENT = 0.03, 500.0
 # prior probability that a gap has no cause of the table, by the number of causes that an answer
@@ -144,6 +144,9 @@ def select(base, library, groups, say, *, cells=True, changes=False):
         best = _search(best, [], first, say, cells, _MOST_TOGETHER * runs)
     if not best.chosen:
         return Selection([], base, first, 0.0, [_errors(base, groups)])
+    if first.probes.has_more_steps:
+        # those between the steps of the first scan, which were found since
+        first = _scanned(base, library, cells)
     best, scans = _exchanged(base, best, library, first, say, cells)
     best = replace(best, model=best.model.polished())
     if changes:

@@ -843,10 +843,12 @@ class Described(Reader):
         return describe_fits(path)
 
     def check(self, found, path):
+        from astropolcal.scripts._common import plain
+
         lines, content = found
         assert content["file"] == str(path)
         assert lines[0].startswith(f"{path}: ")
-        json.dumps(content)
+        json.dumps(plain(content), allow_nan=False)
 
 
 # ---- journals and checkpoints ------------------------------------------------------
