@@ -315,7 +315,7 @@ class Library:
             Name of the file, with suffix ``.asdf``; by default it is made of instrument, mode,
             start and hash.
         **stated
-            As for `with_validity`.
+            As for ``with_validity``.
 
         Returns
         -------

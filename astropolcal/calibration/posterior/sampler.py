@@ -39,7 +39,7 @@ class LogPosterior:
     measurement : Measurement
         The measurement; its current values are those of the fit.
     weights : {"fit", None, "wavelength", "errors"}, NoiseEstimate or array_like
-        Where the noise comes from, as for `calibrate`. By default it is the
+        Where the noise comes from, as for `~astropolcal.calibration.calibrate`. By default it is the
         one that the fit assumed, so that fit and posterior agree; one level
         from the residuals of all data if no fit is known.
     noise : float, `~astropy.units.Quantity` or array_like, optional
@@ -394,11 +394,11 @@ def sample(
     Parameters
     ----------
     calibration : Calibration
-        A calibration with its data, as `calibrate` returns it.
+        A calibration with its data, as `~astropolcal.calibration.calibrate` returns it.
     parameters : sequence of str, optional
-        What varies, see `LogPosterior`; by default all free parameters.
+        What varies, see ``LogPosterior``; by default all free parameters.
     noise : float, `~astropy.units.Quantity` or array_like, optional
-        Noise of the data, see `LogPosterior`; by default the noise that the
+        Noise of the data, see ``LogPosterior``; by default the noise that the
         fit assumed.
     n_walkers : int, optional
         At least twice the number of parameters (the default, or 24 if more).

@@ -233,7 +233,7 @@ _KEYS = (
 
 class Posterior:
     """
-    Samples of the posterior of calibrated parameters; `sample` makes it.
+    Samples of the posterior of calibrated parameters; ``sample`` makes it.
 
     Parameters
     ----------
@@ -517,7 +517,7 @@ class Posterior:
 
     @property
     def covariance(self):
-        """`Covariance` of the samples; finite for undetermined parameters too, by the priors."""
+        """``Covariance`` of the samples; finite for undetermined parameters too, by the priors."""
         n = len(self.names)
         return Covariance(self.names, self.units, np.cov(self.samples().T).reshape(n, n))
 

@@ -193,7 +193,7 @@ def with_validity(calibration, **stated):
     calibration : Calibration
         It is not changed.
     **stated
-        ``mode``, ``valid_from``, ``valid_until``, ``optics_in`` of `Validity`; what is left
+        ``mode``, ``valid_from``, ``valid_until``, ``optics_in`` of ``Validity``; what is left
         out stays as it is.
 
     Returns

@@ -669,7 +669,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     Covariance
         In the gauge of the calibration's. It has no more independent
         directions than groups: for a combination of many parameters take a
-        `bootstrap`.
+        ``bootstrap``.
 
     Raises
     ------

@@ -268,7 +268,7 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
         very measurement brings its weights along; with another one
         the data count as not fitted.
     noise : NoiseEstimate, optional
-        By default `noise_from_errors`.
+        By default ``noise_from_errors``.
     weights : array_like, optional
         Weights of the fit (one over sigma), by default equal; shape (n_data,).
     fitted : bool

@@ -152,7 +152,7 @@ def star_accuracy(table, q=0.0, u_=0.0):
     Parameters
     ----------
     table : `~astropy.table.QTable`
-        As from `star_stokes`.
+        As from ``star_stokes``.
     q, u_ : float or array_like
         What is known of the star, one a wavelength.
 
@@ -314,7 +314,7 @@ def star_check(calibration, chain, observations, positions=None, star=None):
     Compare the polarization of a standard star with that of the catalogue, per wavelength.
 
     Every half-wave-plate cycle is inverted with the calibration, see
-    `star_stokes`; the means are compared with the Serkowski law of the
+    ``star_stokes``; the means are compared with the Serkowski law of the
     star, or with zero. This is the check with HD 30675 of McIntosh et al. (2026, appendix).
 
     Parameters
@@ -334,7 +334,7 @@ def star_check(calibration, chain, observations, positions=None, star=None):
     -------
     `~astropy.table.QTable`
         The columns of `~astropolcal.calibration.validation.star_stokes` and
-        `star_accuracy`; ``dolp_sys_err`` and ``aolp_sys_err``, what the
+        ``star_accuracy``; ``dolp_sys_err`` and ``aolp_sys_err``, what the
         calibration claims of such light, see `~astropolcal.calibration.target_accuracies`; and
         ``q_known``, ``u_known``, ``dolp_known``,
         ``aolp_known`` of the catalogue with ``dolp_known_err`` and ``aolp_known_err``, NaN

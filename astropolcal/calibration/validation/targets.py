@@ -2,7 +2,7 @@
 """
 What an accuracy means for a target: errors of q, u, degree and angle of polarization.
 
-`target_accuracies` is what a calibration claims, from its covariance. The equations of McIntosh et
+``target_accuracies`` is what a calibration claims, from its covariance. The equations of McIntosh et
 al. (2026, Sec. 2.3), after van Holstein et al. 2020, A&A 633, A64
 (doi:10.1051/0004-6361/201834996), stand beside it as `paper_accuracies`.
 """
@@ -372,7 +372,7 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     Return the paper's accuracy of a calibration for several targets, per wavelength.
 
     It follows from residuals alone, and knows neither telescope nor correlations: what a
-    calibration claims is `target_accuracies`. Which datasets give s_rel, s_unpol and s_sky
+    calibration claims is ``target_accuracies``. Which datasets give s_rel, s_unpol and s_sky
     follows from their sources: s_sky is that of unpolarized standard stars. Several of one kind
     count by the rms of their accuracies. Where no dataset of a kind was fitted, a standard of
     that kind counts that was predicted, see `~astropolcal.calibration.add_standard`.

@@ -172,7 +172,7 @@ class Context:
         "default" for that of each effect.
     tracking : tuple of (float, float)
         Law by which the half-wave plate of each dataset follows the sky, see
-        `tracking_laws`.
+        ``tracking_laws``.
     datasets : tuple of str
         Names of the datasets.
 
@@ -271,7 +271,7 @@ class Effect:
     kind : str
         One of ``KINDS``, not the kind of the perturbation, which is in ``kinds``.
     place : str
-        The place in words; ``where`` is the `Where`.
+        The place in words; ``where`` is the ``Where``.
     optic : str or None
         Name of the optic that it acts on, where that is not the first of its kind.
     inserted : Optic or callable
@@ -283,7 +283,7 @@ class Effect:
     when : callable
         Whether the optics of a chain, by `Roles`, have what else is needed.
     near : tuple
-        `Where`, kinds and dependence of the cell to which it is nearest, if it is none.
+        ``Where``, kinds and dependence of the cell to which it is nearest, if it is none.
     absorbed_by : str or None
         The parameters of a usual nominal model that take the effect up entirely, so that data
         never show it; None where there are none.
