@@ -39,8 +39,8 @@ class LogPosterior:
     measurement : Measurement
         The measurement; its current values are those of the fit.
     weights : {"fit", None, "wavelength", "errors"}, NoiseEstimate or array_like
-        Where the noise comes from, as for `~astropolcal.calibration.calibrate`. By default it is the
-        one that the fit assumed, so that fit and posterior agree; one level
+        Where the noise comes from, as for `~astropolcal.calibration.calibrate`. By default it is
+        the one that the fit assumed, so that fit and posterior agree; one level
         from the residuals of all data if no fit is known.
     noise : float, `~astropy.units.Quantity` or array_like, optional
         Noise to use instead: one value, one a wavelength, or one a datum.

@@ -89,7 +89,7 @@ class Calibration:
     provenance : dict
         Software versions and time of the fit.
     posterior : Posterior or None
-        Samples of the parameters' posterior, where `sample` made some. A file
+        Samples of the parameters' posterior, where ``sample`` made some. A file
         keeps some of them, see `~astropolcal.calibration.posterior.Posterior.thinned`.
 
     Examples

@@ -2,8 +2,8 @@
 """
 What an accuracy means for a target: errors of q, u, degree and angle of polarization.
 
-``target_accuracies`` is what a calibration claims, from its covariance. The equations of McIntosh et
-al. (2026, Sec. 2.3), after van Holstein et al. 2020, A&A 633, A64
+``target_accuracies`` is what a calibration claims, from its covariance. The equations of McIntosh
+et al. (2026, Sec. 2.3), after van Holstein et al. 2020, A&A 633, A64
 (doi:10.1051/0004-6361/201834996), stand beside it as `paper_accuracies`.
 """
 
