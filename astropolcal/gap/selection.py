@@ -206,14 +206,19 @@ def _worse(best, steps, history, groups):
     impossible = [i for i, o in enumerate(best.chosen) if not best.model.is_physical(o.name)]
     if impossible or groups is None:
         return impossible[-1:]
-    if len(best.chosen) <= _MOST:
-        pairs = zip(pairwise(history), steps[1:], strict=True)
-        found = [i for i, ((a, b), step) in enumerate(pairs) if _worsens(b, a, step.mean_square)]
-        return found[-1:]
-    # of many, the first may need the last: each is taken out of the whole set
+    pairs = zip(pairwise(history), steps[1:], strict=True)
+    few = len(best.chosen) <= _MOST
+    found = [i for i, ((a, b), step) in enumerate(pairs) if _worsens(b, a, step.mean_square)]
+    # the first may need the last: each is taken out of the whole set, unless there is no evidence
+    # for it beside the others
     scatter, whole = best.model.mean_square, history[-1]
-    without = (foreseen(best.model.without([one.name]), groups) for one in best.chosen)
-    return [i for i, other in enumerate(without) if _worsens(whole, other, scatter)]
+    found = [
+        i
+        for i in (found if few else range(len(best.chosen)))
+        if (few and best.chosen[i].evidence < ENOUGH)
+        or _worsens(whole, foreseen(best.model.without([best.chosen[i].name]), groups), scatter)
+    ]
+    return found[-1:] if few else found
 
 
 def _worsens(after, before, scatter):
