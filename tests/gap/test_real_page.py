@@ -45,9 +45,9 @@ def test_tables_are_those_of_the_record_and_all_shown(script, tmp_path):
 
 
 @pytest.mark.slow
-def test_numbers_are_those_of_the_code(script, shared_data):
-    """Of one dataset; the script writes the record of all in the same way."""
-    number = 3
+@pytest.mark.parametrize("number", [1, 3])
+def test_numbers_are_those_of_the_code(script, shared_data, number):
+    """Of both datasets alone; the script writes the record of all in the same way."""
     record = RECORD[f"dataset {number}"]
     data = script.read(shared_data / "data" / "charis", number)
     found = diagnose(script.CHARIS.chains_for(data), data)
