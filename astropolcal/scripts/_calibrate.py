@@ -10,12 +10,6 @@ import numpy as np
 from astropolcal.exceptions import AstropolcalError, ParameterError
 from astropolcal.files import one_line
 from astropolcal.scripts._common import (
-    MODEL,
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
     check_suffix,
     edit_chains,
     instrument_of,
@@ -29,7 +23,11 @@ from astropolcal.scripts._common import (
 from astropolcal.units import plain_number
 from astropolcal.words import counted
 
-_EXAMPLES = """\
+HELP = "fit an instrument's chain of optics to observation tables"
+DESCRIPTION = """\
+Fit an instrument's chain of optics to observation tables. Without files,
+the packaged example is calibrated."""
+EXAMPLES = """\
 examples:
   astropolcal calibrate                          the packaged example
   astropolcal calibrate run.ecsv -o cal.asdf     one dataset, kept as a file
@@ -41,119 +39,40 @@ examples:
 """
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "calibrate",
-        run,
-        "fit an instrument's chain of optics to observation tables",
-        "Fit an instrument's chain of optics to observation tables. Without files,\n"
-        "the packaged example is calibrated.",
-        _EXAMPLES,
-    )
-    add = adder(parser)
-    add("files FILE", "observation tables (ECSV)", nargs="*", type=Input)
-    add(
-        "-o --output CAL.asdf",
-        "write the calibration here; overwritten if it exists",
-        type=Output,
-    )
-    add("--instrument NAME", "default: as the tables say")
-    _add_model_options(parser, add)
-    _add_fit_options(add)
-    add_shared(parser, "fix", "free")
-    add(
-        "--start OLD.asdf",
-        "start from this calibration, hold it, and refit only what --free names",
-        type=Input,
-    )
-    add_shared(parser, "prior")
-    add(
-        "--gauge",
-        "where the data leave a choice: the least misalignments (default), or where the fit ends",
-        choices=("minimal", "none"),
-        default="minimal",
-    )
-    add_shared(parser, "without")
-    _add_accuracy_options(add)
-    add_shared(parser, "plots", "full", "json", "online", "quiet")
-
-
-def _add_model_options(parser, add):
-    """Add what says how the model is made."""
-    add_shared(parser, *MODEL)
-    add(
-        "--exact",
-        "take the polarization of standard stars and the orientation of fixed optics as "
-        "exact, as published calibrations do; by default they have the errors of the catalogue "
-        "and of the mounting",
-    )
-    add(
-        "--nuisance KIND[:DATASET] ...",
-        "add what differs from dataset to dataset, with a prior: background, beam_gain, or "
-        "lamp (q and u of an unpolarized internal source); for all datasets or for one",
-    )
-
-
-def _add_fit_options(add):
-    """Add what says how the model is fitted."""
-    add(
-        "--observable NAME",
-        "what is fitted (default: %(default)s)",
-        default="normalized_double_difference",
-    )
-    add(
-        "--strategy HOW",
-        "joint (default), two-step (the paper's fit of a polarized source), or sequential: "
-        "polarized source, unpolarized source, stars, each step holding what came before",
-        default="joint",
-    )
-    add(
-        "--loss NAME",
-        "linear (default: least squares), huber, cauchy or bisquare: data far off count less",
-        default="linear",
-    )
-    add(
-        "--keep-all",
-        "mask nothing by itself: neither an unstable lamp, nor saturated frames, nor "
-        "incomplete half-wave-plate cycles",
-    )
-    add(
-        "--weights",
-        "equal weights (default), one over the residuals' scatter at each wavelength, or one "
-        "over the tables' errors",
-        choices=("none", "wavelength", "errors"),
-        default="none",
-    )
-    add(
-        "--errors",
-        "errors from how the residuals scatter and hang together (default), or those of "
-        "independent data with the noise of --weights",
-        choices=("scatter", "white"),
-        default="scatter",
-    )
-
-
-def _add_accuracy_options(add):
-    """Add what says how the accuracy is judged."""
-    add(
-        "--standard FILE ...",
-        "table that is predicted, not fitted; its errors are s_standard. A standard star is "
-        "compared with the catalogue, too",
-        type=Input,
-    )
-    add(
-        "--groups",
-        "what cross-validation leaves out: derotator angles (default, where there are "
-        "three), cycles of the half-wave plate, or whole datasets",
-        choices=("derotator", "cycle", "dataset"),
-    )
-    add(
-        "--target DOLP[,AOLP] ...",
-        "target whose accuracy is given, in percent and degree (default: 30, 1 and 0.1, at "
-        "any angle)",
-    )
+OPTIONS = """
+files FILE * Input  observation tables (ECSV)
+-o --output CAL.asdf Output  write the calibration here; overwritten if it exists
+--instrument NAME  default: as the tables say
+@ derotator bounds m3 plate
+--exact  take the polarization of standard stars and the orientation of fixed optics as exact, as
+    published calibrations do; by default they have the errors of the catalogue and of the mounting
+--nuisance KIND[:DATASET] ...  add what differs from dataset to dataset, with a prior: background,
+    beam_gain, or lamp (q and u of an unpolarized internal source); for all datasets or for one
+--observable NAME =normalized_double_difference  what is fitted (default: %(default)s)
+--strategy HOW =joint  joint (default), two-step (the paper's fit of a polarized source), or
+    sequential: polarized source, unpolarized source, stars, each step holding what came before
+--loss NAME =linear  linear (default: least squares), huber, cauchy or bisquare: data far off count
+    less
+--keep-all  mask nothing by itself: neither an unstable lamp, nor saturated frames, nor incomplete
+    half-wave-plate cycles
+--weights {none,wavelength,errors} =none  equal weights (default), one over the residuals' scatter
+    at each wavelength, or one over the tables' errors
+--errors {scatter,white} =scatter  errors from how the residuals scatter and hang together
+    (default), or those of independent data with the noise of --weights
+@ fix free
+--start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names
+@ prior
+--gauge {minimal,none} =minimal  where the data leave a choice: the least misalignments (default),
+    or where the fit ends
+@ without
+--standard FILE Input ...  table that is predicted, not fitted; its errors are s_standard. A
+    standard star is compared with the catalogue, too
+--groups {derotator,cycle,dataset}  what cross-validation leaves out: derotator angles (default,
+    where there are three), cycles of the half-wave plate, or whole datasets
+--target DOLP[,AOLP] ...  target whose accuracy is given, in percent and degree (default: 30, 1 and
+    0.1, at any angle)
+@ plots full json online quiet
+"""
 
 
 def run(arguments):

@@ -7,22 +7,18 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.chain import stages
 from astropolcal.exceptions import InstrumentError, ParameterError
-from astropolcal.scripts._common import (
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
-    is_quiet,
-    say_written,
-    show,
-    write_json,
-)
+from astropolcal.scripts._common import is_quiet, say_written, show, write_json
 from astropolcal.units import iso_date, plain_number
 
 # what is printed as more than 1
 _ABOVE_ONE = 1.0005
-_EXAMPLES = """\
+HELP = "polarimetric efficiency over wavelength, derotator angle and pointing"
+DESCRIPTION = """\
+Share of the linear polarization that an observation measures, over
+wavelength, derotator angle, altitude and parallactic angle; and the derotator
+offset that loses least of it. Without a calibration the published values are
+taken."""
+EXAMPLES = """\
 examples:
   astropolcal efficiency                         published values of CHARIS
   astropolcal efficiency cal.asdf --altitude 60 --parallactic 94 -o plot.png
@@ -32,47 +28,22 @@ examples:
 """
 
 
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "efficiency",
-        run,
-        "polarimetric efficiency over wavelength, derotator angle and pointing",
-        "Share of the linear polarization that an observation measures, over\n"
-        "wavelength, derotator angle, altitude and parallactic angle; and the derotator\n"
-        "offset that loses least of it. Without a calibration the published values are\n"
-        "taken.",
-        _EXAMPLES,
-    )
-    add = adder(parser)
-    add("file CAL.asdf", "calibration", nargs="?", type=Input)
-    add("--instrument NAME", "default: that of the file, or charis")
-    # without a default, so that it is known whether the table was asked for
-    add("--altitude DEG", "default: 60", type=float)
-    add("--parallactic DEG", "default: 0", type=float)
-    add(
-        "--derotator DEG",
-        "angles of the table (default: 0 to 90 in steps of 15)",
-        type=float,
-        nargs="+",
-    )
-    add(
-        "--wavelength UM",
-        "wavelengths of the table in micrometre, the nearest calibrated ones",
-        type=float,
-        nargs="+",
-    )
-    add("--target RA,DEC", "for the best derotator offset: position in degree")
-    add("--night START/END", "times in UTC, with --target")
-    add("--law MODE", "what the derotator keeps still, such as field (default: pupil)")
-    add("--date DATE", "of the telescope's mirrors, where that matters")
-    add(
-        "-o --output FILE",
-        "save the figure (PNG, PDF, SVG); with --target that of the derotator offsets",
-        type=Output,
-    )
-    add_shared(parser, "json", "online", "quiet")
+# altitude and others have no default, so that it is known whether the table was asked for
+OPTIONS = """
+file CAL.asdf ? Input  calibration
+--instrument NAME  default: that of the file, or charis
+--altitude DEG float  default: 60
+--parallactic DEG float  default: 0
+--derotator DEG + float  angles of the table (default: 0 to 90 in steps of 15)
+--wavelength UM + float  wavelengths of the table in micrometre, the nearest calibrated ones
+--target RA,DEC  for the best derotator offset: position in degree
+--night START/END  times in UTC, with --target
+--law MODE  what the derotator keeps still, such as field (default: pupil)
+--date DATE  of the telescope's mirrors, where that matters
+-o --output FILE Output  save the figure (PNG, PDF, SVG); with --target that of the derotator
+    offsets
+@ json online quiet
+"""
 
 
 def run(arguments):

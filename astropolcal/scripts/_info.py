@@ -6,19 +6,22 @@ from pathlib import Path
 import numpy as np
 
 from astropolcal.exceptions import ObservationError
-from astropolcal.scripts._common import (
-    Input,
-    Output,
-    add_command,
-    add_shared,
-    adder,
-    plain,
-    printer,
-    wrapped,
-    write_json,
-)
+from astropolcal.scripts._common import plain, printer, wrapped, write_json
 from astropolcal.words import counted
 
+HELP = "say what a calibration, a folder of them, a table, cube or product holds"
+DESCRIPTION = (
+    "Say what a calibration file, a folder of calibrations, an observation table, an image cube or "
+    "a corrected product holds; of a calibration also how good it is and for what it is valid. "
+    "Without a file, what this installation knows."
+)
+OPTIONS = """
+file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
+--instruments  list the instruments only
+@ full
+--json FILE Output  write it for machines (- for stdout)
+@ quiet
+"""
 # columns by which a table is known, the more special first
 _TABLES = (
     ({"wavelength", "I", "q", "u", "determined"}, "spectrum of a corrected target"),
@@ -31,30 +34,6 @@ _OBSERVED = {"flux_right", "flux_left", "single_difference", "single_sum"}
 _SHOWN = ("object", "filter", "date", "hwp", "derotator", "parallactic", "altitude")
 _DULL = ("description", "comments", "reference")
 _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
-
-
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "info",
-        run,
-        "say what a calibration, a folder of them, a table, cube or product holds",
-        "Say what a calibration file, a folder of calibrations, an observation "
-        "table, an image cube or a corrected product holds; of a calibration also how good it is "
-        "and for what it is valid. Without a file, what this installation knows.",
-    )
-    add = adder(parser)
-    add(
-        "file FILE|DIR",
-        "ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product",
-        nargs="?",
-        type=Input,
-    )
-    add("--instruments", "list the instruments only")
-    add_shared(parser, "full")
-    add("--json FILE", "write it for machines (- for stdout)", type=Output)
-    add_shared(parser, "quiet")
 
 
 def run(arguments):

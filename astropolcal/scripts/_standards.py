@@ -6,62 +6,39 @@ import math
 import astropy.units as u
 
 from astropolcal.exceptions import ParameterError
-from astropolcal.scripts._common import (
-    Output,
-    add_command,
-    add_shared,
-    adder,
-    printer,
-    wrapped,
-    write_json,
-)
+from astropolcal.scripts._common import printer, wrapped, write_json
 from astropolcal.units import plain_number
 from astropolcal.words import counted, did_you_mean
 
+HELP = "list polarimetric standard stars and when they are observable"
+DESCRIPTION = (
+    "List the polarimetric standard stars of the catalogue. With a site and a night, those that "
+    "rise above the limit, the best for the diattenuation of the telescope first. With a name, all "
+    "that is known of that star."
+)
+OPTIONS = """
+name NAME ?  a star, such as 'HD 293396'
+--kind {polarized,unpolarized}  only stars of this kind
+--band BAND  magnitude and polarization in this band, such as H; the magnitude in V where the
+    catalogue has none in it
+--magnitude LO,HI  brightest and faintest magnitude, in --band, or in V where the catalogue has none
+    in it
+--near RA,DEC  degrees, or 05:26:06,+16:42:00
+--radius DEG float  goes with --near (default: 15)
+--site SITE  subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT
+--night YYYY-MM-DD  date of the evening at the site
+--min-altitude DEG float =30  lowest altitude (default: 30)
+--limit N int  how many to list, the best first (default: 20 of a night, else all)
+--json FILE Output  write it for machines (- for stdout)
+--plot FILE Output  draw altitude and parallactic angle over the night
+@ online quiet
+"""
 # R, J, H and K, for what a calibration assumes of a star
 _BANDS = [0.65, 1.25, 1.65, 2.2] * u.um
 # more stars than this make a figure unreadable
 _DRAWN = 5
 # of a night, whose list is ordered by how good a star is, so that its end is of no use
 _LISTED = 20
-
-
-def add_parser(commands):
-    """Add the subcommand to what ``add_subparsers`` returned."""
-    parser = add_command(
-        commands,
-        "standards",
-        run,
-        "list polarimetric standard stars and when they are observable",
-        "List the polarimetric standard stars of the catalogue. With a site and a "
-        "night, those that rise above the limit, the best for the diattenuation of the telescope "
-        "first. With a name, all that is known of that star.",
-    )
-    add = adder(parser)
-    add("name NAME", "a star, such as 'HD 293396'", nargs="?")
-    add("--kind", "only stars of this kind", choices=("polarized", "unpolarized"))
-    add(
-        "--band BAND",
-        "magnitude and polarization in this band, such as H; the magnitude in V "
-        "where the catalogue has none in it",
-    )
-    add(
-        "--magnitude LO,HI",
-        "brightest and faintest magnitude, in --band, or in V where the catalogue has none in it",
-    )
-    add("--near RA,DEC", "degrees, or 05:26:06,+16:42:00")
-    add("--radius DEG", "goes with --near (default: 15)", type=float)
-    add("--site SITE", "subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT")
-    add("--night YYYY-MM-DD", "date of the evening at the site")
-    add("--min-altitude DEG", "lowest altitude (default: 30)", type=float, default=30.0)
-    add(
-        "--limit N",
-        f"how many to list, the best first (default: {_LISTED} of a night, else all)",
-        type=int,
-    )
-    add("--json FILE", "write it for machines (- for stdout)", type=Output)
-    add("--plot FILE", "draw altitude and parallactic angle over the night", type=Output)
-    add_shared(parser, "online", "quiet")
 
 
 def run(arguments):
