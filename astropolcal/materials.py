@@ -52,6 +52,11 @@ class SellmeierLaw:
         ) ** 0.5
 
 
+def _sellmeier(*terms):
+    """Return a law of strengths and resonances (um)."""
+    return SellmeierLaw(tuple((strength, resonance**2) for strength, resonance in terms))
+
+
 def _range_um(limits, name):
     """Return the two ends of a wavelength range in micrometre."""
     limits = length_to_um(limits, name)
@@ -525,20 +530,8 @@ QUARTZ = UniaxialMaterial(
 #: Dodge 1984, Appl. Opt. 23, 1980, doi:10.1364/AO.23.001980.
 MGF2 = UniaxialMaterial(
     "MgF2",
-    SellmeierLaw(
-        terms=(
-            (0.48755108, 0.04338408**2),
-            (0.39875031, 0.09461442**2),
-            (2.3120353, 23.793604**2),
-        )
-    ),
-    SellmeierLaw(
-        terms=(
-            (0.41344023, 0.03684262**2),
-            (0.50497499, 0.09076162**2),
-            (2.4904862, 23.771995**2),
-        )
-    ),
+    _sellmeier((0.48755108, 0.04338408), (0.39875031, 0.09461442), (2.3120353, 23.793604)),
+    _sellmeier((0.41344023, 0.03684262), (0.50497499, 0.09076162), (2.4904862, 23.771995)),
     measured_range=[0.2, 7.04] * u.um,
     doi="10.1364/AO.23.001980",
     aliases=("magnesium fluoride",),
@@ -549,13 +542,7 @@ MGF2 = UniaxialMaterial(
 #: Malitson 1965, J. Opt. Soc. Am. 55, 1205, doi:10.1364/JOSA.55.001205.
 FUSED_SILICA = IsotropicMaterial(
     "fused silica",
-    SellmeierLaw(
-        terms=(
-            (0.6961663, 0.0684043**2),
-            (0.4079426, 0.1162414**2),
-            (0.8974794, 9.896161**2),
-        )
-    ),
+    _sellmeier((0.6961663, 0.0684043), (0.4079426, 0.1162414), (0.8974794, 9.896161)),
     measured_range=[0.21, 3.71] * u.um,
     doi="10.1364/JOSA.55.001205",
     aliases=("silica", "silica glass", "vitreous silica"),
@@ -568,13 +555,7 @@ FUSED_SILICA = IsotropicMaterial(
 #: infrared, that of the crystal 1.75.
 AL2O3 = IsotropicMaterial(
     "Al2O3",
-    SellmeierLaw(
-        terms=(
-            (1.023798, 0.06144821**2),
-            (1.058264, 0.1106997**2),
-            (5.280792, 17.92656**2),
-        )
-    ),
+    _sellmeier((1.023798, 0.06144821), (1.058264, 0.1106997), (5.280792, 17.92656)),
     measured_range=[0.2652, 5.577] * u.um,
     doi="10.1364/JOSA.52.001377",
     aliases=("alumina", "sapphire", "aluminium oxide", "aluminum oxide"),
@@ -585,7 +566,7 @@ AL2O3 = IsotropicMaterial(
 #: Luke et al. 2015, Opt. Lett. 40, 4823, doi:10.1364/OL.40.004823.
 SI3N4 = IsotropicMaterial(
     "Si3N4",
-    SellmeierLaw(terms=((3.0249, 0.1353406**2), (40314.0, 1239.842**2))),
+    _sellmeier((3.0249, 0.1353406), (40314.0, 1239.842)),
     measured_range=[0.310, 5.504] * u.um,
     doi="10.1364/OL.40.004823",
     aliases=("silicon nitride",),

@@ -435,8 +435,8 @@ def _optics(values, layout):
     found = {}
     for key, (column, words) in layout.optics.items():
         said = next((v[column] for v in values if v.get(column)), "")
-        patterns = reversed(words.items())
-        found |= {key: word for pattern, word in patterns if re.search(pattern, said)}
+        hits = [word for pattern, word in words.items() if re.search(pattern, said)]
+        found |= {key: hits[0]} if hits else {}
     return found
 
 
