@@ -311,3 +311,28 @@ def polarizer():
 def fold_mirror(size):
     """Return the mirror that polarizes the lamp where the polarizer is out."""
     return mounted(optics.Diattenuator(diattenuation=np.zeros(size), name="fold_mirror"))
+
+
+def entrance(source, grid, star, target, mirror):
+    """Return what stands before the half-wave plate: source, and for a star the telescope."""
+    if source in STARS:
+        return [star_source(source, grid, star, target), *telescope(mirror)]
+    return [polarizer() if source == "polarized" else fold_mirror(grid.size)]
+
+
+#: The models of the derotator.
+DEROTATORS = ("elliptical", "linear", "kmirror")
+
+
+def derotator(kind, start, bounds):
+    """Return a derotator of one of `DEROTATORS`, whose retardance starts so."""
+    settings = misaligned(0) | {"mount": "derotator", "name": "derotator"}
+    if kind == "kmirror":
+        return k_mirror(**settings)
+    if kind == "linear":
+        settings["bounds"] |= {"retardance": bounds["horizontal"]}
+        return optics.LinearRetarder(retardance=start, **settings)
+    settings["bounds"] |= bounds
+    # a start inside the bounds, off the point where the two small ones vanish
+    small = np.full(len(start), 1.0) * u.deg
+    return optics.EllipticalRetarder(horizontal=start, diagonal=-small, circular=small, **settings)
