@@ -395,6 +395,13 @@ def write_json(content, path):
         temporary.write_text(text, encoding="utf-8")
 
 
+def give(arguments, lines, content):
+    """Write what machines want, and print lines, as asked for."""
+    if arguments.json:
+        write_json(content, arguments.json)
+    printer(arguments)("\n".join(lines))
+
+
 def write_calibration(calibration, arguments, content):
     """Write calibration, figures and what ``content()`` returns as asked for; return the files."""
     written = []

@@ -226,13 +226,8 @@ def choose_calibration(arguments, files):
         entry = _of_library(path, arguments, night, beam, files)
         calibration, path = entry.calibration, entry.path
     _check_validity(calibration, path, arguments, night)
-    chain = sky_chain(
-        calibration,
-        optics_in=arguments.optics_in,
-        beam=beam,
-        label=str(path),
-        date=night.dates or None,
-    )
+    wanted = {"optics_in": arguments.optics_in, "beam": beam, "date": night.dates or None}
+    chain = sky_chain(calibration, label=str(path), **wanted)
     made = {"calibration": str(path), "calibration_hash": content_hash(calibration)}
     return calibration, chain, made
 
@@ -282,20 +277,18 @@ def _position_angles(table, arguments):
         return None
     # from north through east
     angle = np.full(len(table), arguments.camera_angle or 0.0) * u.deg
-    if arguments.rotation == "pupil":
-        if "parallactic" not in table.colnames:
-            raise ObservationError("--rotation pupil needs the parallactic angle of every frame")
-        angle = angle + table["parallactic"]
-    return angle
+    if arguments.rotation == "fixed":
+        return angle
+    if "parallactic" not in table.colnames:
+        raise ObservationError("--rotation pupil needs the parallactic angle of every frame")
+    return angle + table["parallactic"]
 
 
 def _write_others(result, star, arguments):
     if arguments.spectrum:
-        from astropolcal.files import atomic_path
+        from astropolcal.reduction.tables import write_table
 
-        table = star.table()
-        with atomic_path(arguments.spectrum, ObservationError) as temporary:
-            table.write(temporary, format="ascii.ecsv", overwrite=True)
+        write_table(star.table(), arguments.spectrum, overwrite=True)
     if arguments.plot:
         from astropolcal.plotting._style import save
         from astropolcal.plotting.correction import plot_corrected
@@ -336,23 +329,18 @@ def _report(summary, systematic):
     show(f"Written: {written} ({frames}, mode {summary['mode']})")
     show(f"  calibration: {calibration}")
     if condition.size:
-        show(
-            f"  condition number of the solution for {summary['components']}: "
-            f"{min(condition):.3g} to {max(condition):.3g}"
-        )
+        limits = f"{min(condition):.3g} to {max(condition):.3g}"
+        show(f"  condition number of the solution for {summary['components']}: {limits}")
     for i, words in summary["poorly_determined"].items():
         line = f"  poorly determined at {summary['wavelength_nm'][int(i)]:.6g} nm: {words}"
         show(wrapped(line, indent=4))
     aperture = summary["aperture"]
     show(f"  star within {aperture['radius']:g} pixels, median over the wavelengths:")
     unknown = "infinite" if systematic is not None and systematic.is_open else "not known"
-    for name, unit, error, words, scale in (
-        ("dolp", " %", "s_p", "degree of linear polarization", 100),
-        ("aolp", " deg", "s_chi", "angle of linear polarization", 1),
-    ):
-        values = scale * aperture[name]
-        shown = _middle(values, ".2f" if name == "dolp" else ".1f", unit, name == "aolp")
-        show(f"    {words}: {shown}")
+    for name, unit, error, scale in (("dolp", " %", "s_p", 100), ("aolp", " deg", "s_chi", 1)):
+        words = "degree" if name == "dolp" else "angle"
+        shown = _middle(scale * aperture[name], ".2f" if scale == 100 else ".1f", unit, scale == 1)
+        show(f"    {words} of linear polarization: {shown}")
         for kind, none in (("statistical", "not known"), ("systematic", unknown)):
             values = scale * aperture[f"{error}_{kind}"]
             show(f"      {kind} error: {_middle(values, '.2g', unit, none=none)}")
