@@ -49,8 +49,6 @@ class Shares:
     # measured flux of both beams over all of the light, (K,), and covariance, (K, K)
     values: np.ndarray
     covariance: np.ndarray
-    # of the profile, over its degrees of freedom
-    chi_square: float
 
 
 def wing_shares(cube, good, photometry, level_variance, detector, layout, *, reach=45.0):
@@ -184,7 +182,7 @@ def _fit(star, rings, detector, halo_radius):
     freedom = max(weights.size - len(star.x) - len(c) - len(p), 1)
     found = (p, c, background)
     covariance = _covariance(profile, weights, found) * max(1.0, cost / freedom)
-    return _shares(profile, found, covariance, cost / freedom)
+    return _shares(profile, found, covariance)
 
 
 def _least_squares(profile, weights, start):
@@ -238,7 +236,7 @@ def _slopes(columns, found):
     return np.concatenate([moved, columns(p)])
 
 
-def _shares(profile, found, covariance, chi_square):
+def _shares(profile, found, covariance):
     star, (_, c, background) = profile.star, found
     measured = star.flux.sum(axis=0)
     known = profile.sums() - profile.background_in_apertures(background)
@@ -247,7 +245,7 @@ def _shares(profile, found, covariance, chi_square):
     slopes = np.concatenate([_slopes(profile.lacking, found), aperture])
     noise = slopes.T @ covariance @ slopes + np.diag(star.level_variance.sum(axis=0))
     relative = measured / total**2
-    return Shares(measured / total, noise * np.outer(relative, relative), chi_square)
+    return Shares(measured / total, noise * np.outer(relative, relative))
 
 
 # ---- the wings as they are seen: means in rings, inside the field stop ---------------------------
