@@ -1,17 +1,25 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-What our models do otherwise than those of astropy: keywords only, settings, and cheap copies.
+What our models do otherwise than those of astropy: keywords, settings, units, chains, cheap copies.
 
-Copies touch what `astropy.modeling` keeps to itself, the dictionaries of models and parameters: a
-calibration copies chains and measurements thousands of times, and a deep copy of everything takes
-five times as long. Nothing else in the package does.
+Nothing else in the package touches what `astropy.modeling` keeps to itself. Copies do (the
+dictionaries of models and parameters), because a calibration copies chains and measurements
+thousands of times, and a deep copy of everything takes five times as long. Chains do, because a
+fitter asks every model of a compound for its units, and astropy's ``Mapping`` has no answer.
+Parameters do, because astropy drops the unit of a bound.
 """
 
 import inspect
 from copy import copy, deepcopy
+from functools import partial, reduce
+from operator import or_
 
 import astropy.units as u
-from astropy.modeling import FittableModel, Parameter
+import numpy as np
+from astropy.modeling import CompoundModel, FittableModel, Model, Parameter
+
+from astropolcal.exceptions import ChainError, ParameterError
+from astropolcal.units import to_unit
 
 # what a copy of an optic may share with it
 _SHARED = (str, bool, int, float, type(None), u.UnitBase)
@@ -44,6 +52,13 @@ class KeywordOnly(type(FittableModel)):
     def __init__(cls, name, bases, members, **kwargs):
         # astropy's metaclass writes an __init__ for every class whose members have none
         super().__init__(name, bases, {"__init__": cls.__init__} | members, **kwargs)
+        # and its own ``|`` into every class
+        cls.__or__ = joined
+        for parameter in cls._parameters_.values():
+            if type(parameter) is Parameter:
+                parameter.__class__ = OpticParameter
+                if any(isinstance(bound, u.Quantity) for bound in parameter.bounds):
+                    parameter.bounds = parameter.bounds
         # those of the bases first
         cls._declared_settings = {
             key: setting
@@ -71,6 +86,105 @@ class KeywordOnly(type(FittableModel)):
             if isinstance(base, KeywordOnly):
                 found |= getattr(base.__init__, "__kwdefaults__", None) or {}
         return found
+
+
+class OpticParameter(Parameter):
+    """A parameter whose bounds and ties are converted to its unit."""
+
+    @Parameter.bounds.setter
+    def bounds(self, value):
+        unit = u.one if self.unit is None else self.unit
+        plain = [b.to_value(unit) if isinstance(b, u.Quantity) else b for b in value]
+        Parameter.bounds.fset(self, plain)
+
+    @Parameter.tied.setter
+    def tied(self, value):
+        # a fitter puts what the callable returns into an array of plain numbers
+        wrap = callable(value) and not isinstance(value, partial)
+        Parameter.tied.fset(self, partial(_tied_value, value, self.unit) if wrap else value)
+
+
+def _tied_value(function, unit, model):
+    value = function(model)
+    return value if getattr(value, "unit", None) is None else to_unit(value, unit, "tied value")
+
+
+def joined(left, right):
+    """Return ``left | right`` of two models as a chain."""
+    return Chain("|", left, right) if isinstance(right, Model) else NotImplemented
+
+
+class Chain(CompoundModel):
+    """
+    What ``|`` makes of optics, and of optics and other models of astropy.
+
+    Any of astropy's fitters takes one of one input and one output. Its parameters keep their units
+    in a fit, and their values are numbers in these.
+    """
+
+    def without_units_for_data(self, **data):
+        """Return the chain as a fitter takes it: itself, once data and parameters are checked."""
+        for key in self.param_names:
+            if np.size(getattr(self, key).value) > 1:
+                raise ParameterError(
+                    f"{key} has one value per wavelength, and no fitter of astropy takes a model "
+                    "with such a parameter, not even a fixed one; astropolcal.calibrate does"
+                )
+        inputs = [
+            data[key] if isinstance(data[key], u.Quantity) else u.Quantity(data[key], unit or u.one)
+            for key, unit in (self.input_units or dict.fromkeys(self.inputs)).items()
+        ]
+        outcome = self(*inputs)
+        key = self.outputs[0]
+        given, own = (getattr(value, "unit", u.one) for value in (data[key], outcome))
+        if isinstance(data[key], u.Quantity) and given != own:
+            raise ParameterError(
+                f"{key} is in {given}, but the chain gives {str(own) or 'plain numbers'}"
+            )
+        return self
+
+    def with_units_from_data(self, **data):
+        """Return the fitted chain: itself."""
+        return self
+
+    @property
+    def has_bounds(self):
+        """Whether a free parameter has a bound; what is fixed needs none."""
+        return any_free_bounds(self)
+
+    def __setattr__(self, attr, value):
+        if attr in (self.__dict__.get("_param_names") or ()):
+            # the optic checks value and unit
+            index, key = self._param_map[attr]
+            setattr(self._leaflist[index], key, value)
+        else:
+            super().__setattr__(attr, value)
+
+    def __getitem__(self, index):
+        if not isinstance(index, slice):
+            return super().__getitem__(index)
+        # astropy finds only what is one branch of its tree
+        models = self._leaflist[self._whole(index)]
+        if index.step not in (None, 1) or not models:
+            raise ChainError(f"no optics at {index} of a chain of {len(self._leaflist)}")
+        return reduce(or_, models)
+
+    def _whole(self, index):
+        """Return a slice by number; a name as its stop is the last optic, as astropy has it."""
+        start, stop = (
+            self._str_index_to_int(end) if isinstance(end, str) else end
+            for end in (index.start, index.stop)
+        )
+        return slice(start, stop + 1 if isinstance(index.stop, str) else stop)
+
+
+Chain.__or__ = joined
+
+
+def any_free_bounds(model):
+    """Return whether a parameter that is not fixed has a bound."""
+    parameters = (getattr(model, key) for key in model.param_names)
+    return any(p.bounds != (None, None) and not p.fixed for p in parameters)
 
 
 def copied_attributes(optic, new, memo):

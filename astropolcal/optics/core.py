@@ -18,7 +18,7 @@ from astropy.modeling import FittableModel, InputParameterError, Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import _rotate, _rotation_matrix, rotation_generator, turn
-from astropolcal.optics._modelling import KeywordOnly, copied_attributes
+from astropolcal.optics._modelling import KeywordOnly, copied_attributes, joined
 from astropolcal.units import angle_to_rad, canonical_factor, length_to_um, to_unit
 from astropolcal.words import did_you_mean
 
@@ -151,7 +151,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             self._check_names(kwargs)
             raise ParameterError(f"{type(self).__name__}: {error}") from None
         # astropy would call the five channels x0 to x4
-        self.inputs = self.outputs = LIGHT
+        self.inputs, self.outputs = LIGHT[: self.n_inputs], LIGHT
         self._mount, self._position = None, 0.0
         self.mount = mount
         for key, value in settings.items():
@@ -283,7 +283,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         return values
 
     def _check_unit(self, key, unit):
-        if unit != self._declared(key).unit:
+        # a fitter may leave a parameter behind without its unit
+        if unit is not None and unit != self._declared(key).unit:
             raise ParameterError(
                 f"{self.name or type(self).__name__}.{key} is in {unit}, but its "
                 f"bounds are in {self._declared(key).unit}; set optic.{key} = value * unit"
@@ -414,24 +415,43 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         for derivative in self._derivatives(dispersion, *values):
             yield _rotate(derivative, angle)
 
+    @property
+    def input_units(self):
+        """Micrometre of the wavelength, which is what a fitter hands over without a unit."""
+        return {"wavelength": u.um} | dict.fromkeys(self.inputs[1:])
+
+    def _parameter_units_for_data_units(self, input_units, output_units):
+        # for compound models of astropy; a `Chain` has its own way
+        return {key: unit for key in self.param_names if (unit := self._declared(key).unit)}
+
+    def prepare_inputs(self, wavelength, *light, **kwargs):
+        """Return what `evaluate` takes, as astropy does; refuse a wavelength without unit."""
+        length_to_um(wavelength)
+        return super().prepare_inputs(wavelength, *light, **kwargs)
+
     def evaluate(self, wavelength, I, Q, U, V, *parameters):  # noqa: E741
-        """Return ``wavelength`` and the Stokes parameters behind the optic."""
+        """
+        Return ``wavelength`` and the Stokes parameters behind the optic.
+
+        Without units wavelengths are in micrometre and parameters in their own units.
+        """
+        return wavelength, *self._light_behind(wavelength, (I, Q, U, V), parameters)
+
+    def _light_behind(self, wavelength, light, parameters):
         values = [self._strip(key, p) for key, p in zip(self.param_names, parameters, strict=True)]
         # elements first, (4, 4, ...), so that rows multiply the channels of the light
         matrix = np.moveaxis(
-            self._oriented(*self._resolve(wavelength, None, values)), (-2, -1), (0, 1)
+            self._oriented(*self._resolve(u.Quantity(wavelength, u.um), None, values)),
+            (-2, -1),
+            (0, 1),
         )
-        light = (I, Q, U, V)
         # astropy gives the outputs of scalar inputs back as scalars
         if matrix[0, 0].size > 1 and all(np.size(x) == 1 for x in (wavelength, *light)):
             raise ParameterError(
                 f"{self.name or type(self).__name__} stands at {matrix[0, 0].size} positions: "
                 f"give light of shape {matrix[0, 0].shape}"
             )
-        return (
-            wavelength,
-            *(sum(m * s for m, s in zip(row, light, strict=True)) for row in matrix),
-        )
+        return [sum(m * s for m, s in zip(row, light, strict=True)) for row in matrix]
 
     def _strip(self, key, value):
         """Undo the model-set axis and the unit that astropy adds in a call."""
@@ -442,6 +462,22 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         # a model of astropy is a set of one model
         number = number[0] if number.ndim and number.shape[0] == 1 else number
         return np.asarray(number) * canonical_factor(unit)
+
+    @property
+    def inverse(self):
+        """
+        What gives the light before the optic from the light behind it, at the present values.
+
+        It raises NotImplementedError where no light can be told from what is left of it, and when
+        it is evaluated a ParameterError if that is so at a wavelength.
+        """
+        try:
+            matrix = self.mueller()
+        except ParameterError:  # it depends on the wavelength
+            matrix = np.eye(4)
+        if self.n_inputs < len(LIGHT) or _singular(matrix):
+            raise NotImplementedError(f"the Mueller matrix of {self!r} has no inverse")
+        return Inverse(self)
 
     def with_parameters(self, **values):
         """
@@ -489,3 +525,35 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         """Return the keyword arguments, other than parameters, that rebuild the optic."""
         own = {key: getattr(self, key) for key in self._declared_settings}
         return {"name": self.name, "mount": self.mount} | own
+
+
+class Inverse(FittableModel):
+    """The model that undoes an optic; it has no parameters of its own."""
+
+    n_inputs = n_outputs = 5
+    standard_broadcasting = False
+
+    def __init__(self, optic):
+        super().__init__(name=optic.name)
+        self.inputs = self.outputs = LIGHT
+        self._optic = optic.copy()
+
+    @property
+    def inverse(self):
+        """The optic."""
+        return self._optic.copy()
+
+    def evaluate(self, wavelength, *light):
+        """Return ``wavelength`` and the Stokes parameters before the optic."""
+        matrix = self._optic.mueller(u.Quantity(wavelength, u.um))
+        if _singular(matrix):
+            raise ParameterError(f"the Mueller matrix of {self._optic!r} has no inverse")
+        rows = np.moveaxis(np.linalg.inv(matrix), (-2, -1), (0, 1))
+        return wavelength, *(sum(m * s for m, s in zip(row, light, strict=True)) for row in rows)
+
+
+Inverse.__or__ = joined
+
+
+def _singular(matrix):
+    return np.any(np.linalg.cond(matrix) > 1e12)
