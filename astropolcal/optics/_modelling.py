@@ -10,6 +10,7 @@ Parameters do, because astropy drops the unit of a bound.
 """
 
 import inspect
+from collections import defaultdict
 from copy import copy, deepcopy
 from functools import partial, reduce
 from operator import or_
@@ -160,6 +161,15 @@ class Chain(CompoundModel):
         else:
             super().__setattr__(attr, value)
 
+    def __iter__(self):
+        return iter(self._leaflist)
+
+    def curve(self, what, element=None, *, against="wavelength", wavelength=None, **positions):
+        """Return a model of one input that draws what the chain does; see `Optic.curve`."""
+        from astropolcal.optics.curves import curve_of
+
+        return curve_of(self, list(self), what, element, against, wavelength, **positions)
+
     def __getitem__(self, index):
         if not isinstance(index, slice):
             return super().__getitem__(index)
@@ -179,6 +189,74 @@ class Chain(CompoundModel):
 
 
 Chain.__or__ = joined
+
+
+class SharedParameters(FittableModel):
+    """
+    A model of one input and one output whose parameters are those of optics, the same objects.
+
+    A subclass says with `_adopt` which they are. Parameters keep their units in a fit, and their
+    values are numbers in these; the values of the model are numbers in ``_unit``.
+    """
+
+    n_inputs = 1
+    n_outputs = 1
+    standard_broadcasting = False
+    col_fit_deriv = True
+    _param_names = ()
+    _unit = None
+
+    def _adopt(self, owners):
+        """Take on parameters: of each name the optic that has it, and its name there."""
+        # only then: astropy sets what it knows in the beginning to its default
+        self._param_names, self._owners = tuple(owners), owners
+        self.__dict__ |= {name: getattr(*owner) for name, owner in owners.items()}
+        self._constraints_cache = {}
+        self._param_metrics = defaultdict(dict)
+        self._initialize_slices()
+
+    @property
+    def param_names(self):
+        """Names of the parameters."""
+        return self._param_names
+
+    @property
+    def has_bounds(self):
+        """Whether a free parameter has a bound; what is fixed needs none."""
+        return any_free_bounds(self)
+
+    def __setattr__(self, attr, value):
+        if attr in self._param_names:
+            setattr(*self._owners[attr], value)
+        else:
+            super().__setattr__(attr, value)
+
+    @property
+    def return_units(self):
+        """Unit of the values, where they have one."""
+        return None if self._unit is None else {self.outputs[0]: self._unit}
+
+    def _parameter_units_for_data_units(self, input_units, output_units):
+        units = {name: getattr(self, name).unit for name in self.param_names}
+        return {name: unit for name, unit in units.items() if unit is not None}
+
+    def without_units_for_data(self, **data):
+        """Return the model as a fitter takes it: with values in the unit of the data."""
+        values = data[self.outputs[0]]
+        if not isinstance(values, u.Quantity):
+            return self
+        own = u.one if self._unit is None else self._unit
+        if not values.unit.is_equivalent(own):
+            raise ParameterError(
+                f"the data are in {values.unit}, but the curve gives {str(own) or 'plain numbers'}"
+            )
+        model = self if values.unit == own else self.copy()
+        model._unit = values.unit
+        return model
+
+    def with_units_from_data(self, **data):
+        """Return the fitted model: itself."""
+        return self
 
 
 def any_free_bounds(model):

@@ -223,6 +223,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             if key not in known or value != known[key].default
         }
 
+    #: Methods of the wavelength that `curve` draws, with the unit of their values.
+    _laws = {}
+
     # ---- where the optic stands ------------------------------------------
 
     @property
@@ -371,11 +374,14 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     def _resolve(self, wavelength, position, parameters=None):
         """Bring wavelength, orientation and values to canonical floats."""
         lam, shift, values = self._read(wavelength, position, parameters)
-        dispersion = None if lam is None else self._dispersion(lam)
+        return (*self._moved(self._dispersion_at(lam), values[0], shift), values[1:])
+
+    def _dispersion_at(self, wavelength):
+        """Return the dispersion, or None without a wavelength where none is needed."""
         # only a law needs the wavelength; a constant matrix is the same at all
-        if lam is None and type(self)._dispersion is not Optic._dispersion:
+        if wavelength is None and type(self)._dispersion is not Optic._dispersion:
             raise ParameterError(f"{type(self).__name__} depends on wavelength: give one")
-        return (*self._moved(dispersion, values[0], shift), values[1:])
+        return None if wavelength is None else self._dispersion(wavelength)
 
     def _read(self, wavelength, position, parameters):
         values = self.canonical_values() if parameters is None else parameters
@@ -478,6 +484,59 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         if self.n_inputs < len(LIGHT) or _singular(matrix):
             raise NotImplementedError(f"the Mueller matrix of {self!r} has no inverse")
         return Inverse(self)
+
+    def curve(self, what, element=None, *, against="wavelength", wavelength=None, **positions):
+        """
+        Return a model of one input and one output that draws what the optic does.
+
+        Parameters
+        ----------
+        what : str or Observable
+            ``"mueller"``, an element of the Mueller matrix; ``"I"``, ``"Q"``, ``"U"`` or ``"V"`` of
+            what unpolarized light of intensity one becomes; an
+            `~astropolcal.observations.Observable` where there is a beam splitter; of a single
+            optic also a method of the wavelength, such as ``"retardance"``, or a parameter.
+        element : tuple of int, optional
+            Row and column of the element.
+        against : str
+            ``"wavelength"``, or the stage whose position is the input.
+        wavelength : `~astropy.units.Quantity`, optional
+            The one wavelength of a curve against a stage.
+        **positions : `~astropy.units.Quantity`
+            Positions of other stages, by default those at which the optics stand. One position
+            or, for an observable of several frames, one for each; those of the stage ``against``
+            are added to the input.
+
+        Returns
+        -------
+        `~astropy.modeling.FittableModel`
+            Its parameters are the same objects as those of the optics, of a chain by
+            ``name_parameter``; those with one value per wavelength are left out. After a fit
+            the result has copies of the optics, as its ``chain``.
+
+        Raises
+        ------
+        ParameterError, ChainError
+            If there is no such curve.
+
+        Examples
+        --------
+        The thicknesses of a plate whose retardance was measured:
+
+        >>> import astropy.units as u
+        >>> import numpy as np
+        >>> from astropy.modeling.fitting import TRFLSQFitter
+        >>> from astropolcal.optics import TwoLayerWaveplate
+        >>> wavelength = np.linspace(1.1, 2.4, 9) * u.um
+        >>> measured = TwoLayerWaveplate(w_sio2=1.65 * u.mm).retardance(wavelength)
+        >>> curve = TwoLayerWaveplate().curve("retardance")
+        >>> found = TRFLSQFitter()(curve, wavelength, measured)
+        >>> found.w_sio2.quantity.round(4)
+        <Quantity 1.65 mm>
+        """
+        from astropolcal.optics.curves import curve_of
+
+        return curve_of(self, [self], what, element, against, wavelength, **positions)
 
     def with_parameters(self, **values):
         """
