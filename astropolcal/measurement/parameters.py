@@ -348,3 +348,11 @@ class FreeParameters:
                 shape = np.shape(parameter.value)
                 value = canonical / canonical_factor(parameter.unit)
                 parameter.value = value.reshape(shape)
+
+    def put_stds(self, stds):
+        """Write standard deviations, in the units of the parameters, into the chains; or None."""
+        for slot in self.slots:
+            own = stds[slot.slice]
+            several = None if None in own else np.array(own, dtype=float)
+            for parameter in self._table[slot.name]:
+                parameter.std = several if several is None or slot.size > 1 else float(several[0])

@@ -21,6 +21,7 @@ from astropy.modeling import CompoundModel, FittableModel, Model, Parameter
 
 from astropolcal.exceptions import ChainError, ParameterError
 from astropolcal.units import to_unit
+from astropolcal.words import html
 
 # what a copy of an optic may share with it
 _SHARED = (str, bool, int, float, type(None), u.UnitBase)
@@ -105,9 +106,32 @@ class OpticParameter(Parameter):
         Parameter.tied.fset(self, partial(_tied_value, value, self.unit) if wrap else value)
 
 
+class LinearlyTied(OpticParameter):
+    """A parameter of a measurement, which refuses a callable tie: its Jacobian is analytic."""
+
+    @Parameter.tied.setter
+    def tied(self, value):
+        if callable(value):
+            raise ParameterError(
+                f"{self.name}: a measurement takes no callable tie; give it "
+                "ties={name: Tie(source, factor, offset)}"
+            )
+        Parameter.tied.fset(self, value)
+
+
 def _tied_value(function, unit, model):
     value = function(model)
     return value if getattr(value, "unit", None) is None else to_unit(value, unit, "tied value")
+
+
+def values_text(model):
+    """Return the parameters of a model with their values and units."""
+    parameters = ((key, getattr(model, key)) for key in model.param_names)
+    return ", ".join(
+        f"{key}={np.array2string(p.value, precision=6, threshold=4)}"
+        + (f" {p.unit}" if p.unit else "")
+        for key, p in parameters
+    )
 
 
 def joined(left, right):
@@ -163,6 +187,16 @@ class Chain(CompoundModel):
 
     def __iter__(self):
         return iter(self._leaflist)
+
+    def _repr_html_(self):
+        from astropy.table import Table
+
+        rows = [
+            (i, m.name or "", type(m).__name__, getattr(m, "mount", None) or "", values_text(m))
+            for i, m in enumerate(self)
+        ]
+        names = ("place", "name", "kind", "mount", "parameters")
+        return html(" | ".join(row[1] or row[2] for row in rows), Table(rows=rows, names=names))
 
     def curve(self, what, element=None, *, against="wavelength", wavelength=None, **positions):
         """Return a model of one input that draws what the chain does; see `Optic.curve`."""
@@ -302,3 +336,11 @@ def with_own_scalars(model, labels):
         new.__dict__[label] = parameter
         parameter.value = float(model.__dict__[label].value)
     return new
+
+
+def without_units(model, labels, values, bounds):
+    """Give scalar parameters of a model, its own, plain values and bounds in place of units."""
+    for label, value, bound in zip(labels, values, bounds, strict=True):
+        parameter = model.__dict__[label]
+        parameter._unit = None
+        parameter.value, parameter.bounds = value, bound

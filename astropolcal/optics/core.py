@@ -18,7 +18,7 @@ from astropy.modeling import FittableModel, InputParameterError, Parameter
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.mueller import _rotate, _rotation_matrix, rotation_generator, turn
-from astropolcal.optics._modelling import KeywordOnly, copied_attributes, joined
+from astropolcal.optics._modelling import KeywordOnly, copied_attributes, joined, values_text
 from astropolcal.units import angle_to_rad, canonical_factor, length_to_um, to_unit
 from astropolcal.words import did_you_mean
 
@@ -204,13 +204,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         return new
 
     def __repr__(self):
-        values = ", ".join(
-            f"{key}={np.array2string(getattr(self, key).value, precision=6, threshold=4)}"
-            + (f" {getattr(self, key).unit}" if getattr(self, key).unit else "")
-            for key in self.param_names
-        )
         settings = "".join(f", {key}={value!r}" for key, value in self._unlike_default().items())
-        return f"<{type(self).__name__}({values}{settings})>"
+        return f"<{type(self).__name__}({values_text(self)}{settings})>"
 
     def _unlike_default(self):
         """Return the settings that are not those of the class, name and mount last."""

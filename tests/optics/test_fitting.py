@@ -212,3 +212,10 @@ def test_chains_are_copied_and_pickled():
         np.testing.assert_allclose(
             copy(1.6 * u.um, 1, 1, 0, 0)[1:], relay()(1.6 * u.um, 1, 1, 0, 0)[1:]
         )
+
+
+def test_a_notebook_shows_a_table():
+    page = (relay() | TO_U)._repr_html_()
+    assert page.startswith("<p>first | second | third | fourth | Mapping</p>")
+    for text in ("Diattenuator", "diattenuation=0.3", "theta=51. deg"):
+        assert text in page
