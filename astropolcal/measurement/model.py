@@ -113,6 +113,7 @@ class Measurement(FittableModel):
         self.observable = get_observable(observable)
         self.wavelength = common_wavelengths([obs for _, obs, _ in pairs], wavelength)
         self.free = FreeParameters(self._chains, len(self.wavelength), ties)
+        self.free.check_wavelengths(self.wavelength)
         self.datasets = [
             Dataset(item, obs, self.observable, self.free, self.wavelength, position)
             for item, obs, position in pairs
@@ -283,7 +284,7 @@ class Measurement(FittableModel):
             self._chains_are_shared = False
         if self._fitted:
             self._fitted = False
-            self.free.put_back(self.vector())
+            self.put_back()
             self.free.put_stds([self.__dict__[label].std for label in self._param_names])
         return self._chains
 
@@ -381,6 +382,7 @@ class Measurement(FittableModel):
         """Write values (by default the current ones) into the chains and return these."""
         chains = self.chains
         self.free.put_back(self.vector() if vector is None else vector)
+        self.free.put_wavelengths(self.wavelength)
         return chains
 
     def residuals(self, vector=None):

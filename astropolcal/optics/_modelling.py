@@ -19,10 +19,12 @@ import astropy.units as u
 import numpy as np
 from astropy.modeling import CompoundModel, FittableModel, Model, Parameter
 
-from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.units import to_unit
+from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
+from astropolcal.units import length_to_um, to_unit
 from astropolcal.words import html
 
+# by how much two wavelengths may differ and be the same, as in tables of observations
+_SAME = 1e-5
 # what a copy of an optic may share with it
 _SHARED = (str, bool, int, float, type(None), u.UnitBase)
 
@@ -91,7 +93,42 @@ class KeywordOnly(type(FittableModel)):
 
 
 class OpticParameter(Parameter):
-    """A parameter whose bounds and ties are converted to its unit."""
+    """A parameter that converts bounds and ties to its unit, and knows to what they belong."""
+
+    #: Wavelengths of its values in micrometre, or None where nobody has said.
+    grid = None
+
+    @property
+    def wavelength(self):
+        """Wavelengths of the values of a parameter that has several; None if they are not known."""
+        return None if self.grid is None else self.grid * u.um
+
+    @wavelength.setter
+    def wavelength(self, value):
+        grid = None if value is None else length_to_um(value, f"wavelengths of {self.name}")
+        if grid is not None and (
+            grid.shape != self.shape or not (np.all(grid > 0) and np.all(np.diff(grid) > 0))
+        ):
+            raise ParameterError(
+                f"wavelengths of {self.name} = {value}; allowed are {self.size} that increase"
+            )
+        self.grid = grid
+
+    def at(self, wavelength, values):
+        """Return values of the parameter at wavelengths (um), between its own on straight lines."""
+        grid = self.grid
+        if grid is None or np.size(values) == 1 or wavelength is None:
+            return values
+        if np.shape(wavelength) == grid.shape and np.allclose(wavelength, grid, rtol=_SAME, atol=0):
+            return values
+        low, high = grid[0] * (1 - _SAME), grid[-1] * (1 + _SAME)
+        outside = ~((wavelength >= low) & (wavelength <= high))
+        if np.any(outside):
+            raise WavelengthRangeError(
+                f"{self.name} is known from {grid[0]:g} to {grid[-1]:g} um, not at "
+                f"{np.ravel(wavelength)[np.argmax(outside)]:g} um"
+            )
+        return np.interp(wavelength, grid, values)
 
     @Parameter.bounds.setter
     def bounds(self, value):

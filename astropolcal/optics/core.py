@@ -81,6 +81,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         each frame is added to ``theta``; with a leading minus it is subtracted.
     name : str, optional
         Name of the optic in its chain.
+    wavelength : `~astropy.units.Quantity`, optional
+        Wavelengths of the parameters with one value per wavelength, increasing. At others they
+        are interpolated; without them the optic is for as many wavelengths as there are values.
     **parameters : `~astropy.units.Quantity` or float
         Values of the optic's parameters: a scalar, or one value per wavelength.
 
@@ -134,7 +137,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         description="installed orientation, added to the position of the mount",
     )
 
-    def __init__(self, *args, mount=None, name=None, **kwargs):
+    def __init__(self, *args, mount=None, name=None, wavelength=None, **kwargs):
         if args:
             raise ParameterError(
                 f"{type(self).__name__} takes its parameters by keyword: {self.param_names}"
@@ -156,6 +159,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         self.mount = mount
         for key, value in settings.items():
             setattr(self, key, value)
+        for key in self.param_names if wavelength is not None else ():
+            if getattr(self, key).size > 1:
+                getattr(self, key).wavelength = wavelength
 
     def _check_names(self, kwargs):
         known = [*inspect.signature(type(self)).parameters, "bounds", "fixed", "tied", "meta"]
@@ -383,7 +389,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         lam = None if wavelength is None else length_to_um(wavelength)
         if lam is not None and not np.all(lam > 0):
             raise ParameterError(f"wavelength = {wavelength} must be positive")
-        self._check_grid(lam, values)
+        values = self.values_at(lam, values)
         turned = self._position
         if position is not None:
             turned = finite_position(position, "position", self.stage)
@@ -393,6 +399,15 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     def _moved(self, dispersion, angle, shift):
         """Return what the matrix needs, and the orientation, once the stage has moved."""
         return dispersion, angle + shift
+
+    def values_at(self, lam, values):
+        """Return canonical values at wavelengths (um), where they are known."""
+        values = [
+            getattr(self, key).at(lam, value)
+            for key, value in zip(self.param_names, values, strict=True)
+        ]
+        self._check_grid(lam, values)
+        return values
 
     def _check_grid(self, lam, values):
         for key, value in zip(self.param_names, values, strict=True):
@@ -568,6 +583,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             old, fresh = getattr(self, key), getattr(new, key)
             fresh.fixed, fresh.bounds = old.fixed, old.bounds
             fresh.tied, fresh.prior = old.tied, old.prior
+            if fresh.shape == old.shape:
+                fresh.grid = old.grid
         new._position = self._position
         return new
 

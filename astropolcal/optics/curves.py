@@ -147,10 +147,17 @@ class Curve(SharedParameters):
             self._memo["values"] = (None if self._several else numbers), values
         return values
 
-    def _check_grids(self, wavelength, values):
-        if self._several:
-            for optic, own in zip(self._optics, values, strict=True):
-                optic._check_grid(wavelength, [np.asarray(value) for value in own])
+    def _values_at(self, wavelength, values):
+        """Return the values of each optic at the wavelengths, where some have several."""
+        if not self._several:
+            return values
+        found = []
+        for optic, own in zip(self._optics, values, strict=True):
+            # the curve of a law leaves theta out
+            theta = optic.canonical_values()[: len(optic.param_names) - len(own)]
+            full = optic.values_at(wavelength, [np.asarray(value) for value in (*theta, *own)])
+            found.append(full[len(theta) :])
+        return found
 
     def _at(self, x):
         """Return what depends on the input alone."""
@@ -178,14 +185,15 @@ class LawCurve(Curve):
         return x, self._optics[0]._dispersion_at(_positive(x))
 
     def _values(self, place, values):
-        (optic,), (own,), (x, dispersion) = self._optics, values, place
-        self._check_grids(x, values)
+        (optic,), (x, dispersion) = self._optics, place
+        (own,) = self._values_at(x, values)
         if self._law in optic._laws:
             return getattr(optic, f"_{self._law}")(dispersion, *own) + np.zeros(x.shape)
         return own[optic.own_names.index(self._law)] + np.zeros(x.shape)
 
     def _slopes(self, place, values):
-        (optic,), (own,), (_, dispersion) = self._optics, values, place
+        (optic,), (x, dispersion) = self._optics, place
+        (own,) = self._values_at(x, values)
         if self._law in optic._laws:
             return [getattr(optic, f"_{self._law}_slopes")(dispersion, *own)]
         return [[float(key == self._law) for key in optic.own_names]]
@@ -262,7 +270,7 @@ class LightCurve(Curve):
         light = np.zeros((1, 1, 4))
         light[..., self._element[1]] = 1.0
         steps = []
-        self._check_grids(wavelength, values)
+        values = self._values_at(wavelength, values)
         for optic, (dispersion, shift), (theta, *own) in zip(arm, places, values, strict=True):
             dispersion, angle = optic._moved(dispersion, theta, shift)
             # an angle against a stage is an array, whatever its values

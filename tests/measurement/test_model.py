@@ -461,6 +461,11 @@ def test_put_back_writes_values_with_units(chain, observations):
     (own,) = measurement.put_back(vector)
     assert u.isclose(own["hwp"].w_sio2.quantity, 1.7 * u.mm)
     assert u.allclose(own["derotator"].horizontal.quantity, [10, 20, 30] * u.deg)
+    # they know their wavelengths now
+    between = np.mean(WAVELENGTH[:2].value) * u.um
+    assert u.isclose(own["derotator"].curve("horizontal")(between), 15 * u.deg)
+    with pytest.raises(ParameterError, match=r"derotator\.horizontal has values at 3 wavelengths"):
+        Measurement(own, simulate(chain, WAVELENGTH * 1.1, observations.frames, noise=False))
 
 
 def test_without_copy_the_chain_is_the_one_given(chain, observations):

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from astropolcal import mueller
-from astropolcal.exceptions import ParameterError
+from astropolcal.exceptions import ParameterError, WavelengthRangeError
 from astropolcal.mueller import rotation_generator
 from astropolcal.optics import Diattenuator, LinearPolarizer, LinearRetarder, Optic
 
@@ -189,3 +189,30 @@ def test_values_are_canonical_floats():
     theta, retardance = optic.canonical_values()
     assert theta == pytest.approx(np.pi / 4)
     np.testing.assert_allclose(retardance, [np.pi / 2, np.pi], rtol=1e-15)
+
+
+# --- wavelengths of the values ---------------------------------------------------------
+
+
+def test_values_per_wavelength_are_interpolated_where_they_are_known():
+    optic = LinearRetarder(retardance=[100, 120, 140] * u.deg, wavelength=WAVELENGTH, name="hwp")
+    assert optic.retardance.wavelength.to_value(u.nm) == pytest.approx([1200, 1600, 2100])
+    assert optic.theta.wavelength is None
+    for copy in (optic, optic.copy(), optic.with_parameters(theta=0 * u.deg)):
+        for wavelength, retardance in (
+            (1.4 * u.um, 110),
+            ([1.4, 1.85] * u.um, [110, 130]),
+            (WAVELENGTH, [100, 120, 140]),
+        ):
+            expected = mueller.linear_retarder(retardance * u.deg)
+            np.testing.assert_allclose(copy.mueller(wavelength), expected, atol=1e-12)
+    assert optic(1.4 * u.um, 1, 0, 1, 0)[3] == pytest.approx(np.cos(np.deg2rad(110)))
+    assert u.isclose(optic.curve("retardance")(1.4 * u.um), 110 * u.deg)
+    assert optic.curve("mueller", (2, 2))(1.4 * u.um) == pytest.approx(np.cos(np.deg2rad(110)))
+    with pytest.raises(WavelengthRangeError, match=r"retardance is known from 1\.2 to 2\.1 um"):
+        optic.mueller(2.2 * u.um)
+    for wrong in ([1.2, 1.6] * u.um, [1.2, 2.1, 1.6] * u.um, [0, 1, 2] * u.um):
+        with pytest.raises(ParameterError, match="wavelengths of retardance"):
+            optic.retardance.wavelength = wrong
+    with pytest.raises(ParameterError, match="3 values, one per wavelength, but 2"):
+        LinearRetarder(retardance=[100, 120, 140] * u.deg).mueller([1.4, 1.85] * u.um)
