@@ -367,7 +367,8 @@ class FreeParameters:
                 ):
                     raise ParameterError(
                         f"{name} has values at {grid.size} wavelengths from {grid[0]:g} to "
-                        f"{grid[-1]:g} um, which are not the {wavelength.size} of the data"
+                        f"{grid[-1]:g} um, which are not the {wavelength.size} of the data; "
+                        "optic.resampled(wavelength) interpolates them"
                     )
 
     def put_wavelengths(self, wavelength):

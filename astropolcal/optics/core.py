@@ -84,8 +84,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     wavelength : `~astropy.units.Quantity`, optional
         Wavelengths of the parameters with one value per wavelength, increasing. At others they
         are interpolated; without them the optic is for as many wavelengths as there are values.
-    **parameters : `~astropy.units.Quantity` or float
-        Values of the optic's parameters: a scalar, or one value per wavelength.
+    **parameters : `~astropy.units.Quantity`, `~specutils.Spectrum` or float
+        Values of the optic's parameters: a scalar, or one value per wavelength. A spectrum gives
+        values, their wavelengths and, with an uncertainty, the ``std`` of the parameter.
 
     Raises
     ------
@@ -143,6 +144,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
                 f"{type(self).__name__} takes its parameters by keyword: {self.param_names}"
             )
         values = {key: kwargs.pop(key) for key in self.param_names if key in kwargs}
+        spectra = {key: x for key, x in values.items() if hasattr(x, "spectral_axis")}
+        spectra = {key: _of_spectrum(spectrum) for key, spectrum in spectra.items()}
+        values |= {key: value for key, (_, value, _) in spectra.items()}
         values = {key: self._at_the_door(key, value) for key, value in values.items()}
         settings = {
             key: kwargs.pop(key, setting.default)
@@ -162,6 +166,10 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         for key in self.param_names if wavelength is not None else ():
             if getattr(self, key).size > 1:
                 getattr(self, key).wavelength = wavelength
+        for key, (grid, _, std) in spectra.items():
+            parameter = getattr(self, key)
+            parameter.wavelength = grid if parameter.shape else None
+            parameter.std = None if std is None else to_unit(std, parameter.unit, f"{key}.std")
 
     def _check_names(self, kwargs):
         known = [*inspect.signature(type(self)).parameters, "bounds", "fixed", "tied", "meta"]
@@ -583,9 +591,43 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             old, fresh = getattr(self, key), getattr(new, key)
             fresh.fixed, fresh.bounds = old.fixed, old.bounds
             fresh.tied, fresh.prior = old.tied, old.prior
-            if fresh.shape == old.shape:
+            if fresh.shape == old.shape and fresh.grid is None:
                 fresh.grid = old.grid
         new._position = self._position
+        return new
+
+    def resampled(self, wavelength):
+        """
+        Return a copy with the values per wavelength interpolated at other wavelengths.
+
+        Parameters
+        ----------
+        wavelength : `~astropy.units.Quantity`
+            Increasing, shape (n_wavelengths,), within those of the values.
+
+        Returns
+        -------
+        Optic
+            Its ``std`` are interpolated too. specutils resamples spectra in other ways.
+
+        Raises
+        ------
+        WavelengthRangeError, ParameterError
+            If the values are not known at a wavelength, or nobody has said at which they are.
+        """
+        grid = np.atleast_1d(length_to_um(wavelength))
+        several = [key for key in self.param_names if getattr(self, key).size > 1]
+        values, stds = {}, {}
+        for key in several:
+            parameter = getattr(self, key)
+            if parameter.grid is None:
+                raise ParameterError(f"{key}: its wavelengths are not known; set {key}.wavelength")
+            values[key] = parameter.at(grid, parameter.value) * (parameter.unit or u.one)
+            stds[key] = None if parameter.std is None else parameter.at(grid, parameter.std)
+        new = self.with_parameters(**values)
+        for key in several:
+            getattr(new, key).wavelength = grid * u.um
+            getattr(new, key).std = stds[key]
         return new
 
     def loosened(self, wavelength):
@@ -624,6 +666,19 @@ class Inverse(FittableModel):
 
 
 Inverse.__or__ = joined
+
+
+def _of_spectrum(spectrum):
+    """Return wavelengths, increasing, values and standard deviations (or None) of a spectrum."""
+    from astropy.nddata import StdDevUncertainty
+
+    wavelength = u.Quantity(spectrum.spectral_axis).to(u.um, u.spectral())
+    order, std = np.argsort(wavelength), spectrum.uncertainty
+    if spectrum.mask is not None and np.any(spectrum.mask):
+        raise ParameterError("a spectrum with masked values; cut or resample it first")
+    if std is not None:
+        std = u.Quantity(std.represent_as(StdDevUncertainty).quantity)[order]
+    return wavelength[order], u.Quantity(spectrum.flux)[order], std
 
 
 def _singular(matrix):
