@@ -117,7 +117,7 @@ def test_a_law_of_any_form_is_one_cause():
 
 @pytest.mark.slow
 def test_pairs_that_a_greedy_search_gets_wrong():
-    """Two of three causes that are one, and one cause of much freedom in place of two simple ones."""
+    """Two of three causes that are one, and one of much freedom in place of two simple ones."""
     for number in (27, 3):
         rng = np.random.default_rng([99, number])
         snr = float(np.exp(rng.uniform(np.log(30), np.log(100))))
