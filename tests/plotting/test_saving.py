@@ -43,15 +43,6 @@ def unpainted(monkeypatch):
     monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: path.write_bytes(b"painted"))
 
 
-@pytest.fixture
-def small_pages(monkeypatch):
-    """Figures are painted with a tenth of the pixels, in a quarter of the time."""
-    paint = Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda self, path, **k: paint(self, path, **k | {"dpi": 20})
-    )
-
-
 def names(paths):
     return [path.name for path in paths]
 
@@ -126,7 +117,6 @@ def test_dataset_without_a_datum_is_left_out(several, tmp_path):
     assert "double_differences_2.png" not in names(save_all(without, tmp_path))
 
 
-@pytest.mark.usefixtures("small_pages")
 @pytest.mark.slow
 def test_every_kind_of_calibration_is_drawn(request, tmp_path):
     for name in ["masked", "undetermined", "single_angle"]:
