@@ -7,6 +7,7 @@ that lets through objects and errors of ours only; YAML is looked at by ``check_
 before any of it is loaded.
 """
 
+import datetime
 import errno
 import os
 import re
@@ -18,6 +19,10 @@ import tempfile
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.time import Time
 
 from astropolcal.exceptions import AstropolcalError
 
@@ -302,6 +307,32 @@ def printable(text):
     return "\n".join(
         line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)
         for line in lines
+    )
+
+
+def plain(value, where="value"):
+    """
+    Return a value as JSON knows it: null for what is no finite number, text for keys and names.
+
+    A quantity has ``value`` and ``unit``. ``where`` is for the message of what JSON cannot hold.
+    """
+    if isinstance(value, dict):
+        return {str(key): plain(each, f"{where}.{key}") for key, each in value.items()}
+    if isinstance(value, u.Quantity):
+        return {"value": plain(value.value, where), "unit": str(value.unit)}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(each, f"{where}[{i}]") for i, each in enumerate(value)]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, os.PathLike | datetime.date | Time | u.UnitBase):
+        return one_line(value, None)
+    if value is None or isinstance(value, str | int):
+        return value
+    raise AstropolcalError(
+        f"{where} is a {type(value).__name__}, which JSON cannot hold; allowed are numbers, text, "
+        "dates, paths, units, quantities, arrays, lists and mappings"
     )
 
 

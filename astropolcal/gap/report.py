@@ -16,7 +16,7 @@ from astropy.table import QTable
 from astropolcal import instruments
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError
-from astropolcal.files import atomic_path, printable
+from astropolcal.files import atomic_path, plain, printable
 from astropolcal.gap import _numbers, _words, runs
 from astropolcal.gap.planning import plan
 from astropolcal.gap.residuals import locate
@@ -120,7 +120,7 @@ def to_dict(diagnosis):
     names = [o.name for o in diagnosis.improved.observations]
     asked = diagnosis.settings.get("changes", False)
     words = [*_words.sentences(content), *runs.paragraph(content, names, asked)]
-    return _plain(content | {"sentences": words})
+    return plain(content | {"sentences": words})
 
 
 def _nominal(model):
@@ -191,17 +191,6 @@ def _named(one):
     """Return what a cause or a candidate is called."""
     effect = one.name if one.is_named else None
     return {"name": one.name, "effect": effect, "title": one.effect.title}
-
-
-def _plain(value):
-    """Turn numpy scalars into plain ones, and what is not finite into None."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    # JSON knows neither numpy's numbers nor NaN
-    value = value.item() if isinstance(value, np.generic) else value
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 # ---- tables --------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import numpy as np
 
 from astropolcal.chain import find_optic, leaves, remove_optic
 from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
-from astropolcal.files import atomic_path, check_kind, one_line, printable
+from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
 from astropolcal.units import plain_number
 
 # what a terminal has that nobody made wider
@@ -368,24 +368,9 @@ def wrapped(line, indent=0):
     )
 
 
-def plain(value):
-    """Return a value as JSON knows it: null for what is no finite number, text for the unknown."""
-    if isinstance(value, dict):
-        return {str(key): plain(each) for key, each in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    if isinstance(value, str | bool | int) or value is None:
-        return value
-    return " ".join(str(value).split())
-
-
 def write_json(content, path):
     """Write a dictionary as JSON, atomically; ``-`` is the standard output."""
-    text = json.dumps(plain(content), indent=1, allow_nan=False) + "\n"
+    text = json.dumps(plain(content, f"JSON of {path}"), indent=1, allow_nan=False) + "\n"
     if str(path) == "-":
         sys.stdout.write(text)
         return

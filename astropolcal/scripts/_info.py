@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from astropolcal.exceptions import ObservationError
+from astropolcal.exceptions import AstropolcalError, ObservationError
+from astropolcal.files import one_line, plain
 from astropolcal.scripts._common import (
     Input,
     Output,
     add_command,
     add_shared,
     adder,
-    plain,
     printer,
     wrapped,
     write_json,
@@ -258,8 +258,14 @@ def _other_table(path, table):
 
 
 def _told(values):
-    """Return values as JSON has them; what is neither number, text nor a list is shown as text."""
-    return {str(k): plain(str(v) if isinstance(v, dict) else v) for k, v in values.items()}
+    """Return values as JSON has them; what it does not know, and what is nested, is text."""
+    told = {}
+    for key, value in values.items():
+        try:
+            told[str(key)] = one_line(value, None) if isinstance(value, dict) else plain(value)
+        except AstropolcalError:
+            told[str(key)] = one_line(value, None)
+    return told
 
 
 # ---- FITS files -----------------------------------------------------------------------------

@@ -20,7 +20,6 @@ from astropolcal.calibration.identifiability.linearized import (
     led,
     near_null_directions,
     open_directions,
-    plain,
     step_of,
 )
 from astropolcal.measurement import Normal
@@ -147,13 +146,6 @@ def test_a_parameter_that_changes_nothing():
     ]:
         (direction,) = open_directions(_free(prior), _unit(polarizer_theta=1)[None])
         assert direction["words"] == f"polarizer.theta changes no datum: {words}"
-
-
-def test_numbers_for_machines_are_plain():
-    found = plain({"a": np.float64(1.5), "b": np.array([1, 2])})
-    assert found == {"a": 1.5, "b": [1.0, 2.0]}
-    assert type(found["a"]) is float
-    assert all(type(v) is float for v in found["b"])
 
 
 # --- badly determined directions -----------------------------------------------------------------

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """Every line of a summary from numbers made up for it, and the same numbers for machines."""
 
-import json
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -15,7 +14,6 @@ from astropolcal.calibration.result.summary import (
     _global_lines,
     _goodness_lines,
     _heading,
-    _plain,
     _rows,
     _standard_lines,
     _target_row,
@@ -400,21 +398,3 @@ def test_a_star_beside_its_catalogue():
 
 
 # --- for machines ---------------------------------------------------------------------------------
-
-
-def test_what_json_knows():
-    for value, expected in [
-        (np.float64(1.5), 1.5),
-        (np.int32(3), 3),
-        (np.bool_(True), True),
-        (np.nan, None),
-        (np.inf, None),
-        (np.array([[1.0, np.nan]]), [[1.0, None]]),
-        ((1, "a", None), [1, "a", None]),
-        (2 * u.deg, {"value": 2.0, "unit": "deg"}),
-        ([1, 2] * u.mm, {"value": [1.0, 2.0], "unit": "mm"}),
-        ({"a": {"b": np.array([1])}}, {"a": {"b": [1]}}),
-    ]:
-        found = _plain(value)
-        assert found == expected
-        assert json.loads(json.dumps(found, allow_nan=False)) == expected

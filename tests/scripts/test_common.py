@@ -229,7 +229,7 @@ def test_json_has_null_for_what_is_no_finite_number(capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["1"] == [[1.5, None]]
     assert told["b"] == [2.0, None]
-    # text for what JSON does not know
+    # text for a path, in one line
     assert told["c"] == "x y"
     assert told["d"] == [True, 3, None, "é"]
 

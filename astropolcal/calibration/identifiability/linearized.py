@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration.identifiability.sky import sky_words
+from astropolcal.files import plain
 from astropolcal.units import canonical_factor
 
 __all__ = []
@@ -287,14 +288,6 @@ def _change(free, name, value):
 def _signed(value, digits):
     """Return a number with its sign; zero has none."""
     return f"{value:+.{digits}g}" if value else "0"
-
-
-def plain(moved):
-    """Return changes by parameter as floats and lists."""
-    return {
-        name: float(value) if np.ndim(value) == 0 else [float(v) for v in value]
-        for name, value in moved.items()
-    }
 
 
 # ---- near-null directions -----------------------------------------------------------------

@@ -21,6 +21,7 @@ from astropolcal.calibration.result.verdict import (
 from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
+from astropolcal.files import plain
 from astropolcal.words import counted
 
 __all__ = []
@@ -396,7 +397,7 @@ def to_dict(calibration, targets=TARGETS):
         "stages": calibration.stages,
         "provenance": dict(calibration.provenance),
     }
-    return _plain(content)
+    return plain(content)
 
 
 def _dataset(record):
@@ -407,16 +408,16 @@ def _dataset(record):
         "content_hash": record.content_hash,
         "n_frames": record.n_frames,
         "n_masked": record.n_masked,
-        "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
-        "n": _plain(table["n"]),
-        "k": _plain(table["k"]),
-        **{f"{key}_percent": _plain(_percent(table, key)) for key in _ACCURACIES},
+        "wavelength_nm": table["wavelength"].to_value(u.nm),
+        "n": table["n"],
+        "k": table["k"],
+        **{f"{key}_percent": _percent(table, key) for key in _ACCURACIES},
     }
 
 
 def _standard(entry):
     # nothing is fitted to a standard: with k = 0 its s_res is the error of prediction
-    return _plain(entry) | {"s_res_percent": _plain(entry["s_standard_percent"])}
+    return entry | {"s_res_percent": entry["s_standard_percent"]}
 
 
 def _target(table):
@@ -425,32 +426,15 @@ def _target(table):
     return {
         "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
         "aolp_deg": None if angle is None else float(angle.to_value(u.deg)),
-        "wavelength_nm": _plain(table["wavelength"].to_value(u.nm)),
-        **{f"{key}_percent": _plain(table[key].value) for key in shares},
-        "s_chi_deg": _plain(table["s_chi"].value),
+        "wavelength_nm": table["wavelength"].to_value(u.nm),
+        **{f"{key}_percent": table[key].value for key in shares},
+        "s_chi_deg": table["s_chi"].value,
         "words": table.meta["words"],
     }
 
 
 def _parameter(entry):
-    return {key: _plain(value) for key, value in entry.items() if key != "unit"} | {
-        "unit": str(entry["unit"]) if entry["unit"] is not None else ""
-    }
-
-
-def _plain(value):
-    """Turn arrays, quantities and numpy scalars into what JSON knows; NaN into None."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, u.Quantity):
-        return {"value": _plain(value.value), "unit": str(value.unit)}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
+    return entry | {"unit": "" if entry["unit"] is None else str(entry["unit"])}
 
 
 # ---- mirrors, stars that no fit saw, and what is left open on sky ----
