@@ -18,8 +18,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
+from astropolcal.calibration.noise.estimates import frame_noise
 from astropolcal.gap._frame_looks import Frame, Look, Trial, angle_stages
-from astropolcal.gap.channels import noise, settings
+from astropolcal.gap.channels import settings
 from astropolcal.gap.model import Model, nominal_calibration
 from astropolcal.gap.problem import GapProblem
 from astropolcal.observations.quality import MAD_TO_SIGMA, robust_curve
@@ -421,7 +422,7 @@ def _noise_of_others(channel, residual, angles, without):
     """Return the noise of every datum, as it is where some frames take no part."""
     others = copy.copy(channel)
     others.valid = channel.valid & ~without
-    sigma, stated = noise(others, residual, angles), np.sqrt(channel.variance)
+    sigma, stated = frame_noise(others, residual, angles), np.sqrt(channel.variance)
     for own, told in zip(sigma, stated, strict=True):
         known = others.valid & np.isfinite(told) & (told > 0)
         if known.any():

@@ -34,7 +34,11 @@ from astropolcal.calibration.fit.strategies import (
 )
 from astropolcal.calibration.identifiability.analysis import complete, finding_of
 from astropolcal.calibration.identifiability.sky import view_of_measurement
-from astropolcal.calibration.noise.estimates import noise_from_errors, noise_from_null_channel
+from astropolcal.calibration.noise.estimates import (
+    noise_from_errors,
+    noise_from_null_channel,
+    noise_from_roughness,
+)
 from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
     LOSSES,
@@ -478,27 +482,35 @@ def _errors(measurement, whitened, how):
 
 
 def _lack_of_fit(calibration):
-    """Hold the residuals against the noise that the table states, and that the data show."""
+    """Hold the residuals against the noise that the table states, and that the frames show."""
     found = []
     live = calibration.measurement
-    smooth = {"null_model": "smooth"}
-    for method, options in ((noise_from_errors, {}), (noise_from_null_channel, smooth)):
+    for method in (noise_from_errors, _noise_of_frames):
         try:
-            noise = method(live, **options)
+            noise = method(live)
             test = lack_of_fit(live, calibration, noise)
         except AstropolcalError:
-            continue  # no errors in the table, or no pairs: nothing to hold against
+            continue  # no errors in the table, or too few frames: nothing to hold against
         # unknown where no degree of freedom is left
         ratio = test.chi2 / test.expected if test.expected > 0 else np.nan
         found.append(
             {
                 "noise": noise.method,
+                "noise_percent": 100 * float(np.sqrt(np.mean(noise.sigma_of_data**2))),
                 "times_noise": float(np.sqrt(ratio)),
                 "p_value": float(test.p_value),
                 "words": test.words,
             }
         )
     return found
+
+
+def _noise_of_frames(measurement):
+    """Return the noise that a diagnosis compares with; of few wavelengths that of the null."""
+    try:
+        return noise_from_roughness(measurement)
+    except FitError:
+        return noise_from_null_channel(measurement, null_model="smooth")
 
 
 def _outliers(calibration):

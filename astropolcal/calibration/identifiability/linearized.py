@@ -14,7 +14,7 @@ from astropolcal.units import canonical_factor
 __all__ = []
 
 # singular values below this share of the largest count as zero
-_RANK_TOLERANCE = 1e-9
+RANK = 1e-9
 # and so do those below this: a rounding error, as the error would be 1e12 degrees
 _NOTHING = 1e-12
 # a parameter that moves by less than this share along an open direction stands still
@@ -52,8 +52,20 @@ def decompose(rows):
     _, singular, right = np.linalg.svd(rows, full_matrices=n_rows < n_columns)
     singular = np.pad(singular, (0, n_columns - singular.size))
     # without data the largest singular value is zero too: nothing is determined then
-    threshold = max(_RANK_TOLERANCE * singular.max(initial=0.0), _NOTHING)
+    threshold = max(RANK * singular.max(initial=0.0), _NOTHING)
     return Directions(singular, right, int(np.sum(singular > threshold)))
+
+
+def orthonormal(columns, keep=RANK):
+    """
+    Return an orthonormal basis, (n_rows, rank), of columns, (n_rows, k), compared at unit length.
+    """
+    norm = np.linalg.norm(columns, axis=0)
+    columns = columns[:, norm > 0] / norm[norm > 0]
+    if not columns.shape[1]:
+        return np.zeros((len(columns), 0))
+    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, singular > keep * singular[0]]
 
 
 class Whitened:
