@@ -7,7 +7,7 @@ import pytest
 
 from astropolcal.calibration import Calibration, bootstrap, calibrate
 from astropolcal.calibration.noise.scatter import Scatter, leave_out_groups
-from astropolcal.calibration.noise.weighting import around, weighting_of
+from astropolcal.calibration.noise.weighting import Problem, weighting_of
 from astropolcal.calibration.uncertainty import derived_retardance, standard_errors
 from astropolcal.calibration.uncertainty.refits import robust_covariance
 from astropolcal.calibration.validation.cross_validation import cross_validated_residuals
@@ -259,7 +259,7 @@ def test_derotator_angles_left_out_are_predicted_within_the_errors(charis_data, 
         data = charis_data(name)
         cal = calibrate(make.charis.chains_for([data]), data, cross_validate=False)
         model, weighting = cal.measurement, weighting_of(cal)
-        whitened = around(model, weighting)
+        whitened = Problem(model, weighting).around()
         (part,) = Scatter(model, weighting, whitened).parts
         applied = part.applied(np.eye(model.n_data))
         middle = sum(s * matrix for s, matrix in zip(part.shares, applied, strict=True))

@@ -14,7 +14,7 @@ import pytest
 
 from astropolcal import Calibration, calibrate, optics
 from astropolcal.calibration import sample
-from astropolcal.calibration.noise.weighting import Weighting, around, noise_of
+from astropolcal.calibration.noise.weighting import Problem, Weighting, noise_of
 from astropolcal.calibration.posterior import LogPosterior, Posterior
 from astropolcal.calibration.posterior import checkpoint as checkpoint_module
 from astropolcal.exceptions import (
@@ -171,7 +171,7 @@ def test_noise_from_residuals_is_unbiased():
         best = vector + np.linalg.lstsq(jacobian.T, noise, rcond=None)[0]
         live.observed = live.predict(vector) + noise
         live.parameters = best
-        equal = around(live, Weighting(None, np.full(live.n_data, np.nan)))
+        equal = Problem(live, Weighting(None, np.full(live.n_data, np.nan))).around()
         noise = Weighting("wavelength", np.full(live.n_data, NOISE)).updated(live, equal)
         squares.append(noise.sigma[[0, -1]] ** 2 / NOISE**2)
     assert np.mean(squares, axis=0) == pytest.approx([1.0, 1.0], abs=4 * (2 / 7 / 1000) ** 0.5)

@@ -43,8 +43,8 @@ from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import (
     LOSSES,
     ROUNDS,
+    Problem,
     Weighting,
-    around,
     describe,
     first_weighting,
     noise_of,
@@ -244,22 +244,16 @@ def _fixed(chain, fix):
 def _settled(measurement, weighting, origin, gauge):
     """Choose the gauge where there is a choice; return what is open, noise and linear problem."""
     if gauge == "minimal":
-        problem = BinProblem(measurement, weighting.weight, _level(weighting))
-        chosen, whitened = settled(problem, weighting, origin)
+        chosen, whitened = settled(BinProblem(measurement, weighting), origin)
     else:
-        whitened = around(measurement, weighting)
+        whitened = Problem(measurement, weighting).around()
         chosen = open_parameters(measurement.free, whitened)
     if len(whitened.data.null):
         hold_silent(measurement, origin)
     measurement.weighting = weighting.updated(measurement, whitened)
     if measurement.weighting.weight is not None and weighting.from_residuals:
-        whitened = around(measurement, measurement.weighting)
+        whitened = Problem(measurement, measurement.weighting).around()
     return chosen, measurement.weighting, whitened
-
-
-def _level(weighting):
-    """Return the noise against which priors weigh; one that is not known leaves them out."""
-    return weighting.level if weighting.is_known else 0.0
 
 
 def _check(measurement):
@@ -358,8 +352,7 @@ def _joint(measurement, weighting, fitter, search, prepare):
         if not search or not left:
             break
         small, noise = _thinned(measurement, weighting)
-        problem = BinProblem(small, noise.weight, _level(noise))
-        better, moved = search_branches(problem, small.vector(), origin)
+        better, moved = search_branches(BinProblem(small, noise), small.vector(), origin)
         if not moved.any():
             break
         measurement.parameters = better
@@ -376,13 +369,12 @@ def _thinned(measurement, weighting):
 
 def _first_search(measurement, weighting, origin):
     """Return the best branches; where no noise is known yet, first without the priors."""
-    problem = BinProblem(measurement, weighting.weight, _level(weighting))
+    problem = BinProblem(measurement, weighting)
     found = search_branches(problem, origin)[0]
     if weighting.is_known or not problem.has_priors:
         return found
     measurement.parameters = found
-    weighting = weighting.started(measurement)
-    problem = BinProblem(measurement, weighting.weight, weighting.level)
+    problem = BinProblem(measurement, weighting.started(measurement))
     return search_branches(problem, origin)[0]
 
 

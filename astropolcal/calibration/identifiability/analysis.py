@@ -19,7 +19,6 @@ from astropolcal.calibration.identifiability.ambiguities import (
 )
 from astropolcal.calibration.identifiability.linearized import (
     Whitened,
-    decompose,
     first_of_each_kind,
     led,
     near_null_directions,
@@ -116,14 +115,6 @@ class Identifiability:
         lines += [f"  - {words}" for words in self.sampling]
         lines += [f"  - mirror solution: {words}" for words in self.mirrors]
         return "\n".join(lines)
-
-
-def null_space(free, jacobian):
-    """Return orthonormal directions in which no datum changes, (n_free - rank, n_free).
-
-    In steps of a degree, micrometre or percent; ``jacobian`` is whitened, (n_free, n_data).
-    """
-    return decompose((jacobian * physical_scale(free)[:, None]).T).null
 
 
 def finding_of(free, whitened):

@@ -14,7 +14,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.calibration.identifiability.linearized import orthonormal
+from astropolcal.calibration.identifiability.linearized import RANK, orthonormal
 from astropolcal.exceptions import FitError
 from astropolcal.observations.observables import OBSERVABLES
 from astropolcal.observations.quality import MAD_TO_SIGMA
@@ -320,8 +320,6 @@ _NULL_MODELS = ("constant", "smooth")
 # far below the steps of a run, which in CHARIS's are 12.5 deg of derotator and 11.25 deg of plate
 _SAME_DEROTATOR = np.deg2rad(0.5)
 _SAME_PLATE = np.deg2rad(0.3)
-# what does not vary beyond this share is no column of its own
-_RANK = 1e-9
 
 
 def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
@@ -419,7 +417,7 @@ def _null_scatter(part, vector, null_model):
             # beams unequal by e have the difference x + e (1 - x^2):
             # its constant part is in the design
             columns = np.column_stack([design, x**2])[good]
-            fit, _, rank, _ = np.linalg.lstsq(columns, z[good], rcond=_RANK)
+            fit, _, rank, _ = np.linalg.lstsq(columns, z[good], rcond=RANK)
             squares[i] = np.sum((z[good] - columns @ fit) ** 2)
             dof[i] = good.sum() - rank
     return squares, dof

@@ -11,6 +11,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from astropolcal.calibration.identifiability.linearized import STILL
 from astropolcal.calibration.identifiability.sky import light_of, settings_of, view_of_calibration
 from astropolcal.calibration.noise.scatter import groups_by
 from astropolcal.calibration.system import model_error
@@ -28,8 +29,6 @@ from astropolcal.units import angle_to_rad
 
 __all__ = ["four_accuracies", "paper_accuracies", "target_accuracies", "target_accuracy"]
 
-# what changes by less than this share of all its changes along an open direction stands still
-_STILL = 1e-5
 KEYS = ("s_Q", "s_U", "s_p", "s_chi")
 
 
@@ -59,7 +58,7 @@ class SkyErrors:
             for matrix in (self._covariance, self._known, self._open, self._blind)
         )
         # as for any quantity derived from the parameters, see `Covariance.propagate`
-        limit = _STILL**2 * (known + is_open + blind)
+        limit = STILL**2 * (known + is_open + blind)
         lost = blind > limit
         if not self._partial:
             lost &= known <= limit
