@@ -10,7 +10,7 @@ set leaves lowers the probability of all its causes.
 """
 
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -24,6 +24,8 @@ __all__ = []
 _RETEMPERED = 400
 # fits on the way to the answer need not be carried to the end
 _QUICK = {"steps": 6, "share": 1e-3}
+# of so many causes two may be one that was not seen while the others were missing
+_MERGED = (3, 4)
 # causes are looked at beside all the others so many times
 _TURNS = 1
 # log evidence by which a name may be behind its cell, and a rival has to be ahead
@@ -147,6 +149,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
         first = _scanned(base, library, cells)
+    best = _merged(base, best, library, say, cells)
     best, scans = _exchanged(base, best, library, first, say, cells)
     best = replace(best, model=best.model.polished())
     if changes:
@@ -163,6 +166,30 @@ def select(base, library, groups, say, *, cells=True, changes=False):
 
 def _errors(model, groups):
     return None if groups is None else foreseen(model, groups)
+
+
+def _merged(base, best, library, say, cells):
+    """Return the set with two causes exchanged for one that does what both do."""
+    if not _MERGED[0] <= len(best.chosen) <= _MERGED[1]:
+        return best
+    temper, found = max(1.0, best.model.mean_square), best
+    for pair in combinations(best.chosen, 2):
+        say(f"as one cause: {' and '.join(one.effect.title for one in pair)}")
+        others = [one for one in best.chosen if one not in pair]
+        recipes = [one.recipe for one in others]
+        beside = base.with_effects(recipes, like=best.model, **_QUICK)
+        for one in _best_of(scan(beside, library, cells=cells, temper=temper), _FITTED[-1]):
+            model = beside.with_effects([one.recipe], **_QUICK)
+            lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2) / temper
+            gained = sum(o.cost(temper) for o in pair) - one.cost(temper) - lost
+            if gained > -ENOUGH and model.is_physical(one.name):
+                state = _State(model, [*others, one], best.evidence + gained)
+                found = max(found, state, key=lambda s: s.evidence - ENOUGH * len(s.chosen))
+    return found
+
+
+def _best_of(found, most):
+    return [found.freer(one) for one in _distinct(found.candidates, most)]
 
 
 def _possible(base, best, scans):
@@ -376,8 +403,7 @@ def _grown(states, known, most):
 
 def _continuations(found, most):
     """Return what may be added to a set: one cause, or one in each of the runs."""
-    few = [found.freer(one) for one in _distinct(found.candidates, most)]
-    few = [one for one in few if one.evidence > ENOUGH]
+    few = [one for one in _best_of(found, most) if one.evidence > ENOUGH]
     if found.probes is None or len(found.probes.runs) < 2:
         return [(one,) for one in few]
     first = {}
@@ -422,6 +448,11 @@ def _exchanged(base, best, library, first, say, cells):
                 # so many that none is sure: what each can be told from is all that is asked
                 continue
             fresh = _best_beside(found, one, library)
+            if others and (fresh is None or fresh.evidence < ENOUGH):
+                # the others do what it did
+                model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
+                best, like = _State(model, others, best.evidence - one.evidence), None
+                continue
             if fresh is None or (fresh.name, fresh.degree) == (one.name, one.degree):
                 continue
             if fresh.name in {other.name for other in others}:
@@ -445,7 +476,7 @@ def _beside(model, one, library, cells, like):
 
 def _best_beside(found, own, library):
     """Return the best candidate of a scan; its own again, with a name or another law, if alike."""
-    few = [found.freer(one) for one in _distinct(found.candidates, _FITTED[1])]
+    few = _best_of(found, _FITTED[1])
     mine = [found.freer(one) for one in found.candidates if one.name == own.name]
     names = [
         name
