@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import Angle
 from astropy.time import Time
 from astropy.utils import iers
 from astropy.utils.data import download_file
@@ -24,7 +25,7 @@ from astropolcal.files import one_line
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import MOVES
-from astropolcal.units import angle_to_rad
+from astropolcal.units import angle_to_rad, plain_number
 
 __all__ = ["location_of", "pointing"]
 
@@ -94,6 +95,20 @@ def _warn_of_uncovered(time):
                 AstropolcalWarning,
                 stacklevel=3,
             )
+
+
+def sky_angle(name, value):
+    """
+    Return a right ascension or a declination, by name, in degree.
+
+    Plain numbers are degrees; what is sexagesimal are hours in a right ascension. What is no angle
+    raises a ValueError.
+    """
+    try:
+        return plain_number(value)
+    except (TypeError, ValueError):
+        unit = u.hourangle if name == "right_ascension" else u.deg
+        return float(Angle(str(value), unit=unit).to_value(u.deg))
 
 
 def pointing(coord, time, location):

@@ -29,12 +29,12 @@ from astropolcal.exceptions import (
     ObservationError,
     ParameterError,
 )
+from astropolcal.files import one_line
 from astropolcal.instruments import Instrument
 from astropolcal.instruments.base import without_nuisance
 from astropolcal.instruments.layout import ANGLES, RANGES, TEXTS, convert, frame_time, look_up
-from astropolcal.observations.pointings import offline
+from astropolcal.observations.pointings import offline, sky_angle
 from astropolcal.observations.reading import numeric_column
-from astropolcal.units import plain_number
 
 __all__ = []
 
@@ -150,7 +150,10 @@ class FrameAngles:
     def _column(self, column, values):
         """Return angles as a Quantity, anything else as text."""
         if column in _SKY:
-            return _sky(column, values)
+            try:
+                return [sky_angle(column, value) for value in values] * u.deg
+            except ValueError as error:
+                raise ObservationError(f"{column}: {one_line(error)}") from None
         keyword, layout = self._layout.keywords[column], self._layout
         # states of a modulator, cameras and such
         if not u.Unit(layout.units.get(column, "deg")).is_equivalent(u.deg):
@@ -181,22 +184,6 @@ class FrameAngles:
             lacking = f"no {keyword}" if keyword else "no keyword is known for it"
             raise ObservationError(f"position of {column!r}: {lacking} in the header")
         return numeric_column(self._table, column, self.name, u.rad)
-
-
-def _sky(column, values):
-    from astropy.coordinates import Angle
-
-    try:
-        numbers = [plain_number(value) for value in values]
-        # plain numbers are degrees, also for the right ascension; sexagesimal ones are hours there
-        return numbers * u.deg
-    except (TypeError, ValueError):
-        pass
-    unit = u.hourangle if column == "right_ascension" else u.deg
-    try:
-        return u.Quantity([Angle(str(value), unit=unit).to(u.deg) for value in values])
-    except ValueError as error:
-        raise ObservationError(f"{column}: {' '.join(str(error).split())}") from None
 
 
 # ---- which of a calibration's chains the light of a frame went through ----

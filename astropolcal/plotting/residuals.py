@@ -8,7 +8,7 @@ import numpy as np
 
 from astropolcal.chain import stages
 from astropolcal.exceptions import ObservationError, ParameterError, WavelengthRangeError
-from astropolcal.observations.quality import is_star
+from astropolcal.observations.quality import clusters, is_star
 from astropolcal.optics import COORDINATES
 from astropolcal.plotting._style import (
     BLUE,
@@ -18,7 +18,6 @@ from astropolcal.plotting._style import (
     SIGMA,
     canvas,
     cell_edges,
-    clusters,
     degrees,
     heading,
     legend_outside,
