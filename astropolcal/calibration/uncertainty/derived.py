@@ -14,7 +14,12 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import led
-from astropolcal.calibration.system import free_of, from_first_stage
+from astropolcal.calibration.system import (
+    free_of,
+    from_first_stage,
+    per_canonical,
+    spread_out,
+)
 from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import (
     find_optic,
@@ -359,18 +364,12 @@ def _at_wavelengths(calibration, leaf, keys, lam):
 
 def _of_parameters(calibration, leaf, keys, value, slopes, weights):
     """Return a quantity that depends on parameters of one optic at the same wavelength."""
-    free = free_of(calibration)
-    derivatives = {}
-    for key, slope in zip(keys, slopes, strict=True):
-        parameter = getattr(leaf, key)
-        factor = 1.0 if parameter.unit is None else parameter.unit.to(u.deg)
-        slot, *_ = free.lookup(f"{leaf.name}.{key}")
-        if slot is not None:
-            own = np.ravel(slope)[:, None] * weights if slot.per_wavelength else np.ravel(slope)
-            shape = (*np.shape(value), slot.size) if slot.per_wavelength else np.shape(value)
-            derivatives[f"{leaf.name}.{key}"] = (own * factor).reshape(shape)
-    slopes = slopes_of(free, derivatives, np.shape(value))
-    return derive(calibration, free, value[()], slopes)
+    units = (getattr(leaf, key).unit for key in keys)
+    named = {
+        f"{leaf.name}.{key}": np.ravel(slope) * (1.0 if unit is None else unit.to(u.deg))
+        for key, slope, unit in zip(keys, slopes, units, strict=True)
+    }
+    return _by_name(calibration, value[()], named, weights)
 
 
 def derived_mueller(calibration, positions=None, wavelength=None, beam="right", dataset=0):
@@ -418,13 +417,16 @@ def derived_mueller(calibration, positions=None, wavelength=None, beam="right", 
     lam = _grid(calibration, wavelength)
     chain = with_beam(calibration.chains[dataset], beam)
     value = system_mueller(chain, lam, positions)
-    slopes = {
-        name: slope.value
-        for name, slope in system_mueller_derivatives(chain, lam, positions).items()
-    }
-    axis = None if lam.ndim == 0 else -3
+    return _by_name(calibration, value, system_mueller_derivatives(chain, lam, positions), axis=-3)
+
+
+def _by_name(calibration, value, slopes, mix=None, axis=0):
+    """Return a quantity with its error from derivatives by name, see `spread_out`."""
     free = free_of(calibration)
-    return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
+    mix = np.eye(len(calibration.wavelength)) if mix is None else mix
+    # a single quantity is one of one wavelength
+    slopes = spread_out(free, per_canonical(free, slopes), np.shape(value) or (1,), mix, axis)
+    return derive(calibration, free, value, slopes.reshape(-1, free.size))
 
 
 def _grid(calibration, wavelength):
@@ -440,25 +442,6 @@ def _grid(calibration, wavelength):
             "leave out wavelength"
         )
     return lam
-
-
-def _spread_out(free, slopes, axis):
-    """Give the derivatives to parameters per wavelength their own axis; drop the fixed ones."""
-    spread, shape = {}, ()
-    for name, slope in slopes.items():
-        shape = slope.shape
-        slot, *_ = free.lookup(name)
-        if slot is None:
-            continue
-        if slot.per_wavelength:
-            wide = np.zeros((*shape, slot.size))
-            for i in range(slot.size):
-                here = (*[slice(None)] * (len(shape) + axis), i)
-                # the matrices of wavelength i depend on the i-th value of the parameter alone
-                wide[(*here, ..., i)] = slope[here]
-            slope = wide
-        spread[name] = slope
-    return spread, shape
 
 
 def derived_data(calibration, observations=None, dataset=0):
@@ -589,9 +572,7 @@ def derived_sky(
             change = (numerator[name] - ratio[..., None] * denominator[name]) @ stokes / total
             slopes[name] = -np.einsum("...kp,p...->...k", inverse, change)
     value = np.broadcast_to(stokes[1:3], inverse.shape[:-1]).copy()
-    free = free_of(calibration)
-    axis = None if np.ndim(lam) == 0 else -2
-    return derive(calibration, free, value, slopes_of(free, *_spread_out(free, slopes, axis)))
+    return _by_name(calibration, value, slopes, axis=-2)
 
 
 def _double_difference_rows(chain, lam, positions, modulator):
