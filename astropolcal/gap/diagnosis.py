@@ -152,6 +152,8 @@ class Diagnosis:
     frames: list = field(default_factory=list)
     settings: dict = field(default_factory=dict)
     nested: object = None
+    #: What `astropolcal.gap.report.to_dict` has worked out, None before it was asked.
+    content: dict | None = field(default=None, init=False, repr=False, compare=False)
 
     @property
     def noise_floor_percent(self):

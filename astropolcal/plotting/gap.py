@@ -454,16 +454,15 @@ def _place_label(place):
     return textwrap.fill(words.get(head, place), 16)
 
 
-def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
+def plot_effect_sizes(diagnosis, effect, *, figure=None):
     """
     Draw the fitted size of a cause, by its name, with its errors.
 
     One panel for what it depends on, if that is a cell that changes from frame to frame: the size
     at the middle wavelength with its 68 % band, and the frames as marks. One panel for each
     parameter that changes with the wavelength; crosses mark where the data do not tell the size.
-    ``content`` is what `~astropolcal.gap.report.to_dict` returned, if it is known already.
     """
-    sizes = _sizes_by_wavelength(diagnosis, effect, content)
+    sizes = _sizes_by_wavelength(diagnosis, effect)
     panels = [None, *sizes] if _curve(diagnosis, effect) else list(sizes)
     if not panels:
         raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
@@ -484,14 +483,14 @@ def plot_effect_sizes(diagnosis, effect, *, content=None, figure=None):
     return figure
 
 
-def _sizes_by_wavelength(diagnosis, effect, content):
+def _sizes_by_wavelength(diagnosis, effect):
     names = [cause.name for cause in diagnosis.causes]
     if effect not in names:
         raise ParameterError(f"effect = {effect!r} is no cause; these are: {', '.join(names)}")
-    if content is None:
+    if diagnosis.content is None:
         sizes = Fitted(diagnosis.improved).sizes(effect)
     else:
-        sizes = content["causes"][names.index(effect)]["size"]
+        sizes = diagnosis.content["causes"][names.index(effect)]["size"]
     return {name: size for name, size in sizes.items() if _varies(size["value"])}
 
 

@@ -119,7 +119,7 @@ def run(arguments):
     content = to_dict(diagnosis)
     # first the files: a reader of our words may have gone in the meantime
     written = _write(diagnosis, content, arguments, instrument)
-    say(summary(diagnosis, content, written))
+    say(summary(diagnosis, written))
 
 
 class _Progress:
@@ -217,7 +217,7 @@ def _write(diagnosis, content, arguments, instrument):
 
         figures = {"figures": _figures(diagnosis)}
         figures["size_figures"] = _size_figures(diagnosis, content)
-        write_html(diagnosis, arguments.report, content=content, **figures)
+        write_html(diagnosis, arguments.report, **figures)
         written.append(arguments.report)
     if arguments.save:
         from astropolcal.gap._numbers import with_causes
@@ -250,5 +250,5 @@ def _size_figures(diagnosis, content):
         if any(has_sizes(entry)):
             # the size of some depends on nothing
             with suppress(ParameterError):
-                found[entry["name"]] = plot_effect_sizes(diagnosis, entry["name"], content=content)
+                found[entry["name"]] = plot_effect_sizes(diagnosis, entry["name"])
     return found

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable
 
+from astropolcal.calibration import calibrate
 from astropolcal.calibration.result.summary import (
     _accuracy_lines,
     _bound_lines,
@@ -397,4 +399,21 @@ def test_a_star_beside_its_catalogue():
     assert second.split() == ["1600.0", "-", "-", "-", "-"]
 
 
-# --- for machines ---------------------------------------------------------------------------------
+# --- all at once ----------------------------------------------------------------------------------
+
+
+def test_what_was_fitted_is_only_shown(make, monkeypatch, tmp_path):
+    """No fit, however often and in which form a calibration is written."""
+    lam = [1200, 1600, 2200] * u.nm
+    chain = make.chain(wavelength=lam)
+    cal = calibrate(chain, make.observe(chain, wavelength=lam), search=False)
+
+    def fit(*args, **kwargs):
+        raise AssertionError("a serializer fits")
+
+    monkeypatch.setattr("scipy.optimize.least_squares", fit)
+    monkeypatch.setattr(TRFLSQFitter, "__call__", fit)
+    for _ in range(2):
+        assert cal.summary(full=True)
+        assert cal.to_dict()["verdict"]
+        cal.write(tmp_path / "cal.asdf", overwrite=True)
