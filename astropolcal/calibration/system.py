@@ -7,6 +7,7 @@ import numpy as np
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.observations.reading import nearest_bins
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 from astropolcal.units import canonical_factor
@@ -146,7 +147,6 @@ def model_error(fit, lam, n=3):
 
 
 _TELESCOPE = ("parallactic", "altitude")
-_SAME_WAVELENGTH = 1e-6
 
 
 def match_wavelengths(grid, chain, wavelength):
@@ -157,10 +157,7 @@ def match_wavelengths(grid, chain, wavelength):
         lam = np.atleast_1d(u.Quantity(wavelength)).to(grid.unit)
     except (TypeError, u.UnitConversionError):
         raise ParameterError(f"wavelength = {wavelength!r} needs a unit such as nm") from None
-    # relative, (n_wanted, n_grid)
-    far = np.abs(lam[:, None] - grid) / grid
-    bins = far.argmin(axis=1)
-    off = far.min(axis=1) > _SAME_WAVELENGTH
+    bins, off = nearest_bins(lam, grid)
     if not off.any():
         return lam, bins
     several = [
@@ -214,6 +211,13 @@ def per_canonical(free, slopes):
         for name, slope in slopes.items()
         if free.lookup(name)[0] is not None
     }
+
+
+def between(lam, grid):
+    """Return the weights of linear interpolation between wavelengths, (n_wanted, n_grid)."""
+    order = np.argsort(grid)
+    rows = np.eye(len(grid))[order]
+    return np.stack([np.interp(lam, grid[order], row) for row in rows.T], axis=1)
 
 
 def errors(calibration, axes, value, slopes, bins):

@@ -241,6 +241,26 @@ _FILTERS = Path(__file__).parents[1] / "data" / "filters.ecsv"
 SAME_WAVELENGTH = 1e-5
 
 
+def nearest_bins(wavelength, grid):
+    """Return the bin of a grid that is nearest to each wavelength, and which are off the grid."""
+    nearest = np.abs(wavelength[:, None] - grid).argmin(axis=1)
+    return nearest, np.abs(grid[nearest] - wavelength) > SAME_WAVELENGTH * wavelength
+
+
+def bins_on_grid(observations, grid):
+    """Return the bin of a grid, micrometre, of each wavelength; refuse what is off it."""
+    own = observations.wavelength.to_value(u.um)
+    nearest, off = nearest_bins(own, grid)
+    if off.any():
+        raise ObservationError(
+            f"{observations.name}: {off.sum()} of {own.size} wavelengths, such as "
+            f"{1e3 * own[off][0]:.3f} nm, are none of the {grid.size} of the parameters, "
+            f"{1e3 * grid.min():.3f} to {1e3 * grid.max():.3f} nm "
+            f"(nearest {1e3 * grid[nearest][off][0]:.3f} nm)"
+        )
+    return nearest
+
+
 def common_wavelengths(observations, wavelength=None):
     """Return the grid given, or the union of the wavelengths of datasets, ascending, micrometre."""
     if wavelength is not None:

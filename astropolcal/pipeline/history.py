@@ -23,6 +23,7 @@ from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.measurement import parameter_table
 from astropolcal.observations import Observations
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.pipeline.library import Entry, Library
 
 __all__ = ["Change", "changes", "parameter_history", "restart"]
@@ -267,7 +268,8 @@ def _check_independent(named):
 def _common(named, spaces, parameters):
     """Return the elements to compare, in the order of the first calibration."""
     grids = [calibration.wavelength.to_value("nm") for _, calibration in named]
-    same = all(g.shape == grids[0].shape and np.allclose(g, grids[0], rtol=1e-6) for g in grids)
+    first = grids[0]
+    same = all(g.shape == first.shape and np.allclose(g, first, SAME_WAVELENGTH) for g in grids)
     names = [n for n in spaces[0].names if all(n in space.names for space in spaces)]
     if parameters is not None:
         for key in parameters:

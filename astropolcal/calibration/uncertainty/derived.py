@@ -15,6 +15,7 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.linearized import led
 from astropolcal.calibration.system import (
+    between,
     free_of,
     from_first_stage,
     per_canonical,
@@ -30,6 +31,7 @@ from astropolcal.chain import (
 )
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement.parameters import FreeParameters
+from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import (
     Diattenuator,
     DiattenuatorRetarder,
@@ -338,21 +340,17 @@ def derived_efficiency(calibration, wavelength=None, dataset=0):
 def _at_wavelengths(calibration, leaf, keys, lam):
     """Return parameters (degree or 1) at wavelengths, and the share of each grid point."""
     grid = calibration.wavelength.to_value(u.nm)
-    order = np.argsort(grid)
     wanted = np.atleast_1d(lam.to_value(u.nm))
     # one number for all wavelengths holds anywhere
     several = any(np.size(getattr(leaf, key).value) > 1 for key in keys)
-    slack = 1e-6 * grid.max()
+    slack = SAME_WAVELENGTH * grid.max()
     outside = (wanted < grid.min() - slack) | (wanted > grid.max() + slack)
     if several and outside.any():
         raise WavelengthRangeError(
             f"wavelength {wanted[outside][0]:.2f} nm is outside the calibrated range "
             f"{grid.min():.2f} to {grid.max():.2f} nm"
         )
-    # interpolation is linear in the values: row i says how much of grid point i goes into each
-    # wavelength, (n_grid, n_wanted)
-    rows = [np.interp(wanted, grid[order], unit[order]) for unit in np.eye(grid.size)]
-    weights = np.stack(rows, axis=1)
+    weights = between(wanted, grid)
     parts = []
     for key in keys:
         parameter = getattr(leaf, key)
@@ -436,7 +434,7 @@ def _grid(calibration, wavelength):
         return grid
     lam = u.Quantity(wavelength)
     several = [slot for slot in free_of(calibration).slots if slot.per_wavelength]
-    if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=1e-6)):
+    if several and (lam.shape != grid.shape or not u.allclose(lam, grid, rtol=SAME_WAVELENGTH)):
         raise ParameterError(
             f"{several[0].name} is known at the {grid.size} calibrated wavelengths only: "
             "leave out wavelength"

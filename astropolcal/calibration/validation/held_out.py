@@ -7,9 +7,9 @@ from astropy.table import QTable
 
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.chain import join, leaves
-from astropolcal.exceptions import ChainError, FitError, ObservationError
+from astropolcal.exceptions import ChainError, FitError
 from astropolcal.measurement import Measurement, parameter_table
-from astropolcal.observations.reading import SAME_WAVELENGTH
+from astropolcal.observations.reading import SAME_WAVELENGTH, bins_on_grid
 from astropolcal.optics import PolarizedSource
 
 __all__ = ["add_standard"]
@@ -34,7 +34,7 @@ def standard_accuracy(calibration, chain, observations, positions=None):
     The table of `add_standard`, which keeps it with the calibration.
     """
     refuse_fitted(calibration, observations)
-    rows = rows_on_grid(calibration, observations)
+    rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
     predicted = _calibrated_chain(calibration, chain, rows, observations.name)
     known = parameter_table([predicted])
     fitted = {leaf.name for item in calibration.chains for leaf in leaves(item)}
@@ -63,22 +63,8 @@ def standard_accuracy(calibration, chain, observations, positions=None):
 
 def predicted_chain(calibration, chain, observations):
     """Return the chain with the calibration's values at the wavelengths of the observations."""
-    rows = rows_on_grid(calibration, observations)
+    rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
     return _calibrated_chain(calibration, chain, rows, observations.name, sources=True)
-
-
-def rows_on_grid(calibration, observations):
-    """Return the calibration's wavelength (index) of each of the observations'."""
-    grid, own = (w.to_value(u.nm) for w in (calibration.wavelength, observations.wavelength))
-    nearest = np.abs(own[:, None] - grid).argmin(axis=1)
-    off = np.abs(grid[nearest] - own) > SAME_WAVELENGTH * own
-    if off.any():
-        raise ObservationError(
-            f"{observations.name}: {off.sum()} of {own.size} wavelengths, such as "
-            f"{own[off][0]:.3f} nm, are none of the calibration's {grid.size} from "
-            f"{grid.min():.3f} to {grid.max():.3f} nm (nearest {grid[nearest][off][0]:.3f} nm)"
-        )
-    return nearest
 
 
 def _calibrated_chain(calibration, chain, rows, name, sources=False):

@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import standards, stokes
-from astropolcal.calibration.validation.held_out import predicted_chain, refuse_fitted, rows_on_grid
+from astropolcal.calibration.validation.held_out import predicted_chain, refuse_fitted
 from astropolcal.calibration.validation.targets import target_accuracies
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import (
@@ -17,6 +17,7 @@ from astropolcal.exceptions import (
 )
 from astropolcal.measurement import Measurement
 from astropolcal.observations.quality import cycle_numbers
+from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import PolarizedSource, StarSource
 from astropolcal.stokes import polarization_angle
 
@@ -377,7 +378,8 @@ def star_check(calibration, chain, observations, positions=None, star=None):
     for key in accuracy.colnames[1:]:
         table[key] = accuracy[key]
     _add_known(table, np.asarray(q), np.asarray(stokes_u), covariance)
-    _add_claims(table, calibration, rows_on_grid(calibration, observations))
+    rows = bins_on_grid(observations, calibration.wavelength.to_value(u.um))
+    _add_claims(table, calibration, rows)
     table.meta["words"] = _words(table)
     return table
 
