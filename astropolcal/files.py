@@ -336,6 +336,22 @@ def plain(value, where="value"):
     )
 
 
+_COLUMN_UNITS = {"percent": u.percent, "deg": u.deg, "nm": u.nm}
+
+
+def columns(table, *keys):
+    """Return columns of a table, by default all, as lists by name and unit: ``s_cv_percent``."""
+    found = {}
+    for key in keys or table.colnames:
+        values = np.asarray(table[key])
+        for name, unit in _COLUMN_UNITS.items():
+            if table[key].unit is not None and table[key].unit.is_equivalent(unit):
+                key, values = f"{key}_{name}", table[key].to_value(unit)
+                break
+        found[key] = values.tolist()
+    return found
+
+
 def check_yaml(text, error=AstropolcalError):
     """
     Refuse YAML that is small in a file and immense, endless or deadly when it is loaded.

@@ -20,8 +20,8 @@ from astropolcal.calibration.result.verdict import (
 )
 from astropolcal.calibration.uncertainty.derived import METALS, mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
-from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
-from astropolcal.files import plain
+from astropolcal.calibration.validation.targets import TARGETS, target_accuracies, target_entry
+from astropolcal.files import columns, plain
 from astropolcal.words import counted
 
 __all__ = []
@@ -345,13 +345,6 @@ def _posterior_lines(calibration):
     )
 
 
-def _fitted_star(table):
-    columns = {f"{key}_percent": table[key].value for key in table.colnames[1:]}
-    nm = table["wavelength"].to_value(u.nm)
-    return {"name": table.meta["name"], "from_data": table.meta["from_data"],
-            "wavelength_nm": nm} | columns  # fmt: skip
-
-
 # ---- for machines ------------------------------------------------------------------
 
 
@@ -380,9 +373,12 @@ def to_dict(calibration, targets=TARGETS):
         "left_out": what_is_left_out(calibration),
         "stars": fit.get("stars", []),
         "mirrors": mirrors(calibration),
-        "fitted_stars": [_fitted_star(table) for table in fitted_stars(calibration)],
+        "fitted_stars": [
+            {key: table.meta[key] for key in ("name", "from_data")} | columns(table)
+            for table in fitted_stars(calibration)
+        ],
         "standards": [_standard(entry) for entry in fit.get("standards", [])],
-        "targets": [_target(table) for table in target_accuracies(calibration, targets)],
+        "targets": [target_entry(table) for table in target_accuracies(calibration, targets)],
         "parameters": {
             name: _parameter(entry) for name, entry in calibration.parameter_values().items()
         },
@@ -418,19 +414,6 @@ def _dataset(record):
 def _standard(entry):
     # nothing is fitted to a standard: with k = 0 its s_res is the error of prediction
     return entry | {"s_res_percent": entry["s_standard_percent"]}
-
-
-def _target(table):
-    angle = table.meta["aolp"]
-    shares = [key for key in table.colnames if key not in ("wavelength", "s_chi")]
-    return {
-        "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
-        "aolp_deg": None if angle is None else float(angle.to_value(u.deg)),
-        "wavelength_nm": table["wavelength"].to_value(u.nm),
-        **{f"{key}_percent": table[key].value for key in shares},
-        "s_chi_deg": table["s_chi"].value,
-        "words": table.meta["words"],
-    }
 
 
 def _parameter(entry):
@@ -521,15 +504,10 @@ def star_lines(entry):
 def mirrors(calibration):
     """Return the values of all mirrors for machines."""
     tables = [mirror_values(calibration, name) for name in mirror_names(calibration)]
-    return [_entry(table) for table in tables]
-
-
-def _entry(table):
-    columns = {"wavelength_nm": table["wavelength"].to_value(u.nm)}
-    for key in table.colnames[1:]:
-        unit = "percent" if key.startswith("diattenuation") else "deg"
-        columns[f"{key}_{unit}"] = table[key].value
-    return {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns
+    return [
+        {"name": table.meta["name"], "retardance_held": table.meta["held"]} | columns(table)
+        for table in tables
+    ]
 
 
 # ---- what an accuracy for a target is made of -----------------------------------------------

@@ -8,6 +8,7 @@ from astropy.table import QTable
 from astropolcal.calibration.identifiability.analysis import physical_scale
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import ChainError, FitError
+from astropolcal.files import columns
 from astropolcal.measurement import Measurement, parameter_table
 from astropolcal.observations.reading import SAME_WAVELENGTH, bins_on_grid
 from astropolcal.optics import PolarizedSource
@@ -241,11 +242,7 @@ def add_standard(calibration, chain, observations, positions=None):
     """
     table = standard_accuracy(calibration, chain, observations, positions)
     entry = {key: table.meta[key] for key in ("name", "source", "content_hash", "n_frames")}
-    entry["wavelength_nm"] = table["wavelength"].to_value(u.nm).tolist()
-    entry["n"] = np.asarray(table["n"]).tolist()
-    for key in ("s_standard", "bias", "scatter", "s_cv"):
-        entry[f"{key}_percent"] = table[key].to_value(u.percent).tolist()
-    entry["chi"] = np.asarray(table["chi"]).tolist()
+    entry |= columns(table, "wavelength", "n", "s_standard", "bias", "scatter", "s_cv", "chi")
     entry |= {key: table.meta[key] for key in ("open_percent", "not_calibrated", "words")}
     others = [
         other

@@ -15,6 +15,7 @@ from astropolcal.exceptions import (
     ObservationError,
     WavelengthRangeError,
 )
+from astropolcal.files import columns
 from astropolcal.measurement import Measurement
 from astropolcal.observations.quality import cycle_numbers
 from astropolcal.observations.reading import bins_on_grid
@@ -290,24 +291,12 @@ def _fitted_words(table):
 # ---- check of a calibration with a star of known polarization that no fit has seen ----
 
 
-# what is kept with a calibration, and in which unit
-_KEPT = {
-    "dolp": u.percent,
-    "dolp_err": u.percent,
-    "dolp_sys_err": u.percent,
-    "dolp_known": u.percent,
-    "dolp_known_err": u.percent,
-    "aolp": u.deg,
-    "aolp_err": u.deg,
-    "aolp_sys_err": u.deg,
-    "aolp_known": u.deg,
-    "aolp_known_err": u.deg,
-    "dolp_error": u.percent,
-    "aolp_error": u.deg,
-    "s_dolp": u.percent,
-    "s_q": u.percent,
-    "s_u": u.percent,
-}
+# what is kept with a calibration
+_KEPT = (
+    *("dolp", "dolp_err", "dolp_sys_err", "dolp_known", "dolp_known_err"),
+    *("aolp", "aolp_err", "aolp_sys_err", "aolp_known", "aolp_known_err"),
+    *("dolp_error", "aolp_error", "s_dolp", "s_q", "s_u"),
+)
 
 
 def star_check(calibration, chain, observations, positions=None, star=None):
@@ -471,11 +460,7 @@ def add_star_check(calibration, chain, observations, positions=None):
     table = star_check(calibration, chain, observations, positions)
     entry = {key: table.meta[key] for key in ("name", "star", "words")}
     entry["content_hash"] = observations.content_hash
-    entry["wavelength_nm"] = table["wavelength"].to_value(u.nm).tolist()
-    entry["n_cycles"] = np.asarray(table["n_cycles"]).tolist()
-    for key, unit in _KEPT.items():
-        suffix = "percent" if unit == u.percent else "deg"
-        entry[f"{key}_{suffix}"] = table[key].to_value(unit).tolist()
+    entry |= columns(table, "wavelength", "n_cycles", *_KEPT)
     others = calibration.fit.get("stars", [])
     # checked again, a star replaces its entry
     others = [other for other in others if other["content_hash"] != entry["content_hash"]]

@@ -23,6 +23,7 @@ from astropolcal.calibration.validation.cross_validation import (
 from astropolcal.calibration.validation.held_out import refuse_fitted
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
+from astropolcal.files import columns
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import LinearPolarizer
 from astropolcal.units import angle_to_rad
@@ -214,21 +215,20 @@ def keep_sky_accuracy(calibration, view=None):
         calibration.fit["sky_settings"] = settings_of(calibration.measurement)
     view = view_of_calibration(calibration) if view is None else view
     tables = _accuracies(calibration, TARGETS, [_target(*one) for one in TARGETS], view)
-    calibration.fit["sky_accuracy"] = [_kept(table) for table in tables]
+    calibration.fit["sky_accuracy"] = [
+        {key.lower(): value for key, value in target_entry(table).items()} for table in tables
+    ]
     return calibration
 
 
-def _kept(table):
+def target_entry(table):
+    """Return the accuracies for a target as plain numbers and lists."""
     aolp = table.meta["aolp"]
-    columns = {f"{key.lower()}_percent": table[key].to_value(u.percent) for key in KEYS[:3]}
     return {
         "dolp_percent": float(u.Quantity(table.meta["dolp"]).to_value(u.percent)),
         "aolp_deg": None if aolp is None else float(aolp.to_value(u.deg)),
-        "wavelength_nm": table["wavelength"].to_value(u.nm).tolist(),
-        **{key: values.tolist() for key, values in columns.items()},
-        "s_chi_deg": table["s_chi"].to_value(u.deg).tolist(),
         "words": table.meta["words"],
-    }
+    } | columns(table)
 
 
 # ---- the equations of the paper ------------------------------------------------------------
