@@ -13,14 +13,13 @@ import numpy as np
 
 from astropolcal import optics
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
-from astropolcal.calibration.system import Rows, between
+from astropolcal.calibration.system import Rows, between, free_of
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import (
     AstropolcalWarning,
     ChainError,
     WavelengthRangeError,
 )
-from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.reading import SAME_WAVELENGTH, nearest_bins
 from astropolcal.optics import COORDINATES
 from astropolcal.optics.core import finite_position
@@ -69,8 +68,7 @@ class RowModel(Rows):
         self.calibration = calibration if hasattr(calibration, "covariance") else None
         lam, free = length_to_um(self.wavelength), None
         if self.calibration is not None:
-            grid = len(calibration.wavelength)
-            free = FreeParameters(calibration.chains, grid, calibration.ties)
+            free = free_of(calibration)
         mix = self._mixing(chain, lam, interpolate)
         placed, nodes = _placed(positions, stages(chain))
         super().__init__(chain, lam, placed, free, mix, nodes)

@@ -253,6 +253,11 @@ class FreeParameters:
             for i in range(slot.size)
         ]
 
+    @property
+    def units(self):
+        """Declared units of the elements, None for what has none."""
+        return [slot.unit for slot in self.slots for _ in range(slot.size)]
+
     def start(self):
         """Return the current values of the chains as one vector."""
         vector = np.empty(self.size)

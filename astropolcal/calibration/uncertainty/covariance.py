@@ -344,11 +344,7 @@ def white_covariance(measurement, whitened, weighting):
     per_unit = whitened.scale / free.factors()
     factor = whitened.factor() * (level * per_unit) if np.isfinite(level) else None
     null = whitened.null() * per_unit
-    return Covariance(free.names, _units(free), matrix, factor=factor, null=null)
-
-
-def _units(free):
-    return [slot.unit for slot in free.slots for _ in range(slot.size)]
+    return Covariance(free.names, free.units, matrix, factor=factor, null=null)
 
 
 def sandwich(measurement, whitened, middle, slack=None):
@@ -371,7 +367,7 @@ def sandwich(measurement, whitened, middle, slack=None):
     columns = whitened.live[whitened.errors.determined]
     determined = factor[:, columns]
     matrix[np.ix_(columns, columns)] = determined.T @ determined
-    return Covariance(free.names, _units(free), matrix, factor=factor, null=null)
+    return Covariance(free.names, free.units, matrix, factor=factor, null=null)
 
 
 def residual_variance(calibration):
