@@ -64,8 +64,12 @@ def orthonormal(columns, keep=RANK):
     columns = columns[:, norm > 0] / norm[norm > 0]
     if not columns.shape[1]:
         return np.zeros((len(columns), 0))
-    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > keep * singular[0]]
+    # a calibration is read where there is no scipy
+    from scipy.linalg import qr
+
+    basis, triangle, _ = qr(columns, mode="economic", pivoting=True, check_finite=False)
+    size = np.abs(np.diag(triangle))
+    return basis[:, : len(size)][:, size > keep * size[0]]
 
 
 class Whitened:
