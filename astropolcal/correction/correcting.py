@@ -26,6 +26,9 @@ __all__ = ["correct"]
 #: The whole Mueller matrix, or instrumental polarization only.
 MODES = ("stokes", "ip")
 
+# what a result keeps of the solution and of the frames
+_OF_SOLUTION = ("components", "condition", "determined", "leakage", "weak")
+_OF_FRAMES = ("wavelength", "unit", "north_up", "centre", "pixel_scale")
 # what a caller can do about frames that do not say enough
 _WAYS = {
     "date": "ScienceFrames(..., date=) states it, any_date=True takes any",
@@ -178,40 +181,38 @@ def correct(
     estimator(rows, scale=frames.scale, **how)
     frames, unmeasured = _with_brightness(frames, rows, brightness, how)
     solution = estimator(_rows(model, rows, frames, mode), scale=frames.scale, **how)
-    for words in (*doubts, *unmeasured):
+    for words in (*doubts, *unmeasured, *_weak(solution, frames.wavelength)):
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
-    _warn_of_weak(solution, frames.wavelength)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
-    n = len(components)
-    source = frames.source
+    division = {"chunk": chunk, "workers": workers, "cluster": cluster, "progress": progress}
+    stokes, covariance = _stokes(frames.source, solution, by_variance, **division)
+    known = {key: getattr(solution, key) for key in _OF_SOLUTION}
+    known |= {key: getattr(frames, key) for key in _OF_FRAMES}
+    return Corrected(
+        stokes=stokes,
+        covariance=covariance,
+        systematic=systematic,
+        mode=mode,
+        observable=observable,
+        provenance=_provenance(calibration, frames, systematic, provenance),
+        **known,
+    )
+
+
+def _stokes(source, solution, by_variance, **division):
+    """Return the Stokes components of every pixel and, of fluxes with variances, their covariances.
+
+    Both have the shape (n, n_wavelengths, *image_shape).
+    """
+    n = len(solution.components)
     # first the components, then their covariances as the engine lays them out
     planes = n + (len(covariance_index(n)) if source.has_variances else 0)
     out = run_blocks(
         partial(correct_block, source, solution, by_variance=by_variance),
         (planes, source.n_wavelengths, *source.image_shape),
-        chunk=chunk,
-        workers=workers,
-        cluster=cluster,
-        progress=progress,
+        **division,
     )
-    return Corrected(
-        components,
-        frames.wavelength,
-        out[:n],
-        out[n:] if planes > n else None,
-        systematic,
-        solution.condition,
-        solution.determined,
-        solution.leakage,
-        solution.weak,
-        mode,
-        observable,
-        frames.unit,
-        frames.north_up,
-        frames.centre,
-        frames.pixel_scale,
-        _provenance(calibration, frames, systematic, provenance),
-    )
+    return out[:n], out[n:] if planes > n else None
 
 
 def _check_choices(mode, weights):
@@ -273,17 +274,17 @@ def _rows(model, rows, frames, mode):
     return np.concatenate([rows[..., :1], ideal.rows()[..., 1:]], axis=-1)
 
 
-def _warn_of_weak(solution, wavelength):
+def _weak(solution, wavelength):
+    """Return in words what is poorly determined, if anything is."""
     flags = solution.flags()
-    if flags:
-        first = next(iter(flags))
-        warnings.warn(
-            f"poorly determined at {len(flags)} of {len(wavelength)} wavelengths, left out there: "
-            f"at {wavelength[first]:.6g} {flags[first]} (condition "
-            f"{solution.condition[first]:.3g}, allowed is {solution.max_condition:g})",
-            AstropolcalWarning,
-            stacklevel=3,
-        )
+    if not flags:
+        return []
+    first = next(iter(flags))
+    return [
+        f"poorly determined at {len(flags)} of {len(wavelength)} wavelengths, left out there: "
+        f"at {wavelength[first]:.6g} {flags[first]} (condition "
+        f"{solution.condition[first]:.3g}, allowed is {solution.max_condition:g})"
+    ]
 
 
 def _systematic(model, solution, mode, open_directions, n_samples, seed):

@@ -207,9 +207,10 @@ _MAS_PER_DEG = 3.6e6
 
 
 def choice(name, value, allowed):
-    """Refuse a word that is not among those allowed."""
+    """Return a word, or refuse it if it is not among those allowed."""
     if value not in allowed:
         raise ParameterError(f"{name} = {value!r}; allowed are {', '.join(allowed)}")
+    return value
 
 
 def number(name, value, *, least=0.0, above=-np.inf, most=np.inf):

@@ -32,8 +32,8 @@ examples:
       --parallactic 24,30 --derotator 97 --fix star.q=0.01
 """
 
-# of the light in an image
-_LOOKS = ("source", "psf", "fwhm", "halo", "background")
+# what of the options of --cubes tells of the image, the rest of the detector
+_IMAGE = ("psf", "fwhm", "halo", "motion", "seeing")
 _DEROTATOR = [45 + 12.5 * i for i in range(8)]
 
 #: Options of image cubes, which do nothing without ``--cubes``.
@@ -154,8 +154,22 @@ def _flux(arguments, instrument, chain, wavelength, frames):
         return EXAMPLE["flux"]
     from astropolcal.reduction.cubes import _usual_flux
 
-    options = {name: getattr(arguments, name) for name in _LOOKS}
-    return _usual_flux(chain, instrument, frames, EXAMPLE["flux"], wavelength=wavelength, **options)
+    return _usual_flux(
+        chain,
+        instrument,
+        frames,
+        EXAMPLE["flux"],
+        wavelength=wavelength,
+        source=arguments.source,
+        image=_image(arguments),
+        background=arguments.background,
+    )
+
+
+def _image(arguments):
+    from astropolcal.reduction import ImageModel
+
+    return ImageModel(**{name: getattr(arguments, name) for name in _IMAGE})
 
 
 def _table(arguments, instrument, chain, wavelength, frames, meta):
@@ -177,18 +191,21 @@ def _table(arguments, instrument, chain, wavelength, frames, meta):
 
 
 def _write_cubes(arguments, instrument, chain, wavelength, frames):
-    from astropolcal.reduction.cubes import simulate_cubes
+    from astropolcal.reduction import DetectorModel, simulate_cubes
 
-    names = ("source", "flux", "seed", *_USUAL)
+    options = {name: getattr(arguments, name) for name in _USUAL if name not in _IMAGE}
     return simulate_cubes(
         arguments.cubes,
         chain,
         instrument,
         frames,
         wavelength=wavelength,
-        noise=not arguments.no_noise,
+        source=arguments.source,
+        flux=arguments.flux,
+        image=_image(arguments),
+        detector=DetectorModel(noise=not arguments.no_noise, **options),
+        seed=arguments.seed,
         progress=not arguments.quiet,
-        **{name: getattr(arguments, name) for name in names},
     )
 
 

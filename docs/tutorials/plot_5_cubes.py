@@ -28,7 +28,7 @@ from astropolcal import Observations, calibrate, instruments
 from astropolcal.measurement import parameter_table
 from astropolcal.optics import PolarizedSource
 from astropolcal.plotting.reduction import plot_apertures
-from astropolcal.reduction import reduce_run, simulate_cubes
+from astropolcal.reduction import DetectorModel, ImageModel, reduce_run, simulate_cubes
 from astropolcal.simulation import half_wave_plate_cycles
 
 charis = instruments.get("charis")
@@ -40,7 +40,8 @@ folder = os.environ.get("ASTROPOLCAL_DATA")
 CYCLE = [0, 45, 22.5, 67.5] * u.deg
 frames = half_wave_plate_cycles(CYCLE, [50, 70, 95] * u.deg)
 place = Path(scratch.name) / "lamp"
-cubes = simulate_cubes(place, truth, charis, frames, flux=4e6, bad_pixels=1e-3, seed=2)
+bad = DetectorModel(bad_pixels=1e-3)
+cubes = simulate_cubes(place, truth, charis, frames, flux=4e6, detector=bad, seed=2)
 print(len(cubes), "cubes")
 
 # %%
@@ -111,10 +112,8 @@ cubes = simulate_cubes(
     frames,
     source="star",
     flux=2e6,
-    halo=0.1,
-    motion=1.0,
-    seeing=0.05,
-    background=2.0,
+    image=ImageModel(halo=0.1, motion=1.0, seeing=0.05),
+    detector=DetectorModel(background=2.0),
     seed=3,
 )
 star = reduce_run(cubes, charis, source="star", raw=place / "raw")

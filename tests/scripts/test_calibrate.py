@@ -2,15 +2,11 @@
 """How ``astropolcal calibrate`` judges the accuracy: standards, groups, targets, gauge."""
 
 import json
-import sys
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).parents[1]))
-
 from star_data import WAVELENGTH as STAR_WAVELENGTH
 from star_data import observe_star, star_chain
 
