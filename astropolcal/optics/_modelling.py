@@ -98,6 +98,10 @@ class OpticParameter(Parameter):
     #: Wavelengths of its values in micrometre, or None where nobody has said.
     grid = None
 
+    def __delete__(self, model):
+        # with it, tables of attributes in a documentation show the description
+        raise AttributeError(f"parameter {self.name} cannot be deleted")
+
     @property
     def wavelength(self):
         """Wavelengths of the values of a parameter that has several; None if they are not known."""
