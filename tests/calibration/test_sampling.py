@@ -435,7 +435,7 @@ def test_checkpoint_with_other_values_of_held_parameters(small, tmp_path):
     options = RUN | {"parameters": ["wollaston.efficiency"], "noise": NOISE, "checkpoint": path}
     quiet_sample(small, **options)
     other = make_calibration()
-    other.measurement.hwp_retardance.value += 1e-4
+    other.measurement.hwp_retardance.value += 6e-3
     with pytest.raises(FitError, match="differs in values of the parameters held"):
         quiet_sample(other, **options)
 
