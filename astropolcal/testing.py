@@ -77,7 +77,8 @@ def check_keyword(column, keyword):
     words = keyword.split(" ")
     long = len(words) > 1 and all(w.replace("-", "").replace("_", "").isalnum() for w in words)
     require(
-        keyword == keyword.upper() and (short or long), f"{column}: {keyword!r} is no FITS keyword"
+        keyword == keyword.upper() and (short or long),
+        f"{column}: {keyword!r} is not a FITS keyword",
     )
 
 
@@ -264,7 +265,7 @@ class Probe:
         # what a lamp meets before anything turns belongs to the lamp
         first = next((i for i, leaf in enumerate(inner) if leaf.stage), len(inner))
         left = [leaf.name for leaf in inner[:first] if leaf.name in names]
-        require(not left, f"{source}: {', '.join(left)} of the source would be in front of a star")
+        require(not left, f"{source}: {', '.join(left)} of the source would be upstream of a star")
         lights = [leaf.name for leaf in found if isinstance(leaf, _LIGHTS)]
         require(not lights, f"{source}: {', '.join(lights)} would hide the polarization of a star")
         kept = [leaf.name for leaf in inner[first:]]
@@ -275,7 +276,7 @@ class Probe:
         front = {leaf.stage for leaf in found[: len(found) - len(kept)]}
         require(
             "parallactic" in front,
-            f"{source}: no optic in front of {kept[0]} stands on the stage parallactic",
+            f"{source}: no optic upstream of {kept[0]} stands on the stage parallactic",
         )
         require(
             optic_names(self.instrument.on_sky(sky)) == names,
@@ -292,7 +293,8 @@ class Probe:
             lost = [s for s in angles if s not in known]
             require(
                 not lost,
-                f"{source}: the stage {', '.join(lost)} is no column of tables and in no keyword; "
+                f"{source}: the stage {', '.join(lost)} is not a column of tables and "
+                "in no keyword; "
                 f"known are {', '.join(sorted(known))}",
             )
             require(
@@ -467,7 +469,7 @@ RULES = {
     "on sky": "a chain from the sky starts with the telescope, and nothing of the source is in it",
     "mounts": "the position of every stage is a column of tables, or comes from a keyword",
     "headers": "keywords are those of FITS, differ, and are the same in the file layout",
-    "setup": "a table is told source and optics of its chain, and a strange one is refused",
+    "setup": "a table is given source and optics of its chain, and a strange one is refused",
     "published": "published values are within their bounds and physical, and their meta fit",
     "round trip": "every chain is the same after an ASDF file",
     "predicts": "both beams change with the modulator, and positions are those of the frames",

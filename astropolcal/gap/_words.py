@@ -101,7 +101,7 @@ def shortened(name, width):
 
 
 def sizes(entry):
-    """Return a line a parameter of a cause: its size, its error, how much the data tell of it."""
+    """Return a line per parameter of a cause: its size, its error, how much the data tell of it."""
     pairs = zip(labels(entry), entry["size"].values(), strict=True)
     return [f"{label}: {_size(**size)}" for label, size in pairs]
 
@@ -206,7 +206,7 @@ def title(entry):
 
 
 def own_share(entry):
-    """Return how probable a cause is among its aliases, at whichever of its places."""
+    """Return how probable a cause is among its aliases, regardless of its place."""
     return entry["share"] + sum(one["probability"] for one in _alike(entry)[1:])
 
 
@@ -369,7 +369,7 @@ def _how_large(content):
 
 def _what_is_left(content):
     if content["verdict"] == "none":
-        return "What is below the noise, or what the parameters take up entirely, does not show."
+        return "What is below the noise, or what the parameters absorb entirely, does not show."
     if not content["causes"]:
         return "Nothing should be added to the model before its cause is known."
     where, part = content["where_left"], content["left_share"]
@@ -396,7 +396,7 @@ def _on_sky(content):
         f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
         for old, new in zip(before[:_TARGETS], after[:_TARGETS], strict=True)
     ]
-    known = " if what the data leave open were known" if "as if" in before[0]["words"] else ""
+    known = " if what the data do not determine were known" if "as if" in before[0]["words"] else ""
     return (
         "Errors on sky that calibrate claims, with the nominal -> with the improved model"
         f"{known}: {'; '.join(targets)}. --save keeps the improved one."
@@ -449,7 +449,7 @@ def _wrapped(lines):
 
 
 def _table_lines(causes, most):
-    """Return a line a cause: rank, probability, what it explains, what double differences see."""
+    """Return a line per cause: rank, probability, what it explains, what double differences see."""
     if not causes:
         return []
     more = [f"and {len(causes) - most} more"] if len(causes) > most else []

@@ -2,8 +2,8 @@
 """
 The two channels in which a model is compared with every frame.
 
-Double differences throw away what the optics behind the half-wave plate and
-the detector leave in the data. Two numbers a frame and wavelength keep nearly
+Double differences throw away what the optics downstream of the half-wave plate and
+the detector leave in the data. Two numbers per frame and wavelength keep nearly
 all of it: the difference normalized by the frame's own sum, which knows no
 lamp, and the logarithm of the sum, compared up to the brightness of the lamp.
 The lamp is common to all wavelengths of a frame: its drift is a smooth curve
@@ -258,7 +258,7 @@ def noise(channel, residual, angles):
     """
     Return the noise of every datum: the stated errors, or more where the data say so.
 
-    What optics that stand still or turn can do to a beam is a sum of a few
+    What optics that are static or turn can do to a beam is a sum of a few
     harmonics of the stages' angles, sharp in wavelength or not; everything else
     is smooth in wavelength. So noise is what is left without either.
     """

@@ -234,7 +234,7 @@ def _check_standard(source, target):
                 "polarization is fitted without a prior"
             ) from error
         warnings.warn(
-            f"{error}; it is unpolarized because the table says so",
+            f"{error}; it is unpolarized according to the table",
             AstropolcalWarning,
             stacklevel=2,
         )
@@ -283,7 +283,7 @@ _THART_SIO2, _THART_MGF2 = 1.63398, 1.27711
 #: What has changed; both days are known to the month only (McIntosh et al. 2026, Sec. 2 and 7).
 CHANGES = (
     (None, "2025-08-01", "2025-10-01", "the Nasmyth beam switcher was installed"),
-    ("m3", "2025-12-01", "2026-01-01", "the tertiary mirror M3 was coated anew"),
+    ("m3", "2025-12-01", "2026-01-01", "the tertiary mirror M3 was recoated"),
 )
 
 

@@ -35,7 +35,7 @@ class Observations:
     Beam fluxes of a series of frames, validated.
 
     Make one with `read` or `from_table`; an instance does not change, and
-    `with_mask` and `select` return new ones. The table has one row a frame and
+    `with_mask` and `select` return new ones. The table has one row per frame and
     wavelength, in any order:
 
     ============================== ========= =========================================
@@ -187,7 +187,7 @@ class Observations:
 
     @property
     def frames(self):
-        """One row a frame with every column that belongs to frames (a copy)."""
+        """One row per frame with every column that belongs to frames (a copy)."""
         return self._grid.frames.copy()
 
     @property
@@ -475,7 +475,7 @@ class Observations:
         Parameters
         ----------
         size : {1, 2, 4}
-            Frames a datum: single frames, `pairs`, or pairs in both states of a modulator.
+            Frames per datum: single frames, `pairs`, or pairs in both states of a modulator.
 
         Returns
         -------
@@ -546,7 +546,7 @@ class Observations:
         Parameters
         ----------
         frames : array_like of bool or int
-            One boolean a frame, or indices of frames, each at most once.
+            One boolean per frame, or indices of frames, each at most once.
 
         Returns
         -------
@@ -605,7 +605,7 @@ class Observations:
         Returns
         -------
         `~astropy.table.QTable`
-            One row a frame and bin, masked cells with NaN and a ``mask_reason``.
+            One row per frame and bin, masked cells with NaN and a ``mask_reason``.
 
         Examples
         --------

@@ -1,8 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-What our models do otherwise than those of astropy: keywords only, settings, and cheap copies.
+What our models do differently from those of astropy: keywords only, settings, and cheap copies.
 
-Copies touch what `astropy.modeling` keeps to itself, the dictionaries of models and parameters: a
+Copies touch what `astropy.modeling` keeps private, the dictionaries of models and parameters: a
 calibration copies chains and measurements thousands of times, and a deep copy of everything takes
 five times as long. Nothing else in the package does.
 """

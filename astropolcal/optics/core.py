@@ -272,8 +272,8 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         """
         Return the parameter values as canonical floats (radian, micrometre or 1), ``theta`` first.
 
-        Each has shape () or (n_wavelengths,). A parameter that was given another unit behind the
-        optic's back raises a ParameterError.
+        Each has shape () or (n_wavelengths,). A parameter that was given another unit without the
+        optic raises a ParameterError.
         """
         values = []
         for key in self.param_names:
@@ -415,7 +415,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
             yield _rotate(derivative, angle)
 
     def evaluate(self, wavelength, I, Q, U, V, *parameters):  # noqa: E741
-        """Return ``wavelength`` and the Stokes parameters behind the optic."""
+        """Return ``wavelength`` and the Stokes parameters downstream of the optic."""
         values = [self._strip(key, p) for key, p in zip(self.param_names, parameters, strict=True)]
         # elements first, (4, 4, ...), so that rows multiply the channels of the light
         matrix = np.moveaxis(

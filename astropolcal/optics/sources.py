@@ -13,7 +13,7 @@ __all__ = ["PolarizedSource", "StarSource"]
 
 class PolarizedSource(Optic):
     r"""
-    Source of linearly polarized light, in the place of whatever light arrives.
+    Source of linearly polarized light, in the place of the light that arrives.
 
     .. math:: M = \begin{pmatrix}1&0&0&0\\q&0&0&0\\u&0&0&0\\0&0&0&0\end{pmatrix}
 

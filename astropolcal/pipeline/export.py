@@ -31,7 +31,7 @@ _COLUMNS = {
 # lines of at most 72 characters, as a card of FITS has
 _WORDS = """\
 Each Mueller matrix turns the incident Stokes vector (I, Q, U, V) into
-that behind the beam splitter; its first row, elements (0, j), gives the
+that downstream of the beam splitter; its first row, elements (0, j), gives the
 flux of the beam for incident Stokes parameter j.
 MUELLER columns have 4 x 4 numbers: the index that varies fastest, the
 first of TDIM and of arrays in IDL and Fortran, is the incident Stokes
@@ -43,7 +43,7 @@ calibration leave the element open; NaN: they tell nothing of it."""
 
 def mueller_table(calibration, header=None, *, positions=None, light="sky", wavelength=None):
     """
-    Return the system Mueller matrices of both beams, one row a frame and wavelength.
+    Return the system Mueller matrices of both beams, one row per frame and wavelength.
 
     Parameters
     ----------

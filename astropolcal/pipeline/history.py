@@ -348,7 +348,7 @@ def changes(calibrations, parameters=None):
     Returns
     -------
     `~astropy.table.Table`
-        One row a pair and optic: ``before``, ``after``, ``what``, ``chi2``, ``dof``, ``p_value``,
+        One row per pair and optic: ``before``, ``after``, ``what``, ``chi2``, ``dof``, ``p_value``,
         ``sigma``, ``n_open``, ``left_out``.
 
     Raises
@@ -431,7 +431,7 @@ def restart(calibration, observations, free, *, chain=None, positions=None, **op
         calibration, or all if nothing is). Optics that the old one lacks, such as a new star,
         are free as the instrument has them.
     chain : sequence of chains, optional
-        One a dataset, whose optics take the values of those of the same name; by default as the
+        One per dataset, whose optics take the values of those of the same name; by default as the
         instrument makes them, or the first of the calibration.
     positions : sequence of dict, optional
         As for ``calibrate``; by default as the instrument reads them.

@@ -55,7 +55,7 @@ _LOGARITHMIC_FROM = 6
 
 def plot_accuracy(calibration, reference=None, *, figure=None):
     """
-    Draw the accuracies of a calibration against wavelength, one panel a dataset.
+    Draw the accuracies of a calibration against wavelength, one panel per dataset.
 
     These are s_res, s_mean and s_cv, and s_standard for each standard of the dataset's
     source. Standards of other sources have panels of their own, with the s_cv that they
@@ -119,7 +119,8 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
         for axes, record in zip(panels, records, strict=False):
             name = f"{record.name}: " if count > 1 else ""
             k = np.max(record.accuracy["k"])
-            counts = f"n = {_span(record.accuracy['n'])} data a wavelength, k = {k} free parameters"
+            n = _span(record.accuracy["n"])
+            counts = f"n = {n} data per wavelength, k = {k} free parameters"
             axes.set_title(name + counts)
             handles |= _draw_record(axes, record, calibration)
         looks = {
@@ -133,7 +134,8 @@ def plot_accuracy(calibration, reference=None, *, figure=None):
             for entry in entries:
                 handles |= _draw_standard(axes, entry, looks[entry["content_hash"]])
         for axes, entry in zip(panels[len(records) :], others, strict=True):
-            axes.set_title(f"{entry['name']}: n = {_span(entry['n'])} data a wavelength, predicted")
+            n = _span(entry["n"])
+            axes.set_title(f"{entry['name']}: n = {n} data per wavelength, predicted")
             look = {"color": GREEN, "alpha": 0.6, "label": _COMPARED}
             lam, s_cv = entry["wavelength_nm"], entry["s_cv_percent"]
             handles["s_cv for comparison"] = draw_line(axes, lam, s_cv, **look)
@@ -198,7 +200,7 @@ def _draw_side_by_side(figure, calibration, records, standards):
         axes.set_ylabel("accuracy (% of polarization)")
         n = [count for record in records for count in record.accuracy["n"]]
         k = _span([k for record in records for k in record.accuracy["k"]])
-        axes.set_title(f"n = {_span(n)} data a dataset, k = {k} free parameters")
+        axes.set_title(f"n = {_span(n)} data per dataset, k = {k} free parameters")
         _scale_axis(axes, _all_values(records, standards, {}))
         heading(figure, calibration, "Accuracy of the calibration", [r.name for r in records])
         legend_outside(figure, axes.get_legend_handles_labels()[0])

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""What the data determine, what they leave open, and how parameters are correlated."""
+"""What the data determine, what they do not determine, and how parameters are correlated."""
 
 import textwrap
 from dataclasses import dataclass
@@ -499,6 +499,6 @@ def _explain_hatching(figure, matrix):
 
     without = int((~np.isfinite(np.diag(matrix))).sum())
     if without:
-        label = f"{without} of {len(matrix)} parameters: left open by the data, or at a bound"
+        label = f"{without} of {len(matrix)} parameters: not determined by the data, or at a bound"
         hatched = Patch(facecolor="0.88", edgecolor="0.62", hatch="////", label=label)
         legend_outside(figure, [hatched])

@@ -128,7 +128,7 @@ def _add_fit_options(add):
     )
     add(
         "--errors",
-        "errors from how the residuals scatter and hang together (default), or those of "
+        "errors from how the residuals scatter and are correlated (default), or those of "
         "independent data with the noise of --weights",
         choices=("scatter", "white"),
         default="scatter",
@@ -297,7 +297,7 @@ def _check_standards(paths, standards, files, datasets):
             # a prediction of what was fitted proves nothing
             if standard.content_hash == dataset.content_hash:
                 raise AstropolcalError(
-                    f"--standard {path} is no independent standard: it is fitted as {file}"
+                    f"--standard {path} is not an independent standard: it is fitted as {file}"
                 )
 
 

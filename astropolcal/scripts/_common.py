@@ -160,7 +160,7 @@ def _state(path, place):
 
 
 def _reason(problem):
-    return getattr(problem, "strerror", None) or f"it is no name of a file ({problem})"
+    return getattr(problem, "strerror", None) or f"it is not the name of a file ({problem})"
 
 
 def _check_writable(path, place):
@@ -294,7 +294,7 @@ _SHARED = {
         "--online",
         "fetch new tables of the Earth's rotation; by default the network is not used",
     ),
-    "quiet": ("-q --quiet", "print nothing but warnings and errors"),
+    "quiet": ("-q --quiet", "print only warnings and errors"),
     "plots": ("--plots DIR", "save the figures in this folder", Folder),
     # those that edit the model, for edit_chains
     "fix": (
@@ -369,7 +369,7 @@ def wrapped(line, indent=0):
 
 
 def plain(value):
-    """Return a value as JSON knows it: null for what is no finite number, text for the unknown."""
+    """Return a value as JSON knows it: null for a number that is not finite, else text."""
     if isinstance(value, dict):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -466,7 +466,7 @@ def read_datasets(paths):
 
 
 def _check_table(path):
-    """Refuse a file of ours that is no observation table, and say which command wants it."""
+    """Refuse a file of this package that is not a table, and say which command needs it."""
     try:
         with open(path, "rb") as stream:
             start = stream.read(max(map(len, _NO_TABLES)))

@@ -144,7 +144,7 @@ def _add_errors(add):
     """Add what says how the calibration's errors are propagated."""
     add(
         "--open-directions SIGMA",
-        "systematic errors along what the calibration leaves open: infinite (default), "
+        "systematic errors along what the calibration does not determine: infinite (default), "
         "ignore, or the standard deviation of the angle that each is named after, in degrees",
         type=number_or("infinite", "ignore"),
         default="infinite",
@@ -305,10 +305,10 @@ def _radius(arguments):
 
 def choose_calibration(arguments, files):
     """
-    Return the calibration of the frames, its chain and what is said of where it comes from.
+    Return the calibration of the frames, its chain and the statements on where it comes from.
 
     A file that says itself that it does not hold for the frames is refused like one in a library,
-    unless the user wants it for any date.
+    unless the user asks for it for any date.
     """
     from astropolcal import Calibration, instruments
     from astropolcal.converters.calibration import content_hash
@@ -338,7 +338,7 @@ def choose_calibration(arguments, files):
 
 
 def _check_validity(calibration, path, arguments, night):
-    """Refuse frames for which the calibration does not hold, unless the user wants it."""
+    """Refuse frames for which the calibration does not hold, unless the user asks for it."""
     from astropolcal.pipeline.headers import check_frames
 
     # --filter names the mode as the file does, whatever the headers call it

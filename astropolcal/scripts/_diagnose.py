@@ -80,7 +80,7 @@ def add_parser(commands):
     add("--changes", "ask what changed between several runs of the same kind of source")
     add(
         "--nested",
-        "choose the causes anew without each group of frames, and predict these: slow, and "
+        "choose the causes again without each group of frames, and predict these: slow, and "
         "the one measure in which the choice has no part",
     )
     add("--report FILE.html", "write a page with tables and figures", type=Output)

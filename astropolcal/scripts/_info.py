@@ -198,7 +198,7 @@ def _table(path):
 
 
 def _check_ecsv(path):
-    """Refuse a file that is nothing of ours, and say what is."""
+    """Refuse a file that is nothing of this package, and say what is."""
     try:
         with open(path, "rb") as stream:
             known = stream.read(7) == b"# %ECSV"

@@ -90,7 +90,7 @@ class SerkowskiLaw(Fittable1DModel):
     rotation : `~astropy.units.Quantity`
         Change of the angle with wavelength.
     **kwargs
-        Whatever an `astropy.modeling.Model` takes, such as ``name``.
+        What an `astropy.modeling.Model` takes, such as ``name``.
 
     Raises
     ------

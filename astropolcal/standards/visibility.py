@@ -193,7 +193,7 @@ def telescope_information(
     parallactic : `~astropy.units.Quantity`
         One angle per frame, shape (n,).
     altitude : `~astropy.units.Quantity`, optional
-        One a frame; needed with ``offset``.
+        One per frame; needed with ``offset``.
     frame_error : float
         Standard error of q and of u in one frame. The default of 1 gives errors
         in units of it.

@@ -3,9 +3,9 @@
 1. Calibrate the internal source
 ================================
 
-A lamp behind a polarizer, eight angles of the half-wave plate at each of eight derotator angles:
-from the table of fluxes to a calibration file. By default this is the simulated run that comes with
-the package.
+A lamp downstream of a polarizer, eight angles of the half-wave plate at each of eight derotator
+angles: from the table of fluxes to a calibration file. By default this is the simulated run that
+comes with the package.
 """
 
 # %%

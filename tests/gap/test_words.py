@@ -190,13 +190,15 @@ def test_the_same_kind_at_several_places_is_told_once():
     one = entry(cell("source"), share=0.3, aliases=aliases)
     title = _words.title(one)
     assert title.count("diattenuation") == 1
-    assert "at the source, behind the half-wave plate or behind the derotator" in title
+    assert (
+        "at the source, downstream of the half-wave plate or downstream of the derotator" in title
+    )
     assert _words.own_share(one) == pytest.approx(0.88)
     (other,) = _words.others(one, {})
     assert other.endswith("(11 %)")
     # a place that is much less probable is another answer
     aliases[1]["probability"] = 0.01
-    assert "behind the derotator" not in _words.title(one)
+    assert "downstream of the derotator" not in _words.title(one)
 
 
 def test_long_groups_are_told_shortly():

@@ -280,7 +280,7 @@ def test_quiet_means_the_same_everywhere():
     for command in QUIET:
         action = COMMANDS[command]._option_string_actions["--quiet"]
         assert action is COMMANDS[command]._option_string_actions["-q"], command
-        assert action.help == "print nothing but warnings and errors", command
+        assert action.help == "print only warnings and errors", command
 
 
 @pytest.fixture(scope="module")

@@ -331,7 +331,7 @@ def copy_fitted(origin, target):
 
 
 def _worst(outcomes):
-    """Return the first step that did not arrive, which spoils those behind it, or the last."""
+    """Return the first step that did not converge, which makes the next useless, or the last."""
     return next((o for o in outcomes if not o["converged"]), outcomes[-1])
 
 
@@ -390,8 +390,8 @@ _SILENT = 1e-12
 def settled(problem, weighting, origin):
     """Move a solution along the directions that neither data nor priors see, to the minimal gauge.
 
-    ``origin`` is where the fit started. Returns the parameters that were left open, and the linear
-    problem around the new solution.
+    ``origin`` is where the fit started. Returns the parameters that were not determined, and the
+    linear problem around the new solution.
     """
     measurement = problem.measurement
     vector = measurement.vector()
@@ -415,7 +415,7 @@ def settled(problem, weighting, origin):
 
 
 def open_parameters(free, whitened):
-    """Return the parameters common to all wavelengths that data and priors leave open."""
+    """Return the parameters common to all wavelengths that data and priors do not determine."""
     null = whitened.together.null
     moving = [slot for slot in free.slots if np.abs(null[:, slot.slice]).max(initial=0) > _OPEN]
     return [s.name for s in moving if not s.per_wavelength] or [s.name for s in moving]
@@ -455,7 +455,7 @@ def _step(null, leaders, scale, moved):
 
 
 def _move(problem, vector, step):
-    """Take the step and let the bins follow; None where that spoils the solution."""
+    """Take the step and let the bins follow; None where that corrupts the solution."""
     low, high = problem.measurement.free.bounds()
     before = problem.total(vector)
     trial = np.clip(vector + step, low, high)
@@ -469,7 +469,7 @@ def _move(problem, vector, step):
 def describe_gauge(gauge, chosen, free, held):
     """Say which of the equivalent solutions a calibration reports, and why.
 
-    ``chosen`` are parameters that the data leave open, ``held`` those that the user holds.
+    ``chosen`` are parameters that the data do not determine, ``held`` those that the user holds.
     """
     if gauge not in GAUGES:
         raise FitError(f"gauge = {gauge!r}; allowed are 'minimal' and None")

@@ -67,7 +67,7 @@ class NoiseEstimate:
 
     @property
     def table(self):
-        """One row a dataset and wavelength, a `~astropy.table.QTable`."""
+        """One row per dataset and wavelength, a `~astropy.table.QTable`."""
         columns = {"dataset": self.dataset, "wavelength": self.wavelength}
         meta = {"method": self.method, "words": self.words}
         return QTable(columns | {"sigma": self.sigma, "dof": self.dof}, meta=meta)
@@ -324,7 +324,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     null :math:`z = (x^+ + x^-)/2`. The plate turns the sign of the signal, so
     the null has next to none, while independent noise of the frames is the same
     in both. Taken away from z are what the chain predicts of it (a plate that is not
-    exactly half a wave, with a retarder behind it, leaves some signal there),
+    exactly half a wave, with a retarder downstream of it, leaves some signal there),
     a multiple of :math:`x^2` at each wavelength (what beams unequal by e add,
     :math:`e(1 - x^2)`), and the null model. A datum of one frame is given
     :math:`\sqrt2` times the scatter of what is left.
@@ -344,7 +344,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     -------
     NoiseEstimate
         An upper limit: besides photon and read noise and flicker that changes
-        the ratio of the beams it includes whatever else makes the null change
+        the ratio of the beams it includes anything else makes the null change
         with the plate and is not in the chain, such as diattenuation. For strongly
         polarized light that exceeds the noise; the smooth null model takes
         away most of it. A change of the source's brightness cancels in x.

@@ -76,7 +76,7 @@ def _stars(stars):
 
 
 def _more_reasons(found):
-    """Return in full what the first line has no room for."""
+    """Return in full what the first line has no space for."""
     told = [*found.reasons, *found.cautions]
     hidden = told and "; ".join(told) not in found.words[0]
     return list(_wrap(f"  - {words}" for words in told)) if hidden else []
@@ -196,10 +196,10 @@ def _target_lines(calibration, targets):
     infinite = any(np.isinf(table[key]).any() for table in tables for key in ("s_p", "s_chi"))
     if infinite:
         known = target_accuracies(calibration, targets, open_directions="ignore")
-        lines += ["  as if what the data leave open were known:", *map(_target_row, known)]
+        lines += ["  as if what the data do not determine were known:", *map(_target_row, known)]
     lines.append(f"  {tables[0].meta['words']}")
     if any(table.meta["aolp"] is None for table in tables):
-        lines.append("  AoLP any: at whichever angle the accuracy is worst")
+        lines.append("  AoLP any: the angle with the worst accuracy")
     lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration, infinite)]
     return list(_wrap(lines))
 
@@ -224,7 +224,7 @@ def _short(values, function):
 
 
 def _wavelength_blocks(calibration, known):
-    """Return tables with one row a wavelength, and in each as many parameters as fit."""
+    """Return tables with one row per wavelength, and in each as many parameters as fit."""
     several = [(n, e) for n, e in known.items() if e["value"].ndim and not e["fixed"]]
     marks = "? badly determined, c conditional on a bound"
     for i in range(0, len(several), _N_COLUMNS):
@@ -298,7 +298,7 @@ def _gauge_lines(calibration):
 
 
 def _bound_lines(calibration, known):
-    """Name what is at a bound, how far it may go inward, and whose errors hang on that."""
+    """Name what is at a bound, how far it may go inward, and whose errors depend on that."""
     lines = []
     for name, entry in known.items():
         where = np.flatnonzero(np.ravel(entry["at_bound"]))
@@ -575,7 +575,7 @@ def open_lines(calibration, infinite=True):
     for kind, says in (
         (
             "open",
-            "infinite by what the data leave open"
+            "infinite by what the data do not determine"
             if infinite
             else "resting on priors, as the data leave it open",
         ),
@@ -593,7 +593,8 @@ def _turn(direction):
 
 
 def _open_words(direction):
-    lead = direction["words"].partition(" cannot be told")[0].partition(" changes no datum")[0]
+    lead = direction["words"].partition(" cannot be distinguished")[0]
+    lead = lead.partition(" changes no datum")[0]
     return f"{lead}: {sky_words(direction['sky'])}"
 
 

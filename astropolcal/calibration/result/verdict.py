@@ -223,7 +223,7 @@ def _hanging(free):
     angles = _orientations(free)
     told = [str(e["conditional_on"]) for e in angles.values() if e["status"] == "conditional"]
     names = dict.fromkeys(name for by in told for name in by.split(", ") if name in angles)
-    return f"orientations hang on the bound of {', '.join(names)}" if names else ""
+    return f"orientations depend on the bound of {', '.join(names)}" if names else ""
 
 
 def _width(entry):

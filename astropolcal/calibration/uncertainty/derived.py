@@ -3,8 +3,8 @@
 Quantities that follow from a calibration, with their errors.
 
 To first order: with g the derivative of a quantity to the parameters and C their covariance, the
-variance is g C g. A quantity that moves along a direction which the data leave open has an infinite
-error, however small the change: no pseudo-inverse hides it.
+variance is g C g. A quantity that moves along a direction which the data do not determine has an
+infinite error, however small the change: no pseudo-inverse hides it.
 """
 
 from dataclasses import dataclass, field
@@ -241,7 +241,7 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     Raises
     ------
     ChainError
-        If there is no such optic, or it is no retarder.
+        If there is no such optic, or it is not a retarder.
     WavelengthRangeError
         If a wavelength is outside the grid of its parameters or the law's range.
 

@@ -130,8 +130,8 @@ def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite
         Degree and angle of linear polarization of each. An angle of None stands for any: each
         error is then that at its worst angle.
     open_directions : {"infinite", "ignore"}
-        As for `~astropolcal.correction.correct`: errors along directions that the data leave open
-        are infinite, or zero as if the choice that the calibration made were true.
+        As for `~astropolcal.correction.correct`: errors along directions that the data do not
+        determine are infinite, or zero as if the choice that the calibration made were true.
 
     Returns
     -------
@@ -177,7 +177,7 @@ def _accuracies(calibration, targets, wanted, view, ignore=False):
     if view is None:
         return []
     errors, words, tables = SkyErrors(calibration, view, ignore), _made_of(calibration, view), []
-    words += "; as if what the data leave open were known" if ignore else ""
+    words += "; as if what the data do not determine were known" if ignore else ""
     for (dolp, aolp), (p, double) in zip(targets, wanted, strict=True):
         found = np.max(errors.of_target(p, double), axis=-1)
         if p == 0:
@@ -277,14 +277,14 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     Parameters
     ----------
     dolp : `~astropy.units.Quantity` or float
-        The target's degree of linear polarization; scalar or one a wavelength.
+        The target's degree of linear polarization; scalar or one per wavelength.
     aolp : `~astropy.units.Quantity`
-        Its angle of linear polarization; scalar or one a wavelength.
+        Its angle of linear polarization; scalar or one per wavelength.
     polarized, unpolarized, on_sky : `~astropy.table.QTable`, optional
         Accuracies of the calibrations with the internal source polarized
         (s_rel) and unpolarized (s_unpol) and on an unpolarized standard star
         (s_sky), such as ``Calibration.accuracy``. What is missing counts as
-        zero; its column is NaN and ``meta["words"]`` says so.
+        zero; its column is NaN and ``meta["words"]`` names it.
     column : {"s_mean", "s_res", "s_cv"}
         Which accuracy to take: the paper's is ``s_mean``, the error of a
         prediction at one setting is ``s_cv``.
@@ -341,7 +341,8 @@ def _for_target(dolp, aolp, s_rel, s_abs):
     for name, value in (("dolp", dolp), ("aolp", aolp)):
         if np.shape(value) not in ((), shape):
             raise ParameterError(
-                f"{name} has shape {np.shape(value)}; allowed are () and {shape}, one a wavelength"
+                f"{name} has shape {np.shape(value)}; allowed are () and {shape}, "
+                "one per wavelength"
             )
     return propagate_accuracy(dolp, aolp, s_rel, s_abs)
 
@@ -520,7 +521,7 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
     dataset : int
         Which dataset of the calibration.
     groups : {"derotator", "cycle", "dataset"} or `~numpy.ndarray`, optional
-        Cross-validate anew by what makes a group, or by the group of each datum; by
+        Cross-validate again by what makes a group, or by the group of each datum; by
         default ``s_cv`` is what the calibration remembers (derotator angles).
 
     Returns
