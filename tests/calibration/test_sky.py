@@ -161,7 +161,7 @@ def test_what_is_said_grows_as_the_polarization_becomes_faint(alone):
 def test_a_file_of_before_knows_one_degree_of_polarization():
     for turn, gain, words in [
         ((0, 0), (0, 0), "on sky nothing changes"),
-        ((-5.26, 0), (0, 3), "by up to 5.3 deg and the DoLP by up to 3 % of itself, whatever"),
+        ((-5.26, 0), (0, 3), "by up to 5.3 deg and the DoLP by up to 3 % of itself, regardless"),
         ((0.004, -0.004), (-300, 1), "less than 0.01 deg and the DoLP by up to 300 % of"),
     ]:
         sky = {"aolp_deg": list(turn), "dolp_percent": list(gain)}

@@ -289,7 +289,7 @@ def test_coordinates_are_not_numbers(table):
 
 def test_columns_with_more_than_one_value_a_row(table):
     table["flux_right"] = np.ones((len(table), 2)) * u.adu
-    refuse(table, r"column flux_right has shape \(12, 2\), one value a row is allowed")
+    refuse(table, r"column flux_right has shape \(12, 2\), one value per row is allowed")
 
 
 def test_half_of_the_errors(table):
