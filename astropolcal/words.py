@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Words that messages share: near matches of a name, and numbers with their nouns.
+Words that messages share: near matches of a name, numbers with their nouns, and p-values.
 """
 
 import difflib
@@ -9,6 +9,8 @@ __all__ = []
 
 # difflib's own default: from this similarity on, 1 being the same, a name is suggested
 _SIMILAR = 0.6
+# smaller p-values depend on the far wings of a law that nobody knows
+_LEAST_P = 1e-6
 
 
 def did_you_mean(name, known, *, most=1, cutoff=_SIMILAR, show=repr):
@@ -27,3 +29,8 @@ def did_you_mean(name, known, *, most=1, cutoff=_SIMILAR, show=repr):
 def counted(number, noun, plural=None):
     """Return a number and its noun, which is singular for one only: "1 frame", "0 frames"."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
+def p_words(value):
+    """Return a p-value as all messages have it: "p = 0.02", or "p < 1e-6"."""
+    return f"p = {value:.2g}" if not value < _LEAST_P else "p < 1e-6"

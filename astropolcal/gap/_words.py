@@ -7,12 +7,13 @@ import textwrap
 import numpy as np
 
 from astropolcal.gap.cells import Cell, _kind_words, _place_words, _when
+from astropolcal.words import p_words
 
 # a size is determined if the data narrow it to this share of its physical limit
 _DETERMINED = 0.1
-# smaller probabilities than this are no doubt; above the second the sum of squares alone is not
+# above this probability the sum of squares alone is not
 # conspicuous
-_TINY, _CONSPICUOUS = 1e-6, 0.01
+_CONSPICUOUS = 0.01
 _WIDTH = 80
 # so many causes are named in a sentence, in a title, and in place of another
 _NAMED, _IN_TITLE, _ALIASES = 3, 2, 4
@@ -47,13 +48,13 @@ def percent(value, digits=3):
 
 
 def p(value):
-    """Return a probability as short text."""
-    return f"< {_TINY:.0e}".replace("e-0", "e-") if value < _TINY else f"{value:.2g}"
+    """Return a p-value for a column of a table."""
+    return p_words(value).removeprefix("p ").removeprefix("= ")
 
 
 def doubt(value):
-    """Return how sure it is that noise alone does not do it."""
-    return "beyond doubt" if value < _TINY else f"(p = {p(value)})"
+    """Return how probable it is that noise alone does it, in parentheses."""
+    return f"({p_words(value)})"
 
 
 def share(value):

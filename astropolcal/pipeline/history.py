@@ -24,6 +24,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.measurement import parameter_table
 from astropolcal.observations import Observations
 from astropolcal.pipeline.library import Entry, Library
+from astropolcal.words import p_words
 
 __all__ = ["Change", "changes", "parameter_history", "restart"]
 
@@ -171,7 +172,7 @@ class Change:
     --------
     >>> from astropolcal.pipeline import Change
     >>> print(Change(["a", "b"], ["m3.diattenuation"], 30.0, 1, 4e-8))
-    m3.diattenuation: changed from a to b at 5.5 sigma (chi-square 30.0 of 1, p = 4e-08)
+    m3.diattenuation: changed from a to b at 5.5 sigma (chi-square 30.0 of 1, p < 1e-6)
     """
 
     calibrations: list
@@ -201,7 +202,7 @@ class Change:
         verdict = "changed" if self.p_value < 0.00135 else "no change seen"
         return (
             f"{what}: {verdict} {between} at {self.sigma:.1f} sigma (chi-square {self.chi2:.1f} "
-            f"of {self.dof}, p = {self.p_value:.1g})"
+            f"of {self.dof}, {p_words(self.p_value)})"
         )
 
 

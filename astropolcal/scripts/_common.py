@@ -8,13 +8,19 @@ import re
 import stat
 import sys
 import textwrap
+import warnings
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 
 from astropolcal.chain import find_optic, leaves, remove_optic
-from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    InstrumentError,
+    ParameterError,
+)
 from astropolcal.files import atomic_path, check_kind, one_line, printable
 from astropolcal.units import plain_number
 
@@ -508,6 +514,10 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
             if value:
                 _set(name, parameter, value)
             parameter.fixed = True
+        # zero is the same in all units
+        if parameter.unit and re.fullmatch(r"[-+.\deE\s]+", value) and float(value):
+            message = f"--fix {text}: no unit is given, {parameter.unit} is taken"
+            warnings.warn(message, AstropolcalWarning, stacklevel=2)
     for text in prior:
         name, _, value = text.partition("=")
         for parameter in _parameters(chains, name):

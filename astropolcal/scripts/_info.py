@@ -32,6 +32,14 @@ _SHOWN = ("object", "filter", "date", "hwp", "derotator", "parallactic", "altitu
 _DULL = ("description", "comments", "reference")
 _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
 
+_EXAMPLES = """\
+examples:
+  astropolcal info                     version, instruments and optics
+  astropolcal info cal.asdf --full     all of a calibration's summary
+  astropolcal info library/            the calibrations of a folder
+  astropolcal info run.ecsv            frames, wavelengths and angles of a table
+"""
+
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
@@ -43,6 +51,7 @@ def add_parser(commands):
         "Say what a calibration file, a folder of calibrations, an observation "
         "table, an image cube or a corrected product holds; of a calibration also how good it is "
         "and for what it is valid. Without a file, what this installation knows.",
+        _EXAMPLES,
     )
     add = adder(parser)
     add(

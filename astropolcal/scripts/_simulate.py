@@ -80,7 +80,7 @@ def add_parser(commands):
 def _add_frames(add):
     add(
         "--hwp DEG,DEG,...",
-        "half-wave-plate angles (default: 0 to 78.75 by 11.25)",
+        "half-wave-plate angles (default: 0 to 78.75 by 11.25; of a star 0, 45, 22.5 and 67.5)",
         type=angles,
     )
     add(

@@ -25,6 +25,13 @@ _DRAWN = 5
 # of a night, whose list is ordered by how good a star is, so that its end is of no use
 _LISTED = 20
 
+_EXAMPLES = """\
+examples:
+  astropolcal standards --kind polarized --band H --magnitude 4,8
+  astropolcal standards --site subaru --night 2025-11-03 --plot night.png
+  astropolcal standards "HD 30675"
+"""
+
 
 def add_parser(commands):
     """Add the subcommand to what ``add_subparsers`` returned."""
@@ -36,6 +43,7 @@ def add_parser(commands):
         "List the polarimetric standard stars of the catalogue. With a site and a "
         "night, those that rise above the limit, the best for the diattenuation of the telescope "
         "first. With a name, all that is known of that star.",
+        _EXAMPLES,
     )
     add = adder(parser)
     add("name NAME", "a star, such as 'HD 293396'", nargs="?")

@@ -12,7 +12,7 @@ from astropolcal.calibration.uncertainty.covariance import STATUSES
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
-from astropolcal.words import counted
+from astropolcal.words import counted, p_words
 
 __all__ = ["Verdict"]
 
@@ -460,7 +460,7 @@ def _goodness(calibration):
     if tests:
         told = [
             f"{test['times_noise']:.2g} x {_NOISES.get(test['noise'], test['noise'])} "
-            f"(p = {test['p_value']:.1g})"
+            f"({p_words(test['p_value'])})"
             for test in tests
         ]
         yield f"Scatter     {', '.join(told)}"

@@ -23,6 +23,7 @@ from astropolcal.calibration.noise.scatter import leave_out_groups
 from astropolcal.calibration.noise.weighting import weighting_of
 from astropolcal.calibration.uncertainty.covariance import prior_noise
 from astropolcal.exceptions import FitError
+from astropolcal.words import p_words
 
 __all__ = ["LackOfFit", "lack_of_fit"]
 
@@ -447,7 +448,7 @@ def _verdict(chi2, expected, p_value, noise, priors):
         says = f"the residuals are {ratio:.3g} times the noise: the noise is overestimated"
     else:
         says = "the residuals agree with the noise"
-    says += f" (p = {p_value:.3g})"
+    says += f" ({p_words(p_value)})"
     if priors is not None and priors["p_value"] < _UNLIKELY:
-        says += f"; the data disagree with the priors (p = {priors['p_value']:.3g})"
+        says += f"; the data disagree with the priors ({p_words(priors['p_value'])})"
     return f"{says}; noise: {noise.words}"
