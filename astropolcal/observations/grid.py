@@ -72,7 +72,7 @@ def build_grid(table, label):
     """
     Check a table of observations (one row per frame and wavelength) and sort it into a `Grid`.
 
-    ``label`` is the file or name for messages. Cells that are masked give one warning a reason.
+    ``label`` is the file or name for messages. Cells that are masked give one warning per reason.
     """
     table = check_table(table, label, REQUIRED)
     frame = _integers(table, "frame", label)
@@ -177,7 +177,7 @@ def _wavelength_by_bin(wavelength, bins, bin_index, bin_numbers, unit, label):
         raise ObservationError(
             f"{label}, row {row + 1}: wavelength = {wavelength[row]:.9g} {unit} in bin "
             f"{bins[row]}, other rows of this bin have {by_bin[bin_index[row]]:.9g} {unit}; "
-            "one a bin is allowed"
+            "one per bin is allowed"
         )
     order = np.argsort(by_bin)
     # two bins of one wavelength would count every photon twice in a fit

@@ -42,7 +42,7 @@ class Observations:
     column                         unit      meaning
     ============================== ========= =========================================
     frame, bin                               whole numbers
-    wavelength                     length    one value a bin
+    wavelength                     length    one value per bin
     hwp, derotator                 angle     positions of the stages
     parallactic, altitude          angle     optional, on sky
     flux_right, flux_left          any, one  ordinary and extraordinary beam
@@ -573,7 +573,7 @@ class Observations:
         Parameters
         ----------
         bins : array_like of bool
-            One boolean a bin, shape (B,).
+            One boolean per bin, shape (B,).
 
         Returns
         -------
@@ -736,7 +736,7 @@ def some_frames(grid, frames, label):
 
 
 def some_bins(grid, bins, label):
-    """Return the grid at some wavelengths, one boolean a bin."""
+    """Return the grid at some wavelengths, one boolean per bin."""
     chosen, n_bins = np.asarray(bins), len(grid.bin)
     if chosen.dtype != bool or chosen.shape != (n_bins,):
         raise ObservationError(

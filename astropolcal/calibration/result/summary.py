@@ -183,7 +183,7 @@ def _standard_lines(entry):
 
 
 def _target_lines(calibration, targets):
-    """Return a table with one row a target: median and worst of the wavelengths."""
+    """Return a table with one row per target: median and worst of the wavelengths."""
     tables = target_accuracies(calibration, targets)
     if not tables:
         return []

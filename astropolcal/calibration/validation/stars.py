@@ -47,7 +47,7 @@ def star_stokes(calibration, chain, observations, positions=None):
     `~astropy.table.QTable`
         One row per wavelength: ``wavelength``; ``q``, ``u`` (means over the cycles) and their
         standard errors ``q_err``, ``u_err``, from the scatter of the cycles; ``dolp`` (debiased)
-        and ``aolp`` with errors; ``n_cycles``; ``q_cycles`` and ``u_cycles``, one a cycle, NaN
+        and ``aolp`` with errors; ``n_cycles``; ``q_cycles`` and ``u_cycles``, one per cycle, NaN
         where a cycle does not determine them.
 
     Raises

@@ -136,7 +136,7 @@ def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite
     Returns
     -------
     list of `~astropy.table.QTable`
-        One a target, with columns ``wavelength``, ``s_Q``, ``s_U``, ``s_p`` (percent) and
+        One per target, with columns ``wavelength``, ``s_Q``, ``s_U``, ``s_p`` (percent) and
         ``s_chi`` (degree), infinite where the data leave a direction open that changes it; in
         the meta ``dolp``, ``aolp`` and, in ``words``, what the numbers are made of. None where
         the chain has no half-wave plate.
@@ -392,7 +392,7 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     Returns
     -------
     list of `~astropy.table.QTable`
-        As `target_accuracy` gives them, one a target, with ``dolp`` and ``aolp`` in the
+        As `target_accuracy` gives them, one per target, with ``dolp`` and ``aolp`` in the
         meta; none if no dataset is of a known kind.
 
     Raises
