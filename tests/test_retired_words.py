@@ -58,7 +58,11 @@ def test_retired_words_do_not_occur():
     for path in sorted({path for pattern in WHERE for path in ROOT.glob(pattern)}):
         if path.is_file() and path.suffix in {".md", ".rst", ".py", ".html", ".yaml", ".jinja"}:
             text = path.read_text(encoding="utf-8")
-            text = prose(text) if path.suffix == ".py" else text
+            if path.match("tutorials/*.py"):
+                # their comments are paragraphs of a page
+                text = re.sub("^#", " ", text, flags=re.M)
+            elif path.suffix == ".py":
+                text = prose(text)
             name = path.relative_to(ROOT)
             report += [f"{name}:{line}: {what}" for line, what in found(text, words)]
     assert not report, "\n" + "\n".join(report)
