@@ -397,7 +397,7 @@ def _on_sky(content):
         f"{change(old['s_chi_deg'], new['s_chi_deg'])} deg"
         for old, new in zip(before[:_TARGETS], after[:_TARGETS], strict=True)
     ]
-    known = " if what the data do not determine were known" if "as if" in before[0]["words"] else ""
+    known = " if the undetermined parameters were known" if "as if" in before[0]["words"] else ""
     return (
         "Errors on sky that calibrate claims, with the nominal -> with the improved model"
         f"{known}: {'; '.join(targets)}. --save keeps the improved one."

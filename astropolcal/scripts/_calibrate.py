@@ -59,7 +59,7 @@ def add_parser(commands):
         "write the calibration here; overwritten if it exists",
         type=Output,
     )
-    add("--instrument NAME", "default: as the tables say")
+    add("--instrument NAME", "default: that of the tables")
     _add_model_options(parser, add)
     _add_fit_options(add)
     add_shared(parser, "fix", "free")
@@ -71,7 +71,7 @@ def add_parser(commands):
     add_shared(parser, "prior")
     add(
         "--gauge",
-        "where the data leave a choice: the least misalignments (default), or where the fit ends",
+        "where several solutions are equal: the least misalignments (default), or the end of the fit",
         choices=("minimal", "none"),
         default="minimal",
     )
@@ -111,12 +111,12 @@ def _add_fit_options(add):
     )
     add(
         "--loss NAME",
-        "linear (default: least squares), huber, cauchy or bisquare: data far off count less",
+        "linear (default: least squares), huber, cauchy or bisquare: outliers count less",
         default="linear",
     )
     add(
         "--keep-all",
-        "mask nothing by itself: neither an unstable lamp, nor saturated frames, nor "
+        "do not mask frames automatically: those of an unstable lamp, saturated ones, and "
         "incomplete half-wave-plate cycles",
     )
     add(

@@ -64,12 +64,12 @@ def add_parser(commands):
     add = adder(parser)
     add(
         "files FILE",
-        "observation tables (ECSV); before them may stand a calibration (.asdf), whose "
+        "observation tables (ECSV); a calibration (.asdf) may come first, whose "
         "model is then the nominal one",
         nargs="*",
         type=Input,
     )
-    add("--instrument NAME", "default: as the tables say")
+    add("--instrument NAME", "default: that of the tables")
     # not with a calibration, which has a model
     add_shared(parser, *MODEL, "without", "free", "fix")
     add(
@@ -77,11 +77,11 @@ def add_parser(commands):
         "which effects to try (default: all; help lists them)",
         default="all",
     )
-    add("--changes", "ask what changed between several runs of the same kind of source")
+    add("--changes", "find what changed between several runs of the same kind of source")
     add(
         "--nested",
         "choose the causes again without each group of frames, and predict these: slow, and "
-        "the one measure in which the choice has no part",
+        "the only measure that is independent of the choice",
     )
     add("--report FILE.html", "write a page with tables and figures", type=Output)
     add(

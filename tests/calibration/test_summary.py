@@ -321,7 +321,7 @@ def test_what_is_open_on_sky_is_said_of_the_worst_first():
         ("badly determined", 0.3),
     ]
     assert open_lines(cal) == [
-        "  infinite by what the data do not determine: e.f by +1 deg: "
+        "  infinite, because the data do not determine: e.f by +1 deg: "
         "on sky the AoLP changes by up to 2 "
         "deg and the DoLP by less than 0.01 % of itself, regardless of the DoLP; a.b by +1 deg: "
         "on sky the AoLP changes by up to 0.5 deg and the DoLP by less than 0.01 % of "

@@ -129,7 +129,7 @@ def calibrate(
         it the fit goes downhill from the chain's own values. By default the
         joint strategy searches, and the two-step one, like the paper, does not.
     gauge : {"minimal", None}
-        Which solution to take where the data leave a choice: that with the
+        Which solution to take where several are equal: that with the
         least change of the parameters common to all wavelengths, or wherever
         the fit happens to end. The choice is recorded in ``settings``.
     loss : {"linear", "huber", "cauchy", "bisquare"}

@@ -227,7 +227,7 @@ def _settled_by_a_star(finding, view):
     ]
     if not leads:
         return []
-    return [f"{', '.join(leads)}: {star_words(view.site)} settles what that does on sky"]
+    return [f"{', '.join(leads)}: {star_words(view.site)} determines the angle on sky"]
 
 
 def physical_scale(free):

@@ -147,10 +147,10 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     True
     """
     if gain is None:
-        sigma, words = measurement.sigma, "the errors stated in the table, and nothing else"
+        sigma, words = measurement.sigma, "the errors stated in the table only"
     else:
         sigma = _photon_sigma(measurement, _number("gain", gain, 0, False), read_noise)
-        words = f"photon noise at gain {gain:g} and read noise of {read_noise:g} electrons a beam"
+        words = f"photon noise at gain {gain:g} and read noise of {read_noise:g} electrons per beam"
     bad = ~(np.isfinite(sigma) & (sigma > 0))
     if bad.any():
         raise FitError(
@@ -165,7 +165,7 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
         100 * np.array(rms) * u.percent,
         np.full(len(rows), np.inf),
         "errors",
-        f"{words}: not flicker, nor what moves between frames",
+        f"{words}; it includes neither flicker nor anything that moves between frames",
         sigma.copy(),
     )
 
@@ -387,8 +387,8 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     ]
     sigma = np.sqrt(np.concatenate(per_datum) * squares / np.maximum(dof, 1))
     words = (
-        f"scatter of the null channel about the chain's and a {null_model} null, an upper limit: "
-        "photon and read noise, flicker, and what the chain leaves out of the null"
+        f"scatter of the null channel about the chain's null and a {null_model} term, an upper "
+        "limit; it includes photon and read noise, flicker, and a null that the chain lacks"
     )
     return noise_of_cells(measurement, sigma, dof, "null channel", words)
 

@@ -139,7 +139,7 @@ def _accuracy_words(calibration):
         "  s_res: residuals, corrected for the parameters fitted; s_mean: s_res/sqrt(n), the "
         "paper's s_rel",
         f"  s_cv: rms error on {what_is_left_out(calibration)} left out of the fit",
-        "  s_standard: rms error on datasets that the fit never saw"
+        "  s_standard: rms error on datasets that were not fitted"
         + ("" if calibration.fit.get("standards") else " (none given)"),
     ]
     return list(_wrap(lines))
@@ -196,7 +196,7 @@ def _target_lines(calibration, targets):
     infinite = any(np.isinf(table[key]).any() for table in tables for key in ("s_p", "s_chi"))
     if infinite:
         known = target_accuracies(calibration, targets, open_directions="ignore")
-        lines += ["  as if what the data do not determine were known:", *map(_target_row, known)]
+        lines += ["  as if the undetermined parameters were known:", *map(_target_row, known)]
     lines.append(f"  {tables[0].meta['words']}")
     if any(table.meta["aolp"] is None for table in tables):
         lines.append("  AoLP any: the angle with the worst accuracy")
@@ -575,7 +575,7 @@ def open_lines(calibration, infinite=True):
     for kind, says in (
         (
             "open",
-            "infinite by what the data do not determine"
+            "infinite, because the data do not determine"
             if infinite
             else "resting on priors, as the data leave it open",
         ),

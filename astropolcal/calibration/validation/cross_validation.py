@@ -3,7 +3,7 @@
 Accuracy of a calibration per wavelength (s_res, s_mean, s_cv, s_standard), and its chi-square.
 
 The first two accuracies look back at the data of the fit. The others are errors of predictions: of
-settings that were left out of the fit, and of a dataset that the fit never saw (a standard).
+settings that were left out of the fit, and of a dataset that was not fitted (a standard).
 Whether the residuals exceed the noise is decided by chi-square where the noise is known, and by F
 where it is itself estimated.
 """

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Prediction of standards: datasets that the fit of a calibration never saw."""
+"""Prediction of standards: datasets that the fit of a calibration did not use."""
 
 import astropy.units as u
 import numpy as np
@@ -29,7 +29,7 @@ def refuse_fitted(calibration, observations):
 
 
 def standard_accuracy(calibration, chain, observations, positions=None):
-    """Return how well a calibration predicts a dataset that its fit never saw.
+    """Return how well a calibration predicts a dataset that its fit did not use.
 
     The table of `add_standard`, which keeps it with the calibration.
     """

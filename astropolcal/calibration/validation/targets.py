@@ -177,7 +177,7 @@ def _accuracies(calibration, targets, wanted, view, ignore=False):
     if view is None:
         return []
     errors, words, tables = SkyErrors(calibration, view, ignore), _made_of(calibration, view), []
-    words += "; as if what the data do not determine were known" if ignore else ""
+    words += "; as if the undetermined parameters were known" if ignore else ""
     for (dolp, aolp), (p, double) in zip(targets, wanted, strict=True):
         found = np.max(errors.of_target(p, double), axis=-1)
         if p == 0:
@@ -514,7 +514,7 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
         The calibration; one that was read from a file has its data no more, so
         ``groups`` cannot be chosen.
     standard : Observations or Measurement, optional
-        The dataset the fit never saw: observations with the set-up of
+        The dataset the fit did not use: observations with the set-up of
         ``dataset``, or a measurement with a chain of its own, at its current
         parameters. By default those that the calibration remembers, see
         `~astropolcal.calibration.add_standard`.
