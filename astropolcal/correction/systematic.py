@@ -34,7 +34,7 @@ class Systematic:
         Shape (n_directions, n_wavelengths, n_components, n_components): the last axis is the
         true Stokes vector, the one before what is found.
     open : `~numpy.ndarray` of bool
-        Where the calibration leaves it open how they change, (n_wavelengths, n_components,
+        Where the calibration does not determine how they change, (n_wavelengths, n_components,
         n_components).
     method : str
         ``"linear"`` or ``"sampled"``.

@@ -58,8 +58,8 @@ def tertiary_mirror(model, wavelength, name="m3"):
     """
     Return the tertiary mirror of an alt-azimuth telescope, ready to be calibrated.
 
-    ``"free"``: one free diattenuation per wavelength; the retardance, of which an unpolarized star
-    tells nothing, is fixed at that of the published law. ``"power law"``: the paper's
+    ``"free"``: one free diattenuation per wavelength; the retardance, which an unpolarized star
+    does not constrain, is fixed at that of the published law. ``"power law"``: the paper's
     permittivity, four free numbers for all wavelengths. ``"metal"``: silver with a film of silica;
     its thickness and factors on n and k are free, the factors with normal priors of 0.5 and 0.1
     around 1. All are ``mounted``.

@@ -38,7 +38,7 @@ first of TDIM and of arrays in IDL and Fortran, is the incident Stokes
 parameter j, the other one the outgoing i.
 COV columns have 16 x 16 numbers over the elements 4 i + j: errors of
 the calibration alone, to first order. Infinite: the data of the
-calibration leave the element open; NaN: they tell nothing of it."""
+calibration do not determine the element; NaN: they do not constrain it."""
 
 
 def mueller_table(calibration, header=None, *, positions=None, light="sky", wavelength=None):
@@ -196,7 +196,8 @@ def _plain(table):
     plain.meta["comments"] = [
         "right_ij, left_ij: element (i, j) of the Mueller matrix of the beam, from incident",
         "Stokes parameter j (0 to 3: I, Q, U, V) to outgoing i; _err: its standard error from",
-        "the calibration, inf where the calibration leaves it open, nan where it tells nothing",
+        "the calibration, inf where it does not determine the element, nan where it does not",
+        "constrain it",
     ]
     return plain
 

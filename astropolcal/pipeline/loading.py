@@ -94,7 +94,7 @@ class SystemMueller:
         """
         Covariance of the 16 elements of each matrix, row by row, shape (..., 16, 16).
 
-        Infinite for what the data do not determine and NaN for what they tell nothing of, as
+        Infinite for what the data do not determine and NaN for what they do not constrain, as
         `~astropolcal.calibration.uncertainty.covariance.Covariance.propagate` has it.
         """
         matrix = self.covariance_in_gauge

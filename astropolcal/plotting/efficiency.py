@@ -216,7 +216,7 @@ def plot_comparison(members, *, title=None, figure=None):
         Against the wavelength: retardance of half-wave plate and of derotator, diattenuation
         of the path downstream of the telescope, and the range of the efficiency over the derotator
         angles. Spectra are lines, filters are points on dotted lines. Bars are standard errors of
-        calibrations; where the data leave a value open, the bar goes through the whole panel.
+        calibrations; where the data do not determine a value, the bar goes through the whole panel.
 
     Examples
     --------

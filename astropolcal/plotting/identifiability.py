@@ -400,7 +400,7 @@ def plot_correlations(calibration, *, figure=None):
 
     Parameters given per wavelength form a block, short wavelengths first;
     those common to all wavelengths are drawn wider. Rows and columns of
-    parameters without an error, because the data leave them open or because
+    parameters without an error, because the data do not determine them or because
     they sit at a bound, are hatched: there is no correlation to show.
 
     Parameters

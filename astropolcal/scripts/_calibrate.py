@@ -71,7 +71,7 @@ def add_parser(commands):
     add_shared(parser, "prior")
     add(
         "--gauge",
-        "where several solutions are equal: the least misalignments (default), or the end of the fit",
+        "if several solutions are equal: the least misalignments (default), or the end of the fit",
         choices=("minimal", "none"),
         default="minimal",
     )

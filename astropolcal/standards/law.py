@@ -74,7 +74,7 @@ class SerkowskiLaw(Fittable1DModel):
 
     The model returns the degree; `q`, `u` and `stokes` also use the angle.
     ``theta`` and ``rotation`` are fixed by default, because a fit to degrees
-    says nothing about them.
+    does not constrain them.
 
     Parameters
     ----------

@@ -185,8 +185,8 @@ def telescope_information(
               R = \left|\frac1n \sum e^{2 i \psi}\right| ,
 
     so only the spread of the parallactic angle counts: a half turn of the double
-    angle is all that one can wish for, and a star that barely turns says
-    nothing.
+    angle is all that one can wish for, and a star that barely rotates does
+    not constrain it.
 
     Parameters
     ----------

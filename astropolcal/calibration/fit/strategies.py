@@ -11,10 +11,10 @@ Steps, each of which holds what the steps before have found. Two-step: the polar
 as in McIntosh et al. (2026, Sec. 5.2). Sequential: one dataset after another, as the paper goes
 from the polarized source to the unpolarized one and to the star.
 
-Gauge: where the data leave directions open, every point along them fits equally well, and where a
-fit ends is an accident of its start. The *minimal* gauge takes the solution whose parameters common
-to all wavelengths (the misalignments) have moved least from where they started. A user names
-another gauge by holding parameters (``fix=``) or by a prior.
+Gauge: where the data do not determine all directions, every point along them fits equally well, and
+where a fit ends is an accident of its start. The *minimal* gauge takes the solution whose
+parameters common to all wavelengths (the misalignments) have moved least from where they started. A
+user names another gauge by holding parameters (``fix=``) or by a prior.
 """
 
 from itertools import groupby

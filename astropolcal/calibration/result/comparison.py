@@ -57,8 +57,8 @@ def compare(members):
         zero; ``least_efficiency`` and ``most_efficiency``, over the derotator angles, for the
         angle of polarization that is measured worst, without the telescope. Each of these also
         with ``_std`` after its name: the standard error to first order from the covariance of a
-        calibration, infinite where its data leave the quantity open, NaN where nothing that was
-        fitted moves it, and for what is not a calibration.
+        calibration, infinite where its data do not determine the quantity, NaN where nothing that
+        was fitted moves it, and for what is not a calibration.
 
     Raises
     ------

@@ -577,9 +577,9 @@ def open_lines(calibration, infinite=True):
             "open",
             "infinite, because the data do not determine"
             if infinite
-            else "resting on priors, as the data leave it open",
+            else "from priors, because the data do not determine it",
         ),
-        ("badly determined", "large by what is badly determined"),
+        ("badly determined", "large, because of badly determined directions"),
     ):
         words = [one["words"] for one in found if one["kind"] == kind]
         more = [f"and {len(words) - _N_OPEN} more, see below"] if len(words) > _N_OPEN else []

@@ -58,7 +58,7 @@ class Derived:
         The quantity, of any shape.
     std : `~astropy.units.Quantity` or `~numpy.ndarray`
         Standard error from the calibration, of the same shape: infinite where
-        the data leave it open; NaN where it depends on parameters at a bound
+        the data do not determine it; NaN where it depends on parameters at a bound
         alone, or where a calibration file does not say.
     covariance : callable
         Called without arguments, the covariance of the flattened quantity in

@@ -4,7 +4,7 @@ Errors of parameters that do not come from one covariance: refits, and robust es
 
 Profile: where a parameter enters the model non-linearly, the interval in which chi-square rises by
 one, all others refitted, is a better statement than a standard error, and need not be symmetric.
-Where the data leave a parameter open the profile is flat.
+Where the data do not determine a parameter, its profile is flat.
 
 Bootstrap: frames of one half-wave-plate cycle share what the model lacks (a lamp that drifts, a
 derotator that stands slightly wrong), so their residuals are not independent, and errors from the

@@ -137,8 +137,8 @@ def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite
     -------
     list of `~astropy.table.QTable`
         One per target, with columns ``wavelength``, ``s_Q``, ``s_U``, ``s_p`` (percent) and
-        ``s_chi`` (degree), infinite where the data leave a direction open that changes it; in
-        the meta ``dolp``, ``aolp`` and, in ``words``, what the numbers are made of. None where
+        ``s_chi`` (degree), infinite where it depends on a direction that the data do not determine;
+        in the meta ``dolp``, ``aolp`` and, in ``words``, what the numbers are made of. None where
         the chain has no half-wave plate.
 
     Raises
