@@ -327,7 +327,8 @@ def test_what_is_open_on_sky_is_said_of_the_worst_first():
         "on sky the AoLP changes by up to 0.5 deg and the DoLP by less than 0.01 % of "
         "itself, regardless of the DoLP",
         "  large, because of badly determined directions: m.n is uncertain by 7 deg: "
-        "on sky the AoLP changes by up to 0.3 deg and the DoLP by up to 0.02 % of itself, regardless of the DoLP",
+        "on sky the AoLP changes by up to 0.3 deg and the DoLP by up to 0.02 % of itself, "
+        "regardless of the DoLP",
     ]
 
 
