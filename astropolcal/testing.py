@@ -8,6 +8,7 @@ own tests.
 
 import inspect
 import io
+import re
 import warnings
 from dataclasses import dataclass, field
 
@@ -49,37 +50,33 @@ def optic_names(chain):
     return [leaf.name for leaf in leaves(chain)]
 
 
+def limits(parameter):
+    """Return the bounds of a parameter as numbers."""
+    low, high = parameter.bounds
+    return -np.inf if low is None else low, np.inf if high is None else high
+
+
 def check_values(label, chain, size):
     """Require values that are finite, within their bounds and as many as the wavelengths."""
     for leaf in leaves(chain):
         for key in leaf.param_names:
-            parameter, name = getattr(leaf, key), f"{label}: {leaf.name}.{key}"
-            value = np.asarray(parameter.value)
-            low, high = (
-                np.inf * sign if bound is None else bound
-                for bound, sign in zip(parameter.bounds, (-1, 1), strict=True)
-            )
+            name, value = f"{label}: {leaf.name}.{key}", np.asarray(getattr(leaf, key).value)
+            low, high = limits(getattr(leaf, key))
             good = np.isfinite(value) & (value >= low) & (value <= high)
-            require(
-                good.all(), f"{name} = {value[~good]} is outside of its bounds, {low} to {high}"
-            )
-            require(
-                value.size in (1, size), f"{name} has {value.size} values; allowed are 1 or {size}"
-            )
+            outside = f"{name} = {value[~good]} is outside of its bounds, {low} to {high}"
+            require(good.all(), outside)
+            words = f"{name} has {value.size} values; allowed are 1 or {size}"
+            require(value.size in (1, size), words)
 
 
 def check_keyword(column, keyword):
     """Require a keyword of FITS, perhaps a hierarchical one."""
     require(isinstance(keyword, str) and keyword.strip(), f"{column}: keyword {keyword!r}")
-    plain = keyword.replace("-", "").replace("_", "")
-    short = len(keyword) <= 8 and plain.isalnum()
     # a keyword of several words is a hierarchical one
     words = keyword.split(" ")
-    long = len(words) > 1 and all(w.replace("-", "").replace("_", "").isalnum() for w in words)
-    require(
-        keyword == keyword.upper() and (short or long),
-        f"{column}: {keyword!r} is not a FITS keyword",
-    )
+    known = all(re.fullmatch("[A-Z0-9_-]*[A-Z0-9][A-Z0-9_-]*", word) for word in words)
+    short = len(keyword) <= 8 or len(words) > 1
+    require(known and short, f"{column}: {keyword!r} is no FITS keyword")
 
 
 def check_same(source, optic, old, new):
@@ -113,21 +110,17 @@ def read_back(chain):
 
 def moved_value(parameter, rng):
     """Return a value of a parameter a little off, within its bounds."""
-    low, high = (
-        np.inf * sign if bound is None else bound
-        for bound, sign in zip(parameter.bounds, (-1, 1), strict=True)
-    )
-    value = np.asarray(parameter.value, dtype=float)
-    angle = parameter.unit is not None and parameter.unit.is_equivalent(u.rad)
+    low, high = limits(parameter)
+    value, unit = np.asarray(parameter.value, dtype=float), parameter.unit
     step = rng.normal(size=value.shape)
-    if angle:
-        step = (_MOVED * step * u.rad).to_value(parameter.unit)
+    if unit is not None and unit.is_equivalent(u.rad):
+        step = (_MOVED * step * u.rad).to_value(unit)
     else:
-        step = step * (_MOVED if parameter.unit is None else _MOVED_SHARE * np.abs(value))
+        step = step * (_MOVED if unit is None else _MOVED_SHARE * np.abs(value))
     # at a bound the other way, so that every free parameter moves
     moved = np.where((value + step < low) | (value + step > high), value - step, value + step)
     moved = np.clip(moved, low, high)
-    return moved if parameter.unit is None else moved * parameter.unit
+    return moved if unit is None else moved * unit
 
 
 # optics behind which nothing is left of what polarization the light had
@@ -163,13 +156,10 @@ class Probe:
             require(instrument.answers_to(spelled), f"it does not answer to {spelled!r}")
 
     def check_documentation(self):
-        cls = type(self.instrument)
+        cls, references = type(self.instrument), self.instrument.references
         require((cls.__dict__.get("__doc__") or "").strip(), f"class {cls.__name__}: no docstring")
-        references = self.instrument.references
-        require(
-            not isinstance(references, str) and len(references) > 0,
-            f"references = {references!r}; a tuple of at least one text is needed",
-        )
+        words = f"references = {references!r}; a tuple of at least one text is needed"
+        require(not isinstance(references, str) and len(references) > 0, words)
         require(all(str(text).strip() for text in references), "one of its references is empty")
 
     def check_wavelengths(self):
@@ -214,14 +204,13 @@ class Probe:
 
     def check_names(self):
         for source, chain in self.chains():
-            found = [leaf.name for leaf in leaves(chain)]
+            found = optic_names(chain)
             require(all(found), f"{source}: an optic has no name: {found}")
             odd = [name for name in found if not name.replace("-", "_").isidentifier()]
             require(not odd, f"{source}: {odd} cannot be used as optic.parameter")
             splitters = [leaf.name for leaf in leaves(chain) if leaf.splits_light]
-            require(
-                len(splitters) == 1, f"{source}: one optic must split the light, not {splitters}"
-            )
+            words = f"{source}: one optic must split the light, not {splitters}"
+            require(len(splitters) == 1, words)
 
     def check_bounds(self):
         for grid in (None, self.few):
@@ -242,13 +231,8 @@ class Probe:
             require(np.all(is_physical(whole)), f"{label}: the {beam} beam is not physical")
 
     def _positions(self, chain, n=16):
-        found = {}
-        for stage in stages(chain):
-            number = stage in COORDINATES
-            found[stage] = (
-                self.rng.uniform(0.1, 1, n) * (1 if number else 180) * (u.one if number else u.deg)
-            )
-        return found
+        draws = {stage: self.rng.uniform(0.1, 1, n) for stage in stages(chain)}
+        return {s: x * u.one if s in COORDINATES else 180 * x * u.deg for s, x in draws.items()}
 
     def check_on_sky(self):
         if not self.instrument.has_telescope:
@@ -269,19 +253,13 @@ class Probe:
         lights = [leaf.name for leaf in found if isinstance(leaf, _LIGHTS)]
         require(not lights, f"{source}: {', '.join(lights)} would hide the polarization of a star")
         kept = [leaf.name for leaf in inner[first:]]
-        require(
-            names[-len(kept) :] == kept,
-            f"{source}: on sky there are {', '.join(names)}; the last must be {', '.join(kept)}",
-        )
+        words = f"on sky there are {', '.join(names)}; the last must be {', '.join(kept)}"
+        require(names[-len(kept) :] == kept, f"{source}: {words}")
         front = {leaf.stage for leaf in found[: len(found) - len(kept)]}
-        require(
-            "parallactic" in front,
-            f"{source}: no optic upstream of {kept[0]} stands on the stage parallactic",
-        )
-        require(
-            optic_names(self.instrument.on_sky(sky)) == names,
-            f"{source}: a chain from the sky gets another telescope",
-        )
+        words = f"no optic in front of {kept[0]} stands on the stage parallactic"
+        require("parallactic" in front, f"{source}: {words}")
+        again = optic_names(self.instrument.on_sky(sky))
+        require(again == names, f"{source}: a chain from the sky gets another telescope")
 
     # ---- tables and headers
 
@@ -290,17 +268,11 @@ class Probe:
         known = {*_COLUMNS, *self.instrument.keywords, *(layout.keywords if layout else ())}
         for source, chain in self.chains():
             angles = [s for s in stages(chain) if s not in COORDINATES]
-            lost = [s for s in angles if s not in known]
-            require(
-                not lost,
-                f"{source}: the stage {', '.join(lost)} is not a column of tables and "
-                "in no keyword; "
-                f"known are {', '.join(sorted(known))}",
-            )
-            require(
-                not is_star(source) or self.instrument.location is not None or not angles,
-                f"{source}: a star needs the site of the telescope",
-            )
+            lost = ", ".join(s for s in angles if s not in known)
+            words = f"the stage {lost} is no column of tables and in no keyword; known are "
+            require(not lost, f"{source}: {words}{', '.join(sorted(known))}")
+            placed = not is_star(source) or self.instrument.location is not None or not angles
+            require(placed, f"{source}: a star needs the site of the telescope")
 
     def check_headers(self):
         keywords, layout = self.instrument.keywords, self.instrument.files
@@ -371,18 +343,16 @@ class Probe:
         largest = 0.0
         for source, chain in self.chains(self.few):
             observations = self._observe(chain, source, noise=False)
-            measurement = Measurement(
-                chain, observations, positions=[self.instrument.positions(observations, chain)]
-            )
+            positions = [self.instrument.positions(observations, chain)]
+            measurement = Measurement(chain, observations, positions=positions)
             off = np.abs(measurement.residuals()).max()
             require(
                 off < 1e-9,
                 f"{source}: double differences are off by {off:.2g} from those of the frames; "
                 "do stages stand where its positions say?",
             )
-            change = np.ptp(observations.flux_right / observations.flux_left)
             # an unpolarized lamp may give the same in all frames; one source that varies is enough
-            largest = max(largest, float(change))
+            largest = max(largest, np.ptp(observations.flux_right / observations.flux_left))
         require(largest > 1e-6, "no source gives fluxes that change with the modulator")
 
     def check_calibrates(self):
@@ -430,16 +400,9 @@ class Probe:
             # both states of a modulator at every position
             frames = frames[np.repeat(np.arange(len(frames)), 2)]
             frames["flc_state"] = np.tile([0, 1], len(frames) // 2)
-        return simulate(
-            chain,
-            self.few if grid is None else grid,
-            frames,
-            flux=1e8,
-            noise=noise,
-            seed=self.seed,
-            meta=meta,
-            name=f"simulated {source}",
-        )
+        settings = {"flux": 1e8, "noise": noise, "seed": self.seed, "meta": meta}
+        grid = self.few if grid is None else grid
+        return simulate(chain, grid, frames, name=f"simulated {source}", **settings)
 
     def _frames(self, chain, shift):
         # a derotator that turns by 75 deg sees both of its axes; six cycles are enough for a fit
@@ -514,8 +477,8 @@ class Conformance:
 
     def __str__(self):
         count = len(self.passed) + len(self.failed)
-        words = f"fails {len(self.failed)} of {count} rules" if self.failed else "passes"
-        lines = [f"{self.name} {words}" + ("" if self.failed else f" {count} rules")]
+        words = f"fails {len(self.failed)} of {count}" if self.failed else f"passes {count}"
+        lines = [f"{self.name} {words} rules"]
         lines += [f"- {rule}: {what}" for rule, what in self.failed.items()]
         lines += [f"- {rule} not checked: {why}" for rule, why in self.skipped.items()]
         return "\n".join(lines)

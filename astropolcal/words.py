@@ -4,6 +4,7 @@ Words that messages share: near matches of a name, numbers with their nouns, and
 """
 
 import difflib
+from html import escape
 
 __all__ = []
 
@@ -31,6 +32,7 @@ def counted(number, noun, plural=None):
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
-def p_words(value):
-    """Return a p-value as all messages have it: "p = 0.02", or "p < 1e-6"."""
-    return f"p = {value:.2g}" if not value < _LEAST_P else "p < 1e-6"
+def html(text, table=None):
+    """Return a text, such as a repr, and a table of astropy as a notebook shows them."""
+    shown = "" if table is None else table._repr_html_()
+    return f"<p>{escape(text.removeprefix('<').removesuffix('>'))}</p>{shown}"
