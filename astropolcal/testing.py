@@ -76,7 +76,7 @@ def check_keyword(column, keyword):
     words = keyword.split(" ")
     known = all(re.fullmatch("[A-Z0-9_-]*[A-Z0-9][A-Z0-9_-]*", word) for word in words)
     short = len(keyword) <= 8 or len(words) > 1
-    require(known and short, f"{column}: {keyword!r} is no FITS keyword")
+    require(known and short, f"{column}: {keyword!r} is not a FITS keyword")
 
 
 def check_same(source, optic, old, new):
@@ -256,7 +256,7 @@ class Probe:
         words = f"on sky there are {', '.join(names)}; the last must be {', '.join(kept)}"
         require(names[-len(kept) :] == kept, f"{source}: {words}")
         front = {leaf.stage for leaf in found[: len(found) - len(kept)]}
-        words = f"no optic in front of {kept[0]} stands on the stage parallactic"
+        words = f"no optic upstream of {kept[0]} stands on the stage parallactic"
         require("parallactic" in front, f"{source}: {words}")
         again = optic_names(self.instrument.on_sky(sky))
         require(again == names, f"{source}: a chain from the sky gets another telescope")
@@ -269,7 +269,7 @@ class Probe:
         for source, chain in self.chains():
             angles = [s for s in stages(chain) if s not in COORDINATES]
             lost = ", ".join(s for s in angles if s not in known)
-            words = f"the stage {lost} is no column of tables and in no keyword; known are "
+            words = f"the stage {lost} is not a column of tables and in no keyword; known are "
             require(not lost, f"{source}: {words}{', '.join(sorted(known))}")
             placed = not is_star(source) or self.instrument.location is not None or not angles
             require(placed, f"{source}: a star needs the site of the telescope")

@@ -36,3 +36,8 @@ def html(text, table=None):
     """Return a text, such as a repr, and a table of astropy as a notebook shows them."""
     shown = "" if table is None else table._repr_html_()
     return f"<p>{escape(text.removeprefix('<').removesuffix('>'))}</p>{shown}"
+
+
+def p_words(value):
+    """Return a p-value as all messages have it: "p = 0.02", or "p < 1e-6"."""
+    return f"p = {value:.2g}" if not value < _LEAST_P else "p < 1e-6"

@@ -473,7 +473,7 @@ class Instrument(ABC):
 
         Parameters
         ----------
-        behind : list of Optic
+        downstream of : list of Optic
             The optics from the half-wave plate on, whose wavelengths the telescope must have.
         **options
             Particular to the instrument, see ``sky_options``.

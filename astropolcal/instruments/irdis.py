@@ -456,7 +456,7 @@ class IRDIS(Instrument):
 
         Parameters
         ----------
-        behind : list of Optic
+        downstream of : list of Optic
             The optics from the half-wave plate on.
         wavelength : `~astropy.units.Quantity`, optional
             Filters of the chain by their central wavelengths; needed if it is not of all four.

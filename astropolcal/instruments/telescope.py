@@ -228,7 +228,7 @@ def _check_standard(source, target):
                 f"{target} as a polarized standard star: {error}; with the source 'star' its "
                 "polarization is fitted without a prior"
             ) from error
-        words = f"{error}; it is unpolarized because the table says so"
+        words = f"{error}; it is unpolarized according to the table"
         warnings.warn(words, AstropolcalWarning, stacklevel=2)
         return
     if not source.startswith(known.kind):

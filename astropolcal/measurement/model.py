@@ -312,7 +312,7 @@ class Measurement(FittableModel):
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def evaluate(self, x, *parameters):
-        """Return the predicted data of index ``x``; behind the data come the priors."""
+        """Return the predicted data of index ``x``; after the data come the priors."""
         vector = _numbers(parameters) * self._factors
         return self._pick(self.predict(vector), x, self.free.prior_residuals, vector)
 

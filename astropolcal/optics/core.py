@@ -455,7 +455,7 @@ class Optic(FittableModel, metaclass=KeywordOnly):
 
     def evaluate(self, wavelength, I, Q, U, V, *parameters):  # noqa: E741
         """
-        Return ``wavelength`` and the Stokes parameters behind the optic.
+        Return ``wavelength`` and the Stokes parameters downstream of the optic.
 
         Without units wavelengths are in micrometre and parameters in their own units.
         """
@@ -490,9 +490,9 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     @property
     def inverse(self):
         """
-        What gives the light before the optic from the light behind it, at the present values.
+        What gives the light before the optic from the light downstream of it, at the present values.
 
-        It raises NotImplementedError where no light can be told from what is left of it, and when
+        It raises NotImplementedError where the light cannot be recovered from what is left of it, and when
         it is evaluated a ParameterError if that is so at a wavelength.
         """
         try:

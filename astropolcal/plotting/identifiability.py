@@ -484,5 +484,5 @@ def _explain_hatching(figure, matrix):
 
     without = int((~np.isfinite(np.diag(matrix))).sum())
     if without:
-        label = f"{without} of {len(matrix)} parameters: left open by the data, or at a bound"
+        label = f"{without} of {len(matrix)} parameters: not determined by the data, or at a bound"
         legend_outside(figure, [Patch(**_HATCHED, label=label)])

@@ -184,7 +184,7 @@ def _legend(figure, axes, calibration):
     handles = {label: _neutral(entries[label], label) for label in labels}
     free = len(calibration.identifiability.directions)
     if _ALONE in handles and free:
-        words = f"{_ALONE} (the data leave {counted(free, 'combination')} of parameters open)"
+        words = f"{_ALONE} (the data do not determine {counted(free, 'combination')} of parameters)"
         handles[_ALONE].set_label(words)
     return legend_outside(figure, list(handles.values()))
 

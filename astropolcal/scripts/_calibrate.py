@@ -57,7 +57,7 @@ files FILE * Input  observation tables (ECSV)
     half-wave-plate cycles
 --weights {none,wavelength,errors} =none  equal weights (default), one over the residuals' scatter
     at each wavelength, or one over the tables' errors
---errors {scatter,white} =scatter  errors from how the residuals scatter and hang together
+--errors {scatter,white} =scatter  errors from how the residuals scatter and are correlated
     (default), or those of independent data with the noise of --weights
 @ fix free
 --start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names

@@ -304,7 +304,7 @@ _SHARED = """
 --full  print everything; by default what fits a terminal of 80 columns and 24 lines
 --json FILE Output  write a summary for machines (- for stdout)
 --online  fetch new tables of the Earth's rotation; by default the network is not used
--q --quiet  print nothing but warnings and errors
+-q --quiet  print only warnings and errors
 --plots DIR Folder  save the figures in this folder
 --fix NAME[=VALUE] ...  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
 --free NAME ...  free a parameter, such as wollaston.theta

@@ -38,7 +38,7 @@ file CAL.asdf ? Input  calibration
 --wavelength UM + float  wavelengths of the table in micrometre, the nearest calibrated ones
 --target RA,DEC  for the best derotator offset: position in degree
 --night START/END  times in UTC, with --target
---law MODE  what the derotator keeps still, such as field (default: pupil)
+--law MODE  what the derotator stabilizes, such as field (default: pupil)
 --date DATE  of the telescope's mirrors, where that matters
 -o --output FILE Output  save the figure (PNG, PDF, SVG); with --target that of the derotator
     offsets

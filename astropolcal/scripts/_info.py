@@ -35,7 +35,7 @@ _SHOWN = ("object", "filter", "date", "hwp", "derotator", "parallactic", "altitu
 _DULL = ("description", "comments", "reference")
 _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
 
-_EXAMPLES = """\
+EXAMPLES = """\
 examples:
   astropolcal info                     version, instruments and optics
   astropolcal info cal.asdf --full     all of a calibration's summary

@@ -40,7 +40,7 @@ _DRAWN = 5
 # of a night, whose list is ordered by how good a star is, so that its end is of no use
 _LISTED = 20
 
-_EXAMPLES = """\
+EXAMPLES = """\
 examples:
   astropolcal standards --kind polarized --band H --magnitude 4,8
   astropolcal standards --site subaru --night 2025-11-03 --plot night.png

@@ -93,7 +93,7 @@ class Derived:
         """
         Return the quantity as a `~specutils.Spectrum` with standard deviations.
 
-        What the data leave open is masked. An optic takes a spectrum for a parameter.
+        What the data do not determine is masked. An optic takes a spectrum for a parameter.
         """
         if np.shape(self.value) != np.shape(self.wavelength) or np.ndim(self.value) != 1:
             raise ParameterError("a spectrum has one value at each of several wavelengths")
