@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-What our models do differently from those of astropy: keywords, settings, units, chains, cheap copies.
+How our models differ from those of astropy: keywords, settings, units, chains, cheap copies.
 
 Nothing else in the package touches what `astropy.modeling` keeps private. Copies do (the
 dictionaries of models and parameters), because a calibration copies chains and measurements

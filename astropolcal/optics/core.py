@@ -490,10 +490,10 @@ class Optic(FittableModel, metaclass=KeywordOnly):
     @property
     def inverse(self):
         """
-        What gives the light before the optic from the light downstream of it, at the present values.
+        What gives the light upstream of the optic from that downstream of it, at present values.
 
-        It raises NotImplementedError where the light cannot be recovered from what is left of it, and when
-        it is evaluated a ParameterError if that is so at a wavelength.
+        It raises NotImplementedError where the light cannot be recovered from what is left of
+        it, and when it is evaluated a ParameterError if that is so at a wavelength.
         """
         try:
             matrix = self.mueller()

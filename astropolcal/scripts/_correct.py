@@ -69,9 +69,9 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --camera-angle DEG float  position angle of the +y axis, or with --rotation pupil that from the
     zenith (default: 0)
 --mirrored  east is to the right of north
---open-directions SIGMA sigma =infinite  systematic errors along what the calibration does not determine:
-    infinite (default), ignore, or the standard deviation of the angle that each is named after, in
-    degrees
+--open-directions SIGMA sigma =infinite  systematic errors along what the calibration does not
+    determine: infinite (default), ignore, or the standard deviation of the angle that each is
+    named after, in degrees
 --samples N int =0  systematic errors from N samples of the calibration (default: linearized)
 --seed N int  of the random numbers of --samples
 --spectrum OUT.ecsv Output  table of the star in an aperture
