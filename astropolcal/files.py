@@ -1,9 +1,9 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-Files that appear complete or not at all, and files that may be anything.
+Files that appear complete or not at all, and files that are not trusted.
 
 What is read may come from anywhere. Every reader stands in a door, ``understood``,
-that lets through objects and errors of ours only; YAML is looked at by ``check_yaml``
+that lets through objects and errors of this package only; YAML is looked at by ``check_yaml``
 before any of it is loaded.
 """
 
@@ -57,7 +57,7 @@ def check_new(path, overwrite=False, error=AstropolcalError, sources=()):
     """
     Return the path of a file to write, before the work of writing it is done.
 
-    It is no folder, does not exist unless ``overwrite``, and is none of the ``sources`` of the
+    It is not a folder, does not exist unless ``overwrite``, and is none of the ``sources`` of the
     content.
     """
     path = Path(path)
@@ -103,7 +103,7 @@ def atomic_path(path, error=AstropolcalError):
 def _named(path, error):
     path = Path(path)
     if not path.name or "\0" in str(path):
-        raise error(f"{str(path)!r}: is no name of a file")
+        raise error(f"{str(path)!r}: is not the name of a file")
     return path
 
 
@@ -158,7 +158,7 @@ def _poured(path):
 
 
 def _is_stream(path):
-    """Return whether a file is no regular one, or is where our own words go."""
+    """Return whether a file is not a regular one, or is where our own words go."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -264,10 +264,10 @@ def check_kind(path, error=AstropolcalError):
 @contextmanager
 def understood(path, error, words, *, reads=True):
     """
-    Turn whatever goes wrong in a reader into one line that names the file and says what it is not.
+    Turn any failure of a reader into one line that names the file and says what it is not.
 
-    Parsers raise errors of every kind for a damaged file. Errors of ours pass unchanged. What is
-    no regular file is refused before it is opened, where it is going to be read, see
+    Parsers raise errors of every kind for a damaged file. Errors of this package pass unchanged.
+    What is not a regular file is refused before it is opened, where it is going to be read, see
     ``check_kind``.
     """
     if reads:
@@ -357,7 +357,7 @@ def check_yaml(text, error=AstropolcalError):
     Refuse YAML that is small in a file and immense, endless or deadly when it is loaded.
 
     Links make a document of a kilobyte grow without bounds, loops never end, and a loader that
-    calls itself for each level takes the whole process with it. Nothing is loaded here. What is no
+    calls itself for each level takes the whole process with it. Nothing is loaded here. What is not
     YAML at all raises yaml.YAMLError.
     """
     import yaml

@@ -111,7 +111,7 @@ class Rows:
         if value.size != self._mix.shape[1]:
             raise ParameterError(
                 f"{name} has {value.size} values; allowed are 1 or {self._mix.shape[1]}, "
-                "one a wavelength"
+                "one per wavelength"
             )
         return self._mix @ value
 
@@ -258,7 +258,7 @@ def from_first_stage(chain, wanted=None):
 
 
 def split_chain(chain):
-    """Return the optics in front of the first stage of the instrument, and the others."""
+    """Return the optics upstream of the first stage of the instrument, and the others."""
     found = leaves(chain)
     # up to there it is the telescope or the calibration source
     start = next(

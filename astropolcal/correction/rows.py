@@ -204,7 +204,7 @@ def ideal_chain(chain, wavelength):
     Return a chain of perfect optics at the places and angles of those of a chain.
 
     What turns with a stage is a half-wave plate (a derotator of an odd number of mirrors
-    included), a splitter is perfect, and whatever stands still is what it comes closest to: a
+    included), a splitter is perfect, and what is static is what it comes closest to: a
     mirror, a flip of the image, or nothing. Rotations stay.
 
     Parameters

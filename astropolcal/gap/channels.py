@@ -2,8 +2,8 @@
 """
 The two channels in which a model is compared with every frame.
 
-Double differences throw away what the optics behind the half-wave plate and
-the detector leave in the data. Two numbers a frame and wavelength keep nearly
+Double differences throw away what the optics downstream of the half-wave plate and
+the detector leave in the data. Two numbers per frame and wavelength keep nearly
 all of it: the difference normalized by the frame's own sum, which knows no
 lamp, and the logarithm of the sum, compared up to the brightness of the lamp.
 The lamp is common to all wavelengths of a frame: its drift is a smooth curve

@@ -39,7 +39,7 @@ class HeldOut:
         What was left out.
     squares : `~numpy.ndarray`
         Sum of squared prediction errors of the normalized single difference,
-        one a group.
+        one per group.
     whitened : `~numpy.ndarray`
         Half the sum of squares of the whitened prediction errors of both channels.
     counts : `~numpy.ndarray`

@@ -144,7 +144,7 @@ class FileLayout:
         writes files of its own. The shape, and all places, are then those of both images side by
         side, the left one first.
     weights : {"inverse variance", "error"}
-        What the extension behind the cube holds.
+        What the extension after the cube holds.
     states : dict of str to str
         Value of the ``flc_state`` keyword to state of the modulator, "A" or "B"; "" for none.
     read_outs : dict of str to ReadOut

@@ -3,7 +3,7 @@
 Where the telescope points: altitude, parallactic angle, and what follows them.
 
 On sky, the light turns by the parallactic angle before the telescope and by the
-altitude behind it, and the half-wave plate follows both. The angles come from the table, or
+altitude downstream of it, and the half-wave plate follows both. The angles come from the table, or
 from time, target and site. An exposure takes time, and the angles change while it lasts:
 a frame is then the mean over a few nodes of Gauss and Legendre.
 """
@@ -45,7 +45,7 @@ _SAID = set()
 
 @contextmanager
 def offline():
-    """Use the tables of leap seconds and of the Earth's rotation at hand; never the network."""
+    """Use the tables of leap seconds and of the Earth's rotation available; never the network."""
     with (
         # a calibration must not depend on a server, nor wait for one
         iers.conf.set_temp("auto_download", False),

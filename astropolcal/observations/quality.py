@@ -2,8 +2,8 @@
 """
 Frames of a run that cannot be used, found from the table and masked with a reason.
 
-Nothing is dropped: a masked frame stays in the table with its reason, and one warning a
-reason says how many there are and which. Single cells are
+Nothing is dropped: a masked frame stays in the table with its reason, and one warning
+per reason says how many there are and which. Single cells are
 judged while a table is read.
 """
 

@@ -2,7 +2,7 @@
 """
 Safe reading and checked columns of an observation table.
 
-Files come from anywhere, so whatever is wrong with one ends in a single-line
+Files come from anywhere, so everything that is wrong with one ends in a single-line
 `~astropolcal.exceptions.ObservationError` that names the file and the place.
 Nothing in a file is executed: the text goes through the safe loader of astropy,
 and columns of Python objects are refused.
@@ -131,7 +131,7 @@ def _check_plain(column, name, label):
         )
     if getattr(column, "shape", (0,))[1:]:
         raise ObservationError(
-            f"{label}: column {name} has shape {column.shape}, one value a row is allowed"
+            f"{label}: column {name} has shape {column.shape}, one value per row is allowed"
         )
 
 

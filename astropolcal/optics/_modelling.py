@@ -1,8 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-What our models do otherwise than those of astropy: keywords, settings, units, chains, cheap copies.
+How our models differ from those of astropy: keywords, settings, units, chains, cheap copies.
 
-Nothing else in the package touches what `astropy.modeling` keeps to itself. Copies do (the
+Nothing else in the package touches what `astropy.modeling` keeps private. Copies do (the
 dictionaries of models and parameters), because a calibration copies chains and measurements
 thousands of times, and a deep copy of everything takes five times as long. Chains do, because a
 fitter asks every model of a compound for its units, and astropy's ``Mapping`` has no answer.

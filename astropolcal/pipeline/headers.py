@@ -46,7 +46,7 @@ _OTHERS = {"exposure_time", "mjd", *TEXTS} - set(_SKY)
 def describe(header, instrument=None, stated=()):
     """Return ``instrument``, ``stated`` (as the header says), ``mode`` and ``date`` (ISO, UTC).
 
-    What is not told is None; what the user has ``stated`` is not looked for.
+    What is not known is None; what the user has ``stated`` is not looked for.
     """
     if instrument is None:
         found = _recognized(header)
@@ -131,7 +131,7 @@ class FrameAngles:
 
     @property
     def frames(self):
-        """One row a frame."""
+        """One row per frame."""
         return self._table.copy()
 
     def _complete(self, column, values):
@@ -316,7 +316,7 @@ def _check_mode(held, label, mode, name, way):
     if folded(mode) != folded(held.mode):
         raise CalibrationFileError(
             f"{label} is in mode {mode!r}, but {name} holds for {held}; if it is the same by "
-            f"another name, {way} says so"
+            f"another name, state it by {way}"
         )
 
 
@@ -344,7 +344,7 @@ def _check_changes(changes, days, day, label, way):
             raise CalibrationFileError(
                 f"{label}: {words} between the data of the calibration "
                 f"({' to '.join(dict.fromkeys((days[0][:10], days[-1][:10])))}) and {day}; "
-                f"calibrate anew, or {way}"
+                f"calibrate again, or {way}"
             )
 
 

@@ -8,6 +8,7 @@ import re
 import stat
 import sys
 import textwrap
+import warnings
 from pathlib import Path
 
 import astropy.units as u
@@ -160,7 +161,7 @@ def _state(path, place):
 
 
 def _reason(problem):
-    return getattr(problem, "strerror", None) or f"it is no name of a file ({problem})"
+    return getattr(problem, "strerror", None) or f"it is not the name of a file ({problem})"
 
 
 def _check_writable(path, place):
@@ -298,7 +299,7 @@ _SHARED = """
 --full  print everything; by default what fits a terminal of 80 columns and 24 lines
 --json FILE Output  write a summary for machines (- for stdout)
 --online  fetch new tables of the Earth's rotation; by default the network is not used
--q --quiet  print nothing but warnings and errors
+-q --quiet  print only warnings and errors
 --plots DIR Folder  save the figures in this folder
 --fix NAME[=VALUE] ...  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
 --free NAME ...  free a parameter, such as wollaston.theta
@@ -460,7 +461,7 @@ def read_datasets(paths):
 
 
 def _check_table(path):
-    """Refuse a file of ours that is no observation table, and say which command wants it."""
+    """Refuse a file of this package that is not a table, and say which command needs it."""
     try:
         with open(path, "rb") as stream:
             start = stream.read(max(map(len, _NO_TABLES)))
@@ -502,6 +503,10 @@ def edit_chains(chains, *, without=(), free=(), fix=(), prior=()):
             if value:
                 _set(name, parameter, value)
             parameter.fixed = True
+        # zero is the same in all units
+        if parameter.unit and re.fullmatch(r"[-+.\deE\s]+", value) and float(value):
+            message = f"--fix {text}: no unit is given, {parameter.unit} is taken"
+            warnings.warn(message, AstropolcalWarning, stacklevel=2)
     for text in prior:
         name, _, value = text.partition("=")
         for parameter in _parameters(chains, name):

@@ -57,7 +57,7 @@ files FILE * Input  observation tables (ECSV); before them may stand a calibrati
 @ derotator bounds m3 plate without free fix
 --effects all|NAME,NAME =all  which effects to try (default: all; help lists them)
 --changes  ask what changed between several runs of the same kind of source
---nested  choose the causes anew without each group of frames, and predict these: slow, and the one
+--nested  choose the causes again without each group of frames, and predict these: slow, and the one
     measure in which the choice has no part
 --report FILE.html Output  write a page with tables and figures
 --save CAL.asdf Output  calibrate with the effects that were found, and write the calibration

@@ -12,9 +12,9 @@ from astropolcal.words import counted
 
 HELP = "say what a calibration, a folder of them, a table, cube or product holds"
 DESCRIPTION = (
-    "Say what a calibration file, a folder of calibrations, an observation table, an image cube or "
-    "a corrected product holds; of a calibration also how good it is and for what it is valid. "
-    "Without a file, what this installation knows."
+    "Say what a calibration file, a folder of calibrations, an observation table, an\n"
+    "image cube or a corrected product holds; of a calibration also how good it is and\n"
+    "for what it is valid. Without a file, what this installation knows."
 )
 OPTIONS = """
 file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
@@ -35,6 +35,14 @@ _OBSERVED = {"flux_right", "flux_left", "single_difference", "single_sum"}
 _SHOWN = ("object", "filter", "date", "hwp", "derotator", "parallactic", "altitude")
 _DULL = ("description", "comments", "reference")
 _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
+
+EXAMPLES = """\
+examples:
+  astropolcal info                     version, instruments and optics
+  astropolcal info cal.asdf --full     all of a calibration's summary
+  astropolcal info library/            the calibrations of a folder
+  astropolcal info run.ecsv            frames, wavelengths and angles of a table
+"""
 
 
 def run(arguments):

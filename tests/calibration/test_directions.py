@@ -93,7 +93,8 @@ def test_a_direction_is_led_by_what_all_wavelengths_share(free):
     vector = _unit(polarizer_theta=-2, retarder_retardance=[4, 2, -6])
     ((direction),) = open_directions(free, vector[None])
     assert direction["words"] == (
-        "polarizer.theta by +1 deg cannot be told from retarder.retardance by -2 to +3 deg over "
+        "polarizer.theta by +1 deg cannot be distinguished from "
+        "retarder.retardance by -2 to +3 deg over "
         "the wavelengths"
     )
     assert direction["parameters"]["polarizer.theta"] == pytest.approx(1)
@@ -274,7 +275,9 @@ def test_silent_parameters_are_axes_of_the_null_space(free):
     assert finding.rank == free.size - 2
     assert np.flatnonzero(~finding.identifiable).tolist() == [0, 1, 3]
     assert np.isnan(np.diag(covariance)).nonzero()[0].tolist() == [0, 1, 3]
-    assert "polarizer.theta by +1 deg cannot be told from hwp.w_sio2 by -1 um" in str(finding)
+    assert "polarizer.theta by +1 deg cannot be distinguished from hwp.w_sio2 by -1 um" in str(
+        finding
+    )
 
 
 def test_a_finding_reads_as_a_list():
@@ -292,14 +295,20 @@ def test_a_finding_reads_as_a_list():
 
 def _alike(count, name="m.d", other="w.e"):
     return [
-        {"words": f"{name}[{i}] by +0.01 cannot be told from {other}", "parameters": {name: 0.0}}
+        {
+            "words": f"{name}[{i}] by +0.01 cannot be distinguished from {other}",
+            "parameters": {name: 0.0},
+        }
         for i in range(count)
     ]
 
 
 def test_open_directions_that_differ_by_wavelength_are_counted():
     for count, more in [(3, 0), (4, 0), (5, 2), (22, 19)]:
-        other = {"words": "hwp.theta by +1 deg cannot be told from w.e", "parameters": {"w.e": 1.0}}
+        other = {
+            "words": "hwp.theta by +1 deg cannot be distinguished from w.e",
+            "parameters": {"w.e": 1.0},
+        }
         alone = {"words": "m.d[9] changes no datum", "parameters": {"m.d": 1.0, "x.y": 1.0}}
         words = first_of_each_kind([other, *_alike(count), alone])
         assert words[0] == other["words"], (count, more)

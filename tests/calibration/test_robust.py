@@ -217,7 +217,7 @@ def test_groups_make_standard_errors_robust(few):
 def test_bad_choices_are_refused(few):
     for options, message in [
         ({"groups": "night"}, "block = 'night'; allowed are derotator, pair"),
-        ({"groups": np.zeros(4)}, r"groups of shape \(4,\); allowed are \(96,\), one a datum"),
+        ({"groups": np.zeros(4)}, r"groups of shape \(4,\); allowed are \(96,\), one per datum"),
         ({"groups": np.zeros(96)}, "1 groups; a robust covariance needs 3"),
         ({"correction": "none"}, "correction = 'none'; allowed are leverage, number"),
     ]:

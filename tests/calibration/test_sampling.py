@@ -454,7 +454,7 @@ def test_other_files_are_not_touched(small, tmp_path):
         path = tmp_path / "chain.h5"
         path.write_bytes(content)
         for resume in (True, False):
-            with pytest.raises(FitError, match=r"chain\.h5: is no checkpoint"):
+            with pytest.raises(FitError, match=r"chain\.h5: is not a checkpoint"):
                 quiet_sample(small, **RUN, checkpoint=path, resume=resume)
         assert path.read_bytes() == content
 
@@ -471,7 +471,9 @@ def test_truncated_checkpoint(small, tmp_path):
     path = tmp_path / "chain.h5"
     quiet_sample(small, **RUN, checkpoint=path)
     path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(FitError, match=r"chain\.h5: (is no checkpoint|the checkpoint is damaged)"):
+    with pytest.raises(
+        FitError, match=r"chain\.h5: (is not a checkpoint|the checkpoint is damaged)"
+    ):
         quiet_sample(small, **RUN, checkpoint=path)
 
 

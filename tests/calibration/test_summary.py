@@ -307,9 +307,9 @@ def _with_directions(directions, near_null=()):
 def test_what_is_open_on_sky_is_said_of_the_worst_first():
     cal = _with_directions(
         [
-            _direction("a.b by +1 deg cannot be told from c.d by +1 deg; on sky", 0.5),
-            _direction("e.f by +1 deg cannot be told from g.h by +1 deg; on sky", -2.0),
-            _direction("i.j by +1 deg cannot be told from g.h by +1 deg; on sky", 0.001),
+            _direction("a.b by +1 deg cannot be distinguished from c.d by +1 deg; on sky", 0.5),
+            _direction("e.f by +1 deg cannot be distinguished from g.h by +1 deg; on sky", -2.0),
+            _direction("i.j by +1 deg cannot be distinguished from g.h by +1 deg; on sky", 0.001),
             _direction("k.l changes no datum: it cannot be determined"),
         ],
         [_direction("m.n is uncertain by 7 deg at the noise of this fit; on sky", 0.3, 0.02)],
@@ -321,17 +321,21 @@ def test_what_is_open_on_sky_is_said_of_the_worst_first():
         ("badly determined", 0.3),
     ]
     assert open_lines(cal) == [
-        "  infinite by what the data leave open: e.f by +1 deg: on sky the AoLP changes by up to 2 "
-        "deg and the DoLP by less than 0.01 % of itself, whatever the DoLP; a.b by +1 deg: "
+        "  infinite, because the data do not determine: e.f by +1 deg: "
+        "on sky the AoLP changes by up to 2 "
+        "deg and the DoLP by less than 0.01 % of itself, regardless of the DoLP; a.b by +1 deg: "
         "on sky the AoLP changes by up to 0.5 deg and the DoLP by less than 0.01 % of "
-        "itself, whatever the DoLP",
-        "  large by what is badly determined: m.n is uncertain by 7 deg: on sky the AoLP changes "
-        "by up to 0.3 deg and the DoLP by up to 0.02 % of itself, whatever the DoLP",
+        "itself, regardless of the DoLP",
+        "  large, because of badly determined directions: m.n is uncertain by 7 deg: "
+        "on sky the AoLP changes by up to 0.3 deg and the DoLP by up to 0.02 % of itself, "
+        "regardless of the DoLP",
     ]
 
 
 def test_many_open_directions_are_counted():
-    cal = _with_directions(_direction(f"a.b{i} by +1 deg cannot be told", 1.0) for i in range(5))
+    cal = _with_directions(
+        _direction(f"a.b{i} by +1 deg cannot be distinguished", 1.0) for i in range(5)
+    )
     assert open_lines(cal)[0].endswith("; and 2 more, see below")
     assert open_lines(_with_directions([])) == []
 

@@ -127,7 +127,7 @@ def test_summary_file_and_info_know_the_standard(tables, tmp_path, capsys):
 
 def test_a_fitted_table_is_no_standard(tables, capsys):
     line = complaint(capsys, tables["first"], "--standard", tables["first"])
-    assert "is no independent standard: it is fitted as" in line
+    assert "is not an independent standard: it is fitted as" in line
     line = complaint(capsys, tables["first"], *["--standard", tables["second"]] * 2)
     assert "holds the same frames as" in line
     assert "no such file" in complaint(capsys, tables["first"], "--standard", "nowhere.ecsv")

@@ -119,8 +119,8 @@ def calibrate(
         as the errors of real tables are rarely complete). ``"wavelength"``: one
         level for each wavelength of each dataset, from the residuals, with the
         fit repeated until both agree. ``"errors"``: the errors of the tables.
-        Or the noise itself, its standard deviation as one value, one a
-        wavelength or one a datum.
+        Or the noise itself, its standard deviation as one value, one
+        per wavelength or one per datum.
     ties : dict of str to Tie, optional
         Parameters that follow others.
     positions : sequence of dict, optional
@@ -133,7 +133,7 @@ def calibrate(
         it the fit goes downhill from the chain's own values. By default the
         joint strategy searches, and the two-step one, like the paper, does not.
     gauge : {"minimal", None}
-        Which solution to take where the data leave a choice: that with the
+        Which solution to take where several are equal: that with the
         least change of the parameters common to all wavelengths, or wherever
         the fit happens to end. The choice is recorded in ``settings``.
     loss : {"linear", "huber", "cauchy", "bisquare"}
@@ -146,7 +146,7 @@ def calibrate(
     instrument : str, optional
         Name to record.
     errors : {"scatter", "white"}
-        Errors of the parameters: from how the residuals scatter and hang together at wavelengths,
+        Errors of the parameters: from how the residuals scatter and are correlated at wavelengths,
         pairs of frames and settings of each dataset; or those of independent data whose noise is
         that of ``weights``.
     cross_validate : bool

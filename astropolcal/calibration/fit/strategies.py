@@ -11,10 +11,10 @@ Steps, each of which holds what the steps before have found. Two-step: the polar
 as in McIntosh et al. (2026, Sec. 5.2). Sequential: one dataset after another, as the paper goes
 from the polarized source to the unpolarized one and to the star.
 
-Gauge: where the data leave directions open, every point along them fits equally well, and where a
-fit ends is an accident of its start. The *minimal* gauge takes the solution whose parameters common
-to all wavelengths (the misalignments) have moved least from where they started. A user names
-another gauge by holding parameters (``fix=``) or by a prior.
+Gauge: where the data do not determine all directions, every point along them fits equally well, and
+where a fit ends is an accident of its start. The *minimal* gauge takes the solution whose
+parameters common to all wavelengths (the misalignments) have moved least from where they started. A
+user names another gauge by holding parameters (``fix=``) or by a prior.
 """
 
 from itertools import groupby
@@ -329,7 +329,7 @@ def copy_fitted(origin, target):
 
 
 def _worst(outcomes):
-    """Return the first step that did not arrive, which spoils those behind it, or the last."""
+    """Return the first step that did not converge, which makes the next useless, or the last."""
     return next((o for o in outcomes if not o["converged"]), outcomes[-1])
 
 
@@ -386,8 +386,8 @@ _SILENT = 1e-12
 def settled(problem, origin):
     """Move a solution along the directions that neither data nor priors see, to the minimal gauge.
 
-    ``origin`` is where the fit started. Returns the parameters that were left open, and the linear
-    problem around the new solution.
+    ``origin`` is where the fit started. Returns the parameters that were not determined, and the
+    linear problem around the new solution.
     """
     measurement = problem.measurement
     vector = measurement.vector()
@@ -411,7 +411,7 @@ def settled(problem, origin):
 
 
 def open_parameters(free, whitened):
-    """Return the parameters common to all wavelengths that data and priors leave open."""
+    """Return the parameters common to all wavelengths that data and priors do not determine."""
     known = whitened.together.determined
     moving = [slot for slot in free.slots if not known[slot.slice].all()]
     return [s.name for s in moving if not s.per_wavelength] or [s.name for s in moving]
@@ -451,7 +451,7 @@ def _step(null, leaders, scale, moved):
 
 
 def _move(problem, vector, step):
-    """Take the step and let the bins follow; None where that spoils the solution."""
+    """Take the step and let the bins follow; None where that corrupts the solution."""
     low, high = problem.measurement.free.bounds()
     before = problem.total(vector)
     trial = np.clip(vector + step, low, high)
@@ -465,7 +465,7 @@ def _move(problem, vector, step):
 def describe_gauge(gauge, chosen, free, held):
     """Say which of the equivalent solutions a calibration reports, and why.
 
-    ``chosen`` are parameters that the data leave open, ``held`` those that the user holds.
+    ``chosen`` are parameters that the data do not determine, ``held`` those that the user holds.
     """
     if gauge not in GAUGES:
         raise FitError(f"gauge = {gauge!r}; allowed are 'minimal' and None")

@@ -63,7 +63,7 @@ class Identifiability:
         For each null direction its ``words``, the ``parameters`` that move, and
         what it does to the ``sky``: changes of AoLP and DoLP of ``targets``.
     sampling : list of str
-        Harmonics that the half-wave-plate angles cannot separate, and what stars leave open
+        Harmonics that the half-wave-plate angles cannot separate, and what stars do not determine
         of the telescope.
     mirrors : list of str
         Discrete mirror solutions within the bounds; and the other hand of the whole instrument,
@@ -218,7 +218,7 @@ def _settled_by_a_star(finding, view):
     ]
     if not leads:
         return []
-    return [f"{', '.join(leads)}: {star_words(view.site)} settles what that does on sky"]
+    return [f"{', '.join(leads)}: {star_words(view.site)} determines the angle on sky"]
 
 
 def physical_scale(free):
@@ -231,7 +231,7 @@ def physical_scale(free):
 
 
 def telescope_words(finding, measurement):
-    """Say which parameters of the mirrors upstream of the half-wave plate the stars leave open."""
+    """Say which parameters of mirrors upstream of the half-wave plate stars do not determine."""
     open_names = {
         name
         for direction in (*finding.directions, *finding.near_null)

@@ -35,7 +35,7 @@ class Directions(NamedTuple):
 
     @property
     def determined(self):
-        """Whether each column stands still along all open directions."""
+        """Whether each column is static along all open directions."""
         return (np.abs(self.null) < STILL).all(axis=0)
 
     @property
@@ -176,7 +176,7 @@ _EQUAL = 1e-6
 def ranked(values, equal=None):
     """Return the indices of values, largest first; equal ones keep their order.
 
-    Which of two that are equal up to rounding comes out larger hangs on the processor.
+    Which of two that are equal up to rounding comes out larger depends on the processor.
     """
     values = np.asarray(values, dtype=float)
     if equal is None:
@@ -267,7 +267,7 @@ def _open_words(free, moved, lead):
         with_prior = any(slot.name == stem and not prior.is_flat for slot, prior in free.priors)
         known = "by them, only its prior tells it" if with_prior else "and keeps its start value"
         return f"{lead} changes no datum: it cannot be determined {known}"
-    return f"{lead} by +{step[1]:g}{step[2]} cannot be told from {', '.join(others)}"
+    return f"{lead} by +{step[1]:g}{step[2]} cannot be distinguished from {', '.join(others)}"
 
 
 def first_of_each_kind(directions):

@@ -77,7 +77,7 @@ class NoiseEstimate:
 
     @property
     def table(self):
-        """One row a dataset and wavelength, a `~astropy.table.QTable`."""
+        """One row per dataset and wavelength, a `~astropy.table.QTable`."""
         columns = {"dataset": self.dataset, "wavelength": self.wavelength}
         meta = {"method": self.method, "words": self.words}
         return QTable(columns | {"sigma": self.sigma, "dof": self.dof}, meta=meta)
@@ -157,10 +157,10 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
     True
     """
     if gain is None:
-        sigma, words = measurement.sigma, "the errors stated in the table, and nothing else"
+        sigma, words = measurement.sigma, "the errors stated in the table only"
     else:
         sigma = _photon_sigma(measurement, _number("gain", gain, 0, False), read_noise)
-        words = f"photon noise at gain {gain:g} and read noise of {read_noise:g} electrons a beam"
+        words = f"photon noise at gain {gain:g} and read noise of {read_noise:g} electrons per beam"
     bad = ~(np.isfinite(sigma) & (sigma > 0))
     if bad.any():
         raise FitError(
@@ -331,7 +331,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     null :math:`z = (x^+ + x^-)/2`. The plate turns the sign of the signal, so
     the null has next to none, while independent noise of the frames is the same
     in both. Taken away from z are what the chain predicts of it (a plate that is not
-    exactly half a wave, with a retarder behind it, leaves some signal there),
+    exactly half a wave, with a retarder downstream of it, leaves some signal there),
     a multiple of :math:`x^2` at each wavelength (what beams unequal by e add,
     :math:`e(1 - x^2)`), and the null model. A datum of one frame is given
     :math:`\sqrt2` times the scatter of what is left.
@@ -351,7 +351,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     -------
     NoiseEstimate
         An upper limit: besides photon and read noise and flicker that changes
-        the ratio of the beams it includes whatever else makes the null change
+        the ratio of the beams it includes anything else makes the null change
         with the plate and is not in the chain, such as diattenuation. For strongly
         polarized light that exceeds the noise; the smooth null model takes
         away most of it. A change of the source's brightness cancels in x.
@@ -394,8 +394,8 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     ]
     sigma = np.sqrt(np.concatenate(per_datum) * squares / np.maximum(dof, 1))
     words = (
-        f"scatter of the null channel about the chain's and a {null_model} null, an upper limit: "
-        "photon and read noise, flicker, and what the chain leaves out of the null"
+        f"scatter of the null channel about the chain's null and a {null_model} term, an upper "
+        "limit; it includes photon and read noise, flicker, and a null that the chain lacks"
     )
     return noise_of_cells(measurement, sigma, dof, "null channel", words)
 

@@ -1,6 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 r"""
-How residuals scatter and hang together, and the groups that are left out together.
+How residuals scatter and are correlated, and the groups that are left out together.
 
 What a model gets wrong is not independent from datum to datum: neighbouring wavelengths of a pair
 of frames depart alike, and so do the pairs at one setting of the derotator. Errors that count all
@@ -78,7 +78,7 @@ def groups_by(measurement, by="derotator"):
     for name, count in names:
         if count < 2:
             raise FitError(
-                f"cross-validation by {by}: group {name} has a single member; at least 2 data a "
+                f"cross-validation by {by}: group {name} has a single member; at least 2 data per "
                 "wavelength are needed, group by something else or leave it out"
             )
     return groups
@@ -161,13 +161,13 @@ class _Part:
         return out
 
     def components(self):
-        """Yield whether pairs of a setting hang together, and the correlation of wavelengths."""
+        """Yield whether pairs of a setting are correlated, and the correlation of wavelengths."""
         yield from ((False, kernel) for kernel in self.kernels)
         if self.patterns.shape[1]:
             yield from ((True, kernel) for kernel in self.kernels[1:])
 
     def halves(self, columns):
-        """Return, for each component, columns before and behind its matrix, to be multiplied."""
+        """Return, for each component, columns before and after its matrix, to be multiplied."""
         dense = self.dense(columns)
         seen = np.tensordot(self.patterns, dense, axes=(0, 0))
         for together, kernel in self.components():

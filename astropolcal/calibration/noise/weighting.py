@@ -165,7 +165,7 @@ class Weighting:
 
     ``choice`` says where it comes from: None for one level from all residuals, "wavelength",
     "errors" of the table, or "given"; ``sigma`` is that of every datum, NaN as long as no fit has
-    told it.
+    determined it.
     """
 
     choice: str | None
@@ -207,7 +207,7 @@ class Weighting:
     def updated(self, measurement, whitened=None):
         """Return the noise that the residuals of a fit with this noise show.
 
-        ``whitened`` is the linear problem of the measurement with this noise, if at hand.
+        ``whitened`` is the linear problem of the measurement with this noise, if available.
         """
         if not self.from_residuals:
             return self
@@ -404,7 +404,7 @@ def _rms(values):
 
 
 def _by_wavelength(measurement, leverage):
-    r"""Return one level a dataset and wavelength, not below the floor.
+    r"""Return one level per dataset and wavelength, not below the floor.
 
     :math:`\sigma^2 = \sum r_i^2 / \sum (1 - h_i)` with the leverages h (Hoaglin & Welsch 1978, The
     American Statistician 32, 17).
@@ -434,7 +434,7 @@ def _by_wavelength(measurement, leverage):
 
 
 def given_noise(measurement, noise):
-    """Return the noise of every datum from one value, one a wavelength or one a datum."""
+    """Return the noise of every datum from one value, one per wavelength or one per datum."""
     try:
         noise = u.Quantity(noise).to_value(u.dimensionless_unscaled)
     except (TypeError, u.UnitConversionError):
@@ -446,7 +446,7 @@ def given_noise(measurement, noise):
     if noise.shape not in ((), (measurement.n_data,)):
         raise ParameterError(
             f"noise of shape {noise.shape}; allowed are one value, {len(measurement.wavelength)} "
-            f"(one a wavelength) or {measurement.n_data} (one a datum)"
+            f"(one per wavelength) or {measurement.n_data} (one per datum)"
         )
     return np.broadcast_to(noise, measurement.n_data).astype(float)
 

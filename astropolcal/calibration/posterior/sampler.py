@@ -46,7 +46,7 @@ class LogPosterior:
         the one that the fit assumed, so that fit and posterior agree; one level
         from the residuals of all data if no fit is known.
     noise : float, `~astropy.units.Quantity` or array_like, optional
-        Noise to use instead: one value, one a wavelength, or one a datum.
+        Noise to use instead: one value, one per wavelength, or one per datum.
     parameters : sequence of str, optional
         What varies, ``"hwp.w_sio2"`` (all its values) or
         ``"derotator.horizontal[3]"``; all others keep their fitted values. By

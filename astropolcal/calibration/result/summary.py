@@ -77,7 +77,7 @@ def _stars(stars):
 
 
 def _more_reasons(found):
-    """Return in full what the first line has no room for."""
+    """Return in full what the first line has no space for."""
     told = [*found.reasons, *found.cautions]
     hidden = told and "; ".join(told) not in found.words[0]
     return list(_wrap(f"  - {words}" for words in told)) if hidden else []
@@ -140,7 +140,7 @@ def _accuracy_words(calibration):
         "  s_res: residuals, corrected for the parameters fitted; s_mean: s_res/sqrt(n), the "
         "paper's s_rel",
         f"  s_cv: rms error on {what_is_left_out(calibration)} left out of the fit",
-        "  s_standard: rms error on datasets that the fit never saw"
+        "  s_standard: rms error on datasets that were not fitted"
         + ("" if calibration.fit.get("standards") else " (none given)"),
     ]
     return list(_wrap(lines))
@@ -184,7 +184,7 @@ def _standard_lines(entry):
 
 
 def _target_lines(calibration, targets):
-    """Return a table with one row a target: median and worst of the wavelengths."""
+    """Return a table with one row per target: median and worst of the wavelengths."""
     tables = target_accuracies(calibration, targets)
     if not tables:
         return []
@@ -197,10 +197,10 @@ def _target_lines(calibration, targets):
     infinite = any(np.isinf(table[key]).any() for table in tables for key in ("s_p", "s_chi"))
     if infinite:
         known = target_accuracies(calibration, targets, open_directions="ignore")
-        lines += ["  as if what the data leave open were known:", *map(_target_row, known)]
+        lines += ["  as if the undetermined parameters were known:", *map(_target_row, known)]
     lines.append(f"  {tables[0].meta['words']}")
     if any(table.meta["aolp"] is None for table in tables):
-        lines.append("  AoLP any: at whichever angle the accuracy is worst")
+        lines.append("  AoLP any: the angle with the worst accuracy")
     lines += [_with_wavelengths(line, calibration) for line in open_lines(calibration, infinite)]
     return list(_wrap(lines))
 
@@ -225,7 +225,7 @@ def _short(values, function):
 
 
 def _wavelength_blocks(calibration, known):
-    """Return tables with one row a wavelength, and in each as many parameters as fit."""
+    """Return tables with one row per wavelength, and in each as many parameters as fit."""
     several = [(n, e) for n, e in known.items() if e["value"].ndim and not e["fixed"]]
     marks = "? badly determined, c conditional on a bound"
     for i in range(0, len(several), _N_COLUMNS):
@@ -299,7 +299,7 @@ def _gauge_lines(calibration):
 
 
 def _bound_lines(calibration, known):
-    """Name what is at a bound, how far it may go inward, and whose errors hang on that."""
+    """Name what is at a bound, how far it may go inward, and whose errors depend on that."""
     lines = []
     for name, entry in known.items():
         where = np.flatnonzero(np.ravel(entry["at_bound"]))
@@ -537,11 +537,11 @@ def open_lines(calibration, infinite=True):
     for kind, says in (
         (
             "open",
-            "infinite by what the data leave open"
+            "infinite, because the data do not determine"
             if infinite
-            else "resting on priors, as the data leave it open",
+            else "from priors, because the data do not determine it",
         ),
-        ("badly determined", "large by what is badly determined"),
+        ("badly determined", "large, because of badly determined directions"),
     ):
         words = [one["words"] for one in found if one["kind"] == kind]
         more = [f"and {len(words) - _N_OPEN} more, see below"] if len(words) > _N_OPEN else []
@@ -555,7 +555,8 @@ def _turn(direction):
 
 
 def _open_words(direction):
-    lead = direction["words"].partition(" cannot be told")[0].partition(" changes no datum")[0]
+    lead = direction["words"].partition(" cannot be distinguished")[0]
+    lead = lead.partition(" changes no datum")[0]
     return f"{lead}: {sky_words(direction['sky'])}"
 
 

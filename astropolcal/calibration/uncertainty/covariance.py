@@ -2,9 +2,9 @@
 """
 Covariance of calibrated parameters, with names and units, and errors at a bound.
 
-The matrix has no number for a parameter that the data leave open. What the data do know of such
-parameters (a sum of two angles, say) is kept beside it: the determined directions with their errors
-(``factor``) and the open ones (``null``). With these, the error of anything derived from the
+The matrix has no number for a parameter that the data do not determine. What the data do know of
+such parameters (a sum of two angles, say) is kept beside it: the determined directions with their
+errors (``factor``) and the open ones (``null``). With these, the error of anything derived from the
 parameters is right: finite where the open directions do not move it, infinite where they do.
 
 A parameter at its bound has no standard error: chi-square still falls beyond. How far it may go
@@ -323,9 +323,9 @@ def full_covariance(calibration):
 def covariance_around(measurement, whitened, weighting, scatter=None):
     """Return the covariance with its directions, of a problem that is decomposed once.
 
-    It is the sandwich (White 1980, Econometrica 48, 817) of how residuals scatter and hang
-    together; where they do not tell, that of independent data. What is at a bound may go inward by
-    its error.
+    It is the sandwich (White 1980, Econometrica 48, 817) of how residuals scatter and are
+    correlated; where they do not tell, that of independent data. What is at a bound may go inward
+    by its error.
     """
     scatter = Scatter(measurement, weighting, whitened) if scatter is None else scatter
     if not scatter.is_known:
@@ -467,7 +467,7 @@ def _moved(whitened, held, response, steps, widths):
 
 
 def _without_others(measurement, whitened, held):
-    """Return derivatives and residuals less what the live parameters take up, and how these go."""
+    """Return derivatives and residuals less what the live parameters absorb, and how these go."""
     rows = np.concatenate([whitened.rows, whitened.prior_rows])
     residual = Problem(measurement, measurement.weighting).residuals(measurement.vector())
     # orthonormal: each determined direction in units of its standard error

@@ -3,8 +3,8 @@
 Quantities that follow from a calibration, with their errors.
 
 To first order: with g the derivative of a quantity to the parameters and C their covariance, the
-variance is g C g. A quantity that moves along a direction which the data leave open has an infinite
-error, however small the change: no pseudo-inverse hides it.
+variance is g C g. A quantity that moves along a direction which the data do not determine has an
+infinite error, however small the change: no pseudo-inverse hides it.
 """
 
 from dataclasses import dataclass, field
@@ -70,7 +70,7 @@ class Derived:
         The quantity, of any shape.
     std : `~astropy.units.Quantity` or `~numpy.ndarray`
         Standard error from the calibration, of the same shape: infinite where
-        the data leave it open; NaN where it depends on parameters at a bound
+        the data do not determine it; NaN where it depends on parameters at a bound
         alone, or where a calibration file does not say.
     covariance : callable
         Called without arguments, the covariance of the flattened quantity in
@@ -100,7 +100,7 @@ class Derived:
         """
         Return the quantity as a `~specutils.Spectrum` with standard deviations.
 
-        What the data leave open is masked. An optic takes a spectrum for a parameter.
+        What the data do not determine is masked. An optic takes a spectrum for a parameter.
         """
         if np.shape(self.value) != np.shape(self.wavelength) or np.ndim(self.value) != 1:
             raise ParameterError("a spectrum has one value at each of several wavelengths")
@@ -277,7 +277,7 @@ def derived_retardance(calibration, optic, wavelength=None, dataset=0):
     Raises
     ------
     ChainError
-        If there is no such optic, or it is no retarder.
+        If there is no such optic, or it is not a retarder.
     WavelengthRangeError
         If a wavelength is outside the grid of its parameters or the law's range.
 

@@ -4,7 +4,7 @@ Errors of parameters that do not come from one covariance: refits, and robust es
 
 Profile: where a parameter enters the model non-linearly, the interval in which chi-square rises by
 one, all others refitted, is a better statement than a standard error, and need not be symmetric.
-Where the data leave a parameter open the profile is flat.
+Where the data do not determine a parameter, its profile is flat.
 
 Bootstrap: frames of one half-wave-plate cycle share what the model lacks (a lamp that drifts, a
 derotator that stands slightly wrong), so their residuals are not independent, and errors from the
@@ -494,9 +494,9 @@ def standard_errors(calibration, method=None, groups=None):
     r"""
     Return the standard errors of the free parameters.
 
-    ``"covariance"`` is that of the calibration, by default from how its residuals scatter and hang
-    together. ``"white"`` takes them to be independent, with the noise of its weights.
-    ``"robust"`` lets groups of residuals hang together in any way, see `robust_covariance`.
+    ``"covariance"`` is that of the calibration, by default from how its residuals scatter and are
+    correlated. ``"white"`` takes them to be independent, with the noise of its weights.
+    ``"robust"`` lets groups of residuals be correlated in any way, see `robust_covariance`.
     ``"van-holstein"`` is the error that calibrations of SPHERE/IRDIS and CHARIS quote (van Holstein
     et al. 2020, A&A 633, A64,
     Appendix E): each wavelength is a fit of its own in which the parameters
@@ -521,8 +521,8 @@ def standard_errors(calibration, method=None, groups=None):
     Returns
     -------
     `~astropy.table.QTable`
-        Columns ``name``, ``std`` and ``unit``, one row a parameter; NaN for
-        those at a bound, that the data leave open, or (van Holstein) that are
+        Columns ``name``, ``std`` and ``unit``, one row per parameter; NaN for
+        those at a bound, that the data do not determine, or (van Holstein) that are
         common to all wavelengths. ``meta`` has ``method``, ``held`` and, for
         ``"robust"``, ``groups``.
 
@@ -619,7 +619,7 @@ def robust_covariance(calibration, groups="derotator", correction="leverage"):
     Raises
     ------
     FitError
-        If there are fewer than three groups, the labels are not one a datum,
+        If there are fewer than three groups, the labels are not one per datum,
         or a choice is unknown.
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
@@ -677,7 +677,7 @@ def _labels(measurement, groups):
     labels = labels_of(measurement, groups) if isinstance(groups, str) else np.asarray(groups)
     if labels.shape != (measurement.n_data,):
         raise FitError(
-            f"groups of shape {labels.shape}; allowed are ({measurement.n_data},), one a datum"
+            f"groups of shape {labels.shape}; allowed are ({measurement.n_data},), one per datum"
         )
     _, numbers = np.unique(labels, return_inverse=True)
     if numbers.max() + 1 < _FEWEST_GROUPS:

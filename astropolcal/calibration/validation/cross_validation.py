@@ -3,8 +3,8 @@
 Accuracy of a calibration per wavelength (s_res, s_mean, s_cv, s_standard), and its chi-square.
 
 The first two accuracies look back at the data of the fit. The others are errors of predictions: of
-settings that were left out of the fit, and of a dataset that the fit never saw (a standard).
-Whether the residuals exceed the noise is told by chi-square where the noise is known, and by F
+settings that were left out of the fit, and of a dataset that was not fitted (a standard).
+Whether the residuals exceed the noise is decided by chi-square where the noise is known, and by F
 where it is itself estimated.
 """
 
@@ -22,6 +22,7 @@ from astropolcal.calibration.noise.estimates import data_by_wavelength, noise_fr
 from astropolcal.calibration.noise.scatter import leave_out_groups
 from astropolcal.calibration.noise.weighting import Problem, assumed, weighting_of
 from astropolcal.exceptions import FitError
+from astropolcal.words import p_words
 
 __all__ = ["LackOfFit", "lack_of_fit"]
 
@@ -138,7 +139,7 @@ def _checked(measurement, groups):
     groups = np.asarray(groups)
     if groups.shape != (measurement.n_data,):
         raise FitError(
-            f"groups of shape {groups.shape}; allowed is ({measurement.n_data},), one a datum"
+            f"groups of shape {groups.shape}; allowed is ({measurement.n_data},), one per datum"
         )
     labels, counts = np.unique(groups, return_counts=True)
     if (counts < 2).any():
@@ -251,7 +252,7 @@ def lack_of_fit(measurement, vector=None, noise=None, *, weights=None, fitted=Tr
     where it comes from replicates of the same data, their scatter is taken out of
     the residuals first (Draper & Smith 1998, Sec. 2.1). Priors of a fit are data
     like any other: a row each of r, :math:`\sigma` and J. So a prior that the data
-    overrule adds to chi-square, one that decides what the data leave open adds
+    overrule adds to chi-square, one that decides what the data do not determine adds
     nothing, and one that a fit heeds leaves more freedom to the data.
 
     Parameters
@@ -365,7 +366,7 @@ def _test_by_wavelength(measurement, vector, noise, left, right):
 def _low_rank(measurement, vector, sigma, weights, fitted):
     """Return P and Q of C = 1 + P Q^T, the covariance of residuals over the noise.
 
-    One row a datum, and behind them one a prior of the fit.
+    One row per datum, and after them one a prior of the fit.
     """
     nothing = np.zeros((measurement.n_data, 0))
     if not fitted:
@@ -431,7 +432,7 @@ def _verdict(chi2, expected, p_value, noise, priors):
         says = f"the residuals are {ratio:.3g} times the noise: the noise is overestimated"
     else:
         says = "the residuals agree with the noise"
-    says += f" (p = {p_value:.3g})"
+    says += f" ({p_words(p_value)})"
     if priors is not None and priors["p_value"] < _UNLIKELY:
-        says += f"; the data disagree with the priors (p = {priors['p_value']:.3g})"
+        says += f"; the data disagree with the priors ({p_words(priors['p_value'])})"
     return f"{says}; noise: {noise.words}"

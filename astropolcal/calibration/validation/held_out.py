@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Prediction of standards: datasets that the fit of a calibration never saw."""
+"""Prediction of standards: datasets that the fit of a calibration did not use."""
 
 import astropy.units as u
 import numpy as np
@@ -24,13 +24,13 @@ def refuse_fitted(calibration, observations):
     seen = {record.content_hash: record.name for record in calibration.datasets}
     if observations.content_hash in seen:
         raise FitError(
-            f"{observations.name} is no independent standard: the calibration was fitted "
+            f"{observations.name} is not an independent standard: the calibration was fitted "
             f"to it as {seen[observations.content_hash]}"
         )
 
 
 def standard_accuracy(calibration, chain, observations, positions=None):
-    """Return how well a calibration predicts a dataset that its fit never saw.
+    """Return how well a calibration predicts a dataset that its fit did not use.
 
     The table of `add_standard`, which keeps it with the calibration.
     """
@@ -178,7 +178,8 @@ def _words(table, same_source):
     moved = table.meta["open_percent"]
     if moved > _WORTH_A_WORD * np.nanmedian(table["s_standard"].value):
         words += (
-            f"; along what the calibration leaves open the prediction moves by up to {moved:.2g} % "
+            f"; along what the calibration does not determine the prediction moves by "
+            f"up to {moved:.2g} % "
             "a degree, so its gauge counts"
         )
     return words
@@ -213,8 +214,8 @@ def add_standard(calibration, chain, observations, positions=None):
         ``s_standard / s_cv``: 1 where the standard is predicted as well as settings left out of
         the fit. Meta ``name``, ``source``, ``content_hash``, ``n_frames``, ``words``;
         ``open_percent``: by how much the prediction moves, at most, for one degree, micrometre or
-        percent along what the calibration leaves open; and ``not_calibrated``: optics whose values
-        are those of the chain.
+        percent along what the calibration does not determine; and ``not_calibrated``: optics whose
+        values are those of the chain.
 
     Raises
     ------

@@ -47,9 +47,9 @@ def star_stokes(calibration, chain, observations, positions=None):
     Returns
     -------
     `~astropy.table.QTable`
-        One row a wavelength: ``wavelength``; ``q``, ``u`` (means over the cycles) and their
+        One row per wavelength: ``wavelength``; ``q``, ``u`` (means over the cycles) and their
         standard errors ``q_err``, ``u_err``, from the scatter of the cycles; ``dolp`` (debiased)
-        and ``aolp`` with errors; ``n_cycles``; ``q_cycles`` and ``u_cycles``, one a cycle, NaN
+        and ``aolp`` with errors; ``n_cycles``; ``q_cycles`` and ``u_cycles``, one per cycle, NaN
         where a cycle does not determine them.
 
     Raises
@@ -61,7 +61,7 @@ def star_stokes(calibration, chain, observations, positions=None):
 
     Examples
     --------
-    Frames of a star behind a telescope that does nothing, seen as they are:
+    Frames of a star downstream of a telescope that does nothing, seen as they are:
 
     >>> import astropy.units as u
     >>> from astropolcal.calibration.validation import star_stokes
@@ -156,7 +156,7 @@ def star_accuracy(table, q=0.0, u_=0.0):
     table : `~astropy.table.QTable`
         As from ``star_stokes``.
     q, u_ : float or array_like
-        What is known of the star, one a wavelength.
+        What is known of the star, one per wavelength.
 
     Returns
     -------

@@ -130,15 +130,15 @@ def target_accuracies(calibration, targets=TARGETS, *, open_directions="infinite
         Degree and angle of linear polarization of each. An angle of None stands for any: each
         error is then that at its worst angle.
     open_directions : {"infinite", "ignore"}
-        As for `~astropolcal.correction.correct`: errors along directions that the data leave open
-        are infinite, or zero as if the choice that the calibration made were true.
+        As for `~astropolcal.correction.correct`: errors along directions that the data do not
+        determine are infinite, or zero as if the choice that the calibration made were true.
 
     Returns
     -------
     list of `~astropy.table.QTable`
-        One a target, with columns ``wavelength``, ``s_Q``, ``s_U``, ``s_p`` (percent) and
-        ``s_chi`` (degree), infinite where the data leave a direction open that changes it; in
-        the meta ``dolp``, ``aolp`` and, in ``words``, what the numbers are made of. None where
+        One per target, with columns ``wavelength``, ``s_Q``, ``s_U``, ``s_p`` (percent) and
+        ``s_chi`` (degree), infinite where it depends on a direction that the data do not determine;
+        in the meta ``dolp``, ``aolp`` and, in ``words``, what the numbers are made of. None where
         the chain has no half-wave plate.
 
     Raises
@@ -177,7 +177,7 @@ def _accuracies(calibration, targets, wanted, view, ignore=False):
     if view is None:
         return []
     errors, words, tables = SkyErrors(calibration, view, ignore), _made_of(calibration, view), []
-    words += "; as if what the data leave open were known" if ignore else ""
+    words += "; as if the undetermined parameters were known" if ignore else ""
     for (dolp, aolp), (p, double) in zip(targets, wanted, strict=True):
         found = np.max(errors.of_target(p, double), axis=-1)
         if p == 0:
@@ -276,14 +276,14 @@ def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None
     Parameters
     ----------
     dolp : `~astropy.units.Quantity` or float
-        The target's degree of linear polarization; scalar or one a wavelength.
+        The target's degree of linear polarization; scalar or one per wavelength.
     aolp : `~astropy.units.Quantity`
-        Its angle of linear polarization; scalar or one a wavelength.
+        Its angle of linear polarization; scalar or one per wavelength.
     polarized, unpolarized, on_sky : `~astropy.table.QTable`, optional
         Accuracies of the calibrations with the internal source polarized
         (s_rel) and unpolarized (s_unpol) and on an unpolarized standard star
         (s_sky), such as ``Calibration.accuracy``. What is missing counts as
-        zero; its column is NaN and ``meta["words"]`` says so.
+        zero; its column is NaN and ``meta["words"]`` names it.
     column : {"s_mean", "s_res", "s_cv"}
         Which accuracy to take: the paper's is ``s_mean``, the error of a
         prediction at one setting is ``s_cv``.
@@ -340,7 +340,8 @@ def _for_target(dolp, aolp, s_rel, s_abs):
     for name, value in (("dolp", dolp), ("aolp", aolp)):
         if np.shape(value) not in ((), shape):
             raise ParameterError(
-                f"{name} has shape {np.shape(value)}; allowed are () and {shape}, one a wavelength"
+                f"{name} has shape {np.shape(value)}; allowed are () and {shape}, "
+                "one per wavelength"
             )
     return propagate_accuracy(dolp, aolp, s_rel, s_abs)
 
@@ -390,7 +391,7 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     Returns
     -------
     list of `~astropy.table.QTable`
-        As `target_accuracy` gives them, one a target, with ``dolp`` and ``aolp`` in the
+        As `target_accuracy` gives them, one per target, with ``dolp`` and ``aolp`` in the
         meta; none if no dataset is of a known kind.
 
     Raises
@@ -512,14 +513,14 @@ def four_accuracies(calibration, standard=None, *, dataset=0, groups=None):
         The calibration; one that was read from a file has its data no more, so
         ``groups`` cannot be chosen.
     standard : Observations or Measurement, optional
-        The dataset the fit never saw: observations with the set-up of
+        The dataset the fit did not use: observations with the set-up of
         ``dataset``, or a measurement with a chain of its own, at its current
         parameters. By default those that the calibration remembers, see
         `~astropolcal.calibration.add_standard`.
     dataset : int
         Which dataset of the calibration.
     groups : {"derotator", "cycle", "dataset"} or `~numpy.ndarray`, optional
-        Cross-validate anew by what makes a group, or by the group of each datum; by
+        Cross-validate again by what makes a group, or by the group of each datum; by
         default ``s_cv`` is what the calibration remembers (derotator angles).
 
     Returns
