@@ -312,7 +312,7 @@ def printable(text):
 
 def plain(value, where="value"):
     """
-    Return a value as JSON knows it: null for what is no finite number, text for keys and names.
+    Return a value as JSON knows it: null for a number that is not finite, text for keys and names.
 
     A quantity has ``value`` and ``unit``. ``where`` is for the message of what JSON cannot hold.
     """

@@ -101,7 +101,7 @@ def sky_angle(name, value):
     """
     Return a right ascension or a declination, by name, in degree.
 
-    Plain numbers are degrees; what is sexagesimal are hours in a right ascension. What is no angle
+    Plain numbers are degrees; sexagesimal right ascensions are hours. What is not an angle
     raises a ValueError.
     """
     try:

@@ -128,7 +128,7 @@ class DetectorModel:
     Parameters
     ----------
     background : float or array_like
-        In adu per pixel, scalar or one value a wavelength.
+        In adu per pixel, scalar or one value per wavelength.
     gain, read_noise : float, optional
         Electrons per adu, and electrons per pixel; by default as the layout's ``read_out`` says.
     noise : bool

@@ -15,7 +15,12 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.chain import find_optic, leaves, remove_optic
-from astropolcal.exceptions import AstropolcalError, InstrumentError, ParameterError
+from astropolcal.exceptions import (
+    AstropolcalError,
+    AstropolcalWarning,
+    InstrumentError,
+    ParameterError,
+)
 from astropolcal.files import atomic_path, check_kind, one_line, plain, printable
 from astropolcal.units import plain_number
 

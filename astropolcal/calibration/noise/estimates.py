@@ -470,7 +470,7 @@ def noise_from_roughness(measurement, vector=None):
     r"""
     Return the stated errors, or more where single frames are rough along the wavelengths.
 
-    What optics that stand still or turn do to the normalized difference of a frame is a sum of a
+    What static and rotating optics do to the normalized difference of a frame is a sum of a
     few harmonics of the stages' angles, sharp in wavelength or not; everything else that they do is
     smooth in wavelength. So noise is what is left of the residuals' second differences along the
     wavelengths without these harmonics. The diagnosis of what a model lacks compares with it, too.
@@ -554,7 +554,7 @@ def frame_noise(channel, residual, angles):
     ``channel`` has the stated ``variance`` (n, W, F) and what is ``valid`` (W, F), ``residual`` has
     the shape of the variance, ``angles`` the position of every stage, radian, (F,).
 
-    What optics that stand still or turn can do to a beam is a sum of a few
+    What static and rotating optics can do to a beam is a sum of a few
     harmonics of the stages' angles, sharp in wavelength or not; everything else
     is smooth in wavelength. So noise is what is left without either.
     """
