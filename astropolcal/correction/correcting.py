@@ -97,18 +97,18 @@ def correct(
         Whether parameters known at the calibrated wavelengths only are interpolated linearly
         between them; else each wavelength of the frames must be one of the calibrated.
     open_directions : {"infinite", "ignore"} or float
-        Errors along directions that the calibration leaves open: infinite; zero, as if the choice
-        that it made were true; or the standard deviation of the parameter that each direction is
-        named after (``calibration.identifiability.directions``), in degrees of an angle,
-        micrometres of a thickness, percent of anything else. All that cannot be told from it
-        moves along.
+        Errors along directions that the calibration does not determine: infinite; zero, as if the
+        choice that it made were true; or the standard deviation of the parameter that each
+        direction is named after (``calibration.identifiability.directions``), in degrees of an
+        angle, micrometres of a thickness, percent of anything else. All that cannot be
+        distinguished from it moves along.
     max_age : `~astropy.units.Quantity`, optional
         Time between the data of the calibration and the frames from which on there is a warning;
         by default that of the instrument, see `~astropolcal.pipeline.load`.
     any_date : bool
-        Take the calibration whatever the date of the frames.
+        Take the calibration regardless of the date of the frames.
     n_samples : int
-        If above zero, systematic errors are those of solving anew for so many samples of the
+        If above zero, systematic errors are those of solving again for so many samples of the
         calibration's posterior, or covariance; else they are linearized.
     seed : int, optional
         Of the samples.
@@ -142,7 +142,7 @@ def correct(
     AstropolcalWarning
         If the frames have no pairs, or some have none, where the calibration fitted pairs; their
         brightness cannot be measured; combinations of Stokes parameters are poorly determined at
-        some wavelengths; the calibration leaves open how they change; or it is old.
+        some wavelengths; the calibration does not determine how they change; or it is old.
 
     Examples
     --------
@@ -234,7 +234,8 @@ def _observable(calibration, frames, observable):
             return "intensity", [
                 "the calibration fitted pairs of frames, and these frames have none (half-wave "
                 "plate angles 45 deg apart, hwp=): their intensities are fitted, so that unequal "
-                "gains of the beams, and what the optics behind the half-wave plate polarize "
+                "gains of the beams, and what the optics downstream of the half-wave plate "
+                "polarize "
                 "unknown to the calibration, do not cancel"
             ]
     # of a chain that nobody fitted: what cancels most
@@ -295,7 +296,8 @@ def _systematic(model, solution, mode, open_directions, n_samples, seed):
     found = linear_systematic(model, solution, mode=mode, open_directions=open_directions)
     if found.is_open:
         warnings.warn(
-            "the calibration leaves open how Q and U turn: their systematic errors are infinite. "
+            "the calibration does not determine how Q and U turn: "
+            "their systematic errors are infinite. "
             "Ways out: a calibration with priors on what is open (calibrate --prior), or "
             "open_directions (--open-directions) 'ignore' or a standard deviation",
             AstropolcalWarning,

@@ -12,8 +12,9 @@ import numpy as np
 from scipy.linalg import null_space, qr, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
+from astropolcal.calibration.noise.estimates import frame_noise
 from astropolcal.chain import Train, leaves
-from astropolcal.gap.channels import Channels, expected_fluxes, noise, orthonormal, settings
+from astropolcal.gap.channels import Channels, expected_fluxes, orthonormal, settings
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
 from astropolcal.optics import StarSource
@@ -271,7 +272,7 @@ class GapProblem:
         ):
             angles = {stage: angle[0] for stage, angle in dataset.positions.items()}
             saturating = settings(angles, dataset.observations.n_frames)
-            channel.set_noise(noise(channel, residual, angles), residual, saturating)
+            channel.set_noise(frame_noise(channel, residual, angles), residual, saturating)
         self.fluxes = [
             expected_fluxes(channel, dataset.forward(self.vector(q)))
             for channel, dataset in zip(self.channels, self.datasets, strict=True)

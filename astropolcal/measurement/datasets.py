@@ -10,7 +10,7 @@ from astropy.modeling import Model
 from astropolcal import instruments
 from astropolcal.chain import leaves, stages
 from astropolcal.exceptions import InstrumentError, ObservationError, WavelengthRangeError
-from astropolcal.observations.reading import SAME_WAVELENGTH
+from astropolcal.observations.reading import bins_on_grid
 from astropolcal.optics import COORDINATES
 from astropolcal.propagation import Propagator
 
@@ -44,7 +44,7 @@ class Dataset:
         self.observable = observable
         self.n_free = free.size
         # indices of this dataset's wavelengths on the grid common to all, (n_wavelengths,)
-        self.bins = _bins_on_grid(observations, wavelength)
+        self.bins = bins_on_grid(observations, wavelength)
         self.frames = self._frames_of_data()
         columns = self.frames.T.ravel()
         given = self._given = _positions(chain, observations, positions)
@@ -202,19 +202,6 @@ class Dataset:
             else:
                 out[where] += slope
         return out.reshape(self.n_free, -1) if self._all_valid else out[:, self.valid]
-
-
-def _bins_on_grid(observations, wavelength):
-    own = observations.wavelength.to_value(u.um)
-    # (n_own, n_grid)
-    nearest = np.abs(own[:, None] - wavelength[None, :]).argmin(axis=1)
-    off = np.abs(wavelength[nearest] - own) > SAME_WAVELENGTH * own
-    if off.any():
-        raise ObservationError(
-            f"{observations.name}: wavelength {own[off][0] * 1e3:.3f} nm is not on the grid of the "
-            f"parameters (nearest {wavelength[nearest][off][0] * 1e3:.3f} nm)"
-        )
-    return nearest
 
 
 def _positions(chain, observations, positions):

@@ -55,13 +55,13 @@ GENERATORS = {
 @dataclass(frozen=True)
 class Dependence:
     """
-    How a perturbation depends on the frame, by the text that says so.
+    How a perturbation depends on the frame, by a text.
 
     ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
     ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``, cosine
     and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last move of the
     stage was backwards; ``"move:STAGE"``, how far it was moved, in radian; ``"dataset:NAME"``, in
-    one dataset only. With ``"/dataset:NAME"`` behind it, any of the others is in that dataset
+    one dataset only. With ``"/dataset:NAME"`` after it, any of the others is in that dataset
     only.
     """
 
@@ -72,12 +72,12 @@ class Dependence:
             raise ParameterError(
                 f"dependence = {self.text!r}; allowed are constant, time, time2, step:FRAME, "
                 "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE and dataset:NAME, each "
-                "also with /dataset:NAME behind it"
+                "also with /dataset:NAME after it"
             )
 
     @property
     def parts(self):
-        """The words of the text between its colons, without a dataset behind it."""
+        """The words of the text between its colons, without a dataset after it."""
         return split_run(self.text)[0].split(":")
 
     @property
@@ -166,7 +166,7 @@ class Perturbation(_BeamOptic, FrameOptic):
         ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
         ``"step:N"``, from frame N on; ``"frame:N"``; ``"harmonic:STAGE:N"``, cosine and sine of N
         times the angle of a stage; ``"direction:STAGE"`` and ``"move:STAGE"``, the last move of a
-        stage; ``"dataset:NAME"``; each also with ``"/dataset:NAME"`` behind it. The ``mount`` has
+        stage; ``"dataset:NAME"``; each also with ``"/dataset:NAME"`` after it. The ``mount`` has
         to be what it follows.
     beam : {"right", "left"}
         The beam that goes on in a chain; of consequence for ``"gain"`` only.

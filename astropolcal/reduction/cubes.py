@@ -128,7 +128,7 @@ class DetectorModel:
     Parameters
     ----------
     background : float or array_like
-        In adu per pixel, scalar or one value a wavelength.
+        In adu per pixel, scalar or one value per wavelength.
     gain, read_noise : float, optional
         Electrons per adu, and electrons per pixel; by default as the layout's ``read_out`` says.
     noise : bool
@@ -249,7 +249,7 @@ def simulate_cubes(
     instrument : Instrument
         With a `~astropolcal.instruments.FileLayout`.
     frames : `~astropy.table.QTable`
-        One row a frame: ``hwp`` as commanded, ``derotator`` and whatever else
+        One row per frame: ``hwp`` as commanded, ``derotator`` and anything else
         the chain needs; for a star ``parallactic`` and ``altitude``. A column
         ``hwp_true`` replaces the tracking law, ``time`` and ``exposure_time`` those of
         ``files``; ``em_gain`` and ``read_mode`` of the first row tell how the detector is
@@ -261,7 +261,7 @@ def simulate_cubes(
     stokes : sequence of float
         Stokes vector of the light that enters the chain.
     flux : float or array_like
-        Flux that enters the chain, in adu; scalar or one value a wavelength. Of
+        Flux that enters the chain, in adu; scalar or one value per wavelength. Of
         the internal source, what enters through an area as large as an aperture of
         the layout. By default 1e7, or what lights the brightest pixel to half of the
         saturation where that is less.
@@ -483,7 +483,7 @@ def both_states(frames):
     Parameters
     ----------
     frames : `~astropy.table.QTable`
-        One row a frame.
+        One row per frame.
 
     Returns
     -------

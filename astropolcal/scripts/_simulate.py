@@ -59,7 +59,8 @@ OPTIONS = f"""
     overwritten if it exists
 --instrument NAME =charis  default: charis
 --calibration CAL.asdf Input  take the chain from this file
---hwp DEG,DEG,... angles  half-wave-plate angles (default: 0 to 78.75 by 11.25)
+--hwp DEG,DEG,... angles  half-wave-plate angles (default: 0 to 78.75 by 11.25; of a star 0, 45,
+    22.5 and 67.5)
 --derotator DEG,DEG,... angles  derotator angles (default: 45 to 132.5 by 12.5)
 --source {{internal,star}} =internal  the internal source, or a star (default: %(default)s)
 --altitude DEG[,DEG] angles  altitude angle of a star in all frames, or in the first and last

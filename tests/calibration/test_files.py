@@ -369,7 +369,10 @@ def test_changed_sample_is_refused(sampled, path):
 def test_inconsistent_posterior_with_a_right_checksum(sampled):
     for change, message in [
         ({"names": ["polarizer.theta", "hwp.w_sio2"]}, "posterior: chain of 2 names and 3 units"),
-        ({"names": ["polarizer.theta", "hwp.w_sio2", "x"]}, "posterior of 'x', which is no free"),
+        (
+            {"names": ["polarizer.theta", "hwp.w_sio2", "x"]},
+            "posterior of 'x', which is not a free",
+        ),
         ({"log_prob": np.zeros((2, 2))}, r"posterior: log_prob has shape \(2, 2\)"),
         ({"acceptance": np.zeros(2)}, r"posterior: acceptance has shape \(2,\)"),
         ({"convergence": {"times": np.full(3, np.inf)}}, "posterior: times must be finite"),

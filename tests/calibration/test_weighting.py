@@ -12,10 +12,10 @@ from astropolcal.calibration.noise import noise_from_errors, noise_from_null_cha
 from astropolcal.calibration.noise.weighting import (
     Weighting,
     noise_of,
+    problem_of,
     weighting_of,
 )
 from astropolcal.calibration.posterior import LogPosterior
-from astropolcal.calibration.uncertainty.refits import Refit
 from astropolcal.calibration.validation import lack_of_fit
 from astropolcal.exceptions import (
     AstropolcalWarning,
@@ -356,7 +356,7 @@ def test_posterior_peaks_at_the_fit_with_its_width(fitted):
 def test_refits_stay_at_the_fit(fitted):
     for choice in CHOICES:
         cal = fitted[choice]
-        vector, _, arrived = Refit(cal).fit(cal.measurement.vector())
+        vector, _, arrived = problem_of(cal).fit(cal.measurement.vector())
         assert arrived
         moved = (vector - cal.measurement.vector()) / cal.measurement.free.factors()
         assert np.abs(moved / cal.covariance.stds).max() < 0.01

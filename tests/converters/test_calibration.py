@@ -281,11 +281,14 @@ def spoiled_accuracy(name, values):
 def test_parts_that_do_not_belong_together(cal):
     for spoil, words in [
         (lambda c: c.chains.append(c.chains[0]), "2 chains but 1 datasets"),
-        (change(at_bound=["hwp.thickness"]), "at_bound names 'hwp.thickness', which is no free"),
-        (lambda c: c.fit.update(masked={"a": 1}), "fit.masked is no list of reasons"),
-        (lambda c: c.fit.update(masked=["x"]), "fit.masked is no list of reasons"),
+        (change(at_bound=["hwp.thickness"]), "at_bound names 'hwp.thickness', which is not a free"),
+        (lambda c: c.fit.update(masked={"a": 1}), "fit.masked is not a list of reasons"),
+        (lambda c: c.fit.update(masked=["x"]), "fit.masked is not a list of reasons"),
         (lambda c: c.fit.update(outliers={"a": 1}), "fit.outliers is a dict, not a list"),
-        (lambda c: c.fit.update(outliers=[{"frames": [1]}]), "lacks what a pair of frames is told"),
+        (
+            lambda c: c.fit.update(outliers=[{"frames": [1]}]),
+            "lacks what a pair of frames is described",
+        ),
         (
             lambda c: c.fit.update(
                 outliers=[
@@ -293,11 +296,11 @@ def test_parts_that_do_not_belong_together(cal):
                     | {"brightness": 1}
                 ]
             ),
-            "fit.outliers lacks what a pair of frames is told by",
+            "fit.outliers lacks what a pair of frames is described by",
         ),
-        (spoiled_accuracy("s_res", [["x"], ["y"]]), "s_res is no list of numbers"),
-        (spoiled_accuracy("s_cv", [[1.0], [2.0]]), "s_cv is no list of numbers"),
-        (spoiled_accuracy("s_mean", [1, 2] * u.deg), "s_mean is in deg, which is no fraction"),
+        (spoiled_accuracy("s_res", [["x"], ["y"]]), "s_res is not a list of numbers"),
+        (spoiled_accuracy("s_cv", [[1.0], [2.0]]), "s_cv is not a list of numbers"),
+        (spoiled_accuracy("s_mean", [1, 2] * u.deg), "s_mean is in deg, which is not a fraction"),
         (spoiled_accuracy("wavelength", [1, 2] * u.deg), "must be positive lengths"),
         (spoiled_accuracy("wavelength", [1, -2] * u.um), "must be positive lengths"),
     ]:

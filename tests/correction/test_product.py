@@ -258,7 +258,7 @@ def test_text_that_is_no_ascii_is_refused(path):
     for key in (b"CHECKSUM=", b"DATASUM ="):
         content = content.replace(key, b"COMMENT  ")
     path.write_bytes(content)
-    with pytest.raises(ObservationError, match="text in frame is no ASCII"):
+    with pytest.raises(ObservationError, match="text in frame is not ASCII"):
         Corrected.read(path)
 
 

@@ -562,7 +562,7 @@ def test_frames_that_do_not_say_enough(frames_with, tmp_path):
 
 def test_calibration_that_is_old(frames_with):
     early, late = frames_with({"MJD": 60990.0}, {"MJD": 61313.5})
-    with pytest.raises(AstropolcalError, match=r"M3 was coated anew between .*--any-date"):
+    with pytest.raises(AstropolcalError, match=r"M3 was recoated between .*--any-date"):
         chosen(OLD, [early, late], optics_in=["nbs"])
     with pytest.warns(AstropolcalWarning, match="0.1 yr from the data"):
         chosen(OLD, [early], optics_in=["nbs"], max_age=0.01)
