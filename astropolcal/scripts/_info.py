@@ -11,11 +11,10 @@ from astropolcal.scripts._common import give, printer, wrapped
 from astropolcal.words import counted
 
 HELP = "say what a calibration, a folder of them, a table, cube or product holds"
-DESCRIPTION = (
-    "Say what a calibration file, a folder of calibrations, an observation table, an\n"
-    "image cube or a corrected product holds; of a calibration also how good it is and\n"
-    "for what it is valid. Without a file, what this installation knows."
-)
+DESCRIPTION = """\
+Say what a calibration file, a folder of calibrations, an observation table, an
+image cube or a corrected product holds; of a calibration also how good it is
+and for what it is valid. Without a file, what this installation knows."""
 OPTIONS = """
 file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
 --instruments  list the instruments only

@@ -44,7 +44,7 @@ EXAMPLES = """\
 examples:
   astropolcal standards --kind polarized --band H --magnitude 4,8
   astropolcal standards --site subaru --night 2025-11-03 --plot night.png
-  astropolcal standards "HD 30675"
+  astropolcal standards HD30675
 """
 
 
