@@ -290,7 +290,8 @@ def frame_groups(observations, kind, rows, label, **limits):
     of `pair_frames`, rows and label are for messages.
     """
     frames, time = observations.frames, clock(observations.frames)
-    angles = tuple(observations.position(name) * u.rad for name in ("hwp", "derotator"))
+    plate = observations.position("hwp") * u.rad
+    angles = plate, observations.angle_or_zero("derotator") * u.rad
     named = limits | {"rows": rows, "name": label}
     labels = np.asarray(frames["frame"]).tolist()
     if kind == "hwp":

@@ -59,9 +59,9 @@ def cycle_numbers(observations, start=None):
     if "cycle" in frames.colnames:
         # numbers of cycles need not be consecutive
         return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
-    plate = _step_of(observations.position("hwp"))
+    plate = _step_of(observations.angle_or_zero("hwp"))
     state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
-    moved = np.abs(np.diff(observations.position("derotator"), prepend=0.0)) > _SAME_ANGLE
+    moved = np.abs(np.diff(observations.angle_or_zero("derotator"), prepend=0.0)) > _SAME_ANGLE
     first = None if start is None else _step_of(angle_to_rad(start, "start"))
     cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
     for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
@@ -84,8 +84,11 @@ def mask_incomplete_cycles(observations, angles=(0, 45, 22.5, 67.5) * u.deg):
     """
     Mask the frames of cycles that lack an angle of the half-wave plate.
 
-    They give q without u, or neither. A frame masked at all wavelengths counts as missing.
+    They give q without u, or neither. A frame masked at all wavelengths counts as missing. Without
+    a half-wave plate all frames stay.
     """
+    if "hwp" not in observations.frames.colnames:
+        return observations
     wanted = np.mod(np.atleast_1d(angle_to_rad(angles, "angles")), np.pi)
     plate, cycle = observations.position("hwp"), cycle_numbers(observations, wanted[0] * u.rad)
     lost = observations.mask.all(axis=1)
@@ -145,6 +148,9 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
     """
     if not (limit > 0 and sigma > 0):
         raise ObservationError(f"limit = {limit}, sigma = {sigma}; both must be above zero")
+    if observations.single_beam:
+        # its flux follows the modulation, not only the lamp
+        return observations
     # a lamp changes by factors
     logarithm = np.log(brightness(observations))
     degree = min(2, max(int(np.isfinite(logarithm).sum()) - 4, 0))
@@ -153,7 +159,7 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
     spread = MAD_TO_SIGMA * np.nanmedian(off)
     # NaN, a frame masked already, is not far
     far = np.nan_to_num(off) > max(limit, sigma * spread)
-    moved = np.abs(np.diff(observations.position("derotator"))) > _SAME_ANGLE
+    moved = np.abs(np.diff(observations.angle_or_zero("derotator"))) > _SAME_ANGLE
     # number of the derotator angle in the order of the frames
     run = np.concatenate([[0], np.cumsum(moved)])
     far |= (np.bincount(run, far) >= 0.5 * np.bincount(run))[run]

@@ -165,7 +165,7 @@ class Observations:
         >>> Observations.from_table(QTable({"frame": [0], "bin": [0], "hwp": [0]}), name="x")
         Traceback (most recent call last):
         ...
-        astropolcal.exceptions.ObservationError: x: missing columns wavelength, derotator, flux_right, flux_left; it has frame, bin, hwp
+        astropolcal.exceptions.ObservationError: x: missing columns wavelength, flux_right, flux_left; it has frame, bin, hwp
         """  # noqa: E501
         label = str(name if path is None else path)
         table = complete_table(table, label)
@@ -226,6 +226,19 @@ class Observations:
         return self._grid.flux_left
 
     @property
+    def single_beam(self):
+        """Whether each frame has one beam only: `flux_right`; `flux_left` is then zero."""
+        return self._grid.single
+
+    @property
+    def brightness_groups(self):
+        """Number of the group of frames that share the brightness of the source, shape (F,)."""
+        frames = self._grid.frames
+        if "group" not in frames.colnames:
+            return np.zeros(self.n_frames, dtype=int)
+        return np.unique(np.asarray(frames["group"]), return_inverse=True)[1]
+
+    @property
     def variance_right(self):
         """Variance of `flux_right`, shape (F, W), NaN where masked or unknown."""
         return self._variances[0]
@@ -275,7 +288,8 @@ class Observations:
 
     def _measured(self):
         grid = self._grid
-        return {"flux_right": grid.flux_right, "flux_left": grid.flux_left, **grid.errors}
+        fluxes = {"flux_right": grid.flux_right, "flux_left": grid.flux_left}
+        return ({"flux": grid.flux_right} if grid.single else fluxes) | grid.errors
 
     def __len__(self):
         return self.n_frames
@@ -309,8 +323,8 @@ class Observations:
         low, high = self.wavelength.min(), self.wavelength.max()
         lines = [f"{self.name}: {self._headline()}"]
         lines.append(f"wavelength: {low.value:g} to {high.value:g} {high.unit}")
-        for column in ("hwp", "derotator", "parallactic", "altitude"):
-            if column in self._grid.frames.colnames:
+        for column in self._grid.frames.colnames:
+            if _is_angle(self._grid.frames[column]):
                 lines.append(f"{column}: {_span(np.rad2deg(self.position(column)))} deg")
         lines.append(f"errors: {' and '.join(self._grid.errors) or 'none'}")
         lines += [f"masked, {why}: {counted(n, 'cell')}" for why, n in self.mask_reasons.items()]
@@ -369,6 +383,11 @@ class Observations:
                 f"{self._label}: column {column} is not an angle; a unit such as deg is needed"
             )
         return numeric_column(frames, column, self._label, u.rad)
+
+    def angle_or_zero(self, stage):
+        """Return the position of a stage, zero in all frames where the table has no such column."""
+        there = stage in self._grid.frames.colnames
+        return self.position(stage) if there else np.zeros(self.n_frames)
 
     @property
     def _label(self):

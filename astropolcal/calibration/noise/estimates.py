@@ -427,7 +427,7 @@ def _predicted_differences(part, vector):
 
 
 def _null_design(observations, frames, null_model):
-    angle = observations.position("derotator")[frames]
+    angle = observations.angle_or_zero("derotator")[frames]
     state = np.zeros(len(frames), dtype=int)
     if "flc_state" in observations.frames.colnames:
         column = np.asarray(observations.frames["flc_state"])

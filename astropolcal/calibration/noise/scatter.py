@@ -41,12 +41,13 @@ _RUNS = 8
 def leave_out_groups(measurement):
     """Return the group of each datum for cross-validation: its derotator angle, per dataset.
 
-    On sky the derotator turns slowly, so there a group is one of eight runs of consecutive cycles
-    of the half-wave plate, or one cycle where there are fewer.
+    On sky the derotator turns slowly, so there, and without one, a group is one of eight runs of
+    consecutive cycles of the half-wave plate, or one cycle where there are fewer.
     """
     groups, first = [], 0
     for dataset in measurement.datasets:
-        if "parallactic" in dataset.positions:
+        turns = "derotator" in dataset.observations.frames.colnames
+        if "parallactic" in dataset.positions or not turns:
             group = _star_runs(dataset)
             groups.append(first + group[dataset.group_of_datum])
             first += int(group.max()) + 1
@@ -110,7 +111,7 @@ def _members(measurement, groups, by):
     """Return name and largest number of data at one wavelength of every group."""
     found = []
     for i, (part, where) in enumerate(zip(measurement.datasets, measurement.segments, strict=True)):
-        angle = np.rad2deg(part.observations.position("derotator"))[part.frames[:, 0]]
+        angle = np.rad2deg(part.observations.angle_or_zero("derotator"))[part.frames[:, 0]]
         own, bins = groups[where], measurement.bins[where]
         for k, label in enumerate(np.unique(own)):
             rows = own == label
