@@ -271,10 +271,11 @@ class Sweep:
             by_optic.setdefault(optic, []).append(parameter)
         adjoint, behind = 0.0, []
         # a dark beam has no arm
+        alone = crossings if len(self._arms) == 1 else None
         for steps, weight in zip(self._arms, weights, strict=False):
             row = np.zeros((*weight.shape, 4))
             row[..., 0] = weight
-            inward, pairs = _back(steps, row, [], by_optic, result)
+            inward, pairs = _back(steps, row, [], by_optic, result, alone)
             adjoint, behind = adjoint + inward, behind + pairs
         _back(self._common, adjoint, behind, by_optic, result, crossings)
         shape = self._propagator.shape

@@ -446,7 +446,7 @@ class Probe:
         steps = np.linspace(0, 1, n_cycles).repeat(_CYCLE.size)
         frames = QTable({"hwp": hwp * u.deg, "derotator": (20 + shift + 75 * steps) * u.deg})
         known = {"parallactic": -60 + shift + 100 * steps, "altitude": 40 + shift + 30 * steps}
-        wanted = set(stages(chain)) - {*COORDINATES, "hwp", "derotator"}
+        wanted = {s for s in stages(chain) if s not in COORDINATES} - {"hwp", "derotator"}
         on_sky = bool(wanted & set(known))
         for stage in sorted(wanted | (set(known) if on_sky else set())):
             frames[stage] = known.get(stage, 10 + shift + 60 * steps) * u.deg

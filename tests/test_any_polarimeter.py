@@ -114,7 +114,8 @@ class Crystal(Bench):
     """Liquid crystal with four voltages and a polarizer, one beam: full Stokes."""
 
     name, entrance = "crystal", "lc1_A"
-    states = {"A": (0, 180), "B": (125, 55), "C": (235, 125), "D": (305, 235)}
+    # those of IMaX (Martinez Pillet et al. 2011), the most efficient ones
+    states = {"A": (315, 305.3), "B": (315, 54.7), "C": (225, 125.3), "D": (225, 234.7)}
 
     def inner(self, size):
         for i, theta in enumerate((0, 45)):

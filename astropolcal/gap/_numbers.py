@@ -13,6 +13,7 @@ from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ObservationError
 from astropolcal.gap.problem import OPEN, TOUCHES
 from astropolcal.measurement import Measurement
+from astropolcal.observations.observables import default_observable
 from astropolcal.optics import Perturbation
 
 ACCURACIES = ("s_res", "s_mean", "s_cv")
@@ -181,14 +182,13 @@ def _number(values):
 
 
 class Doubles:
-    """Normalized double differences of a model."""
+    """Normalized double differences of a model, or what its tables allow."""
 
     def __init__(self, model):
         self.problem = model.problem
         self.measurement = Measurement(
             model.chains,
             model.observations,
-            observable="normalized_double_difference",
             ties=model.problem.ties,
         )
 
@@ -206,8 +206,9 @@ class Doubles:
     @property
     def noise_percent(self):
         """Their noise, by that of the single differences, in percent."""
-        sigma = self.in_pairs([c.sigma[0] for c in self.problem.channels])
-        return 100 * float(np.sqrt(np.mean(sigma**2) / 2))
+        sigma = self.in_pairs([c.sigma[c.told] for c in self.problem.channels])
+        frames = self.measurement.observable.frames_per_datum
+        return 100 * float(np.sqrt(np.mean(sigma**2) / frames))
 
 
 # ---- accuracies -----------------------------------------------------------------------------
@@ -223,7 +224,7 @@ def accuracies(model, cross_validate=True):
     """
     instrument = next((o.instrument for o in model.observations if o.instrument), None)
     found = {
-        "observable": "normalized_double_difference",
+        "observable": default_observable(model.observations),
         "wavelength_nm": _number(1e3 * model.problem.wavelength),
         "rms_percent": None,
         "datasets": [],

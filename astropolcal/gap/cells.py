@@ -205,9 +205,11 @@ class Place:
 def places(chain):
     """Return the places of a chain, in the order in which the light meets them."""
     found = [o for o in leaves(chain) if not (o.name or "").startswith("gap_")]
-    split = next(i for i, o in enumerate(found) if o.splits_light)
+    # a chain of one beam ends with its last optic
+    split = next((i for i, o in enumerate(found) if o.splits_light), len(found))
     found = found[: split + 1]
     turning = [o for o in found if o.stage is not None and o.stage not in COORDINATES]
+    turning = [o for o in turning if not o.splits_light]
     first = turning[0] if turning else found[-1]
     out = [Place("source", before=first.name)] if found[0] is not first else []
     own = [o for o in turning if o.stage not in _SKY and not o.rotates_frame]
@@ -242,7 +244,7 @@ def dependences(problem, most_steps=_MOST_STEPS):
         stage
         for dataset in problem.datasets
         for stage in dataset._given
-        if stage not in (*COORDINATES, *_SKY)
+        if stage not in COORDINATES and stage not in _SKY
     )
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]

@@ -9,6 +9,9 @@ lamp, and the logarithm of the sum, compared up to the brightness of the lamp.
 The lamp is common to all wavelengths of a frame: its drift is a smooth curve
 through the run and its flicker a random shift of all wavelengths of a frame
 together, so that neither counts as a gap.
+
+A single beam has the sum only, and of the lamp nothing is known but that the frames of a group
+share its brightness, a number for each wavelength.
 """
 
 import numpy as np
@@ -24,6 +27,8 @@ _LARGEST_DEGREE = 6
 _LARGEST_COLOR = 2
 # a flicker below this is not told to what depends on the flux
 _LARGE_FLICKER = 0.1
+# a single beam of fewer standard deviations than this is no datum
+_FAINT = 5.0
 # the share of the frames' freedom that harmonics may take from the measure of the noise
 _MOST_TURNING = 0.7
 
@@ -47,7 +52,15 @@ class Channels:
                     (var_right + var_left + 2 * cov) / total**2,
                 ]
             )
-        self.valid = dataset.valid & np.isfinite(self.observed).all(axis=0)
+        #: Index of the channel that tells the gap, and how many channels have data.
+        self.told, self.count = (1, 1) if obs.single_beam else (0, 2)
+        self.groups = obs.brightness_groups if obs.single_beam else None
+        usable = ~obs.mask.T if obs.single_beam else dataset.valid
+        self.valid = usable & np.isfinite(self.observed).all(axis=0)
+        if obs.single_beam:
+            # the logarithm of a flux within its noise is none; the differences are 1, and told
+            self.valid &= ~(self.variance[1] > _FAINT**-2)
+            self.variance[0] = 1.0
         self.observed = np.where(self.valid, self.observed, 0.0)
         #: Whether the table states errors.
         self.stated = bool(np.any(np.isfinite(self.variance) & (self.variance > 0) & self.valid))
@@ -88,12 +101,21 @@ class Channels:
         """
         weight = np.where(self.valid, 1 / sigma, 0.0)
         self.sigma = sigma
-        self.lamp = _Lamp(residual[1], weight[1], self.sequence, saturating)
+        if self.groups is None:
+            self.lamp = _Lamp(residual[1], weight[1], self.sequence, saturating)
+        else:
+            self.lamp, weight[0] = _GroupLamp(self.groups), 0.0
         # the flicker makes the sums of a frame correlated: its inverse root is a rank-one change
         self._whitening = weight, self.lamp.shrink(weight[1])
         design = self._sum_whitened(self.lamp.design(self.valid))
         #: Orthonormal directions of the sums that the lamp takes up, (W * F, n).
-        self.nuisance = orthonormal(design.reshape(len(design), -1).T)
+        design = design.reshape(len(design), -1)
+        if self.groups is None:
+            self.nuisance = orthonormal(design.T)
+        else:
+            # no two groups have a datum in common
+            norm = np.linalg.norm(design, axis=1, keepdims=True)
+            self.nuisance = (design / np.where(norm > 0, norm, 1.0))[norm[:, 0] > 0].T
 
     def whiten(self, array):
         """Divide residuals or derivatives, (..., 2, W, F), by the noise and take the lamp out."""
@@ -111,6 +133,13 @@ class Channels:
         out[..., 1, :, :] = self._sum_whitened(array[..., 1, :, :])
         return out
 
+    def gap(self, residual):
+        """Return what of residuals (2, W, F) is a gap: differences, or sums less their lamp."""
+        if self.groups is None:
+            return residual[0]
+        level, weight = residual[1], self.valid / np.square(self.sigma[1])
+        return np.where(self.valid, level - self.lamp.mean(level, weight), 0.0)
+
     def _sum_whitened(self, array):
         weight, (direction, shrink) = self._whitening[0][1], self._whitening[1]
         scaled = array * weight
@@ -121,6 +150,11 @@ class Channels:
     def n_nuisance(self):
         """Number of numbers that describe the lamp."""
         return self.nuisance.shape[1]
+
+    @property
+    def n_data(self):
+        """Number of data, less the numbers that describe the lamp."""
+        return self.count * int(self.valid.sum()) - self.n_nuisance
 
 
 class _Lamp:
@@ -189,6 +223,31 @@ class _Lamp:
             (max(self.degree - self.color, 0), *valid.shape),
         )
         return np.concatenate([own.reshape(-1, *valid.shape), common]) * valid
+
+
+class _GroupLamp(_Lamp):
+    """Brightness of the frames of a single beam: one number for each group and wavelength."""
+
+    flicker, degree, color = 0.0, 0, 0
+
+    def __init__(self, groups):
+        self.groups = groups
+        # (F, n_groups)
+        self.member = np.eye(groups.max() + 1)[groups]
+
+    def mean(self, values, weight):
+        """Return the mean of (..., F) over the group of each frame."""
+        total = (weight @ self.member) @ self.member.T
+        return ((values * weight) @ self.member @ self.member.T) / np.where(total > 0, total, 1.0)
+
+    def brightness(self, shift, weight):
+        """Return the brightness of each frame, that of its group, (F,)."""
+        return self.mean(shift, weight)
+
+    def design(self, valid):
+        """Return the columns of the lamp, shape (k, W, F)."""
+        own = np.eye(len(valid))[:, None, :, None] * self.member.T[None, :, None, :]
+        return own.reshape(-1, *valid.shape) * valid
 
 
 def _mean(values, weight, axis):
@@ -264,7 +323,10 @@ def noise(channel, residual, angles):
     """
     sigma = np.sqrt(channel.variance)
     basis = _turning(angles, channel.valid)
-    for i in range(2):
+    if channel.groups is not None:
+        sigma[0] = 1.0
+        residual = np.stack([residual[0], _ungrouped(channel, residual[1])])
+    for i in range(2 - channel.count, 2):
         rough = _roughness(residual[i], channel.valid, basis)
         stated = np.isfinite(sigma[i]) & (sigma[i] > 0) & channel.valid
         if not stated.any():
@@ -276,6 +338,12 @@ def noise(channel, residual, angles):
             sigma[i] *= max(1.0, rough / _roughness_of(sigma[i], channel.valid))
         sigma[i] = np.where(stated, sigma[i], np.median(sigma[i][stated]))
     return sigma
+
+
+def _ungrouped(channel, residual):
+    """Return residuals of a single beam less the mean of each group."""
+    lamp = _GroupLamp(channel.groups)
+    return np.where(channel.valid, residual - lamp.mean(residual, channel.valid * 1.0), 0.0)
 
 
 def _turning(angles, valid):

@@ -98,10 +98,11 @@ class GapProblem:
         self.fluxes = [None] * len(chains) if like is None else like.fluxes
         #: Functions of the frame on which a cause may depend, once they are known.
         self.waves = None if like is None else like.waves
+        single = all(each.single_beam for each in observations)
         self.measurement = Measurement(
             chains,
             observations,
-            observable="normalized_single_difference",
+            observable="intensity" if single else "normalized_single_difference",
             ties=ties,
             copy=copy,
             positions=[
@@ -380,7 +381,7 @@ class GapProblem:
     def n_data(self):
         """Number of rows that hold data, less the numbers that describe the lamps."""
         known = int(np.count_nonzero(self._holds.any(axis=1)))
-        return known + sum(2 * int(c.valid.sum()) - c.n_nuisance for c in self.channels)
+        return known + sum(channel.n_data for channel in self.channels)
 
     def decomposed(self, coefficients):
         """
@@ -478,7 +479,9 @@ def _positions(chain, observations, fluxes):
     expected = {
         "flux": fluxes,
         "total_flux": np.stack([fluxes.sum(axis=0)] * 2),
-        "previous_flux": fluxes / before,
+        "previous_flux": np.divide(
+            fluxes, before, out=np.ones_like(fluxes), where=before > 0
+        ),
     }
     return found | {stage: expected[stage] for stage in expected.keys() & found.keys()}
 

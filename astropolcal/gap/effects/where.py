@@ -15,7 +15,7 @@ __all__ = []
 #: Roles of which a chain may have several optics.
 SEVERAL = ("polarizer", "mirror", "plate", "derotator", "telescope_mirror")
 # positions that are not those of a stage which carries a retarder
-_NO_STAGES = ("parallactic", "altitude", *COORDINATES)
+_NO_STAGES = (None, "parallactic", "altitude")
 _BEHIND, _BEHIND_PLATE = "behind the derotator", "behind the half-wave plate"
 
 
@@ -110,7 +110,7 @@ class Roles:
     The optics of a chain by what they are for.
 
     There may be several of a kind. The plates are the retarders on the stage ``hwp``, and those
-    on a stage in front of it; the derotators are retarders on a stage behind the plate, whatever
+    on a stage in front of it, or without it all but those on ``derotator``; the derotators are retarders on a stage behind the plate, whatever
     it is called; the telescope's mirrors stand between the rotation by the parallactic angle and
     the plate.
 
@@ -180,11 +180,15 @@ class Roles:
 
     def _turning(self):
         """Return plates and derotators."""
-        found = [o for o in self._own if _retards(o) and o.stage not in (None, *_NO_STAGES)]
+        found = [o for o in self._own if _retards(o) and o.stage not in _NO_STAGES]
+        found = [o for o in found if o.stage not in COORDINATES]
         names = [o.stage for o in found]
-        middle = names.index("hwp") if "hwp" in names else -1
         plates = [o for o in found if o.stage == "hwp"]
-        plates += found[: max(middle, 0)]
+        if plates:
+            plates += found[: names.index("hwp")]
+        else:
+            # without a half-wave plate whatever turns is the plate, but for a derotator
+            plates = [o for o in found if o.stage != "derotator"]
         behind = [o for o in found if not any(o is plate for plate in plates)]
         return {"plate": plates, "derotator": sorted(behind, key=lambda o: o.stage != "derotator")}
 
