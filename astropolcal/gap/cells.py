@@ -166,6 +166,7 @@ def _pattern(text):
             f" that changes {times.get(parts[-1], parts[-1] + ' times')} in a turn of the {stage}"
         ),
         "direction": lambda: f" that depends on the direction of the last move of the {stage}",
+        "state": lambda: f" where {' is '.join(stage.split('='))}",
         "move": lambda: f" that grows with the last move of the {stage}",
     }.get(parts[0], lambda: "")()
 
@@ -248,6 +249,10 @@ def dependences(problem, most_steps=_MOST_STEPS):
     )
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
+    names += [
+        f"state:{stage}"
+        for stage in dict.fromkeys(s for d in problem.datasets for s in d._given if "=" in s)
+    ]
     names += [f"{what}:{s}" for s in ("hwp", "derotator") if s in stages for what in _MOVED]
     several = [d.observations.name for d in problem.datasets]
     runs = several if count_runs(problem) > 1 else []
@@ -489,9 +494,11 @@ class Probes:
         fluxes = self.problem.fluxes[i]
         if fluxes is None:
             return
-        usual = np.median(fluxes)
+        single = channel.groups is not None
+        # half the usual flux of both beams, whether both have light or one
+        usual = np.median(fluxes[0]) / 2 if single else np.median(fluxes)
         # light that is added counts as much as the source gives in the frame, in these units
-        added = usual * (right + left) / np.maximum(fluxes.sum(axis=0), 1e-9 * usual)
+        added = (1 + single) * usual * (right + left) / np.maximum(fluxes.sum(axis=0), 1e-9 * usual)
         order = np.argsort(channel.sequence, kind="stable")
         # the first frame has none before it, and its own counts, as in a chain
         before = fluxes.copy()
@@ -506,6 +513,8 @@ class Probes:
             "crosstalk": (half, -half),
         }
         for kind, (one, other) in changes.items():
+            if single and kind in ("background_of_one_beam", "crosstalk"):
+                continue
             slopes = [a * one + b * other for a, b in channel.slopes(sweep)]
             yield kind, np.stack(slopes)
 

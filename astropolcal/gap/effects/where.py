@@ -62,8 +62,7 @@ class Where:
     def find(self, roles, chosen=None):
         """Return the ``Place`` in a chain, or None; no other where an optic was chosen."""
         if self.relation == "detector":
-            split = next((o for o in roles.leaves if o.splits_light), None)
-            return split and Place("detector", after=split.name)
+            return Place("detector", after=_last(roles.leaves).name)
         if self.optic is None:
             there = {place.name: place for place in places(Train(roles.leaves))}
             return there.get(self.relation)
@@ -98,6 +97,11 @@ class Where:
     def in_front_of(self, roles):
         """Return the name of the place in front of the optic."""
         return Where("before", self.optic, self.is_role).cell_place(roles)
+
+
+def _last(found):
+    """Return the splitter of some optics, or of one beam the last optic."""
+    return next((o for o in found if o.splits_light), found[-1])
 
 
 def is_held(parameter):
