@@ -127,7 +127,7 @@ def simulate(
     """
     wavelength, seed = np.atleast_1d(u.Quantity(wavelength)), check_seed(seed)
     # for unit source, (n_wavelengths, n_frames)
-    names, frames, lamp = _beams(chain, frames, lamp)
+    names, frames, lamp = beams_of_frames(chain, frames, lamp)
     fluxes = expected_fluxes(chain, wavelength, frames, source)[: len(names)]
     scale = entering_flux(flux, lamp, len(frames), len(wavelength))
     # photons arrive in electrons, whatever a camera counts in
@@ -146,7 +146,7 @@ def simulate(
     return Observations.from_table(table, name=name)
 
 
-def _beams(chain, frames, lamp):
+def beams_of_frames(chain, frames, lamp):
     """Return the columns of the fluxes, and the frames and their lamp, one for each beam."""
     if splits(leaves(chain)):
         return ("flux_right", "flux_left"), frames, lamp
@@ -178,6 +178,18 @@ def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
     ``frames`` has the position of every stage, one row per frame; a column such as ``hwp_true``
     goes before ``hwp``. ``source`` is the Stokes vector of the light that enters.
     """
+    positions = stage_positions(chain, frames)
+    propagator = Propagator(chain, length_to_um(wavelength), positions, source)
+    shape = (len(wavelength), len(frames))
+    right, left = (np.broadcast_to(flux, shape) for flux in propagator.fluxes())
+    # a beam that is extinguished may be below zero by a rounding error
+    if min(right.min(), left.min()) < -_ROUNDING:
+        raise ParameterError("the chain gives negative flux: it is not physical", argument="chain")
+    return right.clip(0.0), left.clip(0.0)
+
+
+def stage_positions(chain, frames):
+    """Return the position of each stage of a chain that frames have, canonical, (n_frames,)."""
     # where the true angle of a stage is known, it is that at which it stands
     known = {stage: f"{stage}_true" for stage in stages(chain)}
     columns = {s: true if true in frames.colnames else s for s, true in known.items()}
@@ -187,14 +199,7 @@ def expected_fluxes(chain, wavelength, frames, source=(1.0, 0.0, 0.0, 0.0)):
         for stage, column in columns.items()
         if column in frames.colnames
     }
-    positions |= {s: in_state(frames, s, "frames") for s in known if "=" in s}
-    propagator = Propagator(chain, length_to_um(wavelength), positions, source)
-    shape = (len(wavelength), len(frames))
-    right, left = (np.broadcast_to(flux, shape) for flux in propagator.fluxes())
-    # a beam that is extinguished may be below zero by a rounding error
-    if min(right.min(), left.min()) < -_ROUNDING:
-        raise ParameterError("the chain gives negative flux: it is not physical", argument="chain")
-    return right.clip(0.0), left.clip(0.0)
+    return positions | {s: in_state(frames, s, "frames") for s in known if "=" in s}
 
 
 def _positive(name, value, zero=False):

@@ -479,9 +479,7 @@ def _positions(chain, observations, fluxes):
     expected = {
         "flux": fluxes,
         "total_flux": np.stack([fluxes.sum(axis=0)] * 2),
-        "previous_flux": np.divide(
-            fluxes, before, out=np.ones_like(fluxes), where=before > 0
-        ),
+        "previous_flux": np.divide(fluxes, before, out=np.ones_like(fluxes), where=before > 0),
     }
     return found | {stage: expected[stage] for stage in expected.keys() & found.keys()}
 

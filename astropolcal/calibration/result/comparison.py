@@ -164,9 +164,7 @@ class _Optics:
         found = leaves(path)
         plate = next((o for o in found if o.stage == "hwp"), None)
         turning = (
-            o
-            for o in found
-            if o.stage not in (None, "hwp", *_SKY) and o.stage not in COORDINATES
+            o for o in found if o.stage not in (None, "hwp", *_SKY) and o.stage not in COORDINATES
         )
         return plate, next(turning, None), path
 
