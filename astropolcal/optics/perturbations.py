@@ -72,8 +72,8 @@ class Dependence:
         if not isinstance(self.text, str) or not _FORMS.fullmatch(self.text):
             raise ParameterError(
                 f"dependence = {self.text!r}; allowed are constant, time, time2, step:FRAME, "
-                "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE, state:COLUMN=STATE and "
-                "dataset:NAME, each also with /dataset:NAME behind it"
+                "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE, "
+                "state:COLUMN=STATE and dataset:NAME, each also with /dataset:NAME behind it"
             )
 
     @property
@@ -169,8 +169,8 @@ class Perturbation(_BeamOptic, FrameOptic):
         ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
         ``"step:N"``, from frame N on; ``"frame:N"``; ``"harmonic:STAGE:N"``, cosine and sine of N
         times the angle of a stage; ``"direction:STAGE"`` and ``"move:STAGE"``, the last move of a
-        stage; ``"state:COLUMN=STATE"``, in one state or beam; ``"dataset:NAME"``; each also with ``"/dataset:NAME"`` behind it. The ``mount`` has
-        to be what it follows.
+        stage; ``"state:COLUMN=STATE"``, in one state or beam; ``"dataset:NAME"``; each also with
+        ``"/dataset:NAME"`` behind it. The ``mount`` has to be what it follows.
     beam : {"right", "left"}
         The beam that goes on in a chain; of consequence for ``"gain"`` only.
     theta : `~astropy.units.Quantity`

@@ -114,9 +114,9 @@ class Roles:
     The optics of a chain by what they are for.
 
     There may be several of a kind. The plates are the retarders on the stage ``hwp``, and those
-    on a stage in front of it, or without it all but those on ``derotator``; the derotators are retarders on a stage behind the plate, whatever
-    it is called; the telescope's mirrors stand between the rotation by the parallactic angle and
-    the plate.
+    on a stage in front of it, or without it all but those on ``derotator``; the derotators are
+    retarders on a stage behind the plate, whatever it is called; the telescope's mirrors stand
+    between the rotation by the parallactic angle and the plate.
 
     Parameters
     ----------
