@@ -409,7 +409,7 @@ class Demodulation:
     >>> import numpy as np
     >>> from astropolcal.efficiency import Demodulation
     >>> two = np.array([[[0.5, 0.5], [0.5, -0.5]]])
-    >>> Demodulation("IQ", two, np.linalg.inv(two), np.ones((1, 2))).stokes([1.5, 0.5]).tolist()
+    >>> Demodulation("IQ", two, np.linalg.inv(two), np.ones((1, 2))).stokes([[1.5, 0.5]]).tolist()
     [[2.0, 1.0]]
     """
 
@@ -419,8 +419,9 @@ class Demodulation:
     efficiency: np.ndarray
 
     def stokes(self, fluxes):
-        """Return Stokes parameters, (n_wavelengths, n_components), of measurements, (..., n)."""
-        return np.einsum("wkn,...n->wk", self.matrix, np.asarray(fluxes, dtype=float))
+        """Return Stokes parameters, (n_wavelengths, n_components), of fluxes (n_wavelengths, n)."""
+        fluxes = np.asarray(fluxes, dtype=float)
+        return np.einsum("wkn,wn->wk", self.matrix, fluxes)
 
 
 def demodulation(chain, wavelength, frames, *, components="IQUV", variance=None):

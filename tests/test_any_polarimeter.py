@@ -345,7 +345,8 @@ def test_beams_in_columns_are_frames_of_one_group():
         wide[f"flux_{name}"] = [10.0 + i, 20.0 + i] * u.adu
         wide[f"flux_{name}_err"] = [1.0, 2.0] * u.adu
     found = Observations.from_table(wide)
-    assert found.single_beam and found.n_frames == 6
+    assert found.single_beam
+    assert found.n_frames == 6
     assert found.frames["beam"].tolist() == ["a", "b", "c"] * 2
     assert found.brightness_groups.tolist() == [0, 0, 0, 1, 1, 1]
     assert found.flux_right[:, 0].tolist() == [10, 11, 12, 20, 21, 22]

@@ -370,6 +370,9 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     """
     if null_model not in _NULL_MODELS:
         raise FitError(f"null_model = {null_model!r}; allowed are {', '.join(_NULL_MODELS)}")
+    alone = [p.observations.name for p in measurement.datasets if p.observations.single_beam]
+    if alone:
+        raise FitError(f"{alone[0]}: the null channel needs two beams a frame, it has one")
     vector = measurement.vector() if vector is None else np.asarray(vector, dtype=float)
     parts = [_null_scatter(part, vector, null_model) for part in measurement.datasets]
     squares, dof = (np.concatenate(column) for column in zip(*parts, strict=True))
