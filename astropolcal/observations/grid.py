@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable, vstack
+from astropy.table import QTable, Table, vstack
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
 from astropolcal.observations.reading import check_table, first_bad_row, numeric_column
@@ -79,8 +79,10 @@ def build_grid(table, label):
 
     ``label`` is the file or name for messages. Cells that are masked give one warning a reason.
     """
-    table = beams_as_frames(check_table(table, label, ()), label)
-    single = "flux" in table.colnames and not {*BEAMS} & set(table.colnames)
+    if isinstance(table, Table) and len(table):
+        table = beams_as_frames(check_table(table, label, ()), label)
+    there = set(getattr(table, "colnames", ()))
+    single = "flux" in there and not there & {*BEAMS}
     table = check_table(table, label, (*REQUIRED, "flux") if single else (*REQUIRED, *BEAMS))
     frame = _integers(table, "frame", label)
     bins = _integers(table, "bin", label)

@@ -447,10 +447,11 @@ OBSERVABLES = {
         RatioMethod(),
         NormalizedSingleDifference(),
         NormalizedTripleDifference(),
-        Intensity(),
     )
 }
-"""Every registered `Observable`, by name; the first one is the default."""
+"""Every registered `Observable` of two beams, by name; the first one is the default."""
+
+_INTENSITY = Intensity()
 
 
 def default_observable(observations):
@@ -468,9 +469,8 @@ def get_observable(name):
         return name
     # "Double-Difference" and "double difference" are one name
     key = "_".join(str(name).lower().replace("-", " ").replace("_", " ").split())
-    if key in OBSERVABLES:
-        return OBSERVABLES[key]
-    hint = did_you_mean(key, OBSERVABLES)
-    raise ObservationError(
-        f"unknown observable {name!r}; allowed are {', '.join(OBSERVABLES)}{hint}"
-    )
+    known = OBSERVABLES | {_INTENSITY.name: _INTENSITY}
+    if key in known:
+        return known[key]
+    hint = did_you_mean(key, known)
+    raise ObservationError(f"unknown observable {name!r}; allowed are {', '.join(known)}{hint}")

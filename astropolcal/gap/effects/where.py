@@ -62,7 +62,8 @@ class Where:
     def find(self, roles, chosen=None):
         """Return the ``Place`` in a chain, or None; no other where an optic was chosen."""
         if self.relation == "detector":
-            return Place("detector", after=_last(roles.leaves).name)
+            last = _last(roles.leaves)
+            return last and Place("detector", after=last.name)
         if self.optic is None:
             there = {place.name: place for place in places(Train(roles.leaves))}
             return there.get(self.relation)
@@ -100,8 +101,9 @@ class Where:
 
 
 def _last(found):
-    """Return the splitter of some optics, or of one beam the last optic."""
-    return next((o for o in found if o.splits_light), found[-1])
+    """Return the splitter of some optics, or the last one of a beam that is analysed."""
+    analysed = any(isinstance(o, (optics.LinearPolarizer, optics.StateAnalyser)) for o in found)
+    return next((o for o in found if o.splits_light), found[-1] if analysed else None)
 
 
 def is_held(parameter):
