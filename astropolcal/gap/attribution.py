@@ -349,11 +349,13 @@ def _columns(model, effects, degree):
     while waiting:
         edited, parameters, ties, later = list(model.held_chains), {}, {}, []
         for effect in waiting:
-            # what is absent does nothing to another, but two may free the same parameter
+            # what is absent does nothing to another, but two may free the same parameter, or
+            # exchange the same optic
             edit = effect.edit(edited, context)
             names = {p.name for p in edit.parameters}
             taken = {p.name for own in parameters.values() for p in own}
-            if names & taken or len(parameters) == _TOGETHER:
+            blocked = parameters and not names
+            if blocked or names & taken or len(parameters) == _TOGETHER:
                 later.append(effect)
                 continue
             edited, parameters[effect.name] = edit.chains, edit.parameters

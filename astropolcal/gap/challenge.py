@@ -24,6 +24,7 @@ from astropolcal.files import append_line, atomic_path, understood
 from astropolcal.gap._bench import DETECTOR, Bench, Setup
 from astropolcal.gap._faults import Fault
 from astropolcal.gap.diagnosis import diagnose
+from astropolcal.gap.effects import EFFECTS, get_effect
 from astropolcal.words import counted
 
 __all__ = ["ChallengeResult", "make_challenge", "run_challenge", "score_answer"]
@@ -133,7 +134,11 @@ def make_challenge(seed, *, kind="cell", snr=30.0, setup=None, fault=None):
 
 
 def _effects(faults):
-    return {one.told["effect"] for one in faults if one.told.get("effect")}
+    """Return the effects that contain, or are part of, what there is already."""
+    there = {one.told["effect"] for one in faults if one.told.get("effect")}
+    windows = {getattr(get_effect(name), "thickness", None) for name in there} - {None}
+    same = {name for name, e in EFFECTS.items() if getattr(e, "thickness", None) in windows}
+    return there | same
 
 
 # ---- an answer is scored ----------------------------------------------------------------------

@@ -10,7 +10,7 @@ set leaves lowers the probability of all its causes.
 """
 
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -24,6 +24,8 @@ __all__ = []
 _RETEMPERED = 400
 # fits on the way to the answer need not be carried to the end
 _QUICK = {"steps": 6, "share": 1e-3}
+# of so many causes two may be one that was not seen while the others were missing
+_MERGED = (3, 4)
 # causes are looked at beside all the others so many times
 _TURNS = 1
 # log evidence by which a name may be behind its cell, and a rival has to be ahead
@@ -44,6 +46,8 @@ _OF_OPTIC = (("retardance_h", None), ("retardance_d", None), ("rotation", 2))
 _WIDTH, _FITTED = (3, 2, 1), (6, 4, 3)
 # those that promise less than this share of what the best of them gained are not
 _PROMISING = 0.8
+# but this, where the freedom of the best costs more (log evidence): two simple ones may do better
+_HALF, _DEAR = 0.5, 40.0
 # names are asked for beside so many causes
 _NAMES = 2
 # and so many times as many where all of these are impossible
@@ -132,6 +136,12 @@ class _State:
     def outline(self):
         return frozenset(one.name for one in self.chosen)
 
+    @property
+    def is_dear(self):
+        """Whether one cause explains all, but by much freedom."""
+        alone = len(self.chosen) == 1 and self.model.p_value > REMAINDER
+        return alone and self.chosen[0].cost(1.0) > _DEAR
+
 
 def select(base, library, groups, say, *, cells=True, changes=False):
     """Choose the causes that a model lacks."""
@@ -147,6 +157,7 @@ def select(base, library, groups, say, *, cells=True, changes=False):
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
         first = _scanned(base, library, cells)
+    best = _merged(base, best, library, say, cells)
     best, scans = _exchanged(base, best, library, first, say, cells)
     best = replace(best, model=best.model.polished())
     if changes:
@@ -163,6 +174,30 @@ def select(base, library, groups, say, *, cells=True, changes=False):
 
 def _errors(model, groups):
     return None if groups is None else foreseen(model, groups)
+
+
+def _merged(base, best, library, say, cells):
+    """Return the set with two causes exchanged for one that does what both do."""
+    if not _MERGED[0] <= len(best.chosen) <= _MERGED[1]:
+        return best
+    temper, found = max(1.0, best.model.mean_square), best
+    for pair in combinations(best.chosen, 2):
+        say(f"as one cause: {' and '.join(one.effect.title for one in pair)}")
+        others = [one for one in best.chosen if one not in pair]
+        recipes = [one.recipe for one in others]
+        beside = base.with_effects(recipes, like=best.model, **_QUICK)
+        for one in _best_of(scan(beside, library, cells=cells, temper=temper), _FITTED[-1]):
+            model = beside.with_effects([one.recipe], **_QUICK)
+            lost = 0.5 * (model.fit.chi2 - best.model.fit.chi2) / temper
+            gained = sum(o.cost(temper) for o in pair) - one.cost(temper) - lost
+            if gained > -ENOUGH and model.is_physical(one.name):
+                state = _State(model, [*others, one], best.evidence + gained)
+                found = max(found, state, key=lambda s: s.evidence - ENOUGH * len(s.chosen))
+    return found
+
+
+def _best_of(found, most):
+    return [found.freer(one) for one in _distinct(found.candidates, most)]
 
 
 def _possible(base, best, scans):
@@ -343,7 +378,7 @@ def _search(best, library, first, say, cells, most_causes):
         if not fitted or fitted[0].evidence < best.evidence + ENOUGH:
             break
         best, states = fitted[0], fitted[:width]
-        if best.model.p_value > REMAINDER:
+        if best.model.p_value > REMAINDER and not best.is_dear:
             # what is left may be noise: one look beside the best set will tell
             states = states[:1]
     return best
@@ -353,7 +388,8 @@ def _fitted(grown):
     """Return sets fitted in full, without those that promise too little beside the best of them."""
     found, most = [], -np.inf
     for promised, state, added in grown:
-        if promised - state.evidence < _PROMISING * (most - state.evidence):
+        share = _HALF if any(other.is_dear for other in found) else _PROMISING
+        if promised - state.evidence < share * (most - state.evidence):
             break
         one = _extended(promised, state, added)
         if one is not None:
@@ -376,8 +412,7 @@ def _grown(states, known, most):
 
 def _continuations(found, most):
     """Return what may be added to a set: one cause, or one in each of the runs."""
-    few = [found.freer(one) for one in _distinct(found.candidates, most)]
-    few = [one for one in few if one.evidence > ENOUGH]
+    few = [one for one in _best_of(found, most) if one.evidence > ENOUGH]
     if found.probes is None or len(found.probes.runs) < 2:
         return [(one,) for one in few]
     first = {}
@@ -421,17 +456,23 @@ def _exchanged(base, best, library, first, say, cells):
             if len(best.chosen) > _MOST:
                 # so many that none is sure: what each can be told from is all that is asked
                 continue
-            fresh = _best_beside(found, one, library)
-            if fresh is None or (fresh.name, fresh.degree) == (one.name, one.degree):
+            rivals = _rivals_beside(found, one, library)
+            if others and (not rivals or rivals[0].evidence < ENOUGH):
+                # the others do what it did
+                model = base.with_effects([o.recipe for o in others], like=best.model, **_QUICK)
+                best, like = _State(model, others, best.evidence - one.evidence), None
                 continue
-            if fresh.name in {other.name for other in others}:
-                continue
-            place = best.chosen.index(one)
-            chosen = [*best.chosen[:place], fresh, *best.chosen[place + 1 :]]
-            model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
-            if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
-                scans[fresh.name], like = scans.pop(one.name), None
-                best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
+            for fresh in rivals:
+                if (fresh.name, fresh.degree) == (one.name, one.degree):
+                    break
+                if fresh.name in {other.name for other in others}:
+                    continue
+                chosen = [fresh if o is one else o for o in best.chosen]
+                model = base.with_effects([o.recipe for o in chosen], like=best.model, **_QUICK)
+                if model.is_physical(fresh.name) and _gains(model, fresh, best.model, one):
+                    scans[fresh.name], like = scans.pop(one.name), None
+                    best = _State(model, chosen, best.evidence + fresh.evidence - one.evidence)
+                    break
         if best is before:
             break
     return best, {name: found for name, (_, found) in scans.items()}
@@ -443,26 +484,27 @@ def _beside(model, one, library, cells, like):
     return scan(model, library, cells=cells, temper=temper, without=one.name, like=like)
 
 
-def _best_beside(found, own, library):
-    """Return the best candidate of a scan; its own again, with a name or another law, if alike."""
-    few = [found.freer(one) for one in _distinct(found.candidates, _FITTED[1])]
-    mine = [found.freer(one) for one in found.candidates if one.name == own.name]
+def _rivals_beside(found, own, library):
+    """
+    Return what may be in place of a cause, best first, those that are clearly better and its own.
+
+    Each is a name where that does as well.
+    """
+    few = _best_of(found, _FITTED[1])
+    few += [o for o in _best_of(found, _MORE * _FITTED[1]) if o.is_named][: _FITTED[-1]]
+    mine = [found.freer(one) for one in found.candidates if one.name == own.name][:1]
     names = [
-        name
-        for one in [*few, *mine]
-        if not one.is_named
-        for name in found.named_as(one, library)
-        if name.evidence > one.evidence - _AS_GOOD
+        name for one in [*few, *mine] if not one.is_named for name in found.named_as(one, library)
     ]
-    rivals = [*few, *mine]
-    if not rivals:
-        return None
-    best = max(rivals, key=lambda one: one.evidence)
-    if mine and best.evidence < mine[0].evidence + _CLEARLY:
-        best = mine[0]
+    enough = mine[0].evidence + _CLEARLY if mine else -np.inf
+    better = {one.name: one for one in few if one.evidence >= enough}
+    best = sorted(better.values(), key=_evidence) + mine
     # a name is given where it does as well as its cell
-    as_good = [one for one in names if one.evidence > best.evidence - _AS_GOOD]
-    return max(as_good, key=lambda one: one.evidence, default=best)
+    as_good = [[n for n in (*names, one) if n.evidence > one.evidence - _AS_GOOD] for one in best]
+    return [
+        max((n for n in same if n.is_named), key=lambda n: n.evidence, default=one)
+        for one, same in zip(best, as_good, strict=True)
+    ]
 
 
 def _gains(new, fresh, old, one):
