@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from astropolcal.chain import leaves, stages
+from astropolcal.chain import leaves, stages, states_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.observations import Observations
 from astropolcal.observations.pointings import in_state
@@ -150,7 +150,7 @@ def beams_of_frames(chain, frames, lamp):
     """Return the columns of the fluxes, and the frames and their lamp, one for each beam."""
     if splits(leaves(chain)):
         return ("flux_right", "flux_left"), frames, lamp
-    beams = [stage.partition("=")[2] for stage in stages(chain) if stage.startswith("beam=")]
+    beams = states_of(chain).get("beam")
     if not beams or "beam" in frames.colnames:
         return ("flux",), frames, lamp
     count = len(beams)

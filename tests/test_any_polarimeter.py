@@ -13,10 +13,12 @@ from astropolcal.chain import insert_optic, join, stages
 from astropolcal.correction import ScienceFrames, correct, measurement_rows
 from astropolcal.exceptions import ObservationError
 from astropolcal.gap import diagnose
+from astropolcal.gap.report import summary
 from astropolcal.instruments import Instrument, SkyLaw
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
 from astropolcal.simulation import simulate
+from astropolcal.testing import check_instrument
 
 FREE = {"fixed": {"theta": False}, "bounds": {"theta": (-10, 10)}}
 
@@ -210,6 +212,13 @@ def test_a_new_instrument_is_short():
 
 
 @every
+def test_the_instrument_conforms(kind):
+    # the test instruments have neither site nor keywords
+    report = check_instrument(kind, skip=["mounts"], raises=False)
+    assert report, str(report)
+
+
+@every
 def test_noiseless_frames_are_predicted_and_the_derivative_is_that_of_differences(kind):
     measurement = Measurement(kind.chain(), observed(kind, noise=False))
     vector = measurement.vector()
@@ -251,6 +260,9 @@ def test_a_planted_fault_is_found_and_none_without_one(kind):
     assert diagnose(kind.chain(), observed(kind, seed=3)).verdict == "none"
     chain, name = truth_with_fault(kind)
     found = diagnose(kind.chain(), observed(kind, chain, seed=3, flux=1e6))
+    words = summary(found)
+    assert "double diff" not in words.replace("in double diff.", "")
+    assert "half-wave" not in words or kind.name == "fourbeams"
     assert found.verdict in ("named", "located")
     assert name in found.causes[0].name
     assert found.gap_after_percent < 0.3 * found.gap_before_percent

@@ -182,13 +182,14 @@ def _number(values):
 
 
 class Doubles:
-    """Normalized double differences of a model, or what its tables allow."""
+    """Normalized double differences of a model."""
 
     def __init__(self, model):
         self.problem = model.problem
         self.measurement = Measurement(
             model.chains,
             model.observations,
+            observable="normalized_double_difference",
             ties=model.problem.ties,
         )
 
@@ -206,9 +207,8 @@ class Doubles:
     @property
     def noise_percent(self):
         """Their noise, by that of the single differences, in percent."""
-        sigma = self.in_pairs([c.sigma[c.told] for c in self.problem.channels])
-        frames = self.measurement.observable.frames_per_datum
-        return 100 * float(np.sqrt(np.mean(sigma**2) / frames))
+        sigma = self.in_pairs([c.sigma[0] for c in self.problem.channels])
+        return 100 * float(np.sqrt(np.mean(sigma**2) / 2))
 
 
 # ---- accuracies -----------------------------------------------------------------------------

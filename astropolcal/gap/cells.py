@@ -513,7 +513,7 @@ class Probes:
             "crosstalk": (half, -half),
         }
         for kind, (one, other) in changes.items():
-            if single and kind in ("background_of_one_beam", "crosstalk"):
+            if single and kind not in ("background", "nonlinearity"):
                 continue
             slopes = [a * one + b * other for a, b in channel.slopes(sweep)]
             yield kind, np.stack(slopes)

@@ -8,7 +8,7 @@ import numpy as np
 from astropy.modeling import Model
 
 from astropolcal import instruments
-from astropolcal.chain import leaves, stages
+from astropolcal.chain import leaves, stages, states_of
 from astropolcal.exceptions import InstrumentError, ObservationError, WavelengthRangeError
 from astropolcal.observations.pointings import plain_states
 from astropolcal.observations.reading import SAME_WAVELENGTH
@@ -224,11 +224,7 @@ def _check_fit(chain, observations, observable):
         raise ObservationError(
             f"{name}: observable {observable.name} of {words[0]} a frame; allowed is {words[1]}"
         )
-    known = {}
-    for stage in (stage for stage in stages(chain) if "=" in stage):
-        column, _, state = stage.partition("=")
-        known.setdefault(column, []).append(state)
-    for column, states in known.items():
+    for column, states in states_of(chain).items():
         # a column that is missing is named where its positions are read
         found = observations.frames.columns.get(column, [])
         strange = sorted(set(plain_states(found)) - set(states))

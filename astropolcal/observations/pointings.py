@@ -398,11 +398,16 @@ def frame_coordinate(observations, name):
         # both entries alike: what depends on all of the light acts on both beams alike
         total = np.where(observations.mask.T, 0.0, fluxes.sum(axis=0))
         return np.stack([total, total])
-    # stable: frames of one time stay in the order of the table
-    order = np.argsort(time, kind="stable")
-    # what the frame before leaves behind; the first one has none, and 1 changes nothing there
+    # what the frame before leaves behind, of several beams that of the same one; the first has
+    # none, and 1 changes nothing there, nor where there is no light
+    beams = observations.frames.columns.get("beam", np.zeros(observations.n_frames))
     ratio = np.ones_like(fluxes)
-    ratio[..., order[1:]] = fluxes[..., order[1:]] / fluxes[..., order[:-1]]
+    for beam in np.unique(beams):
+        own = np.flatnonzero(np.asarray(beams) == beam)
+        # stable: frames of one time stay in the order of the table
+        order = own[np.argsort(time[own], kind="stable")]
+        now, before = fluxes[..., order[1:]], fluxes[..., order[:-1]]
+        ratio[..., order[1:]] = np.divide(now, before, out=np.ones_like(now), where=before != 0)
     return np.where(np.isnan(ratio), 1.0, ratio)
 
 

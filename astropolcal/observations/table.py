@@ -43,9 +43,10 @@ class Observations:
     ============================== ========= =========================================
     frame, bin                               whole numbers
     wavelength                     length    one value a bin
-    hwp, derotator                 angle     positions of the stages
+    hwp, derotator, ...            angle     positions of the stages that the chain has
     parallactic, altitude          angle     optional, on sky
-    flux_right, flux_left          any, one  ordinary and extraordinary beam
+    flux_right, flux_left          any, one  ordinary and extraordinary beam; or
+    flux, or flux_NAME             any, one  a single beam, or several others
     flux_right_err, flux_left_err  of flux   optional errors of the beams, or
     single_difference_err,         of flux   errors of R - L and R + L (used where
     single_sum_err                           the former are absent)

@@ -100,8 +100,8 @@ def _add_fit_options(add):
     """Add what says how the model is fitted."""
     add(
         "--observable NAME",
-        "what is fitted (default: %(default)s)",
-        default="normalized_double_difference",
+        "what is fitted (default: normalized_double_difference; single differences of tables "
+        "without half-wave plate, and the intensity of single beams)",
     )
     add(
         "--strategy HOW",
@@ -168,7 +168,8 @@ def run(arguments):
     check_suffix("-o", arguments.output, ".asdf")
     _check_start(arguments)
     # raises before any table is read
-    get_observable(arguments.observable)
+    if arguments.observable is not None:
+        get_observable(arguments.observable)
     targets = [_target(text) for text in arguments.target] or TARGETS
     # so that a first call without any data shows what comes out
     files = arguments.files or [_example(say)]

@@ -192,7 +192,7 @@ def _table(path):
 
     _check_ecsv(path)
     table = read_ecsv(path)
-    if _OBSERVED & set(table.colnames):
+    if _OBSERVED & set(table.colnames) or {"frame", "flux"} <= set(table.colnames):
         return _observations(path)
     return _lines(*_other_table(path, table))
 
@@ -216,11 +216,13 @@ def _observations(path):
     import astropy.units as u
 
     from astropolcal.observations import Observations
+    from astropolcal.observations.observables import default_observable
 
     # again, with all checks; the first look was for the columns only
     observations = Observations.read(path)
+    paired = default_observable([observations]) == "normalized_double_difference"
     # raises where a plate angle has no partner at all
-    pairs = observations.pairs()
+    pairs = observations.pairs() if paired else ()
     content = {
         "file": str(path),
         "instrument": observations.instrument,

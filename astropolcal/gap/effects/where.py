@@ -245,7 +245,8 @@ def adapted(effects, chains):
     list of Effect
         An effect that acts on one kind of optic comes once for each such optic: under its own name
         for the first, as ``"name:optic"`` for the others. Where there is no derotator, the words
-        of what stands behind it name the half-wave plate.
+        of what stands behind it name the half-wave plate; where there is no such plate, that of a
+        plate names the optic.
 
     Examples
     --------
@@ -259,9 +260,20 @@ def adapted(effects, chains):
     chains = list(chains)
     found = [one for effect in effects for one in effect.per_optic(chains)]
     found = [one for one in found if one.applies(chains)]
+    found = [_renamed(one, chains) for one in found]
     if any(Roles(chain).derotator is not None for chain in chains):
         return found
     return [_reworded(one) for one in found]
+
+
+def _renamed(effect, chains):
+    """Name the plate as its chain does, where none is on the stage of a half-wave plate."""
+    every = [o for chain in chains for o in Roles(chain).all("plate")]
+    if not every or any(o.stage == "hwp" for o in every) or effect.acts_on != "plate":
+        return effect
+    name = effect.optic or every[0].name
+    words = {"title": effect.title, "place": effect.place}
+    return effect.changed(**{k: v.replace("half-wave plate", name) for k, v in words.items()})
 
 
 def _reworded(effect):
