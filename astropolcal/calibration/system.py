@@ -245,6 +245,9 @@ def from_first_stage(chain, wanted=None):
         )
         if on_stage:
             return join(found[i:])
+    if wanted is None and any(leaf.stage in COORDINATES for leaf in found):
+        # whatever is in several states is not a source
+        return chain
     raise ChainError("the chain has no optic on a stage; give the chain from the sky")
 
 
