@@ -491,7 +491,8 @@ def _rivals_beside(found, own, library):
     Each is a name where that does as well.
     """
     few = _best_of(found, _FITTED[1])
-    few += [o for o in _best_of(found, _MORE * _FITTED[1]) if o.is_named][: _FITTED[-1]]
+    named = [one for one in _distinct(found.candidates, _MORE * _FITTED[1]) if one.is_named]
+    few += map(found.freer, named[: _FITTED[-1]])
     mine = [found.freer(one) for one in found.candidates if one.name == own.name][:1]
     names = [
         name for one in [*few, *mine] if not one.is_named for name in found.named_as(one, library)
