@@ -27,7 +27,13 @@ from astropolcal.exceptions import AstropolcalError, InstrumentError
 from astropolcal.instruments import Instrument
 from astropolcal.mueller import is_physical
 from astropolcal.observations.quality import is_star
-from astropolcal.optics import COORDINATES, LinearPolarizer, Optic, PolarizedSource
+from astropolcal.optics import (
+    COORDINATES,
+    LinearPolarizer,
+    Optic,
+    PolarizedSource,
+    StateAnalyser,
+)
 from astropolcal.simulation import simulate
 
 __all__ = ["check_instrument"]
@@ -138,6 +144,8 @@ def moved_value(parameter, rng):
 
 # optics behind which nothing is left of what polarization the light had
 _LIGHTS = (LinearPolarizer, PolarizedSource)
+# what tells polarization where no optic splits the light
+_ANALYSERS = (LinearPolarizer, StateAnalyser)
 # columns that every table may have
 _COLUMNS = ("hwp", "derotator", "parallactic", "altitude", "flc_state")
 _CYCLE = np.array([0, 45, 22.5, 67.5, 11.25, 56.25, 33.75, 78.75])
@@ -226,6 +234,10 @@ class Probe:
             require(not odd, f"{source}: {odd} cannot be used as optic.parameter")
             splitters = [leaf.name for leaf in leaves(chain) if leaf.splits_light]
             require(len(splitters) < 2, f"{source}: one optic may split the light, not {splitters}")
+            analysers = [o for o in leaves(chain)[1:] if isinstance(o, _ANALYSERS)]
+            require(
+                splitters or analysers, f"{source}: one optic must split the light, or analyse it"
+            )
 
     def check_bounds(self):
         for grid in (None, self.few):

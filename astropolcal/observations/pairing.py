@@ -13,7 +13,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
-from astropolcal.observations.pointings import clock
+from astropolcal.observations.pointings import angle_or_zero, clock
 from astropolcal.units import angle_to_rad
 from astropolcal.words import counted
 
@@ -291,7 +291,7 @@ def frame_groups(observations, kind, rows, label, **limits):
     """
     frames, time = observations.frames, clock(observations.frames)
     plate = observations.position("hwp") * u.rad
-    angles = plate, observations.angle_or_zero("derotator") * u.rad
+    angles = plate, angle_or_zero(observations, "derotator") * u.rad
     named = limits | {"rows": rows, "name": label}
     labels = np.asarray(frames["frame"]).tolist()
     if kind == "hwp":

@@ -301,7 +301,7 @@ def sky_positions(observations, location=None, *, law=TRACKING, nodes=1, when="m
     if "derotator" in observations.frames.colnames:
         found["derotator"] = observations.position("derotator")
     follows = tracked(0.0, parallactic, altitude, law)
-    offset = observations.angle_or_zero("hwp")
+    offset = angle_or_zero(observations, "hwp")
     if "hwp_true" in observations.frames.colnames:
         # what the plate really did differs from the law by a constant offset in each frame
         offset = observations.position("hwp_true") - follows
@@ -409,6 +409,13 @@ def frame_coordinate(observations, name):
         now, before = fluxes[..., order[1:]], fluxes[..., order[:-1]]
         ratio[..., order[1:]] = np.divide(now, before, out=np.ones_like(now), where=before != 0)
     return np.where(np.isnan(ratio), 1.0, ratio)
+
+
+def angle_or_zero(observations, stage):
+    """Return the position of a stage, zero in all frames where the table has no such column."""
+    if stage in observations.frames.colnames:
+        return observations.position(stage)
+    return np.zeros(observations.n_frames)
 
 
 def in_state(frames, name, label):

@@ -14,6 +14,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import AstropolcalWarning, ObservationError
+from astropolcal.observations.pointings import angle_or_zero
 from astropolcal.units import angle_to_rad
 from astropolcal.words import counted
 
@@ -59,9 +60,9 @@ def cycle_numbers(observations, start=None):
     if "cycle" in frames.colnames:
         # numbers of cycles need not be consecutive
         return np.unique(np.asarray(frames["cycle"]), return_inverse=True)[1]
-    plate = _step_of(observations.angle_or_zero("hwp"))
+    plate = _step_of(angle_or_zero(observations, "hwp"))
     state = frames["flc_state"] if "flc_state" in frames.colnames else np.zeros(len(plate))
-    moved = np.abs(np.diff(observations.angle_or_zero("derotator"), prepend=0.0)) > _SAME_ANGLE
+    moved = np.abs(np.diff(angle_or_zero(observations, "derotator"), prepend=0.0)) > _SAME_ANGLE
     first = None if start is None else _step_of(angle_to_rad(start, "start"))
     cycle, number, seen = np.zeros(len(plate), dtype=int), 0, set()
     for i, key in enumerate(zip(plate.tolist(), np.asarray(state).tolist(), strict=True)):
@@ -159,7 +160,7 @@ def mask_unstable_lamp(observations, *, limit=0.1, sigma=6.0):
     spread = MAD_TO_SIGMA * np.nanmedian(off)
     # NaN, a frame masked already, is not far
     far = np.nan_to_num(off) > max(limit, sigma * spread)
-    moved = np.abs(np.diff(observations.angle_or_zero("derotator"))) > _SAME_ANGLE
+    moved = np.abs(np.diff(angle_or_zero(observations, "derotator"))) > _SAME_ANGLE
     # number of the derotator angle in the order of the frames
     run = np.concatenate([[0], np.cumsum(moved)])
     far |= (np.bincount(run, far) >= 0.5 * np.bincount(run))[run]

@@ -385,11 +385,6 @@ class Observations:
             )
         return numeric_column(frames, column, self._label, u.rad)
 
-    def angle_or_zero(self, stage):
-        """Return the position of a stage, zero in all frames where the table has no such column."""
-        there = stage in self._grid.frames.colnames
-        return self.position(stage) if there else np.zeros(self.n_frames)
-
     @property
     def _label(self):
         return self.name if self.path is None else str(self.path)

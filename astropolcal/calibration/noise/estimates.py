@@ -14,6 +14,7 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal.exceptions import FitError
+from astropolcal.observations.pointings import angle_or_zero
 from astropolcal.units import angle_to_rad
 
 __all__ = ["NoiseEstimate", "noise_from_errors", "noise_from_null_channel", "noise_from_replicates"]
@@ -430,7 +431,7 @@ def _predicted_differences(part, vector):
 
 
 def _null_design(observations, frames, null_model):
-    angle = observations.angle_or_zero("derotator")[frames]
+    angle = angle_or_zero(observations, "derotator")[frames]
     state = np.zeros(len(frames), dtype=int)
     if "flc_state" in observations.frames.colnames:
         column = np.asarray(observations.frames["flc_state"])

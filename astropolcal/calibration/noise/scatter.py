@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from astropolcal.exceptions import FitError
+from astropolcal.observations.pointings import angle_or_zero
 from astropolcal.observations.quality import cycle_numbers, is_star
 
 __all__ = []
@@ -111,7 +112,7 @@ def _members(measurement, groups, by):
     """Return name and largest number of data at one wavelength of every group."""
     found = []
     for i, (part, where) in enumerate(zip(measurement.datasets, measurement.segments, strict=True)):
-        angle = np.rad2deg(part.observations.angle_or_zero("derotator"))[part.frames[:, 0]]
+        angle = np.rad2deg(angle_or_zero(part.observations, "derotator"))[part.frames[:, 0]]
         own, bins = groups[where], measurement.bins[where]
         for k, label in enumerate(np.unique(own)):
             rows = own == label
