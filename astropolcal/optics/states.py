@@ -65,8 +65,8 @@ class StateAnalyser(FrameOptic):
               \begin{pmatrix}1&\eta&0&0\\ \eta&1&0&0\\0&0&0&0\\0&0&0&0\end{pmatrix}
 
     with x = 1 in its beam or state and 0 in the others: one beam of a double Wollaston prism
-    (Oliva 1997, Astron. Astrophys. Suppl. 123, 589, doi:10.1051/aas:1997175), or one polarizer of a filter wheel. For
-    all beams to be analysed, each needs one.
+    (Oliva 1997, A&AS 123, 589), or one polarizer of a filter wheel. For all beams to be analysed,
+    each needs one.
 
     Parameters
     ----------
